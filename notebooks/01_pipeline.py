@@ -25,11 +25,11 @@
 from IPython.display import Markdown, display
 
 from wheretolook import load_scorer
-from wheretolook.figures.peaks import peaks_figure
-from wheretolook.figures.pipeline import pipeline_figure
-from wheretolook.release.notebook import open_release
-from wheretolook.release.showcase import open_showcase
-from wheretolook.release.showcase_figures import peaks_of, pipeline_of
+from wheretolook_paper.figures.peaks import peaks_figure
+from wheretolook_paper.figures.pipeline import pipeline_figure
+from wheretolook_paper.release.notebook import open_release
+from wheretolook_paper.release.showcase import open_showcase
+from wheretolook_paper.release.showcase_figures import peaks_of, pipeline_of
 
 # %% [markdown]
 # The release holds landmarks, viewpoints and labels, but no meshes: the apartment is generated anew from its seed. That
@@ -80,7 +80,7 @@ display(peaks_figure(*peaks_of(showcase, scorer, location)))
 # On a machine with a display, this opens the scene, its landmarks and the mapping cameras in Open3D's viewer:
 #
 # ```python
-# from wheretolook.figures.viewer import show_scene
+# from wheretolook_paper.figures.viewer import show_scene
 #
 # localization_map = showcase.localization_map
 # show_scene(showcase.mesh, localization_map.landmarks.points, localization_map.mapping_poses, cut_m=1.5)

@@ -23,11 +23,11 @@
 # %config InlineBackend.figure_formats = ["retina"]
 from IPython.display import display
 
-from wheretolook.figures.lattices import fibonacci_figure
-from wheretolook.figures.sampling import sampling_figure
-from wheretolook.release.notebook import open_release
-from wheretolook.release.showcase import open_showcase
-from wheretolook.release.showcase_figures import sampling_of
+from wheretolook_paper.figures.lattices import fibonacci_figure
+from wheretolook_paper.figures.sampling import sampling_figure
+from wheretolook_paper.release.notebook import open_release
+from wheretolook_paper.release.showcase import open_showcase
+from wheretolook_paper.release.showcase_figures import sampling_of
 
 # %% [markdown]
 # An apartment of the release, generated anew from its seed; a place in it where half of all views fail.

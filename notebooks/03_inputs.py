@@ -24,12 +24,12 @@
 from IPython.display import display
 
 from wheretolook import load_scorer
-from wheretolook.figures.inputs import inputs_figure
-from wheretolook.figures.learning import learning_figure
-from wheretolook.methods.mlp.architecture import architecture_table
-from wheretolook.release.notebook import open_release
-from wheretolook.release.showcase import open_showcase
-from wheretolook.release.showcase_figures import learning_of
+from wheretolook_paper.figures.inputs import inputs_figure
+from wheretolook_paper.figures.network_walkthrough import learning_figure
+from wheretolook_paper.release.mlp_architecture import architecture_table
+from wheretolook_paper.release.notebook import open_release
+from wheretolook_paper.release.showcase import open_showcase
+from wheretolook_paper.release.showcase_figures import learning_of
 
 # %% [markdown]
 # An apartment of the release, generated anew from its seed, and the paper's network that ships.

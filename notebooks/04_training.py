@@ -25,7 +25,7 @@
 # %config InlineBackend.figure_formats = ["retina"]
 from IPython.display import Markdown, display
 
-from wheretolook.release.notebook import open_release, open_store
+from wheretolook_paper.release.notebook import open_release, open_store
 
 release = open_release()
 tracking = open_store(release)
@@ -37,8 +37,8 @@ tracking = open_store(release)
 # 30 × 30 bins of the image, each with the mean of the landmarks in it: their pixel, and depth or position.
 
 # %%
-from wheretolook.release.paper_architecture import paper_architecture_table
 from wheretolook.utils.tracking import newest_run
+from wheretolook_paper.release.paper_architecture import paper_architecture_table
 
 run = newest_run(tracking, "train", params={"dataset": release.name, "method": "mlp-2d+3d"})
 paper_architecture_table(run.data.params).style.hide()
@@ -52,7 +52,7 @@ paper_architecture_table(run.data.params).style.hide()
 # trains it.
 
 # %%
-from wheretolook.learning.runs import trained
+from wheretolook_paper.release.training_histories import trained
 
 trained(tracking, release.name).style.hide().format(precision=3, na_rep="–")
 
@@ -64,8 +64,8 @@ trained(tracking, release.name).style.hide().format(precision=3, na_rep="–")
 # heart.
 
 # %%
-from wheretolook.figures.training import training_figure
-from wheretolook.learning.runs import histories
+from wheretolook_paper.figures.training import training_figure
+from wheretolook_paper.release.training_histories import histories
 
 curves = histories(tracking, release.name)
 command = "`wheretolook train --config configs/release.yaml`"
@@ -96,9 +96,9 @@ display(calibration_figure(calibration))
 
 # %%
 from wheretolook import load_scorer
-from wheretolook.figures.peaks import peaks_figure
-from wheretolook.release.showcase import open_showcase
-from wheretolook.release.showcase_figures import mistaken_location, peaks_of
+from wheretolook_paper.figures.peaks import peaks_figure
+from wheretolook_paper.release.showcase import open_showcase
+from wheretolook_paper.release.showcase_figures import mistaken_location, peaks_of
 
 # %% [markdown]
 # The place is one of an apartment that none of them has learnt from, where half of all views fail. Its mesh is

@@ -25,9 +25,9 @@
 # %config InlineBackend.figure_formats = ["retina"]
 from IPython.display import Markdown, display
 
-from wheretolook.evaluation.paper_tables import NOTE
-from wheretolook.release.notebook import open_release, open_store
-from wheretolook.release.table_view import latest_paper_table, paper_styler
+from wheretolook_paper.evaluation.paper_tables import NOTE
+from wheretolook_paper.release.notebook import open_release, open_store
+from wheretolook_paper.release.table_view import latest_paper_table, paper_styler
 
 release = open_release()
 tracking = open_store(release)
@@ -89,7 +89,7 @@ display(regret_figure(latest_scores(tracking, "interiors")))
 # the paper's network. What suffers most is what counts landmarks or sums up their information.
 
 # %%
-from wheretolook.figures.occlusion import occlusion_figure
+from wheretolook_paper.figures.occlusion import occlusion_figure
 
 display(occlusion_figure(scores))
 

@@ -24,8 +24,8 @@
 from IPython.display import display
 
 from wheretolook.evaluation.results import latest_scores
-from wheretolook.figures.top_n import top_n_figure
-from wheretolook.release.notebook import open_release, open_store
+from wheretolook_paper.figures.top_n import top_n_figure
+from wheretolook_paper.release.notebook import open_release, open_store
 
 release = open_release()
 scores = latest_scores(open_store(release), release.name)
@@ -57,6 +57,6 @@ display(top_n_figure(scores, expected))
 # Within 5 cm and 0.4°, in %: the share of good ones among the best N, and of locations with a good one among N.
 
 # %%
-from wheretolook.figures.top_n import top_n_table
+from wheretolook_paper.figures.top_n import top_n_table
 
 top_n_table(scores).style.format(precision=1)

@@ -28,13 +28,13 @@ import pandas as pd
 from IPython.display import Markdown, display
 
 from wheretolook.figures.path_film import methods_figure, still_figure
-from wheretolook.figures.paths import paths_figure
 from wheretolook.planning.config import PathConfig, PathsConfig, PlanConfig
 from wheretolook.planning.method_paths import path_views, plan_by_methods
-from wheretolook.planning.path_report import path_markdown
-from wheretolook.release.notebook import open_release, open_store
-from wheretolook.release.showcase import open_showcase
 from wheretolook.utils.tracking import newest_artifact
+from wheretolook_paper.figures.paths import paths_figure
+from wheretolook_paper.paths.path_report import path_markdown
+from wheretolook_paper.release.notebook import open_release, open_store
+from wheretolook_paper.release.showcase import open_showcase
 
 # %% [markdown]
 # ## Three ways to look
@@ -45,7 +45,8 @@ from wheretolook.utils.tracking import newest_artifact
 # %%
 release = open_release()
 showcase = open_showcase(release, "apartment-210")
-start, goal = [-1.83, 1.20, 1.55], [2.24, -2.12, 1.53]
+start = [-1.83, 1.20, 1.55]
+goal = [2.24, -2.12, 1.53]
 config = PlanConfig(grid=(8, 8, 4), directions=200, planner=PathConfig(time_s=6.0))
 
 # %% [markdown]
@@ -54,7 +55,8 @@ config = PlanConfig(grid=(8, 8, 4), directions=200, planner=PathConfig(time_s=6.
 # improved until time is up.
 
 # %%
-localization_map, methods = showcase.localization_map, ["forward", "fisher-trace-gp", "set"]
+localization_map = showcase.localization_map
+methods = ["forward", "fisher-trace-gp", "set"]
 paths = plan_by_methods(showcase, release, methods, start, goal, config)
 
 # %% [markdown]

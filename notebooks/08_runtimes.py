@@ -26,8 +26,8 @@
 import pandas as pd
 from IPython.display import Image, Markdown, display
 
-from wheretolook.release.notebook import open_release, open_store
 from wheretolook.utils.tracking import newest_artifact
+from wheretolook_paper.release.notebook import open_release, open_store
 
 tracking = open_store(open_release())
 
@@ -39,7 +39,7 @@ tracking = open_store(open_release())
 # the gain can be told from the machine's. Below, the whole check with occlusion, which the paper's times leave out.
 
 # %%
-from wheretolook.figures.runtimes import runtime_figure
+from wheretolook_paper.figures.runtimes import runtime_figure
 
 times = pd.read_csv(newest_artifact(tracking, "benchmark", "runtimes.csv"))
 display(runtime_figure(times))
@@ -50,7 +50,7 @@ display(runtime_figure(times))
 # Median, least and most seconds of repeated runs, and billions of projections a second that the counting stands for.
 
 # %%
-from wheretolook.figures.runtimes import runtime_table
+from wheretolook_paper.figures.runtimes import runtime_table
 
 runtime_table(times).style.hide().format(precision=3)
 
@@ -62,8 +62,8 @@ runtime_table(times).style.hide().format(precision=3)
 # With `--scaling` it measures how time and memory grow, too, which is drawn here if the store knows it.
 
 # %%
-from wheretolook.figures.runtimes import scaling_figure
 from wheretolook.utils.errors import MissingRunError
+from wheretolook_paper.figures.runtimes import scaling_figure
 
 try:
     display(scaling_figure(pd.read_csv(newest_artifact(tracking, "benchmark", "scaling.csv"))))

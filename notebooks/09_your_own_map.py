@@ -28,18 +28,18 @@ from IPython.display import display
 from PIL import Image
 
 from wheretolook import LocalizationMap, load_scorer, poses_looking_along
-from wheretolook.figures.house_image import dollhouse
-from wheretolook.figures.pipeline import ranked_figure
+from wheretolook.dataset.sampling import free_locations
+from wheretolook.figures.dollhouse import dollhouse
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.refine import refine_directions
 from wheretolook.planning.viewpoint_map import ViewpointMap
-from wheretolook.release.example_model import make_example_model
-from wheretolook.release.notebook import open_release
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.space.free_space import FreeSpace
-from wheretolook.viewpoints.sampling import free_locations
+from wheretolook_paper.figures.pipeline import ranked_figure
+from wheretolook_paper.release.example_model import make_example_model
+from wheretolook_paper.release.notebook import open_release
 
 # %% [markdown]
 # ## A map

@@ -32,23 +32,23 @@ import pandas as pd
 from IPython.display import display
 
 from wheretolook import LocalizationMap, load_scorer, poses_looking_along
-from wheretolook.figures.house_image import dollhouse
-from wheretolook.figures.look_film import still_figure, tell_looks
-from wheretolook.figures.looks import looks_figure
+from wheretolook.dataset.sampling import free_locations
+from wheretolook.figures.dollhouse import dollhouse
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
-from wheretolook.labelling.localizer import Localizer
+from wheretolook.localization.localizer import Localizer
 from wheretolook.looks.around import best_looks
-from wheretolook.mapping.building import build_map
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.release.notebook import open_release
+from wheretolook.mapping.rendered_map import build_map
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh, save_glb
-from wheretolook.scenes.procedural.generator import generate_apartment
 from wheretolook.space.free_space import FreeSpace
-from wheretolook.viewpoints.sampling import free_locations
+from wheretolook_paper.figures.look_film import still_figure, tell_looks
+from wheretolook_paper.figures.looks import looks_figure
+from wheretolook_paper.release.notebook import open_release
+from wheretolook_rooms.generator import generate_apartment
 
 # %% [markdown]
 # ## An apartment and its map
@@ -56,10 +56,14 @@ from wheretolook.viewpoints.sampling import free_locations
 # Generated, with the same wallpaper in two rooms.
 
 # %%
-folder, camera, seed = Path(mkdtemp()), PinholeCamera(), 536
+folder = Path(mkdtemp())
+camera = PinholeCamera()
+seed = 536
 save_glb(generate_apartment(ApartmentConfig(vary=True), seed), folder / "scan.glb")
 mesh = load_mesh(folder / "scan.glb")
-space, renderer, config = FreeSpace(mesh), WarpRenderer(mesh), MapConfig(n_images=100)
+space = FreeSpace(mesh)
+renderer = WarpRenderer(mesh)
+config = MapConfig(n_images=100)
 
 # %% [markdown]
 # Mapped from 100 images along a walk, in less than a minute on two cores.
@@ -84,7 +88,8 @@ places = np.random.default_rng(3).choice(free[abs(free[:, 2] - 1.3) < 0.5], 20, 
 # is best alone comes first.
 
 # %%
-scorer, directions = load_scorer(open_release().root / "weights", localization_map), fibonacci_sphere(100)
+scorer = load_scorer(open_release().root / "weights", localization_map)
+directions = fibonacci_sphere(100)
 
 
 def two_looks(place):

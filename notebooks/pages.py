@@ -38,7 +38,9 @@ nav a { margin-right: 1em; display: inline-block }
 @media (max-width: 40rem) { body { margin: 1rem auto; font-size: 15px } pre { font-size: 12px } }
 """
 
-LARGE, QUALITY, WIDEST_PX = 25_000, 55, 960
+LARGE = 25_000
+QUALITY = 55
+WIDEST_PX = 960
 """Bytes above which a picture loses something, its quality then, and its width at most."""
 
 
@@ -73,8 +75,10 @@ def notebook_page(notebook: Any, others: dict[str, str] | None = None) -> str:
     from pygments.formatters import HtmlFormatter
     from pygments.lexers import PythonLexer
 
-    markdown, formatter = MarkdownIt("commonmark").enable("table"), HtmlFormatter(nobackground=True)
-    body, about = [], ""
+    markdown = MarkdownIt("commonmark").enable("table")
+    formatter = HtmlFormatter(nobackground=True)
+    body = []
+    about = ""
     for cell in notebook.cells:
         if cell.cell_type == "markdown":
             body.append(_from_above(markdown.render(cell.source)))
@@ -195,7 +199,8 @@ def main(arguments: list[str]) -> int:
     import jupytext
     from nbclient.exceptions import CellExecutionError, CellTimeoutError, DeadKernelError
 
-    folder, out = Path(arguments[0]), Path(arguments[1])
+    folder = Path(arguments[0])
+    out = Path(arguments[1])
     notebooks = sorted(folder.glob("[0-9]*.py"))  # not this file
     titles = {path.stem: title_of(jupytext.read(path)) for path in notebooks}
     paths = [path for path in notebooks if len(arguments) < 3 or path.stem in arguments[2:]]

@@ -43,7 +43,8 @@ def quads_mesh(quads, textures, repeat=1.0, vertex_colors=None):
 
 def box_quads(low, high, inward=False):
     """The six faces (6, 4, 3) of a box, seen from outside or from inside."""
-    low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+    low = np.asarray(low, dtype=np.float64)
+    high = np.asarray(high, dtype=np.float64)
     quads = low + _FACES * (high - low)
     return quads[:, ::-1] if inward else quads
 

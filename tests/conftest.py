@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, poses_looking_along
-from wheretolook.labelling import local_engine
-from wheretolook.labelling.shard import LabelledShard, Shard, ShardWorker
+from wheretolook.localization import local_engine
+from wheretolook.localization.shard import LabelledShard, Shard, ShardWorker
 from wheretolook.utils.tracking import client
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.utils.warp import start_warp
@@ -109,7 +109,8 @@ class RandomViews:
 def random_views(request: pytest.FixtureRequest) -> RandomViews:
     rng = np.random.default_rng(request.param)
     camera = PinholeCamera(320, 200 + 20 * request.param, 150.0 + 30 * request.param)
-    points, locations = rng.uniform(-4, 4, (800, 3)), rng.uniform(-2, 2, (5, 3))
+    points = rng.uniform(-4, 4, (800, 3))
+    locations = rng.uniform(-2, 2, (5, 3))
     directions = rng.normal(size=(17, 3))
     mask = rng.random((len(locations), len(points))) < 0.6
     location_rows = rng.integers(0, len(locations), 40)

@@ -8,9 +8,9 @@ from typing import Any
 
 from synthetic_dataset import CAMERA
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.learning.trained_network import StoredNetwork, TrainedNetwork
-from wheretolook.methods.mlp.config import MlpConfig
-from wheretolook.methods.train_config import TrainConfig
+from wheretolook.scorers.mlp.config import MlpConfig
+from wheretolook.scorers.train_config import TrainConfig
+from wheretolook.training.trained_network import StoredNetwork, TrainedNetwork
 
 OF_MLP = {option.name for option in fields(MlpConfig)}
 

@@ -18,7 +18,8 @@ class MaskAgreement:
     @classmethod
     def between(cls, mask: ArrayLike, truth: ArrayLike) -> MaskAgreement:
         """Compare masks (L, N), True where free."""
-        found, free = np.asarray(mask, dtype=bool), np.asarray(truth, dtype=bool)
+        found = np.asarray(mask, dtype=bool)
+        free = np.asarray(truth, dtype=bool)
         if found.shape != free.shape:
             raise ValueError(f"masks of shapes {found.shape} and {free.shape}")
         both, n_found, n_free = (int(part.sum()) for part in (found & free, found, free))

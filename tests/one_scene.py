@@ -1,4 +1,4 @@
-"""Labels the viewpoints of one scene, as `wheretolook.labelling.labeller.label_scenes` does those of many."""
+"""Labels the viewpoints of one scene, as `wheretolook.localization.labeller.label_scenes` does those of many."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import pandas as pd
 
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.labelling.config import LabelConfig
-from wheretolook.labelling.labeller import LabelTask, label_scenes
-from wheretolook.labelling.shard import SceneJob
+from wheretolook.localization.config import LabelConfig
+from wheretolook.localization.labeller import LabelTask, label_scenes
+from wheretolook.localization.shard import SceneJob
 
 
 def label_viewpoints(
@@ -26,7 +26,8 @@ def label_viewpoints(
     description: str = "label",
 ) -> pd.DataFrame:
     """`label_scenes` for one scene, of the parts of a `SceneJob` and a `LabelTask`: the table with its labels."""
-    config, extractor = config or LabelConfig(), extractor or ExtractorConfig()
+    config = config or LabelConfig()
+    extractor = extractor or ExtractorConfig()
     job = SceneJob(mesh, landmarks, camera, config.localizer, extractor, device, config.store_matches)
     (scene,) = label_scenes([LabelTask(description, job, table, shards)], config, progress, description)
     return scene.table

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.dataset.sampling_config import Split
+from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, pose_columns, write_table
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.bins import bin_views_plain
 from wheretolook.mapping.colmap_model import save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.viewpoints.config import Split
-from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, pose_columns, write_table
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 from wheretolook.visibility.occlusion import StoredOcclusion
 

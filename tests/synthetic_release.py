@@ -9,9 +9,9 @@ import pandas as pd
 
 from synthetic_dataset import make_dataset
 from synthetic_scores import make_scores
-from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.names import RELEASE_FILE
-from wheretolook.evaluation.paper_tables import write_paper_tables
+from wheretolook_paper.evaluation.paper_tables import write_paper_tables
 
 METHODS: tuple[str, ...] = ("random", "bins", "fisher-trace-exact", "mlp-2d+z", "mlp-2d+3d")
 
@@ -19,7 +19,8 @@ METHODS: tuple[str, ...] = ("random", "bins", "fisher-trace-exact", "mlp-2d+z", 
 def make_release(root: Path) -> Dataset:
     """A dataset of two test scenes with results, the record of one network, and no MLflow store."""
     dataset = make_dataset(root, ("test", "test"), n_locations=4, n_directions=6)
-    results, weights = root / "results", root / "weights"
+    results = root / "results"
+    weights = root / "weights"
     results.mkdir()
     weights.mkdir()
     scores = make_scores(METHODS, scenes=("scene-0", "scene-1"))

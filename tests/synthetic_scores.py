@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
+from wheretolook.dataset.thresholds import THRESHOLDS, threshold_key
 from wheretolook.evaluation.scores import RELEASED_DIVISOR
-from wheretolook.viewpoints.thresholds import THRESHOLDS, threshold_key
 
 KEYS = tuple(map(threshold_key, THRESHOLDS))
 FISHER: tuple[str, ...] = tuple(
@@ -34,7 +34,8 @@ def make_scores(
     seed: int = 0,
 ) -> pd.DataFrame:
     """A table as the evaluate stage writes it, of 50 locations a scene; the oracle's shares are 0.9."""
-    rng, shape = np.random.default_rng(seed), (len(top_n), len(KEYS))
+    rng = np.random.default_rng(seed)
+    shape = (len(top_n), len(KEYS))
     rows = []
     for scene in ("all", *scenes):
         n_locations = 50 * (len(scenes) if scene == "all" else 1)
@@ -43,7 +44,8 @@ def make_scores(
         unknown = np.full(shape, np.nan)
         for method, shares in raw.items():
             differences = shares - (raw[reference] if reference else unknown)
-            learned, width = method.startswith("mlp"), 0.0 if method == reference else 0.02
+            learned = method.startswith("mlp")
+            width = 0.0 if method == reference else 0.02
             for number, n in enumerate(top_n):
                 row: dict[str, object] = {"method": method, "occlusion": "mesh", "candidates": "all"}
                 row |= {"top_n": n, "scene": scene}

@@ -16,7 +16,7 @@ import pytest
 
 from wheretolook import cli
 from wheretolook.cli import main
-from wheretolook.methods.registry import describe_methods, scorers
+from wheretolook.scorers.registry import describe_methods, scorers
 
 
 def test_methods_are_listed_without_a_dataset(

@@ -288,7 +288,8 @@ def rows_of(page: Path, header: str) -> dict[str, list[str]]:
     ],
 )
 def test_tables_hold_the_numbers_of_the_release(page: str, columns: list[str], header: str) -> None:
-    known, rows = number_rows(), rows_of(ROOT / page, header)
+    known = number_rows()
+    rows = rows_of(ROOT / page, header)
     assert len(rows) == (6 if page == "README.md" else 16)
     checked = {label: method for label, method in METHODS.items() if label in rows}
     wanted = {label: [known[method][column] for column in columns] for label, method in checked.items()}
@@ -296,7 +297,8 @@ def test_tables_hold_the_numbers_of_the_release(page: str, columns: list[str], h
 
 
 def test_tables_by_camera_hold_the_numbers_of_the_release() -> None:
-    page, methods = ROOT / "docs" / "results.md", ("set", "expected-inliers", "bins", "visible")
+    page = ROOT / "docs" / "results.md"
+    methods = ("set", "expected-inliers", "bins", "visible")
     table = pd.read_csv(ROOT / "data" / "release" / "results" / "cameras.csv")
     cells = {}
     for row in table.to_dict("records"):

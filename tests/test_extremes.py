@@ -8,25 +8,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from open3d_renderer import Open3DRenderer
 from planning.rooms import CAMERA, DIRECTIONS, GRID, room_landmarks
 from selection.room import WEIGHTS
 from synthetic_dataset import make_landmarks
 from wheretolook.cli import main
+from wheretolook.dataset.sampling import sample_viewpoints
+from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, check_voxels, fibonacci_sphere
 from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.methods.registry import make_scorer, scorers
 from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.planning.map_building import build_viewpoint_map
-from wheretolook.rendering.open3d_renderer import Open3DRenderer
 from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.scorers.registry import make_scorer, scorers
 from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils import memory
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.viewpoints.config import SampleConfig
-from wheretolook.viewpoints.sampling import sample_viewpoints
 from wheretolook.visibility.counting import FrustumCounter, count_plain
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import NoOcclusion
@@ -103,7 +103,8 @@ def test_a_view_exactly_on_a_landmark() -> None:
 def test_images_of_one_pixel() -> None:
     from box_scenes import furnished_room
 
-    camera, pose = PinholeCamera(1, 1, 1.0), poses_looking_along([(3.0, 2.5, 1.5)], FORWARD)
+    camera = PinholeCamera(1, 1, 1.0)
+    pose = poses_looking_along([(3.0, 2.5, 1.5)], FORWARD)
     images = [WarpRenderer(furnished_room(), method=method).render(camera, pose) for method in ("raster", "rays")]
     images.append(Open3DRenderer(furnished_room()).render(camera, pose))
     for image in images:
@@ -119,7 +120,8 @@ def test_images_of_one_pixel() -> None:
 
 
 def test_seventy_thousand_directions() -> None:
-    axes, points = fibonacci_sphere(70_000), room_landmarks(60).points
+    axes = fibonacci_sphere(70_000)
+    points = room_landmarks(60).points
     place = np.array([(3.0, 2.5, 1.5)])
     rotations = rotation_looking_along(axes)
     counts = survey(CAMERA, rotations, place, points, NoOcclusion(), keep=5).counts
@@ -179,7 +181,8 @@ def test_short_sides_of_a_grid_too_large_stay(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_more_counts_or_viewpoints_than_memory_holds_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    landmarks, rotations = room_landmarks(60), rotation_looking_along(fibonacci_sphere(20_000))
+    landmarks = room_landmarks(60)
+    rotations = rotation_looking_along(fibonacci_sphere(20_000))
     monkeypatch.setattr(memory, "available_bytes", lambda: 2_000_000)
     with pytest.raises(ConfigError, match="directions would fit"):
         survey(CAMERA, rotations, GRID.centers()[:10], landmarks.points, NoOcclusion())

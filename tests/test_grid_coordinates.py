@@ -12,6 +12,7 @@ import pytest
 
 from box_scenes import ROOM, furnished_room
 from mapping.conftest import BoxFreeSpace, box_room
+from open3d_renderer import Open3DRenderer
 from planning.rooms import CAMERA, DIRECTIONS, GRID, free_voxels, room_landmarks
 from selection.room import POINTS, WEIGHTS, write_room
 from wheretolook import WhereToLook
@@ -22,21 +23,20 @@ from wheretolook.geometry.local_origin import local_origin, poses_from
 from wheretolook.geometry.poses import Float, camera_centers, pose_error, poses_looking_along, transform
 from wheretolook.geometry.tsdf import DepthImage, TsdfVolume
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.labelling.localizer import Localizer
-from wheretolook.mapping.building import build_map
+from wheretolook.localization.localizer import Localizer
 from wheretolook.mapping.colmap_model import load_mapping_poses, save_mapping_poses
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.methods.registry import make_scorer, scorers
+from wheretolook.mapping.rendered_map import build_map
 from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewpointMap
-from wheretolook.rendering.open3d_renderer import Open3DRenderer
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.robot.export import export_robot
 from wheretolook.robot.wheretolook_robot import RobotScorer
 from wheretolook.scenes.cutting import cut_above
 from wheretolook.scenes.loading import load_mesh, save_glb
+from wheretolook.scorers.registry import make_scorer, scorers
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.space.tsdf_space import TsdfSpace
 from wheretolook.utils.errors import OutOfRangeWarning
@@ -109,12 +109,14 @@ def test_images_and_depth_are_the_same() -> None:
         far = renderer.render(camera, far_poses(ROOM_POSES))
         assert np.isclose(far.depth_m, near.depth_m, atol=1e-4).mean() > 0.999
         assert (np.abs(far.rgb.astype(int) - near.rgb) <= 2).mean() > 0.999
-    cut, cut_there = cut_above(furnished_room(), 1.5), cut_above(far_room(), 1.5 + SHIFT[2])
+    cut = cut_above(furnished_room(), 1.5)
+    cut_there = cut_above(far_room(), 1.5 + SHIFT[2])
     np.testing.assert_allclose(cut_there.bounds - SHIFT, cut.bounds, atol=1e-8)
 
 
 def test_rays_and_free_space_are_the_same() -> None:
-    near, far = FreeSpace(furnished_room()), FreeSpace(far_room())
+    near = FreeSpace(furnished_room())
+    far = FreeSpace(far_room())
     assert near.two_sided == far.two_sided
     rng = np.random.default_rng(1)
     a, b = rng.uniform(0, ROOM, (2, 300, 3))
@@ -124,7 +126,8 @@ def test_rays_and_free_space_are_the_same() -> None:
     occluded = near.raycaster.occluded(a[:20], b)
     assert 0.05 < occluded.mean() < 0.95
     np.testing.assert_array_equal(far.raycaster.occluded(a[:20] + SHIFT, b + SHIFT), occluded)
-    hits, there = near.raycaster.cast(a, b - a), far.raycaster.cast(a + SHIFT, b - a)
+    hits = near.raycaster.cast(a, b - a)
+    there = far.raycaster.cast(a + SHIFT, b - a)
     np.testing.assert_allclose(there.distance_m, hits.distance_m, atol=1e-4)
 
 
@@ -139,7 +142,8 @@ def test_what_is_in_view_is_the_same(model: str) -> None:
         assert found.occlusion is not None
         return found.counts, found.occlusion.mask
 
-    near, far = seen(locations, points, furnished_room()), seen(locations + SHIFT, points + SHIFT, far_room())
+    near = seen(locations, points, furnished_room())
+    far = seen(locations + SHIFT, points + SHIFT, far_room())
     np.testing.assert_array_equal(far[0], near[0])
     np.testing.assert_array_equal(far[1], near[1])
 
@@ -166,7 +170,8 @@ def test_depth_images_fuse_to_the_same() -> None:
 
 @LOOSE
 def test_scores_are_the_same_by_every_method() -> None:
-    landmarks, poses = room_landmarks(400), poses_looking_along(GRID.centers()[list(free_voxels())][:8], DIRECTIONS[:8])
+    landmarks = room_landmarks(400)
+    poses = poses_looking_along(GRID.centers()[list(free_voxels())][:8], DIRECTIONS[:8])
     known = poses_looking_along([(3.0, 2.5, 1.5)] * 4, DIRECTIONS[:4])
     near = LocalizationMap(landmarks, CAMERA, MeshOcclusion(MeshRaycaster(furnished_room())), mapping_poses=known)
     far = LocalizationMap(
@@ -194,7 +199,8 @@ def test_a_colmap_model_gives_the_same_views(tmp_path: Path) -> None:
     for hides in ("none", "hidden-points"):
         near = WhereToLook.from_colmap(folder, occlusion=hides, directions=100)
         far = WhereToLook.from_colmap(tmp_path / "far", occlusion=hides, directions=100)
-        views, there = near.best(POINTS), far.best(POINTS + SHIFT)
+        views = near.best(POINTS)
+        there = far.best(POINTS + SHIFT)
         np.testing.assert_array_equal(there.n_visible, views.n_visible)
         np.testing.assert_allclose(there.yaw_deg, views.yaw_deg, atol=1e-6)
         np.testing.assert_allclose(there.score, views.score, rtol=1e-4)
@@ -208,7 +214,8 @@ def test_a_colmap_model_gives_the_same_views(tmp_path: Path) -> None:
 
 
 def test_a_map_is_triangulated_and_localized_against_as_well(tmp_path: Path) -> None:
-    camera, mesh = PinholeCamera(320, 240, 160.0), replace(box_room(), origin=SHIFT)
+    camera = PinholeCamera(320, 240, 160.0)
+    mesh = replace(box_room(), origin=SHIFT)
 
     class There(BoxFreeSpace):
         def is_free(self, points):
@@ -234,7 +241,8 @@ def test_a_map_is_triangulated_and_localized_against_as_well(tmp_path: Path) -> 
 
 def test_a_pose_is_estimated_as_exactly_as_near_the_origin() -> None:
     rng = np.random.default_rng(0)
-    points, pose = rng.uniform(0, ROOM, (200, 3)), ROOM_POSES[0]
+    points = rng.uniform(0, ROOM, (200, 3))
+    pose = ROOM_POSES[0]
     pixels = CAMERA.project(transform(pose, points))
     rows = np.flatnonzero((transform(pose, points)[:, 2] > 0.1) & CAMERA.in_image(pixels))
     keypoints = Keypoints(pixels.astype(np.float32), np.zeros((200, 128), np.float32), np.ones(200, np.float32))
@@ -249,7 +257,8 @@ def test_a_pose_is_estimated_as_exactly_as_near_the_origin() -> None:
 def test_a_viewpoint_map_and_a_robots_file_are_the_same(tmp_path: Path) -> None:
     landmarks = room_landmarks(300)
     grid = VoxelGrid(tuple(SHIFT), tuple(SHIFT + ROOM), GRID.shape)
-    maps, robots = [], []
+    maps = []
+    robots = []
     for name, around, voxels in (
         ("near", LocalizationMap(landmarks, CAMERA, MeshOcclusion(MeshRaycaster(furnished_room()))), GRID),
         ("far", LocalizationMap(far_landmarks(landmarks), CAMERA, MeshOcclusion(MeshRaycaster(far_room()))), grid),
@@ -266,7 +275,8 @@ def test_a_viewpoint_map_and_a_robots_file_are_the_same(tmp_path: Path) -> None:
     np.testing.assert_array_equal(far.n_visible, near.n_visible)
     asked = np.random.default_rng(0).uniform(0, ROOM, (100, 3))
     np.testing.assert_array_equal(far.best_many(asked + SHIFT).direction_id, near.best_many(asked).direction_id)
-    views, there = robots[0].views(ROOM_POSES), robots[1].views(far_poses(ROOM_POSES))
+    views = robots[0].views(ROOM_POSES)
+    there = robots[1].views(far_poses(ROOM_POSES))
     np.testing.assert_array_equal(there.n_visible, views.n_visible)
     np.testing.assert_allclose(there.score, views.score, atol=1e-4)
 

@@ -19,7 +19,7 @@ from pages import about_of, main, notebook_page, small_picture, small_table
 from PIL import Image
 
 from synthetic_release import make_release
-from wheretolook.methods.styles import MethodStyle, method_style
+from wheretolook.scorers.styles import MethodStyle, method_style
 from wheretolook.utils.tracking import newest_run
 from wheretolook.utils.tracking_config import TrackingConfig
 
@@ -179,7 +179,8 @@ def shrunk(pixels: np.ndarray) -> tuple[Image.Image, tuple[int, int]]:
 
 def test_cells_of_tables_keep_the_names_that_their_style_speaks_of() -> None:
     style = "<style>#T_1 th.col_heading { color: red } #T_1_row0_col1 { font-weight: bold }</style>"
-    head, cell = '<th id="T_1_a" class="col_heading level0" >a</th>', '<td id="T_1_b" class="data" >1</td>'
+    head = '<th id="T_1_a" class="col_heading level0" >a</th>'
+    cell = '<td id="T_1_b" class="data" >1</td>'
     bold = '<td id="T_1_row0_col1" class="data col1" >2</td>'
     assert small_table(f'{style}<table id="T_1"><tr class="x">{head}{cell}{bold}</tr></table>') == (
         f'{style}<table id="T_1"><tr><th class="col_heading">a</th><td>1</td><td id="T_1_row0_col1">2</td></tr></table>'

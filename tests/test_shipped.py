@@ -96,7 +96,7 @@ import wheretolook
 print(sorted(name for name in sys.modules if name.partition(".")[0] not in sys.stdlib_module_names))
 print([name for name in wheretolook.__all__ if not hasattr(wheretolook, name)])
 from wheretolook import load_scorer
-from wheretolook.methods.set.score import SetScorer
+from wheretolook.scorers.set.score import SetScorer
 print([name for name in ("lightning", "mlflow", "sklearn", "matplotlib", "ray") if name in sys.modules])"""
     path = str(Path(wheretolook.__file__).parents[1])
     code = f"import sys; sys.path.insert(0, {path!r})\n{code}"

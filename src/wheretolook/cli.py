@@ -129,14 +129,14 @@ def _run(command: str, arguments: list[str]) -> int:
         fix = f"Did you mean {near}?" if near else f"Use one of {', '.join([*STAGES, *OWN])}."
         raise ConfigError("unknown stage", value=command, fix=fix)
     if command == "evaluate" and "--list-methods" in arguments:
-        from wheretolook.methods.registry import describe_methods
+        from wheretolook.scorers.registry import describe_methods
 
         texts = describe_methods()
         width = max(map(len, texts))
         print("\n".join(f"{name:<{width}}  {text}" for name, text in texts.items()))
         return 0
     if command == "figures" and "--list" in arguments:
-        from wheretolook.release.catalog import catalog_text
+        from wheretolook_paper.release.catalog import catalog_text
 
         print(catalog_text())
         return 0
@@ -168,7 +168,8 @@ def parse_experiment(command: str, arguments: list[str]) -> Experiment | None:
     """
     from wheretolook.config import MOVED, Experiment
 
-    options, short = all_options(Experiment), {**_SHORT, **STAGES[command].short}
+    options = all_options(Experiment)
+    short = {**_SHORT, **STAGES[command].short}
     arguments = list(arguments)
     places = [place for place, name in enumerate(arguments) if name in _SIGNED and place + 1 < len(arguments)]
     for place in reversed(places):  # a value such as -y looks like an option
@@ -224,7 +225,8 @@ def _check_file(path: Path, options: Mapping[str, Option], group: str = "") -> N
     try:
         content = read_yaml(path) or {}
     except FileNotFoundError as error:
-        near, there = nearest(str(path), shipped_configs()), ", ".join(shipped_configs())
+        near = nearest(str(path), shipped_configs())
+        there = ", ".join(shipped_configs())
         fix = f"Did you mean {near}?" if near else f"Give the path of a YAML file, or one that ships: {there}."
         raise ConfigError("there is no such file", path=path, fix=fix) from error
     except (OSError, ValueError) as error:

@@ -145,7 +145,7 @@ To plan in what depth images saw as free, without the mesh: --occlusion.model ts
         "release_name evaluate.methods evaluate.occlusions evaluate.candidates tracking.folder",
         ("evaluate", "occlusion", "tracking"),
         "--config configs/release.yaml",
-        refuses="wheretolook.release.naming",
+        refuses="wheretolook_paper.release.naming",
     ),
     "log-release": Stage(
         "log_release",
@@ -187,10 +187,10 @@ Without --config it is configs/release.yaml, whose runs are logged first. Tables
 
 OWN = {
     "select": ("wheretolook.select.command", "The best views at places of your own COLMAP model; needs no dataset."),
-    "check": ("wheretolook.check.command", "How well views of your own map are told apart, by its own photographs."),
+    "check": ("wheretolook.holdout.command", "How well views of your own map are told apart, by its own photographs."),
     "view": ("wheretolook.view.command", "A scene or your own map in the browser, with the score of every view."),
     "export": ("wheretolook.robot.command", "What a robot needs to score views of your own map, without PyTorch."),
-    "benchmark": ("wheretolook.benchmark.command", "The Active Localization Benchmark on its scene folders."),
+    "benchmark": ("wheretolook_paper.benchmark.command", "The Active Localization Benchmark on its scene folders."),
 }
 """Sub-commands with options of their own, which are no stages of an experiment: their module, and what they do."""
 

@@ -7,23 +7,23 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
 
+from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.figures.config import FiguresConfig
 from wheretolook.geometry.camera import CameraConfig
-from wheretolook.labelling.config import LabelConfig
+from wheretolook.localization.config import LabelConfig
 from wheretolook.mapping.config import MapConfig
-from wheretolook.methods.adapted.config import AdaptConfig
-from wheretolook.methods.train_config import MOVED as MOVED_TRAIN_OPTIONS
-from wheretolook.methods.train_config import TrainConfig
 from wheretolook.planning.config import PathsConfig, PlanConfig, ViewpointMapConfig
 from wheretolook.scans.config import RgbdConfig
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
+from wheretolook.scorers.adapted.config import AdaptConfig
+from wheretolook.scorers.train_config import MOVED as MOVED_TRAIN_OPTIONS
+from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.utils.confine import check_folder_name, entry_of
 from wheretolook.utils.devices import check_device_name, usable_device
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.viewpoints.config import SampleConfig
 from wheretolook.visibility.config import OcclusionConfig
 
 NOT_SCENES = (

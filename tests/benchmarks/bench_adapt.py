@@ -16,14 +16,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from wheretolook.dataset.folders import Dataset
-from wheretolook.dataset.scene import Scene
+from wheretolook.dataset.environment import Scene
+from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.viewpoint_table import CAMERA_ID, poses
 from wheretolook.evaluation.adaptation import compare_log_odds
-from wheretolook.methods.adapted.fit import adapt
-from wheretolook.methods.registry import make_scorer
+from wheretolook.scorers.adapted.gp_correction import adapt
+from wheretolook.scorers.registry import make_scorer
 from wheretolook.stages.adapt import labelled_views
 from wheretolook.utils.shipped import WEIGHTS, shipped
-from wheretolook.viewpoints.table import CAMERA_ID, poses
 
 
 def main() -> None:
@@ -39,7 +39,8 @@ def main() -> None:
     for files in Dataset.load(options.data).split(options.split):
         if options.scenes and files.name not in options.scenes:
             continue
-        table, scene = files.read_table(), Scene(files, device="cpu")
+        table = files.read_table()
+        scene = Scene(files, device="cpu")
         views = labelled_views(files, scene, table, shipped(WEIGHTS) / "set.safetensors")
         numbers = table[CAMERA_ID].to_numpy() if CAMERA_ID in table else np.zeros(len(table), dtype=int)
         bins = np.empty(len(table))
@@ -49,7 +50,8 @@ def main() -> None:
             bins[at] = make_scorer("bins", files.localization_map(camera, "cpu")).score(poses(table)[at])
         locations = np.random.default_rng(options.seed).permutation(np.unique(views.group))
         learn = np.isin(views.group, locations[: len(locations) // 2])
-        start, rest = time.monotonic(), views.rows(~learn)
+        start = time.monotonic()
+        rest = views.rows(~learn)
         learnt = adapt(views.rows(learn))
         seconds = time.monotonic() - start
         judged = rest.good, rest.group, rest.centers

@@ -33,9 +33,9 @@ METHODS = ("opencv", "colmap", "warp")
 
 def rendered(args: argparse.Namespace) -> NDArray[np.uint8]:
     """Views (N, 480, 640, 3) from anywhere in the scene."""
+    from wheretolook.dataset.viewpoint_table import poses
     from wheretolook.geometry.camera import PinholeCamera
     from wheretolook.rendering.warp_renderer import WarpRenderer
-    from wheretolook.viewpoints.table import poses
 
     with tempfile.TemporaryDirectory() as name:
         scene = bench_scenes.open_scene(args.scene, Path(name), args.seed, args.device)
@@ -49,7 +49,8 @@ def time_on_cpu(
     """Milliseconds an image on one core and over processes, and the keypoints."""
     extractor = KeypointExtractor(config)
     extractor.extract(images[0])
-    found, times = [], []
+    found = []
+    times = []
     for rgb in tqdm(images, config.method, unit="image"):
         start = time.perf_counter()
         found.append(extractor.extract(rgb))
@@ -79,7 +80,8 @@ def time_on_device(
     batches = [grey[start : start + batch] for start in range(0, len(grey), batch)]
     extractor.extract_many(batches[0])
     first: list[Keypoints] = []
-    times, same = [], True
+    times = []
+    same = True
     for repeat in tqdm(range(repeats), "warp", unit="repeat"):
         found: list[Keypoints] = []
         for part in batches:

@@ -25,16 +25,16 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good, poses
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.labelling.config import LabelConfig
-from wheretolook.labelling.labeller import LabelTask, label_scenes
-from wheretolook.labelling.shard import SceneJob
-from wheretolook.mapping.building import build_map
+from wheretolook.localization.config import LabelConfig
+from wheretolook.localization.labeller import LabelTask, label_scenes
+from wheretolook.localization.shard import SceneJob
 from wheretolook.mapping.config import MapConfig
+from wheretolook.mapping.rendered_map import build_map
 from wheretolook.rendering.warp_renderer import WarpRenderer
-from wheretolook.viewpoints.table import LOCALIZED, is_good, poses
 
 EXTRACTORS = {
     "opencv": ExtractorConfig("opencv"),

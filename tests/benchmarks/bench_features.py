@@ -25,21 +25,21 @@ from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score
 from tqdm.auto import tqdm
 
+from wheretolook.dataset.viewpoint_table import LOCALIZED
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.labelling.config import LocalizerConfig
-from wheretolook.labelling.localizer import Localizer
-from wheretolook.mapping.building import build_map
+from wheretolook.localization.config import LocalizerConfig
+from wheretolook.localization.localizer import Localizer
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.methods.registry import load_scorer, make_scorer
+from wheretolook.mapping.rendered_map import build_map
 from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.scorers.registry import load_scorer, make_scorer
 from wheretolook.utils.npz_files import load_npz, save_npz
-from wheretolook.viewpoints.table import LOCALIZED
 from wheretolook.visibility.occlusion import MeshOcclusion
 
 CAMERA = PinholeCamera()
@@ -47,7 +47,8 @@ CAMERA = PinholeCamera()
 
 def looked_at(scene: bench_scenes.Scene, locations: int, directions: int, seed: int) -> NDArray[np.float64]:
     """Poses (locations x directions, 3, 4): free places 0.8 to 2 m high, looked from all around."""
-    rng, (low, high) = np.random.default_rng(seed), scene.mesh.bounds
+    rng = np.random.default_rng(seed)
+    (low, high) = scene.mesh.bounds
     found = np.empty((0, 3))
     while len(found) < locations:
         places = rng.uniform((*low[:2], 0.8), (*high[:2], 2.0), (2000, 3))
@@ -63,7 +64,8 @@ def keypoints_of(
 ) -> tuple[list[Keypoints], list[float]]:
     """Keypoints of views (B, 3, 4), by an extractor and kept in a folder; and the CPU seconds that each took."""
     renderer: Any = None
-    found, seconds = [], []
+    found = []
+    seconds = []
     for row, pose in enumerate(tqdm(poses, f"{extractor.config.method}: extract", unit="view")):
         path = folder / f"{row:05}.npz"
         if not path.is_file():
@@ -85,7 +87,8 @@ def localize(
     localizer: Localizer, keypoints: list[Keypoints], poses: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], float]:
     """Which views localize within 5 cm and 0.4 degrees, (B,), and the milliseconds to match one."""
-    good, spent = [], 0.0
+    good = []
+    spent = 0.0
     for found, pose in zip(keypoints, poses, strict=True):
         start = time.process_time()
         ((rows, landmarks),) = localizer.match([found])
@@ -99,7 +102,8 @@ def localize(
 
 def numbers(scores: NDArray[Any], good: NDArray[np.bool_], locations: NDArray[np.int64], seed: int = 0) -> str:
     """AUC and regret of scores (L x D,) with intervals over the L locations, as text."""
-    rng, n = np.random.default_rng(seed), locations.max() + 1
+    rng = np.random.default_rng(seed)
+    n = locations.max() + 1
     per = scores.reshape(n, -1), good.reshape(n, -1)
 
     def of(rows: NDArray[np.int64]) -> tuple[float, float]:

@@ -15,21 +15,21 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wheretolook.fisher.exact import exact_information, exact_information_plain
-from wheretolook.fisher.field import FisherField
-from wheretolook.fisher.field_sums import field_sums_plain
-from wheretolook.fisher.information import information_matrices
-from wheretolook.fisher.metrics import METRICS, eigenvalues, eigenvalues_plain, metric_of
-from wheretolook.fisher.soft_visibility import (
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
+from wheretolook.geometry.pose_information import information_matrices
+from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.visibility.frustum import LandmarkSets, PosedViews
+from wheretolook_paper.fisher.exact import exact_information, exact_information_plain
+from wheretolook_paper.fisher.field import FisherField
+from wheretolook_paper.fisher.field_sums import field_sums_plain
+from wheretolook_paper.fisher.metrics import METRICS, eigenvalues, eigenvalues_plain, metric_of
+from wheretolook_paper.fisher.soft_visibility import (
     GaussianProcessVisibility,
     QuadraticVisibility,
     SoftVisibility,
     cone_half_angle,
 )
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
-from wheretolook.geometry.poses import Float, poses_looking_along
-from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 
 ROOM_M = ((-5.0, -4.0, 0.0), (5.0, 4.0, 2.6))
 
@@ -70,7 +70,9 @@ def ask(locations: Float, points: Float, visibilities: dict[str, SoftVisibility]
 
 def errors_over_samples(samples: tuple[int, ...] = (10, 15, 20, 30, 50, 70, 100, 150)) -> None:
     """Approximations against what the camera really sees, over the samples of the Gaussian process."""
-    camera, points, axes = PinholeCamera(), room_landmarks(5000), fibonacci_sphere(300)
+    camera = PinholeCamera()
+    points = room_landmarks(5000)
+    axes = fibonacci_sphere(300)
     locations = np.random.default_rng(1).uniform((-4, -3, 0.6), (4, 3, 2.0), (20, 3))
     views = poses_looking_along(np.repeat(locations, len(axes), axis=0), np.tile(axes, (len(locations), 1)))
     rows = np.repeat(np.arange(len(locations)), len(axes))
@@ -109,9 +111,12 @@ def main() -> None:
     if args.errors:
         errors_over_samples()
         return
-    rng, repeats, device = np.random.default_rng(0), args.repeats, args.device
+    rng = np.random.default_rng(0)
+    repeats = args.repeats
+    device = args.device
 
-    camera, points = PinholeCamera(), room_landmarks(args.landmarks)
+    camera = PinholeCamera()
+    points = room_landmarks(args.landmarks)
     visibilities: dict[str, SoftVisibility] = {
         "quadratic": QuadraticVisibility(cone_half_angle(camera)),
         "gp": GaussianProcessVisibility.fitted(cone_half_angle(camera)),

@@ -19,20 +19,20 @@ import numpy as np
 import pandas as pd
 
 from mask_agreement import MaskAgreement
+from wheretolook.dataset.sampling import free_locations
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh
-from wheretolook.scenes.procedural.generator import generate_apartment
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.tracking import log, start_run
 from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.viewpoints.sampling import free_locations
 from wheretolook.visibility.config import DEFAULT_RADIUS
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import MeshOcclusion
+from wheretolook_rooms.generator import generate_apartment
 
 RADII = (1, 2, 5, 10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300, 500, 1000)
 
@@ -40,7 +40,8 @@ RADII = (1, 2, 5, 10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300, 500, 1000)
 def surface_points(raycaster: MeshRaycaster, locations: np.ndarray, n: int, seed: int) -> np.ndarray:
     """What n rays in random directions from random free locations meet, (at most n, 3) metres, 5 mm off."""
     rng = np.random.default_rng(seed)
-    origins, directions = locations[rng.integers(0, len(locations), n)], rng.normal(size=(n, 3))
+    origins = locations[rng.integers(0, len(locations), n)]
+    directions = rng.normal(size=(n, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     distance = raycaster.cast(origins, directions).distance_m
     hit = np.isfinite(distance)

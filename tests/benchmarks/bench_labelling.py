@@ -26,24 +26,25 @@ import bench_scenes
 import numpy as np
 import torch
 
-from wheretolook.dataset.folders import SceneFolder
+from wheretolook.dataset.layout import SceneFolder
+from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.features import aliked_batch, matching, similarity
 from wheretolook.features.extraction import KeypointExtractor
-from wheretolook.labelling import labeller
-from wheretolook.labelling.config import LabelConfig
-from wheretolook.labelling.localizer import Localizer
-from wheretolook.labelling.shard import SceneJob
+from wheretolook.localization import labeller
+from wheretolook.localization.config import LabelConfig
+from wheretolook.localization.localizer import Localizer
+from wheretolook.localization.shard import SceneJob
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.warp_renderer import WarpRenderer
-from wheretolook.stages.inputs import extractor_of
-from wheretolook.viewpoints.table import poses
+from wheretolook.stages.preconditions import extractor_of
 
 
 class Stages:
     """Seconds of named stages, the device waited for at the end of each."""
 
     def __init__(self, device: str) -> None:
-        self.on_gpu, self.seconds = device != "cpu", dict[str, float]()
+        self.on_gpu = device != "cpu"
+        self.seconds = dict[str, float]()
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
@@ -74,7 +75,8 @@ class Stages:
 
 def by_stage(folder: SceneFolder, renderer: Any, views: Any, batch: int, device: str) -> list[Any]:
     """One process labels views in batches of so many, stage by stage; returns the images."""
-    camera, images = next(iter(folder.cameras().values())), []
+    camera = next(iter(folder.cameras().values()))
+    images = []
     localizer = Localizer(Landmarks.load(folder.landmarks), camera, None, extractor_of(folder), device)
     network = getattr(localizer.extractor._extraction, "_network", None)
     for warm in (True, False):
@@ -103,7 +105,8 @@ def by_stage(folder: SceneFolder, renderer: Any, views: Any, batch: int, device:
 def variant(folder: SceneFolder, images: list[Any], name: str, batch: int, device: str) -> None:
     """Extracts images in another way, and tells how long it takes and how many keypoints stay."""
     config = extractor_of(folder)
-    usual, other = KeypointExtractor(config, device), KeypointExtractor(config, device)
+    usual = KeypointExtractor(config, device)
+    other = KeypointExtractor(config, device)
     extraction: Any = other._extraction
     kind = torch.device(device).type
     if name == "plain":
@@ -118,7 +121,8 @@ def variant(folder: SceneFolder, images: list[Any], name: str, batch: int, devic
         inner = extraction.detect
         extraction.detect = lambda x: inner(x.contiguous(memory_format=torch.channels_last))
     elif name == "half":
-        number, inner = torch.float16 if kind == "cuda" else torch.bfloat16, extraction.detect
+        number = torch.float16 if kind == "cuda" else torch.bfloat16
+        inner = extraction.detect
 
         def half(x: Any) -> Any:
             with torch.autocast(kind, number):
@@ -131,13 +135,18 @@ def variant(folder: SceneFolder, images: list[Any], name: str, batch: int, devic
     with clock("extract"):
         found = [one for part in parts for one in other.extract_batch(part)]
     was = [one for part in parts for one in usual.extract_batch(part)]
-    stay, near, total, cosine = 0, 0, 0, []
+    stay = 0
+    near = 0
+    total = 0
+    cosine = []
     for a, b in zip(was, found, strict=True):
         total += len(a)
         if len(a) and len(b):
             apart = np.linalg.norm(a.pixels[:, None] - b.pixels[None], axis=-1)
-            nearest, close = apart.argmin(1), apart.min(1)
-            stay, near = stay + int((close < 0.01).sum()), near + int((close < 0.5).sum())
+            nearest = apart.argmin(1)
+            close = apart.min(1)
+            stay = stay + int((close < 0.01).sum())
+            near = near + int((close < 0.5).sum())
             rows = close < 0.5
             cosine.append((a.descriptors[rows] * b.descriptors[nearest[rows]]).sum(1))
     within = [f"{100 * n / max(1, total):.1f} % within {px} px" for n, px in ((stay, 0.01), (near, 0.5))]
@@ -151,7 +160,8 @@ def blocks(folder: SceneFolder, images: list[Any], sizes: list[int], at_a_time: 
     """Matches with blocks of products of other sizes, and so many images at a time."""
     landmarks = Landmarks.load(folder.landmarks)
     localizer = Localizer(landmarks, next(iter(folder.cameras().values())), None, extractor_of(folder), device)
-    keypoints, kind = localizer.extract(images[:16]), torch.device(device).type
+    keypoints = localizer.extract(images[:16])
+    kind = torch.device(device).type
     for size, together in [(size, 0) for size in sizes] + [(0, n) for n in at_a_time]:
         if together:
             similarity._TOGETHER[kind] = together
@@ -184,8 +194,17 @@ def together(folder: SceneFolder, table: Any, workers: int, device: str) -> None
 
     usual, labeller.tqdm = labeller.tqdm, Noted  # type: ignore[misc]
     cameras = tuple(folder.cameras().items()) if folder.cameras_file.is_file() else ()
-    start, job = time.perf_counter(), SceneJob(folder.mesh, folder.landmarks, folder.camera, LabelConfig().localizer,
-                                               extractor_of(folder), device, False, cameras)  # fmt: skip
+    start = time.perf_counter()  # fmt: skip
+    job = SceneJob(
+        folder.mesh,
+        folder.landmarks,
+        folder.camera,
+        LabelConfig().localizer,
+        extractor_of(folder),
+        device,
+        False,
+        cameras,
+    )
     with tempfile.TemporaryDirectory() as shards:
         config = LabelConfig(workers=workers, shard_size=max(8, min(64, len(table) // (4 * workers))))
         (done,) = labeller.label_scenes([labeller.LabelTask("scene", job, table, Path(shards))], config, progress=False)

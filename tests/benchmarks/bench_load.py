@@ -26,7 +26,9 @@ COMMAND = [sys.executable, "-c", "import sys; from wheretolook.cli import main; 
 
 def memory_mb(root: psutil.Process) -> tuple[float, float, int]:
     """Resident and own memory in 10^6 bytes of a process and of all below it, and how many they are."""
-    resident, own, n = 0, 0, 0
+    resident = 0
+    own = 0
+    n = 0
     try:
         processes = [root, *root.children(recursive=True)]
     except psutil.NoSuchProcess:
@@ -36,7 +38,9 @@ def memory_mb(root: psutil.Process) -> tuple[float, float, int]:
             memory = process.memory_full_info()
         except psutil.Error:  # it has just ended
             continue
-        resident, own, n = resident + memory.rss, own + memory.pss, n + 1
+        resident = resident + memory.rss
+        own = own + memory.pss
+        n = n + 1
     return resident / 1e6, own / 1e6, n
 
 
@@ -59,7 +63,10 @@ def main() -> int:
     parser.add_argument("--every", type=float, default=2.0)
     parser.add_argument("command", nargs=argparse.REMAINDER, help="what follows `wheretolook`")
     args = parser.parse_args()
-    start, told, asked, ended = time.monotonic(), 0, 0.0, ""
+    start = time.monotonic()
+    told = 0
+    asked = 0.0
+    ended = ""
     rows: list[tuple[float, float, float]] = []
     signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background commands would ignore
     process = subprocess.Popen([*COMMAND, *args.command], start_new_session=True)
@@ -79,7 +86,8 @@ def main() -> int:
             process.kill()
             process.wait()
         elif seconds > max(60 * args.minutes, asked + 30):  # again if it came at a bad time
-            ended, asked = ", interrupted when the time was over", seconds
+            ended = ", interrupted when the time was over"
+            asked = seconds
             process.send_signal(signal.SIGINT)
         time.sleep(args.every)
     print(f"exit {process.returncode} after {time.monotonic() - start:.1f} s{ended}")

@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from wheretolook.dataset.folders import SceneFolder
+from wheretolook.dataset.layout import SceneFolder
+from wheretolook.dataset.viewpoint_table import poses, read_table
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.looks.around import best_looks
-from wheretolook.methods.registry import load_scorer
+from wheretolook.scorers.registry import load_scorer
 from wheretolook.utils.shipped import WEIGHTS, shipped
-from wheretolook.viewpoints.table import poses, read_table
 
 
 def main() -> None:

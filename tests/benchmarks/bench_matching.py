@@ -53,9 +53,11 @@ def main() -> None:
     args = parser.parse_args()
     bench_scenes.use_one_thread()
     rng = np.random.default_rng(args.seed)
-    landmarks, queries = descriptors_like_sift(args.landmarks, rng), descriptors_like_sift(args.keypoints, rng)
+    landmarks = descriptors_like_sift(args.landmarks, rng)
+    queries = descriptors_like_sift(args.keypoints, rng)
     unit_queries = unit_descriptors(queries)
-    matcher, by_topk = DescriptorMatcher(landmarks, args.device), plain(landmarks, args.device)
+    matcher = DescriptorMatcher(landmarks, args.device)
+    by_topk = plain(landmarks, args.device)
     sides: dict[str, Callable[[], Any]] = {
         "DescriptorMatcher": lambda: matcher.nearest_two(queries),
         "product and topk": lambda: by_topk(unit_queries),
@@ -64,7 +66,8 @@ def main() -> None:
     cpu_times: dict[str, list[float]] = {name: [] for name in sides}
     for repeat in range(args.repeats + 2):
         for name, run in sides.items():
-            start, cpu_start = time.perf_counter(), time.process_time()
+            start = time.perf_counter()
+            cpu_start = time.process_time()
             run()  # returns on the CPU: a GPU has finished then
             if repeat >= 2:  # what is set up on the first calls is not measured
                 times[name].append(1e3 * (time.perf_counter() - start))

@@ -32,26 +32,26 @@ import pycolmap
 from scipy.special import expit
 from tqdm.auto import tqdm
 
-from wheretolook.check.checking import check_map
-from wheretolook.check.figure import check_figure
-from wheretolook.check.learning import photographed_views
-from wheretolook.check.leave_out import left_out_blocks
-from wheretolook.check.numbers import measure
-from wheretolook.check.report import place_radius
-from wheretolook.check.scores import Scoring
-from wheretolook.check.source import PhotographedMap, open_map, says_metric
 from wheretolook.evaluation.adaptation import compare_log_odds, gain_markdown
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.registry import kind_of
 from wheretolook.figures.style import save_figure
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, camera_centers, invert_poses, pose_error
+from wheretolook.holdout.checking import check_map
+from wheretolook.holdout.figure import check_figure
+from wheretolook.holdout.holdout import left_out_blocks
+from wheretolook.holdout.holdout_views import photographed_views
+from wheretolook.holdout.metrics import measure
+from wheretolook.holdout.photo_map import PhotographedMap, open_map, says_metric
+from wheretolook.holdout.report import place_radius
+from wheretolook.holdout.scores import Scoring
 from wheretolook.mapping.colmap_model import colmap_poses, holds_model
 from wheretolook.mapping.config import MapConfig, PhotographsConfig
-from wheretolook.mapping.incremental import photograph_features
 from wheretolook.mapping.photograph_map import map_photographs
 from wheretolook.mapping.photographs import SUFFIXES
 from wheretolook.mapping.scale import fit_similarity
+from wheretolook.mapping.sfm import photograph_features
 from wheretolook.mapping.triangulation import (
     Stored,
     choose_pairs,
@@ -60,7 +60,7 @@ from wheretolook.mapping.triangulation import (
     shrink_depth,
     surface_overlap,
 )
-from wheretolook.methods.adapted.fit import adapt
+from wheretolook.scorers.adapted.gp_correction import adapt
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.processes import Processes
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
@@ -112,7 +112,8 @@ def map_known_poses(
     )
     with Processes(workers) as processes:
         features = photograph_features(work / "images", work / "photographs", 0, extractor, processes, device)
-        names, stored = features.names, features.stored
+        names = features.names
+        stored = features.stored
         pinhole = PinholeCamera(*features.sizes[0].tolist(), focal_px)
         pairs = choose_pairs(surface_overlap(pinhole, poses, depth_m), PARTNERS)
         camera = pycolmap.Camera(camera_id=1, **pinhole.colmap.record())
@@ -127,7 +128,8 @@ def map_known_poses(
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
-    options.ceres.solver_options.num_threads, options.ceres.solver_options.function_tolerance = 1, 1e-6
+    options.ceres.solver_options.num_threads = 1
+    options.ceres.solver_options.function_tolerance = 1e-6
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     with quiet_colmap("ERROR"):
         matcher = pycolmap.GeometricVerifierOptions(num_threads=1)
@@ -214,7 +216,9 @@ def main() -> None:
     method, _, network = args.extractor.partition("=")
     extractor = ExtractorConfig(method, weights=network)
     with tempfile.TemporaryDirectory() as name:
-        work, start, metric = args.work or Path(name), time.perf_counter(), True
+        work = args.work or Path(name)
+        start = time.perf_counter()
+        metric = True
         if args.poses and not holds_model(work / "map"):
             map_known_poses(args.poses, work, args.focal_px, extractor, args.workers, args.device)
         if args.images:
@@ -224,7 +228,8 @@ def main() -> None:
                 places = work / "map", work / "photographs"
                 map_photographs(settings, *places, workers=args.workers, device=args.device)
             metric = says_metric(work / "map")
-        mapped, scene = time.perf_counter(), args.name or (args.poses or args.images).resolve().name
+        mapped = time.perf_counter()
+        scene = args.name or (args.poses or args.images).resolve().name
         opened = open_map(work / "map", work / "photographs" / "database.db", metric, scene)
         scoring = Scoring(weights=args.weights, also=tuple(args.also))
         how = {"views": args.views, "workers": args.workers, "device": args.device}

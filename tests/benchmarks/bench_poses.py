@@ -28,24 +28,25 @@ import pycolmap
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, poses
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.matching import Matches
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, pose_error
-from wheretolook.labelling.config import LocalizerConfig
-from wheretolook.labelling.localizer import Localization, Localizer
-from wheretolook.labelling.shard import BATCH
-from wheretolook.mapping.building import build_map
+from wheretolook.localization.config import LocalizerConfig
+from wheretolook.localization.localizer import Localization, Localizer
+from wheretolook.localization.shard import BATCH
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.rendered_map import build_map
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
-from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, poses
 
 Estimate = Callable[[Keypoints, NDArray[np.int64], NDArray[np.int64]], Localization]
 
-MAX_ERROR_M, MAX_ERROR_DEG = 0.05, 0.4
+MAX_ERROR_M = 0.05
+MAX_ERROR_DEG = 0.4
 RATIOS = (0, 0.1, 0.15, 0.25, 0.5, 1)  # inliers over matches, between which times are shown
 
 
@@ -54,13 +55,15 @@ def by_pycolmap(landmarks: Landmarks, camera: PinholeCamera, config: LocalizerCo
     params = [camera.focal_px, camera.cx, camera.cy]
     colmap_camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=camera.width, height=camera.height, params=params)
     estimation = pycolmap.AbsolutePoseEstimationOptions()
-    estimation.ransac.max_error, estimation.ransac.random_seed = config.max_error_px, config.seed
+    estimation.ransac.max_error = config.max_error_px
+    estimation.ransac.random_seed = config.seed
     options = colmap_camera, estimation, pycolmap.AbsolutePoseRefinementOptions()
 
     def estimate(keypoints: Keypoints, of_image: NDArray[np.int64], of_map: NDArray[np.int64]) -> Localization:
         if len(of_map) < config.min_matches:
             return Localization(TOO_FEW_MATCHES, None, len(of_map), matched_rows=of_map)
-        pixels, points = keypoints.pixels[of_image].astype(np.float64), landmarks.points[of_map]
+        pixels = keypoints.pixels[of_image].astype(np.float64)
+        points = landmarks.points[of_map]
         found = pycolmap.estimate_and_refine_absolute_pose(pixels, points, *options)
         if found is None:
             return Localization(NO_POSE, None, len(of_map), matched_rows=of_map)
@@ -91,7 +94,8 @@ def matched(
     mesh: Path, localizer: Localizer, camera: PinholeCamera, true_poses: Float, device: str
 ) -> tuple[list[tuple[Keypoints, Matches]], dict[str, list[float]]]:
     """Keypoints and matches of every view, and the CPU milliseconds a view of each step, by batch."""
-    renderer, found = WarpRenderer(load_mesh(mesh), device), []
+    renderer = WarpRenderer(load_mesh(mesh), device)
+    found = []
     times: dict[str, list[float]] = {"render": [], "extract": [], "match": []}
     for start in tqdm(range(0, len(true_poses), BATCH), "match", unit="batch"):
         batch = true_poses[start : start + BATCH]
@@ -110,7 +114,8 @@ def matched(
 
 def run(estimate: Estimate, views: list[tuple[Keypoints, Matches]], true_poses: Float) -> dict[str, NDArray[Any]]:
     """Of each view: CPU milliseconds, inliers, status, and whether it localizes, and does so within the limits."""
-    seconds, results = [], []
+    seconds = []
+    results = []
     for keypoints, matches in views:
         start = time.thread_time()
         results.append(estimate(keypoints, *matches))
@@ -131,7 +136,9 @@ def run(estimate: Estimate, views: list[tuple[Keypoints, Matches]], true_poses: 
 
 def report_on(name: str, found: dict[str, NDArray[Any]], reference: dict[str, NDArray[Any]]) -> dict[str, Any]:
     """Print and return the times of an estimator and how far it agrees with the reference."""
-    ms, good, expected = found["ms"], found["good"], reference["good"]
+    ms = found["ms"]
+    good = found["good"]
+    expected = reference["good"]
     report = {
         "mean_ms": float(ms.mean()),
         "ms": bench_scenes.spread(ms),
@@ -173,7 +180,8 @@ def main() -> None:
     sides = [(f"pycolmap, seed {config.seed}", by_pycolmap(landmarks, camera, config)) for config in configs]
     sides += [(f"PoseLib, seed {one.config.seed}", one.estimate) for one in localizers]
     results = {name: run(estimate, views, true_poses) for name, estimate in sides}
-    before, now = results["pycolmap, seed 0"], results["PoseLib, seed 0"]
+    before = results["pycolmap, seed 0"]
+    now = results["PoseLib, seed 0"]
     compared = {name: report_on(name, found, before) for name, found in results.items()}
     print(f"PoseLib takes {before['ms'].sum() / now['ms'].sum():.1f} times less; by pycolmap's share of inliers:")
     ratio = before["inliers"] / np.maximum(n_matches, 1)

@@ -32,7 +32,8 @@ ONE_BY_ONE = 100  # of so many queries one is asked alone
 def made_up(folder: Path) -> Path:
     """A viewpoint map of random scores."""
     rng = np.random.default_rng(0)
-    grid, directions = VoxelGrid((0.0, 0.0, 0.0), (16.0, 16.0, 16.0), (16, 16, 16)), fibonacci_sphere(500)
+    grid = VoxelGrid((0.0, 0.0, 0.0), (16.0, 16.0, 16.0), (16, 16, 16))
+    directions = fibonacci_sphere(500)
     scores = rng.random((len(grid), len(directions))).astype(np.float32)
     ranked = np.argsort(-scores, axis=1, kind="stable").astype(np.uint16)
     n_visible = rng.integers(0, 900, scores.shape).astype(np.uint32)
@@ -40,7 +41,8 @@ def made_up(folder: Path) -> Path:
         "random", "fibonacci", {"model": "PINHOLE", "width": 1, "height": 1, "params": [1.0] * 4}, "none", ""
     )
     rows = np.arange(len(grid), dtype=np.int32)
-    ids, digests = np.arange(3, dtype=np.int64), np.zeros((3, 2), dtype=np.uint64)
+    ids = np.arange(3, dtype=np.int64)
+    digests = np.zeros((3, 2), dtype=np.uint64)
     ViewpointMap(grid, rows, directions, ranked, scores, n_visible, ids, digests, origin).save(folder)
     return folder
 
@@ -55,9 +57,12 @@ def ask(folder: Path, n: int, number: int) -> tuple[str, float, float, tuple[flo
     """Digest of the answers to n queries, seconds of batches and of single queries, memory before and after."""
     viewpoint_map = ViewpointMap.load(folder, mmap=True)
     before = memory_mb()
-    low, high = np.asarray(viewpoint_map.grid.lower), np.asarray(viewpoint_map.grid.upper)
+    low = np.asarray(viewpoint_map.grid.lower)
+    high = np.asarray(viewpoint_map.grid.upper)
     blocks = -(-n // BATCH)
-    digests, batches_s, singles_s = [b""] * blocks, 0.0, 0.0
+    digests = [b""] * blocks
+    batches_s = 0.0
+    singles_s = 0.0
     for block in np.roll(np.arange(blocks), number * blocks // 8):
         points: Float = np.random.default_rng(int(block)).uniform(low, high, (min(BATCH, n - int(block) * BATCH), 3))
         start = time.perf_counter()

@@ -36,21 +36,22 @@ import pycolmap
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from wheretolook.dataset.viewpoint_table import LOCALIZED, poses
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.descriptors import quantize_descriptors
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, camera_centers, pose_error
-from wheretolook.labelling.localizer import Localizer
-from wheretolook.mapping.building import build_map
+from wheretolook.localization.localizer import Localizer
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.rendered_map import build_map
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.utils.colmap import quiet_colmap
-from wheretolook.viewpoints.table import LOCALIZED, poses
 
-LIMIT_M, LIMIT_DEG = 0.05, 0.4
+LIMIT_M = 0.05
+LIMIT_DEG = 0.4
 FEW_INLIERS = 10
 """What our localizer asks for by default, and COLMAP 30: tells how much of the disagreement is due to that."""
 BINS_M = (0.0, 0.5, 1.0, 1.5, 2.0, np.inf)
@@ -67,7 +68,8 @@ class Stopwatch:
     @contextmanager
     def __call__(self, stage: str, share: int = 1) -> Iterator[None]:
         """Time a block; its time is spread evenly over `share` entries."""
-        wall, cpu = time.perf_counter(), time.process_time()
+        wall = time.perf_counter()
+        cpu = time.process_time()
         yield
         self.wall.setdefault(stage, []).extend([(time.perf_counter() - wall) / share] * share)
         self.cpu.setdefault(stage, []).extend([(time.process_time() - cpu) / share] * share)
@@ -88,13 +90,16 @@ class ColmapRegistration:
     """
 
     def __init__(self, map_dir: Path, folder: Path, clock: Stopwatch, seed: int) -> None:
-        self._map_dir, self._clock = map_dir, clock
-        self._database, self._list = folder / "queries.db", folder / "pairs.txt"
+        self._map_dir = map_dir
+        self._clock = clock
+        self._database = folder / "queries.db"
+        self._list = folder / "pairs.txt"
         with clock("copy"):
             shutil.copy(map_dir / "database.db", self._database)
         self._connection = pycolmap.Database.open(str(self._database))
         mapped = self._connection.read_all_images()
-        self._mapped_names, self._next_id = [image.name for image in mapped], 1 + max(i.image_id for i in mapped)
+        self._mapped_names = [image.name for image in mapped]
+        self._next_id = 1 + max(i.image_id for i in mapped)
         self._matching = pycolmap.FeatureMatchingOptions(num_threads=1)
         self._verification = pycolmap.TwoViewGeometryOptions()
         self._verification.ransac.random_seed = seed
@@ -187,7 +192,9 @@ def label_by_colmap(
                 colmap.match(some)
             bar.update(len(some))
     colmap.open_model()
-    before, default, lenient = colmap.state(), [], []
+    before = colmap.state()
+    default = []
+    lenient = []
 
     def outcome(registered: bool, image_id: int) -> tuple[Float | None, int]:
         if not registered:
@@ -226,7 +233,8 @@ def label_by_localizer(
     localizer: Localizer, images: Iterable[NDArray[np.uint8]], true_poses: Float, clock: Stopwatch
 ) -> tuple[pd.DataFrame, list[Keypoints]]:
     """Results of our localizer, and the keypoints it found."""
-    extractor, found = TimedExtractor(localizer.extractor.config, clock), []
+    extractor = TimedExtractor(localizer.extractor.config, clock)
+    found = []
     for index, rgb in enumerate(images):
         if index == 0:  # with the localizer's own extractor: what is set up on the first call is not measured
             localizer.localize(rgb)
@@ -289,7 +297,8 @@ def by_distance(distance_m: Float, colmap: pd.DataFrame, ours: pd.DataFrame) -> 
         inside = (distance_m >= low) & (distance_m < high)
         if not inside.any():
             continue
-        a, b = colmap["good"][inside], ours["good"][inside]
+        a = colmap["good"][inside]
+        b = ours["good"][inside]
         row = {"from_m": low, "to_m": high, "views": int(inside.sum()), "colmap": float(a.mean()),
                "ours": float(b.mean()), "equal": float((a == b).mean())}  # fmt: skip
         rows.append(row)
@@ -304,7 +313,8 @@ def disagreements(distance_m: Float, n_keypoints: list[int], colmap: pd.DataFram
     """Print and return the viewpoints whose labels differ."""
     listed = pd.DataFrame({"distance_m": distance_m, "keypoints": n_keypoints})
     for side, rows in (("colmap", colmap), ("ours", ours)):
-        listed[f"{side}_cm"], listed[f"{side}_deg"] = 100 * rows["error_m"], rows["error_deg"]
+        listed[f"{side}_cm"] = 100 * rows["error_m"]
+        listed[f"{side}_deg"] = rows["error_deg"]
         listed[f"{side}_inliers"] = rows["n_inliers"]
     listed = listed[(colmap["good"] != ours["good"]).to_numpy()]
     print(f"\n{len(listed)} disagreements (NaN: no pose)")
@@ -364,7 +374,9 @@ def main() -> None:
     args = parser.parse_args()
     bench_scenes.use_one_thread()
 
-    config, camera, clock = ExtractorConfig(args.extractor, args.first_octave), PinholeCamera(), Stopwatch()
+    config = ExtractorConfig(args.extractor, args.first_octave)
+    camera = PinholeCamera()
+    clock = Stopwatch()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         scene = bench_scenes.open_scene(args.scene, folder, args.seed, args.device)

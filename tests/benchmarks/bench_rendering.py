@@ -13,10 +13,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from open3d_renderer import Open3DRenderer
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.rendering.open3d_renderer import Open3DRenderer
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
@@ -27,7 +27,8 @@ def bumpy_room(n_triangles: int = 100_000, seed: int = 0) -> TexturedMesh:
     rows = round(np.sqrt(n_triangles / 4))
     columns = 2 * rows
     v, u = np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
-    azimuth, polar = 2 * np.pi * u, np.pi * v
+    azimuth = 2 * np.pi * u
+    polar = np.pi * v
     radius = 1 + 0.05 * np.sin(40 * azimuth) * np.sin(20 * polar)
     sphere = np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], axis=-1)
     vertices = (sphere * radius[..., None] * (4, 3, 1.5)).reshape(-1, 3)
@@ -71,12 +72,14 @@ def main() -> None:
     low, high = mesh.bounds
     locations = rng.uniform(low + 0.3 * (high - low), high - 0.3 * (high - low), (args.batch, 3))
     directions = rng.normal(size=(args.batch, 3)) * (1, 1, 0.2)
-    camera, poses = PinholeCamera(), poses_looking_along(locations, directions)
+    camera = PinholeCamera()
+    poses = poses_looking_along(locations, directions)
     texels = sum(texture.shape[0] * texture.shape[1] for texture in mesh.textures)
     print(f"{len(mesh.triangles):,} triangles, {texels / 1e6:.1f} M texels, {camera.width} x {camera.height} pixels")
 
     start = time.perf_counter()
-    warp, raycaster = WarpRenderer(mesh, args.device), MeshRaycaster(mesh, args.device)
+    warp = WarpRenderer(mesh, args.device)
+    raycaster = MeshRaycaster(mesh, args.device)
     print(f"Warp set-up           {time.perf_counter() - start:14.2f} s")
     open3d = Open3DRenderer(mesh)
     landmarks = mesh.vertices[rng.integers(0, len(mesh.vertices), 20_000)]

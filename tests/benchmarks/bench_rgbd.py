@@ -26,12 +26,13 @@ from scipy.stats import spearmanr
 from sklearn.metrics import cohen_kappa_score, roc_auc_score
 from tqdm.auto import tqdm
 
-from wheretolook.check.checking import check_map
-from wheretolook.check.leave_out import LeftOut, left_out_blocks, without
-from wheretolook.check.scores import Scoring
-from wheretolook.check.source import MAX_ERROR_DEG, MAX_ERROR_M, PhotographedMap, open_map
+from wheretolook.dataset.viewpoint_table import LOCALIZED
 from wheretolook.geometry.poses import pose_error
-from wheretolook.labelling.localizer import Localizer
+from wheretolook.holdout.checking import check_map
+from wheretolook.holdout.holdout import LeftOut, left_out_blocks, without
+from wheretolook.holdout.photo_map import MAX_ERROR_DEG, MAX_ERROR_M, PhotographedMap, open_map
+from wheretolook.holdout.scores import Scoring
+from wheretolook.localization.localizer import Localizer
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scans.checks import landmark_readings
@@ -40,7 +41,6 @@ from wheretolook.scans.depth_correction import DepthCorrection, fit_depth_correc
 from wheretolook.scans.frames import RgbdFrame, RgbdFrames
 from wheretolook.scans.fusion import fuse
 from wheretolook.scans.textures import textured
-from wheretolook.viewpoints.table import LOCALIZED
 
 METHODS = ("set", "expected-inliers", "visible")
 APPEARANCES = ("colors", "texture")
@@ -50,7 +50,8 @@ class Part:
     """Some frames of a recording."""
 
     def __init__(self, frames: RgbdFrames, rows: np.ndarray) -> None:
-        self.frames, self.rows = frames, rows
+        self.frames = frames
+        self.rows = rows
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -90,10 +91,13 @@ def rendered_labels(
     hidden = np.array([row_of[source.names[row]] for row in left_out.block.left_out])
     landmarks, rest = map_without(source, left_out)
     kept = np.setdiff1d(np.arange(len(frames)), hidden)
-    start, read_m = time.perf_counter(), frames.survey_m
+    start = time.perf_counter()
+    read_m = frames.survey_m
     if correct:  # by what is left of the map
         frames.correct_depths(fit_depth_correction(*landmark_readings(frames, rest).T) or DepthCorrection())
-    part, poses, number = Part(frames, kept), frames.cam_from_world[kept], left_out.block.number
+    part = Part(frames, kept)
+    poses = frames.cam_from_world[kept]
+    number = left_out.block.number
     colors = fuse(part, frames.camera, poses, config, progress=False)
     meshes = {"colors": colors, "texture": textured(colors, part, frames.camera, poses, progress=False)}
     spent = f"{time.perf_counter() - start:.0f} s"
@@ -104,7 +108,8 @@ def rendered_labels(
     columns = []
     renderers = {name: WarpRenderer(mesh) for name, mesh in meshes.items()}
     for row in at:
-        pose, found = frames.cam_from_world[row], {}
+        pose = frames.cam_from_world[row]
+        found = {}
         for name, renderer in renderers.items():
             found |= label(localizer, renderer.render(frames.camera, pose[None]).rgb[0], pose, name)
         columns.append(found)
@@ -114,23 +119,23 @@ def rendered_labels(
         pictures = [frames[row].rgb, *(one.render(frames.camera, pose).rgb[0] for one in renderers.values())]
         name = f"block-{number:02}{'-corrected' if correct else ''}.png"
         cv2.imwrite(str(out.parent / name), np.hstack(pictures)[:, :, ::-1])
-    frames.depth_correction, frames.survey_m = DepthCorrection(), read_m
+    frames.depth_correction = DepthCorrection()
+    frames.survey_m = read_m
     return pd.concat([left_out.views, pd.DataFrame(columns)], axis=1).assign(block=number, corrected=correct)
 
 
 def summarize(views: pd.DataFrame, appearance: str, depths: str) -> dict[str, object]:
     """One row of the table."""
-    good, rendered = views["good"].astype(bool), views[f"{appearance} good"].astype(bool)
+    good = views["good"].astype(bool)
+    rendered = views[f"{appearance} good"].astype(bool)
     row: dict[str, object] = {"appearance": appearance, "depths": depths, "views": len(views), "good": int(good.sum())}
     row |= {"good_rendered": int(rendered.sum()), "agree": float((good == rendered).mean())}
     row["kappa"] = float(cohen_kappa_score(good, rendered))
     row["inliers_rank_correlation"] = float(spearmanr(views["n_inliers"], views[f"{appearance} n_inliers"])[0])
     both = views[good & rendered]
     row["inliers_ratio"] = float((both[f"{appearance} n_inliers"] / both["n_inliers"]).median())
-    row["error_m"], row["error_m_photographs"] = (
-        float(both[f"{appearance} error_m"].median()),
-        float(both["error_m"].median()),
-    )
+    row["error_m"] = float(both[f"{appearance} error_m"].median())
+    row["error_m_photographs"] = float(both["error_m"].median())
     for method in METHODS:
         for name, truth in (("photographs", good), ("renders", rendered)):
             known = truth.nunique() == 2

@@ -25,18 +25,20 @@ from bench_scorers import room_map
 
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, poses_looking_along
-from wheretolook.methods.registry import load_scorer
 from wheretolook.robot.export import export_robot
 from wheretolook.robot.wheretolook_robot import RobotScorer
+from wheretolook.scorers.registry import load_scorer
 from wheretolook.visibility.occlusion import NoOcclusion
 
 
 def timed(label: str, work: Callable[[int], object], repeats: int) -> None:
     """Print median, quartiles and range of the repeats in ms, and the median of the processor's time."""
     work(0)
-    walls, used = [], []
+    walls = []
+    used = []
     for number in range(repeats):
-        start, computed = time.perf_counter(), time.process_time()
+        start = time.perf_counter()
+        computed = time.process_time()
         work(number)
         walls.append(time.perf_counter() - start)
         used.append(time.process_time() - computed)
@@ -58,7 +60,8 @@ def main() -> None:
     localization_map = replace(room_map(args.landmarks, np.zeros((1, 3)), "cpu"), occlusion=NoOcclusion())
     rng = np.random.default_rng(1)
     low, high = np.array(ROOM_M)
-    at, axes = rng.uniform(low + 0.5, high - 0.5, (args.repeats, 3)), fibonacci_sphere(args.directions)
+    at = rng.uniform(low + 0.5, high - 0.5, (args.repeats, 3))
+    axes = fibonacci_sphere(args.directions)
     poses = poses_looking_along(at, rng.normal(size=(args.repeats, 3)))
 
     def around(place: Float) -> Float:
@@ -66,7 +69,8 @@ def main() -> None:
 
     with tempfile.TemporaryDirectory() as folder:
         export_robot(localization_map, args.weights, folder)
-        robot, scorer = RobotScorer(folder), load_scorer(args.weights, localization_map)
+        robot = RobotScorer(folder)
+        scorer = load_scorer(args.weights, localization_map)
         views = robot.views(poses)
         off = np.abs(views.score - scorer.score(poses)).max()
         seen = f"{np.median(views.n_visible):.0f} in view (up to {views.n_visible.max()})"

@@ -20,18 +20,18 @@ import pandas as pd
 from scipy.special import expit
 from sklearn.metrics import log_loss, roc_auc_score
 
-from wheretolook.check.leave_out import LeftOut, left_out_blocks, without
-from wheretolook.check.source import PhotographedMap, open_map
 from wheretolook.cli import main as wheretolook
 from wheretolook.config import Experiment
-from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.calibration import expected_calibration_error
 from wheretolook.geometry.poses import camera_centers
-from wheretolook.methods.adapted.fit import LocalizedViews, adapt
-from wheretolook.methods.adapted.score import log_odds_of
-from wheretolook.methods.registry import load_scorer
+from wheretolook.holdout.holdout import LeftOut, left_out_blocks, without
+from wheretolook.holdout.photo_map import PhotographedMap, open_map
+from wheretolook.scorers.adapted.gp_correction import LocalizedViews, adapt
+from wheretolook.scorers.adapted.score import log_odds_of
+from wheretolook.scorers.registry import load_scorer
 from wheretolook.stages.adapt import labelled_views
-from wheretolook.stages.inputs import open_scene
+from wheretolook.stages.preconditions import open_scene
 from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.shipped import WEIGHTS, shipped
 
@@ -71,7 +71,8 @@ def scanned_scene(source: PhotographedMap, left_out: LeftOut, args: argparse.Nam
 def judged(source: PhotographedMap, left_out: LeftOut, name: str, args: argparse.Namespace) -> pd.DataFrame:
     """The photographs of a block, and their log-odds before and after learning from the renders."""
     dataset = Dataset.load(args.data / name)
-    files, weights = dataset.scenes[0], shipped(WEIGHTS) / "set.safetensors"
+    files = dataset.scenes[0]
+    weights = shipped(WEIGHTS) / "set.safetensors"
     scene = open_scene(Experiment(name=name, data=args.data), dataset, files)
     learnt_from = labelled_views(files, scene, files.read_table(), weights)
     learnt = adapt(learnt_from)

@@ -15,11 +15,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from wheretolook.dataset.viewpoint_table import SCHEMA, UNLABELLED, pose_columns
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.scenes.loading import load_mesh, save_glb
 from wheretolook.space.free_space import FreeSpace
-from wheretolook.viewpoints.table import SCHEMA, UNLABELLED, pose_columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ def open_scene(source: Path | None, folder: Path, seed: int, device: str) -> Sce
     """Read the scene, or generate an apartment into `folder`."""
     if source is None:
         from wheretolook.scenes.config import ApartmentConfig
-        from wheretolook.scenes.procedural.generator import generate_apartment
+        from wheretolook_rooms.generator import generate_apartment
 
         source = folder / "mesh.glb"
         save_glb(generate_apartment(ApartmentConfig(), seed, device=device), source)
@@ -65,7 +65,8 @@ def open_scene(source: Path | None, folder: Path, seed: int, device: str) -> Sce
 
 def viewpoints_anywhere(scene: Scene, number: int, seed: int) -> pd.DataFrame:
     """Unlabelled viewpoints at random free locations, in directions uniform on the sphere: they know of no map."""
-    rng, found = np.random.default_rng(seed), np.empty((0, 3))
+    rng = np.random.default_rng(seed)
+    found = np.empty((0, 3))
     while len(found) < number:
         candidates = rng.uniform(*scene.mesh.bounds, (20_000, 3))
         found = np.concatenate([found, candidates[scene.free_space.is_free(candidates)]])
@@ -89,9 +90,11 @@ def viewpoints_anywhere(scene: Scene, number: int, seed: int) -> pd.DataFrame:
 
 def agreement(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> dict[str, float | int]:
     """The 2 x 2 table of two labels, the share that is equal, and Cohen's kappa (1960): 1 is perfect, 0 is chance."""
-    both, neither = int((first & second).sum()), int((~first & ~second).sum())
+    both = int((first & second).sum())
+    neither = int((~first & ~second).sum())
     equal = (both + neither) / len(first)
-    p, q = first.mean(), second.mean()
+    p = first.mean()
+    q = second.mean()
     chance = p * q + (1 - p) * (1 - q)
     return {
         "both": both,

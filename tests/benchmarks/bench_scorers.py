@@ -22,8 +22,8 @@ from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.methods.base import Scorer
-from wheretolook.methods.registry import load_scorer, make_scorer
+from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.registry import load_scorer, make_scorer
 from wheretolook.visibility.occlusion import StoredOcclusion
 
 

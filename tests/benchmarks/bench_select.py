@@ -27,14 +27,16 @@ from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.methods.registry import load_scorer
+from wheretolook.scorers.registry import load_scorer
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.visibility.cached_occlusion import RememberedOcclusion
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import NoOcclusion
-from wheretolook.visibility.remembered import RememberedOcclusion
 
-SIDE_M, ROOM_M, HEIGHT_M = 20.0, 5.0, 3.0
+SIDE_M = 20.0
+ROOM_M = 5.0
+HEIGHT_M = 3.0
 CAMERAS: dict[str, Camera] = {
     "pinhole": PinholeCamera(640, 480, 320.0),
     "radial": ColmapCamera("SIMPLE_RADIAL", 640, 480, (320.0, 320.0, 240.0, 0.01)),
@@ -114,9 +116,11 @@ def cpu_seconds() -> float:
 
 def measure(text: str, work: Callable[[], object], repeat: int) -> None:
     """Print median and spread of wall and CPU time."""
-    wall, cpu = [], []
+    wall = []
+    cpu = []
     for _ in range(repeat):
-        start, start_cpu = time.perf_counter(), cpu_seconds()
+        start = time.perf_counter()
+        start_cpu = cpu_seconds()
         work()
         wall.append(time.perf_counter() - start)
         cpu.append(cpu_seconds() - start_cpu)

@@ -21,17 +21,18 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.results import SCORES_CSV, runs_of_rows
 from wheretolook.evaluation.scores import read_scores
-from wheretolook.release.runs import log_release
 from wheretolook.utils.tracking import NestedRun, client, log_nested, start_run
 from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook_paper.release.runs import log_release
 
 
 @contextmanager
 def timed(what: str) -> Iterator[None]:
-    start, processor = time.perf_counter(), time.process_time()
+    start = time.perf_counter()
+    processor = time.process_time()
     yield
     print(f"{what:60} {time.perf_counter() - start:6.1f} s, {time.process_time() - processor:6.1f} s of the processor")
 

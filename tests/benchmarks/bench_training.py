@@ -26,15 +26,15 @@ import numpy as np
 import torch
 from lightning.pytorch import LightningModule, Trainer, seed_everything
 
-from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.layout import Dataset
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.inputs.channels import CHANNELS, PAPER_VARIANTS
-from wheretolook.learning.classifier import ViewpointClassifier, weight_penalty, weighted_bce
-from wheretolook.learning.data import LabelledViews, ViewpointDataModule
-from wheretolook.learning.fit import EpochRecord, RunLog, fit, home_device
-from wheretolook.methods.mlp.config import MlpConfig
-from wheretolook.methods.mlp.network import NetworkSpec, ViewpointNetwork
-from wheretolook.methods.train_config import TrainConfig
+from wheretolook.scorers.mlp.config import MlpConfig
+from wheretolook.scorers.mlp.network import NetworkSpec, ViewpointNetwork
+from wheretolook.scorers.train_config import TrainConfig
+from wheretolook.training.classifier import ViewpointClassifier, weight_penalty, weighted_bce
+from wheretolook.training.data import LabelledViews, ViewpointDataModule
+from wheretolook.training.fit import EpochRecord, RunLog, fit, home_device
 from wheretolook.utils.tracking import start_run
 from wheretolook.utils.tracking_config import TrackingConfig
 
@@ -111,9 +111,11 @@ def make_network(data: ViewpointDataModule, variant: str) -> ViewpointNetwork:
 
 def bare_epochs(data: ViewpointDataModule, variant: str, epochs: int, device: str) -> list[float]:
     """Seconds of each epoch of a plain loop over the same batches."""
-    config, network = data.options, make_network(data, variant).to(device)
+    config = data.options
+    network = make_network(data, variant).to(device)
     optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
-    loader, seconds = data.train_dataloader(), []
+    loader = data.train_dataloader()
+    seconds = []
     for _ in range(epochs):
         start = now(device)
         for means, filled, labels, _ in loader:
@@ -152,7 +154,8 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
             classifier = ViewpointClassifier(make_network(data, args.variant), options, data.class_weights)
             fit(classifier, data, record, config)
             done = now(device)
-    rows, steps = record.rows, len(data.train_dataloader())
+    rows = record.rows
+    steps = len(data.train_dataloader())
     logging = [row["logging_s"] for row in rows]
     result: dict[str, Any] = {
         "what": "training",

@@ -27,17 +27,18 @@ from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.rendering.types import camera_rays
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh
-from wheretolook.scenes.procedural.generator import generate_apartment
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.visibility.occlusion import MeshOcclusion
 from wheretolook.visibility.tsdf import TsdfOcclusion
+from wheretolook_rooms.generator import generate_apartment
 
 MAX_DEPTH_M = 20.0
 
 
 def free_points(mesh: TexturedMesh, rng: np.random.Generator, n: int) -> np.ndarray:
     """Random free places (n, 3)."""
-    space, found = FreeSpace(mesh), np.empty((0, 3))
+    space = FreeSpace(mesh)
+    found = np.empty((0, 3))
     while len(found) < n:
         points = rng.uniform(*mesh.bounds, (20_000, 3))
         found = np.concatenate([found, points[space.is_free(points)]])
@@ -46,7 +47,8 @@ def free_points(mesh: TexturedMesh, rng: np.random.Generator, n: int) -> np.ndar
 
 def surface_points(raycaster: MeshRaycaster, places: np.ndarray, rng: np.random.Generator, n: int) -> np.ndarray:
     """What random, mostly level rays from the places meet, 3 mm off, (at most n, 3)."""
-    origins, rays = places[rng.integers(0, len(places), n)], rng.normal(size=(n, 3)) * (1, 1, 0.5)
+    origins = places[rng.integers(0, len(places), n)]
+    rays = rng.normal(size=(n, 3)) * (1, 1, 0.5)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     distance = raycaster.cast(origins, rays).distance_m
     hit = np.isfinite(distance)
@@ -69,9 +71,11 @@ def render_depth(
 
 def measure(name: str, mesh: TexturedMesh, landmarks: np.ndarray | None, args: argparse.Namespace) -> Iterator[dict]:
     """One row for each number of images and voxel size."""
-    rng, raycaster = np.random.default_rng(args.seed), MeshRaycaster(mesh)
+    rng = np.random.default_rng(args.seed)
+    raycaster = MeshRaycaster(mesh)
     places = free_points(mesh, rng, args.locations + max(args.images))
-    locations, eyes = places[: args.locations], places[args.locations :]
+    locations = places[: args.locations]
+    eyes = places[args.locations :]
     points = surface_points(raycaster, eyes, rng, 20_000) if landmarks is None else landmarks
     truth = MeshOcclusion(raycaster).unoccluded(locations, points)
     images = list(render_depth(raycaster, PinholeCamera(), eyes, rng))

@@ -57,8 +57,12 @@ class Visitor(threading.Thread):
 
     def __init__(self, port: int, seconds: float, seed: int, clicks: bool = True) -> None:
         super().__init__(daemon=True)
-        self.port, self.seconds, self.rng = port, seconds, np.random.default_rng(seed)
-        self.received, self.error, self.clicks = 0, "", clicks
+        self.port = port
+        self.seconds = seconds
+        self.rng = np.random.default_rng(seed)
+        self.received = 0
+        self.error = ""
+        self.clicks = clicks
 
     def run(self) -> None:
         import viser
@@ -151,7 +155,8 @@ def _opening(model: Path) -> list[tuple[float, float]]:
         port = probe.getsockname()[1]
     code = "import sys; from wheretolook.cli import main; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", code, "view", "--map", str(model), "--port", str(port)]
-    start, protocol = time.monotonic(), f"viser-v{viser.__version__}"
+    start = time.monotonic()
+    protocol = f"viser-v{viser.__version__}"
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         told: list[tuple[float, float]] = []
@@ -193,7 +198,8 @@ def _turns(session: Any, n: int = 20) -> None:
     time.sleep(2)
     times = []
     for axis in session.place.directions[:: len(session.place.directions) // n][:n]:
-        start, session.controls.picture_told.content = time.monotonic(), ""
+        start = time.monotonic()
+        session.controls.picture_told.content = ""
         session.turn_to(axis)
         while not session.controls.picture_told.content and time.monotonic() - start < 10:
             time.sleep(0.001)

@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.bench_select import SIDE_M, write_model
 from benchmarks.bench_view import Counted, camera_message, memory_mb, message
 from wheretolook.view.opened import open_map
-from wheretolook.view.played import FORWARD, Played, looking_ahead
+from wheretolook.view.paths import FORWARD, Played, looking_ahead
 from wheretolook.view.server import Viewer
 from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
@@ -78,7 +78,8 @@ def nonsense(controls: Any, number: int, rng: np.random.Generator) -> bytes:
 
 def turn_s(client: Any, session: Any, degrees: float) -> float:
     """Seconds until a view turned by hand has its score; at most a minute."""
-    told, start = session.controls.picture_told, time.monotonic()
+    told = session.controls.picture_told
+    start = time.monotonic()
     told.content = ""
     client.send(message("GuiUpdateMessage", uuid=session.controls.yaw._impl.uuid, updates={"value": degrees}))
     while not told.content and time.monotonic() - start < 60:
@@ -107,24 +108,29 @@ def main() -> None:
             while len(viewer.sessions) < n:
                 time.sleep(0.01)
             sessions.append(max(viewer.sessions.items())[1])
-        (bad, good), (flooded, kept) = clients, sessions
+        (bad, good) = clients
+        (flooded, kept) = sessions
         good.send(CLICK)
         while kept.place is None:
             time.sleep(0.05)
         time.sleep(1)
         quiet = [turn_s(good, kept, 10.0 * n - 20) for n in range(5)]
-        rng, sent = np.random.default_rng(0), threading.Event()
-        before, threads = memory_mb(), threading.active_count()
+        rng = np.random.default_rng(0)
+        sent = threading.Event()
+        before = memory_mb()
+        threads = threading.active_count()
 
         def flood() -> None:
             for number in range(options.messages):
                 bad.send(nonsense(flooded.controls, number, rng))
             sent.set()
 
-        start, ended = time.monotonic(), 0.0
+        start = time.monotonic()
+        ended = 0.0
         threading.Thread(target=flood, daemon=True).start()
         during: list[float] = []
-        memory, most = [before], threads
+        memory = [before]
+        most = threads
         while not ended or time.monotonic() - ended < 5:
             during.append(turn_s(good, kept, float(37 * len(during) % 300 - 150)))
             memory.append(memory_mb())

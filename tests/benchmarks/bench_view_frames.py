@@ -44,7 +44,8 @@ def going_round(viewer: Viewer) -> Iterator[None]:
     ended = threading.Event()
 
     def go() -> None:
-        middle, step = SIDE_M / 2, 0
+        middle = SIDE_M / 2
+        step = 0
         while not ended.wait(1 / 60):
             for client in viewer.server.get_clients().values():
                 turn = 0.015 * step
@@ -85,7 +86,8 @@ def main() -> None:
             tab.wait(lambda page: "Click a place" in page.text, 60)
             viewer.shared.worker.stop()  # floors would take the cores from the browser
             turning: Any = next(iter(viewer.sessions.values()))._turning_camera
-            most, less = turning._most, 0
+            most = turning._most
+            less = 0
             found: dict[bool, list[float]] = {False: [], True: []}
             print(f"{n:,} landmarks, drawn by {tab.evaluate(RENDERER)}", flush=True)
             for _ in range(options.repeat):

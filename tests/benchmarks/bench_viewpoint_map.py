@@ -24,17 +24,17 @@ from bench_visibility import on_surface
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.methods.base import Scorer
-from wheretolook.methods.registry import load_scorer, make_scorer
 from wheretolook.planning.map_building import build_viewpoint_map, update_viewpoint_map
 from wheretolook.planning.refine import refine_directions
-from wheretolook.planning.sequences import TurnLimit, best_sequence, greedy_sequence
+from wheretolook.planning.view_sequence import TurnLimit, best_sequence, greedy_sequence
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.config import ApartmentConfig
-from wheretolook.scenes.procedural.generator import generate_apartment
+from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.registry import load_scorer, make_scorer
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.visibility.occlusion import MeshOcclusion
+from wheretolook_rooms.generator import generate_apartment
 
 
 def rows_of(landmarks: Landmarks, rows: slice) -> Landmarks:
@@ -48,8 +48,10 @@ def queries(viewpoint_map: ViewpointMap, repeats: int) -> None:
     grid = viewpoint_map.grid
     rows = rng.integers(0, len(viewpoint_map.scores), 1_000_000)
     points = viewpoint_map.locations[rows] + rng.uniform(-0.5, 0.5, (len(rows), 3)) * grid.voxel_m
-    arrays, tuples = list(points[:5000]), points[:5000].tolist()
-    axis, n = np.array([0.6, -0.8, 0.0]), len(arrays)
+    arrays = list(points[:5000])
+    tuples = points[:5000].tolist()
+    axis = np.array([0.6, -0.8, 0.0])
+    n = len(arrays)
 
     def each(query, asked=arrays):
         def work() -> None:
@@ -58,7 +60,8 @@ def queries(viewpoint_map: ViewpointMap, repeats: int) -> None:
 
         return work
 
-    unit, units = 1e6 / n, f"us for each of {n:,}"
+    unit = 1e6 / n
+    units = f"us for each of {n:,}"
     timed("best, point an array", each(viewpoint_map.best), repeats, unit, units)
     timed("best, point a tuple", each(viewpoint_map.best, tuples), repeats, unit, units)
     timed("best 10", each(lambda p: viewpoint_map.best_n(p, 10)), repeats, unit, units)

@@ -51,15 +51,19 @@ FLOPS_PER_PROJECTION = 22
 
 def with_triangles(mesh: TexturedMesh, least: int) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and triangles of a mesh whose largest triangles are cut into four until there are `least`."""
-    vertices, triangles = mesh.vertices.astype(np.float64), mesh.triangles
+    vertices = mesh.vertices.astype(np.float64)
+    triangles = mesh.triangles
     while len(triangles) < least:
         a, b, c = np.moveaxis(vertices[triangles], 1, 0)
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
         cut = np.argsort(-area)[: -(-(least - len(triangles)) // 3)]
-        n, m = len(vertices), len(cut)
+        n = len(vertices)
+        m = len(cut)
         a, b, c = np.moveaxis(vertices[triangles[cut]], 1, 0)
         vertices = np.concatenate([vertices, (a + b) / 2, (b + c) / 2, (c + a) / 2])
-        ab, bc, ca = n + np.arange(m), n + m + np.arange(m), n + 2 * m + np.arange(m)
+        ab = n + np.arange(m)
+        bc = n + m + np.arange(m)
+        ca = n + 2 * m + np.arange(m)
         i, j, k = triangles[cut].T
         parts = np.concatenate([np.stack(part, 1) for part in ((i, ab, ca), (ab, j, bc), (ca, bc, k), (ab, bc, ca))])
         triangles = np.concatenate([np.delete(triangles, cut, 0), parts])
@@ -82,7 +86,8 @@ def on_surface(mesh: TexturedMesh, number: int, rng: np.random.Generator) -> np.
 
 
 def free_points(mesh: TexturedMesh, number: int, rng: np.random.Generator, device: str) -> np.ndarray:
-    free_space, found = FreeSpace(mesh, device=device), np.empty((0, 3))
+    free_space = FreeSpace(mesh, device=device)
+    found = np.empty((0, 3))
     while len(found) < number:
         candidates = rng.uniform(*mesh.bounds, (20_000, 3))
         found = np.concatenate([found, candidates[free_space.is_free(candidates)]])
@@ -93,7 +98,8 @@ class Peak:
     """The most memory in use while a block runs: of the process, or of the device's pool."""
 
     def __init__(self, device: str) -> None:
-        self.device, self.bytes = device, 0
+        self.device = device
+        self.bytes = 0
 
     def __enter__(self) -> Peak:
         gc.collect()
@@ -133,11 +139,23 @@ def timed(work: Callable[[], object], repeats: int) -> dict[str, float]:
 @wp.kernel
 def _multiply_add_kernel(n: wp.int32, out: wp.array[wp.float32]):
     i = wp.tid()
-    a, b, c, d = wp.float32(i), wp.float32(i + 1), wp.float32(i + 2), wp.float32(i + 3)
-    e, f, g, h = wp.float32(i + 4), wp.float32(i + 5), wp.float32(i + 6), wp.float32(i + 7)
+    a = wp.float32(i)
+    b = wp.float32(i + 1)
+    c = wp.float32(i + 2)
+    d = wp.float32(i + 3)
+    e = wp.float32(i + 4)
+    f = wp.float32(i + 5)
+    g = wp.float32(i + 6)
+    h = wp.float32(i + 7)
     for _ in range(n):
-        a, b, c, d = a * 0.999 + 0.5, b * 0.999 + 0.5, c * 0.999 + 0.5, d * 0.999 + 0.5
-        e, f, g, h = e * 0.999 + 0.5, f * 0.999 + 0.5, g * 0.999 + 0.5, h * 0.999 + 0.5
+        a = a * 0.999 + 0.5
+        b = b * 0.999 + 0.5
+        c = c * 0.999 + 0.5
+        d = d * 0.999 + 0.5
+        e = e * 0.999 + 0.5
+        f = f * 0.999 + 0.5
+        g = g * 0.999 + 0.5
+        h = h * 0.999 + 0.5
     out[i] = a + b + c + d + e + f + g + h
 
 
@@ -165,7 +183,7 @@ def machine(device: str) -> dict[str, Any]:
 
 def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     from wheretolook.scenes.config import ApartmentConfig
-    from wheretolook.scenes.procedural.generator import generate_apartment
+    from wheretolook_rooms.generator import generate_apartment
 
     rng = np.random.default_rng(0)
     base = load_mesh(args.scene) if args.scene else generate_apartment(ApartmentConfig(), 0, device=device)
@@ -245,7 +263,8 @@ def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
         "counts with occlusion equal the twin's:", bool(np.array_equal(seen.counts, masked)), f"{mask.mean():.1%} free"
     )
     if on_gpu:
-        flops, alone = peak_flops(device), next(row for row in rows if row["what"] == "counts alone")
+        flops = peak_flops(device)
+        alone = next(row for row in rows if row["what"] == "counts alone")
         share = alone["projections_per_s"] * FLOPS_PER_PROJECTION / flops
         rows.append({"what": "peak", "threads": 1, "flops": flops, "equivalent_share_of_peak": share})
         print(f"measured peak {flops / 1e12:.1f} TFLOP/s in single precision; projecting everything as fast as counts "
@@ -263,7 +282,7 @@ BASE = {"landmarks": 24_919, "locations": 64, "directions": 500}
 
 def scaling(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     from wheretolook.scenes.config import ApartmentConfig
-    from wheretolook.scenes.procedural.generator import generate_apartment
+    from wheretolook_rooms.generator import generate_apartment
 
     rng = np.random.default_rng(0)
     base = load_mesh(args.scene) if args.scene else generate_apartment(ApartmentConfig(), 0, device=device)
@@ -271,7 +290,8 @@ def scaling(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     points = on_surface(mesh, max(SCALING["landmarks"]), rng)
     locations = free_points(mesh, max(SCALING["locations"]), rng, device)
     occlusion = MeshOcclusion(MeshRaycaster(mesh, device))
-    on_gpu, rows = wp.get_device(device).is_cuda, []
+    on_gpu = wp.get_device(device).is_cuda
+    rows = []
     for axis, values in SCALING.items():
         for value in values:
             size = {**BASE, axis: value}
@@ -295,11 +315,12 @@ def scaling(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
 def bounded(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     """2 million landmarks x 5,000 locations within the memory allowed."""
     from wheretolook.scenes.config import ApartmentConfig
-    from wheretolook.scenes.procedural.generator import generate_apartment
+    from wheretolook_rooms.generator import generate_apartment
 
     rng = np.random.default_rng(0)
     mesh = untextured(*with_triangles(generate_apartment(ApartmentConfig(), 0, device=device), args.triangles))
-    points, locations = on_surface(mesh, 2_000_000, rng), free_points(mesh, 5_000, rng, device)
+    points = on_surface(mesh, 2_000_000, rng)
+    locations = free_points(mesh, 5_000, rng, device)
     occlusion = MeshOcclusion(MeshRaycaster(mesh, device)) if wp.get_device(device).is_cuda else NoOcclusion()
     rotations = rotation_looking_along(fibonacci_sphere(args.directions))
     start = time.perf_counter()
@@ -322,10 +343,10 @@ def rows_of(file: Path, part: str) -> list[dict[str, Any]]:
 
 
 def draw(args: argparse.Namespace) -> None:
-    from wheretolook.figures.runtimes import runtime_figure, scaling_figure
     from wheretolook.figures.style import save_figure
-    from wheretolook.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
     from wheretolook.utils.tracking_config import TrackingConfig
+    from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
+    from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
 
     sizes, growth = (
         pd.DataFrame([row for file in args.draw for row in rows_of(Path(file), part)])

@@ -20,15 +20,15 @@ import pandas as pd
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import log_loss, roc_auc_score
 
-from wheretolook.dataset.folders import SceneFolder
+from wheretolook.dataset.layout import SceneFolder
+from wheretolook.dataset.viewpoint_table import is_good, poses, read_table
 from wheretolook.geometry.poses import camera_centers
-from wheretolook.labelling import confidence
-from wheretolook.labelling.look_sets import label_sets
-from wheretolook.looks import worth
-from wheretolook.looks.union import log_position_variance, seen_around
-from wheretolook.methods.registry import load_scorer
+from wheretolook.localization import confidence
+from wheretolook.localization.joint_labels import label_sets
+from wheretolook.looks import set_score as worth
+from wheretolook.looks.joint_visibility import log_position_variance, seen_around
+from wheretolook.scorers.registry import load_scorer
 from wheretolook.utils.shipped import WEIGHTS, shipped
-from wheretolook.viewpoints.table import is_good, poses, read_table
 
 VARIANCE = 0.375  # how much the log of the position's variance counts, against the log-odds
 SURE = 0.99
@@ -36,14 +36,19 @@ SURE = 0.99
 
 def drawn_sets(scene: SceneFolder, places: int, draws: int) -> pd.DataFrame:
     """Sets drawn at random, with what was expected of them and what became of them."""
-    table, around = read_table(scene.table, pixels=True), scene.localization_map()
-    scorer, rng = load_scorer(str(shipped(WEIGHTS) / "set.safetensors"), around), np.random.default_rng(0)
+    table = read_table(scene.table, pixels=True)
+    around = scene.localization_map()
+    scorer = load_scorer(str(shipped(WEIGHTS) / "set.safetensors"), around)
+    rng = np.random.default_rng(0)
     cam_from_world = poses(table)
-    scores, sets, told = scorer.score(cam_from_world), [], []
+    scores = scorer.score(cam_from_world)
+    sets = []
+    told = []
     of_place = list(table.groupby("location_id").indices.values())
     for number in rng.permutation(len(of_place))[:places]:
         rows = of_place[number]
-        center, axes = camera_centers(cam_from_world[rows[:1]])[0], cam_from_world[rows, 2, :3]
+        center = camera_centers(cam_from_world[rows[:1]])[0]
+        axes = cam_from_world[rows, 2, :3]
         seen = seen_around(scorer, center, axes, scores[rows])
         likely = scores[rows] + 0.02
         for n in np.tile((1, 2, 3, 5), draws):
@@ -85,7 +90,8 @@ def main() -> None:
     chance = np.clip(1 - sets["failed"].to_numpy(), worth.LEAST_CHANCE, 1 - worth.LEAST_CHANCE)
     mixed = np.log(chance / (1 - chance)) - VARIANCE * sets["log_position_variance"].to_numpy()
     fitted = report("worth", mixed[:, None], sets)
-    scale, bias = float(fitted.coef_[0, 0]), float(fitted.intercept_[0])
+    scale = float(fitted.coef_[0, 0])
+    bias = float(fitted.intercept_[0])
     weights = dict(zip(worth.TOLD, (round(scale, 4), round(-scale * VARIANCE, 4)), strict=True))
     print(json.dumps({"weights": weights, "bias": round(bias, 4)}, indent=2))
 

@@ -22,18 +22,19 @@ import pandas as pd
 from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score
 
-from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.sampling_config import Split
+from wheretolook.dataset.viewpoint_table import CAMERA_ID, is_good, poses
 from wheretolook.evaluation.calibration import expected_calibration_error
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.scores import is_probability
 from wheretolook.evaluation.scoring import score_scenes
 from wheretolook.geometry.camera import field_of_view_deg
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.learning.weights import method_of_weights
-from wheretolook.viewpoints.config import Split
-from wheretolook.viewpoints.table import CAMERA_ID, is_good, poses
+from wheretolook.training.weights import method_of_weights
 
-NARROW_DEG, WIDE_DEG = 60, 95
+NARROW_DEG = 60
+WIDE_DEG = 95
 LIMITS = 0.05, 0.4  # metres and degrees
 RIGHT = 0.5, 5.0  # a pose that is the view's, however exact
 SHARES = ("expected-inliers", "visible")  # these give shares of a map's landmarks, which differ in number by scene

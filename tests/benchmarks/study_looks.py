@@ -26,15 +26,15 @@ from sklearn.neural_network import MLPClassifier
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from wheretolook.dataset.folders import SceneFolder
+from wheretolook.dataset.layout import SceneFolder
+from wheretolook.dataset.viewpoint_table import is_good, poses, read_table
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.labelling.look_sets import label_sets
-from wheretolook.looks.choice import Turns, best_one_by_one, choose_looks, evenly_spread
-from wheretolook.looks.union import PRIOR, SeenAround, information_matrices, seen_around
-from wheretolook.looks.worth import SetWorth, count_worth
-from wheretolook.methods.registry import load_scorer
+from wheretolook.localization.joint_labels import label_sets
+from wheretolook.looks.joint_visibility import PRIOR, SeenAround, information_matrices, seen_around
+from wheretolook.looks.selection import Turns, best_one_by_one, choose_looks, evenly_spread
+from wheretolook.looks.set_score import SetWorth, count_worth
+from wheretolook.scorers.registry import load_scorer
 from wheretolook.utils.shipped import WEIGHTS, shipped
-from wheretolook.viewpoints.table import is_good, poses, read_table
 
 DRAWN = {2: 14, 3: 10, 5: 3}
 """Sets drawn at a place, by their number of looks."""
@@ -61,9 +61,11 @@ def log_odds(chance: Any) -> Any:
 
 def told_of(looks: list[int], seen: SeenAround, sure: SeenAround, scores: Float, axes: Float) -> dict[str, float]:
     """What is known of a set before looking: all of `TOLD`."""
-    sums, best = seen.union(looks), np.sort(log_odds(scores[looks]))[::-1]
+    sums = seen.union(looks)
+    best = np.sort(log_odds(scores[looks]))[::-1]
     variances = np.linalg.inv(information_matrices(sums[1:]) + PRIOR * np.eye(6)).diagonal()
-    expected, alone = np.log1p(sums[0]), np.log1p(seen.sums()[looks, 0].sum())
+    expected = np.log1p(sums[0])
+    alone = np.log1p(seen.sums()[looks, 0].sum())
     angles = [float(np.degrees(np.arccos(np.clip(axes[i] @ axes[j], -1, 1)))) for i, j in combinations(looks, 2)]
     return {
         "log_odds_alone": log_odds(1 - seen.failed(looks)),
@@ -86,7 +88,8 @@ def sets_at(
     seen: SeenAround, sure: SeenAround, scores: Float, axes: Float, rng: np.random.Generator
 ) -> dict[tuple[int, ...], list[str]]:
     """Sets of looks at a place, and the rules that choose each; those drawn have none."""
-    found, turns = dict[tuple[int, ...], list[str]](), Turns(axes)
+    found = dict[tuple[int, ...], list[str]]()
+    turns = Turns(axes)
     likely = np.exp(log_odds(scores) / 2)
     for n, drawn in DRAWN.items():
         if n > len(axes):
@@ -105,14 +108,19 @@ def sets_at(
 
 def sets_of(scene: SceneFolder, places: int) -> pd.DataFrame:
     """Sets at places of a scene: what is known of them, the rules that choose them, and whether they localize."""
-    table, around, rng = read_table(scene.table, pixels=True), scene.localization_map(), np.random.default_rng(0)
-    scorer, cam_from_world = load_scorer(str(shipped(WEIGHTS) / "set.safetensors"), around), poses(table)
+    table = read_table(scene.table, pixels=True)
+    around = scene.localization_map()
+    rng = np.random.default_rng(0)
+    scorer = load_scorer(str(shipped(WEIGHTS) / "set.safetensors"), around)
+    cam_from_world = poses(table)
     scores = scorer.score(cam_from_world)
-    sets, told = list[NDArray[np.int64]](), list[dict[str, Any]]()
+    sets = list[NDArray[np.int64]]()
+    told = list[dict[str, Any]]()
     of_place = list(table.groupby("location_id").indices.values())
     for number in rng.permutation(len(of_place))[:places]:
         rows = of_place[number]
-        center, axes = camera_centers(cam_from_world[rows[:1]])[0], cam_from_world[rows, 2, :3]
+        center = camera_centers(cam_from_world[rows[:1]])[0]
+        axes = cam_from_world[rows, 2, :3]
         seen, sure = (seen_around(scorer, center, axes, scores[rows], sure) for sure in (False, True))
         for looks, rules in sets_at(seen, sure, scores[rows], axes, rng).items():
             sets.append(rows[list(looks)])
@@ -139,7 +147,8 @@ def main() -> None:
     options = parser.parse_args()
     found = [sets_of(SceneFolder(folder, "val"), options.places) for folder in options.scenes]
     sets = pd.concat(found, ignore_index=True)
-    good, place = sets["good"].to_numpy(bool), ["n_looks", "scene", "location_id"]
+    good = sets["good"].to_numpy(bool)
+    place = ["n_looks", "scene", "location_id"]
     print(f"{len(sets)} sets, {len(sets.groupby(place[1:]))} places")
     any_good = sets.groupby(place)["good"].any().groupby("n_looks").mean()
     print("any of the sets:", ", ".join(f"{n} looks {100 * share:.1f}" for n, share in any_good.items()))

@@ -30,18 +30,18 @@ import numpy as np
 import pandas as pd
 import torch
 
-from wheretolook.dataset.folders import Dataset
-from wheretolook.inputs.landmarks_in_view import ATTRIBUTES
-from wheretolook.learning.fit import RunLog
-from wheretolook.learning.learner import Task
-from wheretolook.learning.provenance import weights_path
-from wheretolook.learning.scenes import with_also
-from wheretolook.methods.mlp.config import MlpConfig
-from wheretolook.methods.set import learn as set_learner
-from wheretolook.methods.set.config import SetConfig
-from wheretolook.methods.set.learn import SetData, learn_set
-from wheretolook.methods.train_config import TrainConfig
+from wheretolook.dataset.layout import Dataset
+from wheretolook.inputs.landmark_features import ATTRIBUTES
+from wheretolook.scorers.mlp.config import MlpConfig
+from wheretolook.scorers.set import learn as set_learner
+from wheretolook.scorers.set.config import SetConfig
+from wheretolook.scorers.set.learn import SetData, learn_set
+from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.stages.train import train_methods as train
+from wheretolook.training.fit import RunLog
+from wheretolook.training.learner import Task
+from wheretolook.training.provenance import weights_path
+from wheretolook.training.scenes import with_also
 from wheretolook.utils.tracking import start_run
 from wheretolook.utils.tracking_config import TrackingConfig
 
@@ -90,7 +90,8 @@ def seeds(dataset: Dataset, args: argparse.Namespace, tracking: TrackingConfig) 
     def described_once(task: Task) -> SetData:
         if not described:
             described["all"] = SetData(task)
-        described["all"].config, described["all"].options = task.config, task.options
+        described["all"].config = task.config
+        described["all"].options = task.options
         return described["all"]
 
     set_learner.SetData = described_once  # type: ignore[assignment,misc]
@@ -127,7 +128,8 @@ def of_set_network(dataset: Dataset, args: argparse.Namespace, tracking: Trackin
     if args.part == "options":
         conditions = [(" ".join(f"{k}={v}" for k, v in one.items()) or "default", one, whole) for one in args.choices]
     if args.part == "curves":
-        rows, rng = whole.numpy(), np.random.default_rng(0)
+        rows = whole.numpy()
+        rng = np.random.default_rng(0)
         scene = data.views.scene[rows]
         order = rng.permutation(np.unique(scene))
         some = {f"{n} scenes": rows[np.isin(scene, order[:n])] for n in (1, 2, 3, 5, 7, 9) if n <= len(order)}
@@ -142,7 +144,8 @@ def of_set_network(dataset: Dataset, args: argparse.Namespace, tracking: Trackin
             settings = replace(SetConfig(**args.set), **options)
             # as many steps, whatever there is to learn from
             epochs = min(200, round(settings.epochs * len(whole) / len(rows)))
-            config, own = replace(task.config, seed=seed), replace(settings, epochs=epochs)
+            config = replace(task.config, seed=seed)
+            own = replace(settings, epochs=epochs)
             data.config = config
             torch.manual_seed(seed)
             about = {"condition": name, "seed": seed}

@@ -13,8 +13,8 @@ import pytest
 import wheretolook
 from box_scenes import furnished_room
 from planning.rooms import CAMERA, room_landmarks
-from wheretolook.dataset.folders import SceneFolder
-from wheretolook.dataset.scene import Scene, SceneConfig
+from wheretolook.dataset.environment import Scene, SceneConfig
+from wheretolook.dataset.layout import SceneFolder
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.rendering import raycasting
 from wheretolook.scenes import loading
@@ -37,8 +37,10 @@ def files(tmp_path: Path) -> SceneFolder:
 def test_a_mesh_is_loaded_once_and_rays_are_cast_against_one_tree(
     files: SceneFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    loaded, trees = [], []
-    load, build = loading.load_mesh, raycasting.MeshRaycaster.__init__
+    loaded = []
+    trees = []
+    load = loading.load_mesh
+    build = raycasting.MeshRaycaster.__init__
     monkeypatch.setattr(loading, "load_mesh", lambda *args, **options: loaded.append(args) or load(*args, **options))
     monkeypatch.setattr(raycasting.MeshRaycaster, "__init__", lambda *args: trees.append(args) or build(*args))
     scene = Scene(files, CAMERA)

@@ -31,7 +31,8 @@ def test_bootstrap_resamples_within_scenes() -> None:
 
 
 def test_a_ratio_is_unknown_only_where_its_denominator_is_zero() -> None:
-    top, bottom = np.array([[1.0, 0.0], [1.0, 0.0]]), np.array([[1.0, 0.0], [0.0, 0.0]])
+    top = np.array([[1.0, 0.0], [1.0, 0.0]])
+    bottom = np.array([[1.0, 0.0], [0.0, 0.0]])
     low, high = LocationBootstrap(np.zeros(2, dtype=int), 1000, seed=0).ratio(top, bottom)
     assert (low[0], high[0]) == (1, 2)  # 2 / 2, 2 / 1, or a quarter of the draws 2 / 0, which says nothing
     assert np.isnan([low[1], high[1]]).all()
@@ -75,7 +76,9 @@ def test_paired_p_is_never_zero_and_the_same_again() -> None:
 
 def test_copies_of_a_location_in_its_block_tell_nothing_new() -> None:
     rng = np.random.default_rng(3)
-    good, chosen, scene = rng.random((80, 2)), rng.integers(1, 4, (80, 1)).astype(float), np.repeat([0, 1], 40)
+    good = rng.random((80, 2))
+    chosen = rng.integers(1, 4, (80, 1)).astype(float)
+    scene = np.repeat([0, 1], 40)
     alone = LocationBootstrap(scene, 1000, 0)
     copies = np.repeat(np.arange(80), 3)
     together = LocationBootstrap(scene[copies], 1000, 0, copies % 40)  # numbers of blocks need not differ by scene

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from synthetic_scores import EVERY_METHOD, KEYS, make_scores, older
-from wheretolook.evaluation.paper_tables import PAPER, paper_tables, write_paper_tables
+from wheretolook_paper.evaluation.paper_tables import PAPER, paper_tables, write_paper_tables
 
 PRINTED = {
     ("vs_others", "random"): (54.7, 60.9, 60.9, 61.1),

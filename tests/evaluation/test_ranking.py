@@ -9,11 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from wheretolook.dataset.thresholds import threshold_key, threshold_label
 from wheretolook.evaluation.config import EvaluateConfig, candidates_label
 from wheretolook.evaluation.ranking import TestViews, choose_at_random, choose_best, choose_by_truth, rank_views
 from wheretolook.evaluation.scores import reference_method, score_table
 from wheretolook.utils.errors import ConfigError
-from wheretolook.viewpoints.thresholds import threshold_key, threshold_label
 
 HAND = TestViews(
     # location 0 has four views, location 1 has one, location 2 has three, in mixed order
@@ -133,7 +133,8 @@ def test_new_columns_by_hand() -> None:
     config = EvaluateConfig(top_n=(1, 3), thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=2000)
     table = score_table(HAND, scores, ["a", "b"], config)
     row = {(r["method"], r["top_n"], r["scene"]): r for r in table.to_dict("records")}
-    fine, coarse = "0.05m_0.4deg", "5m_10deg"
+    fine = "0.05m_0.4deg"
+    coarse = "5m_10deg"
 
     # the best of bins are 12, 9, 7, those of the reference 11, 9, 6
     bins = row["bins", 1, "all"]
@@ -196,7 +197,8 @@ def test_a_method_that_chooses_alike_does_not_differ() -> None:
     scores = {"mlp-2d": values / 2, "mlp-2d+3d": values, "bins": rng.random(len(values))}
     config = EvaluateConfig(thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=200)
     table = score_table(views, scores, ["a", "b", "c"], config)
-    same, other = table[table["method"].str.startswith("mlp")], table[table["method"] == "bins"]
+    same = table[table["method"].str.startswith("mlp")]
+    other = table[table["method"] == "bins"]
     assert (same[[name for name in table if name.startswith("difference_")]] == 0).all(axis=None)
     assert (same[[name for name in table if name.startswith("p_")]] == 1).all(axis=None)
     assert (other["difference_5m_10deg"] != 0).any() and (other["p_5m_10deg"] < 1).any()

@@ -11,7 +11,7 @@ import pytest
 from synthetic_scores import EVERY_METHOD, KEYS, make_scores, older
 from wheretolook.evaluation.report import best_in_words, score_markdown
 from wheretolook.evaluation.score_table import main_rows, reference_of
-from wheretolook.methods.styles import method_style
+from wheretolook.scorers.styles import method_style
 
 FINEST = KEYS[0]
 
@@ -62,7 +62,8 @@ def test_the_headline_table_holds_all_that_is_known(scores: pd.DataFrame, report
         "AUC",
     ]
     for method in ("random", "fisher-logdet-gp", "mlp-2d"):
-        row, cells = one_row(scores, method), table[method_style(method).label]
+        row = one_row(scores, method)
+        cells = table[method_style(method).label]
         for key, name in zip(KEYS, ("5 cm, 0.4°", "25 cm, 2°", "0.5 m, 5°", "5 m, 10°"), strict=True):
             share, low, high, raw = (
                 percent(row[f"{name}_{key}"]) for name in ("normalized", "normalized_low", "normalized_high", "raw")
@@ -166,13 +167,15 @@ def test_the_reference_is_known_where_another_method_chooses_alike(scores: pd.Da
 
 
 def test_occlusion_models_and_candidates_are_compared(scores: pd.DataFrame) -> None:
-    other, fewer = make_scores(seed=1).assign(occlusion="none"), make_scores(seed=2).assign(candidates="best 100")
+    other = make_scores(seed=1).assign(occlusion="none")
+    fewer = make_scores(seed=2).assign(candidates="best 100")
     fewer = fewer[fewer["method"] != "mlp-2d"]
     everything = pd.concat([scores, fewer, other])  # indices repeat
     report = score_markdown(everything)
     pd.testing.assert_frame_equal(main_rows(everything), scores)
     assert table_below(report, "Best viewpoint") == table_below(score_markdown(scores), "Best viewpoint")
-    occlusions, candidates = table_below(report, "By occlusion model"), table_below(report, "By set of candidates")
+    occlusions = table_below(report, "By occlusion model")
+    candidates = table_below(report, "By set of candidates")
     assert [*occlusions["random"]] == ["mesh", "none"]
     assert [*candidates["random"]] == ["all", "best 100"]
     for cell, table in (
@@ -203,7 +206,8 @@ def told(reference: str = "", n: int = 1, **good: float) -> str:
     table = make_scores(("random", *good), reference or None, (n,), ("a",))
     table["reference"] = reference
     for name, value in {**good, "random": 20.5}.items():
-        rows, share = table["method"] == name, value / 50
+        rows = table["method"] == name
+        share = value / 50
         table.loc[rows, f"raw_{FINEST}"] = share
         table.loc[rows, [f"raw_low_{FINEST}", f"raw_high_{FINEST}"]] = share - 0.06, share + 0.06
         difference = share - good.get(reference, np.nan) / 50

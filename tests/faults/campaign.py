@@ -43,7 +43,8 @@ def main(arguments: list[str] | None = None) -> int:
     _say(f"imported everything in {time.monotonic() - start:.0f} s")
     root = Path(tempfile.mkdtemp(prefix="faults-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
     try:
-        workshop, rng = cases.Workshop(root, _say), random.Random(options.seed)
+        workshop = cases.Workshop(root, _say)
+        rng = random.Random(options.seed)
         readers = [name for name in damage.READERS if not options.readers or name in options.readers]
         read = {damage.READERS[name][0] for name in readers if options.damages}
         read_cases = [case for case in everything if not case.again and (case.after or case.name) in read]

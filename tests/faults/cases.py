@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from faults.runs import at_file_events, contents, run
-from wheretolook.check.source import WORK
+from wheretolook.holdout.photo_map import WORK
 
 EXPERIMENT = """\
 name: tiny
@@ -154,7 +154,8 @@ class Workshop:
     """The states of the files that cases start from, and what an undisturbed run of each leaves."""
 
     def __init__(self, root: Path, say: Callable[[str], None] = print) -> None:
-        self.root, self.say = root, say
+        self.root = root
+        self.say = say
         self.folder = root / "work" / "run"  # the same path in every job: records of what was made hold it
         self.folder.parent.mkdir(parents=True)
         self.expected: dict[str, dict[str, str]] = {}
@@ -244,7 +245,8 @@ class Workshop:
         one = run(self.folder, case.arguments, at_file_events(self.folder, note))
         if one.code != 0:
             raise RuntimeError(f"{case.name}: exit code {one.code}\n{one.out[-2000:]}\n{one.err[-4000:]}")
-        self.seconds[case.name], self.events[case.name] = time.monotonic() - start, counter.stat().st_size
+        self.seconds[case.name] = time.monotonic() - start
+        self.events[case.name] = counter.stat().st_size
         self.say(f"{case.name}: {self.seconds[case.name]:.1f} s, {self.events[case.name]} changes of files")
         if not case.again:
             name = case.after or case.name
@@ -255,7 +257,8 @@ class Workshop:
 
     def differences(self, case: Case) -> list[str]:
         """In which files the folder differs from what an undisturbed run leaves."""
-        found, expected = _one_name(contents(self.folder)), _one_name(self.expected[case.after or case.name])
+        found = _one_name(contents(self.folder))
+        expected = _one_name(self.expected[case.after or case.name])
         if case.before == "map" and case.after == "map":  # which holds photographs for others
             found = {path: digest for path, digest in found.items() if not path.startswith("photographs/")}
         made = [
@@ -295,7 +298,7 @@ def _photographs(folder: Path) -> None:
 def _labelled(folder: Path) -> None:
     """A dataset of two labelled scenes, whose labels are made up."""
     from synthetic_dataset import make_dataset
-    from wheretolook.dataset.stamps import write_stamp
+    from wheretolook.dataset.artifact_cache import write_stamp
 
     for scene in make_dataset(folder / "data" / "synthetic", ("train", "test")).scenes:
         write_stamp(scene, "label", "key")

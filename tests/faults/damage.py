@@ -13,7 +13,7 @@ from pathlib import Path
 from faults.cases import CHECK, CORRIDOR, SPACE, SYNTHETIC, Case, Workshop, stage
 from faults.kills import Outcome, _labels_here
 from faults.runs import Run, contents
-from wheretolook.check.source import WORK
+from wheretolook.holdout.photo_map import WORK
 
 WAYS = ("removed", "emptied", "truncated", "a bit flipped")
 

@@ -62,7 +62,8 @@ def _killed(workshop: Workshop, case: Case, kind: str, rng: random.Random) -> Ou
     number = signal.SIGINT if interrupted else signal.SIGKILL
     if "change of a file" in kind:
         event = rng.randint(1, max(1, workshop.events[case.name]))
-        at, hook = f"change {event} of {workshop.events[case.name]}", _signals_itself(workshop, event, number)
+        at = f"change {event} of {workshop.events[case.name]}"
+        hook = _signals_itself(workshop, event, number)
         run = Run(workshop.folder, case.arguments).start(hook)
     else:
         moment = rng.uniform(0, workshop.seconds[case.name])
@@ -119,8 +120,8 @@ _ONE_WORKER = dict.fromkeys(("map", "label", "demo", "compare-paths"), ("--label
 
 def _labels_here() -> None:
     """The next run labels in its own process: quicker, and the same labels are promised for any number of workers."""
-    from wheretolook.labelling import local_engine
-    from wheretolook.labelling.shard import ShardWorker
+    from wheretolook.localization import local_engine
+    from wheretolook.localization.shard import ShardWorker
 
     def run_local(shards, workers, tick):  # type: ignore[no-untyped-def]
         worker = ShardWorker()

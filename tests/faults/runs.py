@@ -195,7 +195,9 @@ def at_file_events(folder: Path, do: Callable[[int], None]) -> Hook:
     """A hook that calls `do` with a number that counts up, before each change of a file or folder in a folder."""
 
     def hook() -> None:
-        mine, count, root = os.getpid(), 0, f"{folder}/"
+        mine = os.getpid()
+        count = 0
+        root = f"{folder}/"
 
         def audit(event: str, arguments: tuple[object, ...]) -> None:
             nonlocal count

@@ -14,7 +14,7 @@ from wheretolook.features.descriptors import quantize_descriptors, unit_descript
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.registry import all_extractors, all_kinds, kind_of, that_extract
 from wheretolook.features.similarity import SimilarityMatcher, mutual_plain
-from wheretolook.labelling.config import LabelConfig, LocalizerConfig
+from wheretolook.localization.config import LabelConfig, LocalizerConfig
 from wheretolook.utils.errors import ConfigError, WeightsError
 
 LEARNED = ("aliked", "disk", "xfeat")
@@ -166,13 +166,15 @@ def test_aliked_finds_in_a_batch_what_kornia_finds_image_by_image(least, tmp_pat
     extractor = KeypointExtractor(ExtractorConfig("aliked", weights=str(untrained("aliked", tmp_path))))
     network = extractor._extraction._network
     whole = np.stack([image(seed) for seed in range(4)])
-    whole[2], whole[3, :50] = 128, 40  # two images with flat parts, one has nothing else
+    whole[2] = 128  # two images with flat parts, one has nothing else
+    whole[3, :50] = 40
     images = torch.from_numpy(whole).permute(0, 3, 1, 2) / 255
     with torch.inference_mode():
         scores = network.extract_dense_map(images)[1]
         network.dkd.scores_th = float(scores.quantile(least)) if least else float(scores.min()) - 1e-3
         network.dkd.n_limit = 300  # of which some images have more
-        found, plain = detect_and_describe(network, images), found_plain(network, images)
+        found = detect_and_describe(network, images)
+        plain = found_plain(network, images)
     assert len(found) == 4 and any(0 < len(each[2]) < 300 for each in plain)
     for (pixels, descriptors, scored), expected in zip(found, plain, strict=True):
         assert len(pixels) == len(expected[0])
@@ -200,7 +202,9 @@ def test_images_that_go_together_hold_as_much_as_their_pixels(tmp_path):
     extractor = KeypointExtractor(ExtractorConfig("xfeat", max_keypoints=50, weights=str(untrained("xfeat", tmp_path))))
     alone = list(extractor.extract_many(image(seed) for seed in range(5)))
     network = extractor._extraction
-    network.batch, extractor.on_gpu, sizes = 2, True, []  # as on a GPU
+    network.batch = 2  # as on a GPU
+    extractor.on_gpu = True
+    sizes = []
     detect = network.detect
     network.detect = lambda images: sizes.append(len(images)) or detect(images)
     assert (extractor.batch_of(640, 480), extractor.batch_of(1280, 480), extractor.batch_of(9999, 9999)) == (2, 1, 1)

@@ -24,7 +24,8 @@ def random_descriptors(n: int, seed: int = 0) -> Descriptors:
 def extreme_descriptors(n: int, seed: int = 0) -> Descriptors:
     """Only values 0 and 255, so that sums are as large as possible; the first row is all 255, the second all 0."""
     values = 255 * np.random.default_rng(seed).integers(0, 2, (n, 128), dtype=np.uint8)
-    values[:1], values[1:2] = 255, 0
+    values[:1] = 255
+    values[1:2] = 0
     return values
 
 
@@ -83,7 +84,8 @@ def test_both_nearest_may_lie_in_one_group_or_in_two(device: str) -> None:
     query = np.full((1, 128), 100, dtype=np.uint8)
     for first, second in ((3, 4), (4, 3), (31, 32), (199, 0), (0, 199), (64, 95), (130, 67)):
         landmarks[:] = 1
-        landmarks[first], landmarks[second] = 90, 80
+        landmarks[first] = 90
+        landmarks[second] = 80
         rows, best, next_best = DescriptorMatcher(landmarks, device).nearest_two(query)
         assert (rows[0], best[0], next_best[0]) == (first, 128 * 9000, 128 * 8000)
 

@@ -17,9 +17,9 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.config import ApartmentConfig
-from wheretolook.scenes.procedural.generator import generate_apartment
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import ConfigError
+from wheretolook_rooms.generator import generate_apartment
 
 EVERYTHING = ExtractorConfig(max_keypoints=100_000)
 
@@ -34,7 +34,8 @@ def texture(seed: int, rows: int = 240, columns: int = 320) -> np.ndarray:
 def renders() -> np.ndarray:
     """Views in an apartment, (4, 240, 320) uint8."""
     config = ApartmentConfig(n_rooms=3, texture_size=2048, light_rays=4, light_spacing_m=0.5)
-    mesh, rng = generate_apartment(config, 1), np.random.default_rng(2)
+    mesh = generate_apartment(config, 1)
+    rng = np.random.default_rng(2)
     free = FreeSpace(mesh)
     eyes = rng.uniform(*mesh.bounds, (1000, 3)) * (1, 1, 0) + (0, 0, 1.4)
     eyes = eyes[free.is_free(eyes)][:4]
@@ -92,7 +93,8 @@ def test_agrees_with_opencv_on_textures_of_any_shape(shape, device):
 
 @pytest.mark.parametrize(("name", "value"), [("first_octave", 0), ("peak_threshold", 0.04), ("edge_threshold", 2.0)])
 def test_agrees_with_opencv_whatever_the_settings(name, value, device):
-    config, image = ExtractorConfig(max_keypoints=100_000), texture(1, 160, 200)
+    config = ExtractorConfig(max_keypoints=100_000)
+    image = texture(1, 160, 200)
     object.__setattr__(config, name, value)  # a constant too
     theirs = opencv(image, config)
     (ours,) = WarpSift(config, device).extract_many(image[None])

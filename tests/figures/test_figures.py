@@ -9,12 +9,12 @@ import pandas as pd
 import pytest
 from matplotlib.colors import to_rgb
 
-from wheretolook.figures.lattices import covering_radius_deg, fibonacci_figure, nearest_angles_deg
 from wheretolook.figures.style import save_figure
-from wheretolook.figures.training import training_figure
 from wheretolook.geometry.lattices import fibonacci_sphere, released_lattice
-from wheretolook.methods.fisher import APPROXIMATIONS, METRICS
-from wheretolook.methods.styles import method_group, method_style
+from wheretolook.scorers.styles import method_group, method_style
+from wheretolook_paper.figures.lattices import covering_radius_deg, fibonacci_figure, nearest_angles_deg
+from wheretolook_paper.figures.training import training_figure
+from wheretolook_paper.scorers.fisher import APPROXIMATIONS, METRICS
 
 
 def test_covering_radius_of_platonic_solids() -> None:

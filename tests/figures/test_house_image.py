@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from box_scenes import CABINET, ROOM, furnished_room
-from wheretolook.figures.house_image import dollhouse
+from wheretolook.figures.dollhouse import dollhouse
 from wheretolook.utils.errors import ConfigError, SceneError
 
 
@@ -23,7 +23,9 @@ def test_a_plan_has_x_to_the_right_and_y_up() -> None:
 
 def test_points_are_shown_unless_something_stands_before_them() -> None:
     plan = dollhouse(furnished_room(), elevation_deg=90, width_px=300)
-    under_the_cabinet, on_the_floor, outside = [5.0, 1.0, 0.05], [2.0, 4.0, 0.0], [20.0, 0.0, 0.0]
+    under_the_cabinet = [5.0, 1.0, 0.05]
+    on_the_floor = [2.0, 4.0, 0.0]
+    outside = [20.0, 0.0, 0.0]
     assert plan.shows(np.array([under_the_cabinet, on_the_floor, outside])).tolist() == [False, True, False]
 
 

@@ -12,11 +12,11 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from synthetic_dataset import make_dataset
+from wheretolook.dataset.sampling_config import Split
+from wheretolook.dataset.thresholds import ALL, THRESHOLDS
 from wheretolook.figures.labels import SHADES, label_figure
 from wheretolook.figures.style import save_figure
-from wheretolook.labelling.report import POSITIVE, LabelSummary, label_summary, threshold_sentence
-from wheretolook.viewpoints.config import Split
-from wheretolook.viewpoints.thresholds import ALL, THRESHOLDS
+from wheretolook.localization.report import POSITIVE, LabelSummary, label_summary, threshold_sentence
 
 SPLITS: dict[int, tuple[Split, ...]] = {
     1: ("test",),

@@ -12,14 +12,14 @@ import pytest
 from PIL import Image
 
 from box_scenes import furnished_room
-from wheretolook.figures.house_image import dollhouse
-from wheretolook.figures.look_film import LookStory, film_frames, still_figure, tell_looks, turning_poses
-from wheretolook.figures.looks import looks_figure
-from wheretolook.figures.moving import save_moving
+from wheretolook.figures.animation import save_moving
+from wheretolook.figures.dollhouse import dollhouse
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along, rotation_angle_deg
-from wheretolook.labelling.estimation import PoseEstimator
+from wheretolook.localization.estimation import PoseEstimator
 from wheretolook.utils.errors import ConfigError, PoseError
+from wheretolook_paper.figures.look_film import LookStory, film_frames, still_figure, tell_looks, turning_poses
+from wheretolook_paper.figures.looks import looks_figure
 
 CAMERA = PinholeCamera(160, 120, 80.0)
 POSES = poses_looking_along([[0.5, 0.2, 1.2]] * 2, [[1.0, 0, 0], [0.3, 1.0, 0.1]])
@@ -64,7 +64,8 @@ def test_a_turn_keeps_the_place_and_goes_the_shortest_way() -> None:
 
 
 def test_a_film_shows_each_look_each_turn_and_all_together(tmp_path: Path) -> None:
-    told, house = story(), dollhouse(furnished_room(), width_px=200)
+    told = story()
+    house = dollhouse(furnished_room(), width_px=200)
     turn = turning_poses(POSES, 2)[0]
     frames = list(film_frames(told, house, [(turn, IMAGES)]))
     assert len(frames) == 2 + 2 + 1 and len({image.shape for image, _ in frames}) == 1

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from wheretolook.figures.moving import save_moving
+from wheretolook.figures.animation import save_moving
 from wheretolook.figures.path_film import FRAME_MS, film_frames, methods_figure, still_figure
-from wheretolook.planning.route_views import PathView
+from wheretolook.planning.routes import PathView
 from wheretolook.utils.errors import ConfigError
 
 

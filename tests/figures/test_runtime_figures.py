@@ -11,12 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from wheretolook.figures.occlusion import occlusion_figure
-from wheretolook.figures.runtimes import duration, machine_label, runtime_figure, scaling_figure
 from wheretolook.figures.style import save_figure
-from wheretolook.methods.styles import method_style
+from wheretolook.scorers.styles import method_style
+from wheretolook_paper.figures.occlusion import occlusion_figure
+from wheretolook_paper.figures.runtimes import duration, machine_label, runtime_figure, scaling_figure
 
-COUNTS, EVERYTHING, TWIN = "counts alone", "occlusion, counts, best 100", "NumPy twin, counts alone, scaled"
+COUNTS = "counts alone"
+EVERYTHING = "occlusion, counts, best 100"
+TWIN = "NumPy twin, counts alone, scaled"
 CPU = {"device": "cpu", "name": "Intel(R) Xeon(R) Gold 6430 CPU @ 2.10GHz", "cores": 2}
 GPU = {"device": "cuda:0", "name": "NVIDIA H200", "cores": 16}
 PAPER = {"paper, CPU, 1 thread": 7387.0, "paper, GPU": 23.0, "released kernel, H200": 12.2}

@@ -15,20 +15,20 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
 from box_scenes import ROOM, furnished_room
-from wheretolook.figures.house_image import dollhouse, frustum_corners, frustum_segments
-from wheretolook.figures.inputs import BinnedImage, inputs_figure
-from wheretolook.figures.learning import learning_figure
+from wheretolook.dataset.viewpoint_table import pose_columns
+from wheretolook.figures.dollhouse import dollhouse, frustum_corners, frustum_segments
 from wheretolook.figures.overview import Overview, View, overview_figure
-from wheretolook.figures.peaks import peaks_figure, spread_extrema
-from wheretolook.figures.pipeline import Pipeline, pipeline_figure, ranked_figure
-from wheretolook.figures.sampling import Sampling, sampling_figure
 from wheretolook.figures.style import TWO_COLUMNS_IN, save_figure
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.geometry.poses import poses_looking_along, transform
-from wheretolook.planning.turns import pan_tilt_angles
+from wheretolook.planning.camera_turns import pan_tilt_angles
 from wheretolook.stages.demo import _ends
-from wheretolook.viewpoints.table import pose_columns
+from wheretolook_paper.figures.inputs import BinnedImage, inputs_figure
+from wheretolook_paper.figures.network_walkthrough import learning_figure
+from wheretolook_paper.figures.peaks import peaks_figure, spread_extrema
+from wheretolook_paper.figures.pipeline import Pipeline, pipeline_figure, ranked_figure
+from wheretolook_paper.figures.sampling import Sampling, sampling_figure
 
 CAMERA = PinholeCamera(64, 48, 32.0)
 HOUSE = dollhouse(furnished_room(), width_px=240)
@@ -106,8 +106,10 @@ def test_sampling_figure_draws_voxels_directions_and_occlusion(tmp_path: Path) -
     grid = VoxelGrid((0, 0, 0), ROOM, (4, 3, 2))
     layer = np.arange(len(grid))[::2]
     free = np.arange(len(layer)) % 3 > 0
-    directions, landmarks = fibonacci_sphere(50), np.random.default_rng(0).uniform((0, 0, 0), ROOM, (60, 3))
-    kept, unoccluded = np.arange(50) < 12, np.arange(60) < 25
+    directions = fibonacci_sphere(50)
+    landmarks = np.random.default_rng(0).uniform((0, 0, 0), ROOM, (60, 3))
+    kept = np.arange(50) < 12
+    unoccluded = np.arange(60) < 25
     n_visible = 10 * np.arange(50)[::-1]
     sampling = Sampling(plan, grid, layer, free, grid.centers()[layer[1]], directions, n_visible, kept, landmarks,
                         unoccluded)  # fmt: skip
@@ -137,11 +139,13 @@ def test_sampling_figure_draws_voxels_directions_and_occlusion(tmp_path: Path) -
 def image() -> BinnedImage:
     pixels = np.array([[5.0, 5.0], [6.0, 6.0], [60.0, 40.0]])
     counts = np.zeros((6, 6), np.int32)
-    counts[0, 0], counts[5, 5] = 2, 1
+    counts[0, 0] = 2
+    counts[5, 5] = 1
     means = {}
     for number, name in enumerate("uvxyz"):
         means[name] = np.full((6, 6), np.nan)
-        means[name][0, 0], means[name][5, 5] = -1.25 - number, 2.0 + number
+        means[name][0, 0] = -1.25 - number
+        means[name][5, 5] = 2.0 + number
     return BinnedImage(np.full((48, 64, 3), 120, np.uint8), pixels, means, counts)
 
 
@@ -195,7 +199,8 @@ def test_learning_figure_draws_what_passes_through(image: BinnedImage, channels:
 def test_extrema_are_spread() -> None:
     directions = fibonacci_sphere(300)
     scores = directions @ (0, 0, 1.0)
-    peaks, pits = spread_extrema(directions, scores, 4, 40.0), spread_extrema(directions, scores, 4, 40.0, False)
+    peaks = spread_extrema(directions, scores, 4, 40.0)
+    pits = spread_extrema(directions, scores, 4, 40.0, False)
     assert peaks[0] == 0 and pits[0] == 299
     for found in (peaks, pits):
         cosines = directions[found] @ directions[found].T
@@ -233,14 +238,16 @@ def test_overview_draws_places_scores_and_both_views(tmp_path: Path) -> None:
     plan = dollhouse(furnished_room(), elevation_deg=90, cut_m=1.5, one_sided=False, width_px=240)
     locations = np.array([[1.0, 2.0, 1.4], [2.0, 3.0, 1.4], [3.0, 1.0, 1.4]])
     directions = fibonacci_sphere(80)
-    scores, shares = np.linspace(0, 1, 80), np.array([0.2, 0.9, 0.5])
+    scores = np.linspace(0, 1, 80)
+    shares = np.array([0.2, 0.9, 0.5])
     rgb = np.full((48, 64, 3), 90, np.uint8)
     best, worst = (View(rgb, directions[row], float(scores[row]), f"outcome {row}") for row in (79, 30))
     what = Overview(
         "a room", "set of landmarks", plan, locations, shares, locations[1], directions, scores, best, worst
     )
     figure = overview_figure(what)
-    above, sphere = figure.axes[0], next(axes for axes in figure.axes if axes.name == "hammer")
+    above = figure.axes[0]
+    sphere = next(axes for axes in figure.axes if axes.name == "hammer")
     (dots,) = [one for one in above.collections if isinstance(one, PathCollection)]
     order = np.argsort(shares)
     np.testing.assert_allclose(dots.get_offsets(), plan.pixels(locations)[order])  # good ones lie on top

@@ -17,7 +17,7 @@ from wheretolook.evaluation.calibration import calibration_rows
 from wheretolook.figures.calibration import calibration_figure
 from wheretolook.figures.scores import regret_figure, score_figure
 from wheretolook.figures.style import save_figure
-from wheretolook.methods.styles import method_style
+from wheretolook.scorers.styles import method_style
 
 FEW: tuple[str, ...] = ("random", "visible", "bins", "mlp-2d")
 FAR = ("random", "forward", "max-visibility-swapped")
@@ -38,7 +38,8 @@ def test_score_figure_draws_the_methods_that_matter_best_first(methods: tuple[st
     for axes, key in zip(figure.axes, (KEYS[0], KEYS[-1]), strict=True):
         low, high = axes.get_xlim()
         assert 50 < low < 80 and high > 100
-        numbers, arrows = [text.get_text() for text in axes.texts[: len(shown)]], axes.texts[len(shown) :]
+        numbers = [text.get_text() for text in axes.texts[: len(shown)]]
+        arrows = axes.texts[len(shown) :]
         for y, method in enumerate(shown):
             row = _row(scores, method, 1)
             (mark,) = _marks(axes, method)
@@ -120,7 +121,8 @@ def test_calibration_figure_draws_the_curves(tmp_path: Path) -> None:
         parts.append(rows.assign(method=method, temperature=temperature))
     table = pd.concat(parts, ignore_index=True)
     figure = calibration_figure(table)
-    curves, counts = figure.axes[:2], figure.axes[2:]
+    curves = figure.axes[:2]
+    counts = figure.axes[2:]
     assert [axes.get_title() for axes in curves] == ["MLP, 2d", "MLP, 2d + 3d"]
     assert [len(axes.lines) for axes in curves] == [3, 2]  # with the diagonal; one has no temperature
     np.testing.assert_array_equal(curves[0].lines[0].get_xydata(), [[0, 0], [1, 1]])

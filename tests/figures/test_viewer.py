@@ -9,9 +9,9 @@ import open3d as o3d
 import pytest
 
 from box_scenes import furnished_room, random_triangles
-from wheretolook.figures.viewer import FRUSTUM_M, scene_geometries, show_scene
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
+from wheretolook_paper.figures.viewer import FRUSTUM_M, scene_geometries, show_scene
 
 POSES = poses_looking_along([[1.0, 1, 1], [2, 2, 2]], [[1.0, 0, 0], [0, 1, 0]])
 LANDMARKS = np.random.default_rng(0).uniform(0, 3, (20, 3))
@@ -40,7 +40,8 @@ def test_meshes_keep_their_textures_and_colours(seed: int) -> None:
     mesh = random_triangles(seed)
     for number, one in enumerate(scene_geometries(mesh)):
         rows = mesh.triangle_texture == number
-        part, corners = one["geometry"], mesh.triangles[rows].reshape(-1)
+        part = one["geometry"]
+        corners = mesh.triangles[rows].reshape(-1)
         np.testing.assert_allclose(np.asarray(part.vertices), mesh.vertices[corners])
         uvs = mesh.corner_uvs[rows].reshape(-1, 2)
         np.testing.assert_allclose(

@@ -25,7 +25,8 @@ def test_opencv_model_projects_as_opencv() -> None:
 
 
 def test_a_pinhole_of_colmap_is_our_pinhole() -> None:
-    ours, colmap = PinholeCamera(640, 480, 320.0), ColmapCamera("SIMPLE_PINHOLE", 640, 480, (320.0, 320.0, 240.0))
+    ours = PinholeCamera(640, 480, 320.0)
+    colmap = ColmapCamera("SIMPLE_PINHOLE", 640, 480, (320.0, 320.0, 240.0))
     points = np.random.default_rng(0).normal(size=(5000, 3))
     in_front = points[:, 2] > 1e-3
     np.testing.assert_array_equal(colmap.sees(points), in_front & ours.in_image(ours.project(points)))

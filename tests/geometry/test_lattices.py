@@ -37,7 +37,8 @@ def test_fibonacci_covers_the_sphere_three_times_finer_than_the_released_lattice
 
 
 def test_nearest_neighbour_spread() -> None:
-    fibonacci, released = nearest_gaps_deg(fibonacci_sphere(500)), nearest_gaps_deg(released_lattice(500))
+    fibonacci = nearest_gaps_deg(fibonacci_sphere(500))
+    released = nearest_gaps_deg(released_lattice(500))
     assert (fibonacci.min(), fibonacci.max()) == pytest.approx((7.9, 9.0), abs=0.06)
     assert (released.min(), released.max()) == pytest.approx((0.33, 16.2), abs=0.06)
 

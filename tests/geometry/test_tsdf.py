@@ -32,7 +32,8 @@ def test_the_surface_lies_where_the_mesh_is(volume: TsdfVolume) -> None:
 
 
 def test_a_depth_camera_may_have_two_focal_lengths_and_its_own_centre() -> None:
-    depth, pose = np.random.default_rng(0).uniform(1, 2, (240, 320)), np.eye(4)[:3]
+    depth = np.random.default_rng(0).uniform(1, 2, (240, 320))
+    pose = np.eye(4)[:3]
     camera = ColmapCamera("PINHOLE", 320, 240, (200.0, 210.0, 155.0, 118.0))
     points = DepthImage(depth, camera, pose).points(10.0)
     rows, columns = np.divmod(np.arange(320 * 240), 320)

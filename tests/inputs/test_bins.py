@@ -13,7 +13,7 @@ from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import transform
 from wheretolook.inputs.bins import arrange, bin_views, bin_views_plain, count_bins
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, LANDMARK_CHANNELS, PAPER_VARIANTS
-from wheretolook.inputs.landmarks_in_view import ATTRIBUTES, LandmarkDescriber
+from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import ConfigError
@@ -51,7 +51,8 @@ def test_bins_counted_by_hand(bin_function) -> None:  # type: ignore[no-untyped-
 def test_kernel_bins_as_its_plain_twin(random_views: RandomViews, device: str) -> None:
     v = random_views
     arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
-    kernel, plain = bin_views(arguments, bins=12, device=device), bin_views_plain(arguments, bins=12)
+    kernel = bin_views(arguments, bins=12, device=device)
+    plain = bin_views_plain(arguments, bins=12)
     np.testing.assert_array_equal(kernel.counts, plain.counts)
     np.testing.assert_allclose(kernel.means, plain.means, rtol=1e-5, atol=2e-5)
     assert plain.counts.sum() > 500
@@ -88,7 +89,8 @@ def landmarks_of(views: RandomViews) -> Landmarks:
 
 
 def test_kernel_bins_what_landmarks_are_like_as_its_plain_twin(random_views: RandomViews, device: str) -> None:
-    v, landmarks = random_views, landmarks_of(random_views)
+    v = random_views
+    landmarks = landmarks_of(random_views)
     arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
     kernel = bin_views(arguments, bins=12, device=device, landmarks=landmarks)
     plain = bin_views_plain(arguments, bins=12, landmarks=landmarks)
@@ -103,7 +105,8 @@ def test_kernel_bins_what_landmarks_are_like_as_its_plain_twin(random_views: Ran
 
 @pytest.mark.parametrize("distorted", [False, True])
 def test_channels_of_landmarks_are_means_of_their_attributes(random_views: RandomViews, distorted: bool) -> None:
-    v, landmarks = random_views, landmarks_of(random_views)
+    v = random_views
+    landmarks = landmarks_of(random_views)
     camera = ColmapCamera("RADIAL", 320, 240, (150.0, 165.0, 118.0, -0.15, 0.02)) if distorted else v.camera
     arguments = v.cam_from_world, v.points, v.visible, v.location_rows
     binned = bin_views(PosedViews(camera, *arguments), bins=1, landmarks=landmarks)
@@ -117,7 +120,8 @@ def test_channels_of_landmarks_are_means_of_their_attributes(random_views: Rando
 
 
 def test_a_mean_with_an_unknown_value_is_unknown_and_nothing_else_is(random_views: RandomViews, device: str) -> None:
-    v, landmarks = random_views, landmarks_of(random_views)
+    v = random_views
+    landmarks = landmarks_of(random_views)
     known = np.random.default_rng(1).random(len(landmarks)) < 0.9
     landmarks = replace(landmarks, ambiguity=np.where(known, landmarks.ambiguity, np.nan).astype(np.float32))
     arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
@@ -132,7 +136,8 @@ def test_a_mean_with_an_unknown_value_is_unknown_and_nothing_else_is(random_view
 def test_blocks_do_not_change_the_bins(random_views: RandomViews) -> None:
     v = random_views
     arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
-    whole, blocks = bin_views(arguments, bins=6), bin_views(arguments, bins=6, block_bytes=7 * 36 * 24)
+    whole = bin_views(arguments, bins=6)
+    blocks = bin_views(arguments, bins=6, block_bytes=7 * 36 * 24)
     np.testing.assert_array_equal(whole.means, blocks.means)
     np.testing.assert_array_equal(whole.counts, blocks.counts)
 
@@ -150,7 +155,8 @@ def test_input_sizes_are_those_of_the_variants(random_views: RandomViews) -> Non
 
 def test_compact_layout_moves_filled_bins_to_the_front_in_order() -> None:
     means = np.zeros((1, 2, 2, 2), dtype=np.float32)
-    means[0, :, 0, 1], means[0, :, 1, 1] = (5, 6), (7, 8)
+    means[0, :, 0, 1] = (5, 6)
+    means[0, :, 1, 1] = (7, 8)
     filled = np.array([[[False, True], [False, True]]])
     assert arrange(means, filled, "compact").reshape(2, 4).tolist() == [[5, 7, 0, 0], [6, 8, 0, 0]]
     assert arrange(means, filled, "in_place") is means

@@ -12,9 +12,9 @@ from synthetic_dataset import CAMERA, make_landmarks
 from wheretolook.geometry.camera import ColmapCamera
 from wheretolook.geometry.poses import Float, poses_looking_along, transform
 from wheretolook.inputs.channels import ATTRIBUTES, POSE_ATTRIBUTES
-from wheretolook.inputs.landmarks_in_view import POOLED, LandmarkDescriber, pool
+from wheretolook.inputs.landmark_features import POOLED, LandmarkDescriber, pool
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
-from wheretolook.labelling.labeller import LABELS
+from wheretolook.localization.labeller import LABELS
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.visibility.occlusion import StoredOcclusion
 
@@ -37,7 +37,8 @@ def localization_map(request: pytest.FixtureRequest, device: str) -> Localizatio
 
 
 def test_each_landmark_by_hand(localization_map: LocalizationMap) -> None:
-    m, views = localization_map.landmarks, some_views()
+    m = localization_map.landmarks
+    views = some_views()
     described = LandmarkDescriber(localization_map).describe(views)
     visible = localization_map.landmarks_in_view(views)
     assert len(described) == 50 and described.counts.tolist() == np.diff(visible.starts).tolist()
@@ -84,7 +85,8 @@ def test_pooled_by_numpy(localization_map: LocalizationMap) -> None:
     np.testing.assert_allclose(pooled[:, 2], (coarse > 0).sum(1))
     np.testing.assert_allclose(pooled[:, 3], np.log1p(np.sort(coarse, axis=1)[:, 8:]).sum(1), rtol=1e-5)
     np.testing.assert_allclose(pooled[:, 4], views[:, 2, 2], atol=1e-6)
-    values, starts = described.values.cpu().numpy(), described.starts.cpu().numpy()
+    values = described.values.cpu().numpy()
+    starts = described.starts.cpu().numpy()
     for view in range(50):
         part = values[starts[view] : starts[view + 1]].astype(np.float64)
         if len(part) == 0:
@@ -96,8 +98,10 @@ def test_pooled_by_numpy(localization_map: LocalizationMap) -> None:
 
 
 def test_a_views_numbers_are_its_own(localization_map: LocalizationMap) -> None:
-    views, order = some_views(), np.random.default_rng(2).permutation(50)
-    describer, camera = LandmarkDescriber(localization_map), localization_map.camera
+    views = some_views()
+    order = np.random.default_rng(2).permutation(50)
+    describer = LandmarkDescriber(localization_map)
+    camera = localization_map.camera
     together = pool(describer.describe(views), views, camera).cpu()
     shuffled = pool(describer.describe(views[order]), views[order], camera).cpu()
     np.testing.assert_allclose(shuffled, together[order], rtol=1e-5, atol=1e-6)
@@ -146,7 +150,7 @@ def test_blocks_of_views_hold_all_or_evenly_spread_landmarks(
     views = some_views()
     describer = LandmarkDescriber(localization_map)
     whole = describer.describe(views)
-    monkeypatch.setattr("wheretolook.inputs.landmarks_in_view.BLOCK_ENTRIES", {"cpu": 100, "cuda": 100})
+    monkeypatch.setattr("wheretolook.inputs.landmark_features.BLOCK_ENTRIES", {"cpu": 100, "cuda": 100})
     at = 0
     for rows, part, visible in describer.in_blocks(views, most):
         assert rows.start == at and (len(part) == 1 or part.counts.sum() <= 100)
@@ -179,7 +183,8 @@ def test_views_share_locations_in_whatever_order_they_come() -> None:
 
 
 def test_one_view_is_described_and_thinned_as_it_is_among_others(localization_map: LocalizationMap) -> None:
-    poses, describer = some_views(), LandmarkDescriber(localization_map)
+    poses = some_views()
+    describer = LandmarkDescriber(localization_map)
     ((_, together, seen),) = describer.in_blocks(poses, 20)
     assert int(seen.max()) > 20 == int(together.counts.max())
     for view, pose in enumerate(poses):

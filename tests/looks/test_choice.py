@@ -10,16 +10,23 @@ import pytest
 
 from selection.room import POINTS, WEIGHTS, write_room
 from wheretolook import LocalizationMap, load_scorer
-from wheretolook.fisher.exact import exact_information
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import poses_looking_along, rotation_angle_deg, rotation_looking_along
 from wheretolook.looks.around import best_looks, candidates
-from wheretolook.looks.choice import Turns, best_one_by_one, choose_exhaustively, choose_looks, evenly_spread, worth_of
-from wheretolook.looks.union import SeenAround, log_position_variance, seen_around, union_plain
-from wheretolook.looks.worth import SetWorth, count_worth, fisher_worth
-from wheretolook.methods.base import Scorer
-from wheretolook.methods.matchability.score import ExpectedScorer
+from wheretolook.looks.joint_visibility import SeenAround, log_position_variance, seen_around, union_plain
+from wheretolook.looks.selection import (
+    Turns,
+    best_one_by_one,
+    choose_exhaustively,
+    choose_looks,
+    evenly_spread,
+    worth_of,
+)
+from wheretolook.looks.set_score import SetWorth, count_worth, fisher_worth
+from wheretolook.scorers.base import Scorer
 from wheretolook.utils.errors import ConfigError, PlanningError, WeightsError
+from wheretolook_paper.fisher.exact import exact_information
+from wheretolook_paper.scorers.expected import ExpectedScorer
 
 AXES = direction_lattice(24)
 
@@ -38,7 +45,7 @@ def some_seen(seed: int = 0, d: int = 9, u: int = 30) -> SeenAround:
     rng = np.random.default_rng(seed)
     chances = (rng.random((d, u)) * (rng.random((d, u)) < 0.4)).astype(np.float32)
     offsets = rng.normal(0, 2, (u, 3))
-    from wheretolook.fisher.information import bearing_numbers
+    from wheretolook.geometry.pose_information import bearing_numbers
 
     return SeenAround(
         chances, np.concatenate([np.ones((u, 1)), bearing_numbers(offsets)], 1), (chances > 0).sum(1), rng.random(d)
@@ -81,7 +88,8 @@ def test_greedy_choice_with_exchange_is_nearly_the_best_of_all_sets(worth: objec
         seen = some_seen(seed)
         turns = Turns(AXES[:9])
         for n in (1, 2, 3):
-            chosen, best = choose_looks(seen, worth, n, turns), choose_exhaustively(seen, worth, n, turns)  # type: ignore[arg-type]
+            chosen = choose_looks(seen, worth, n, turns)  # type: ignore[arg-type]
+            best = choose_exhaustively(seen, worth, n, turns)
             assert len({*chosen.looks}) == n
             failed = np.prod(1 - seen.alone[list(chosen.looks)], keepdims=True)
             assert best.worth - 1e-9 <= chosen.worth + 0.05 * abs(best.worth)
@@ -126,7 +134,8 @@ def test_more_looks_are_worth_more_and_the_first_is_the_best_alone(scorer: Score
 
 
 def test_candidates_are_the_best_that_lie_apart() -> None:
-    axes, rng = direction_lattice(500), np.random.default_rng(0)
+    axes = direction_lattice(500)
+    rng = np.random.default_rng(0)
     scores = rng.random(500)
     rows = candidates(axes, scores, 24)
     assert rows[0] == scores.argmax() and len(rows) == 24
@@ -149,7 +158,8 @@ def test_baselines() -> None:
 
 
 def test_bad_input_is_refused(seen: SeenAround, tmp_path: Path) -> None:
-    turns, worth = Turns(AXES), SetWorth.shipped()
+    turns = Turns(AXES)
+    worth = SetWorth.shipped()
     for n in (0, 7):
         with pytest.raises(ConfigError, match="1 to 6 looks"):
             choose_looks(seen, worth, n, turns)

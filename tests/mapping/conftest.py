@@ -52,7 +52,10 @@ def noise_texture(rng: np.random.Generator, size: int = 512) -> np.ndarray:
 def box_room(size: tuple[float, float, float] = ROOM_SIZE, seed: int = 0) -> TexturedMesh:
     """The inside of a box with a corner at the origin, each face with a texture of its own, 2.5 m across."""
     size_m = np.array(size)
-    vertices, triangles, uvs, textures = [], [], [], []
+    vertices = []
+    triangles = []
+    uvs = []
+    textures = []
     rng = np.random.default_rng(seed)
     for axis in range(3):
         u, v = np.delete(np.arange(3), axis)

@@ -16,7 +16,8 @@ from wheretolook.rendering.warp_renderer import WarpRenderer
 
 CAMERA = PinholeCamera(480, 360, 330.0)
 DICTIONARY = "DICT_4X4_50"
-_BLACK, _MARGIN = 96, 16  # pixels of a marker's texture: its black square, and the white around it
+_BLACK = 96  # pixels of a marker's texture: its black square, and the white around it
+_MARGIN = 16
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,9 @@ MARKERS = (WallMarker(3, (1.6, 3.99, 1.5)), WallMarker(7, (2.6, 3.99, 1.0)), Wal
 def marker_room(markers: tuple[WallMarker, ...] = MARKERS, dictionary: str = DICTIONARY) -> TexturedMesh:
     """`box_room` with markers, each on a white square. No texture repeats: a mapping would take places for one."""
     room = box_room()
-    vertices, uvs, textures = [room.vertices], [room.corner_uvs / 2], list(room.textures)
+    vertices = [room.vertices]
+    uvs = [room.corner_uvs / 2]
+    textures = list(room.textures)
     for marker in markers:
         center = np.array(marker.center)
         vertices.append((center + (marker.corners - center) * (1 + 2 * _MARGIN / _BLACK)).astype(np.float32))
@@ -69,13 +72,16 @@ def hand_held_poses(n: int = 14, seed: int = 0) -> Float:
     rng = np.random.default_rng(seed)
     along = np.linspace(0, 1, n)
     positions = np.stack([1.2 + 2.6 * along, 1.3 + 0.4 * np.sin(7 * along), 1.4 + 0.2 * np.cos(9 * along)], axis=1)
-    yaw, pitch = np.radians(90 + 28 * np.sin(5 * along)), np.radians(rng.uniform(-8, 8, n))
+    yaw = np.radians(90 + 28 * np.sin(5 * along))
+    pitch = np.radians(rng.uniform(-8, 8, n))
     axes = np.stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)], axis=1)
     poses = poses_looking_along(positions, axes)
     roll = np.radians(rng.normal(scale=1.0, size=n))
     turn = np.zeros((n, 3, 3))
     turn[:, 0, 0] = turn[:, 1, 1] = np.cos(roll)
-    turn[:, 0, 1], turn[:, 1, 0], turn[:, 2, 2] = -np.sin(roll), np.sin(roll), 1
+    turn[:, 0, 1] = -np.sin(roll)
+    turn[:, 1, 0] = np.sin(roll)
+    turn[:, 2, 2] = 1
     return turn @ poses
 
 

@@ -14,10 +14,10 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping import triangulation
-from wheretolook.mapping.building import build_map
 from wheretolook.mapping.colmap_model import load_mapping_poses
 from wheretolook.mapping.config import MapConfig, WalkConfig
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
+from wheretolook.mapping.rendered_map import build_map
 from wheretolook.mapping.walk import plan_walk
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.utils.errors import ConfigError, MapError
@@ -118,7 +118,8 @@ def test_keypoint_pixels_have_the_colour_of_the_landmark(built):
 
 def test_stored_landmarks_are_those_of_the_model_and_its_database(built):
     folder, _ = built
-    stored, read = Landmarks.load(folder / "landmarks.npz"), load_colmap_landmarks(folder, folder / "database.db")
+    stored = Landmarks.load(folder / "landmarks.npz")
+    read = load_colmap_landmarks(folder, folder / "database.db")
     for name, value in vars(stored).items():
         np.testing.assert_array_equal(value, getattr(read, name))
     assert (stored.track_length >= 2).all()
@@ -152,7 +153,8 @@ def test_same_seed_same_bytes_whatever_the_workers(built, room, room_free_space,
 @pytest.mark.slow
 def test_no_two_threads_match_in_one_process(room, room_free_space, renderer, tmp_path, monkeypatch):
     """pycolmap's BLAS would give them the same buffer once in many maps."""
-    threads, match = [], pycolmap.match_image_pairs
+    threads = []
+    match = pycolmap.match_image_pairs
 
     def watched(database, options, *arguments, **named):
         threads.append(options.num_threads)
@@ -192,7 +194,9 @@ class FailingRenderer:
     """Renders the first batch and is then interrupted, as by Ctrl-C."""
 
     def __init__(self, renderer: WarpRenderer, error: type[BaseException]) -> None:
-        self.renderer, self.error, self.calls = renderer, error, 0
+        self.renderer = renderer
+        self.error = error
+        self.calls = 0
 
     def render(self, camera, cam_from_world):
         self.calls += 1

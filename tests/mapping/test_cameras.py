@@ -9,7 +9,7 @@ import pytest
 
 from mapping.test_landmarks import CENTERS, hand_written_model
 from synthetic_dataset import CAMERA, make_mapping_poses, make_scene
-from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import load_mapping_poses, save_mapping_poses
@@ -23,7 +23,8 @@ def scene(tmp_path: Path) -> SceneFolder:
 
 
 def test_poses_come_back_from_disk_and_give_the_same_bytes(tmp_path: Path) -> None:
-    poses, path = make_mapping_poses(3), tmp_path / "cameras.npz"
+    poses = make_mapping_poses(3)
+    path = tmp_path / "cameras.npz"
     save_mapping_poses(poses, path)
     np.testing.assert_array_equal(load_mapping_poses(path), poses.astype(np.float32))
     content = path.read_bytes()

@@ -14,7 +14,8 @@ TURN = Rotation.from_euler("xyz", [40, -65, 110], degrees=True).as_matrix()
 
 
 def looking(yaw_deg: np.ndarray, pitch_deg: np.ndarray, roll_deg: np.ndarray) -> np.ndarray:
-    yaw, pitch = np.radians(yaw_deg), np.radians(pitch_deg)
+    yaw = np.radians(yaw_deg)
+    pitch = np.radians(pitch_deg)
     axes = np.stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)], axis=1)
     poses = poses_looking_along(np.zeros((len(yaw), 3)), axes)
     roll = Rotation.from_euler("z", np.asarray(roll_deg)[:, None], degrees=True).as_matrix()
@@ -37,7 +38,8 @@ def test_level_cameras_give_up_exactly_whatever_their_pitch() -> None:
 
 def test_rolled_photographs_do_not_move_it() -> None:
     rng = np.random.default_rng(0)
-    yaw, roll = rng.uniform(0, 360, 20), rng.normal(scale=1.0, size=20)
+    yaw = rng.uniform(0, 360, 20)
+    roll = rng.normal(scale=1.0, size=20)
     roll[:5] = 90.0  # held upright, without saying so
     gravity = estimate_gravity(looking(yaw, rng.uniform(-20, 20, 20), roll))
     assert off_deg(gravity.up) < 1.0

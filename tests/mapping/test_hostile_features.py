@@ -11,7 +11,7 @@ import pytest
 from mapping.test_landmarks import hand_written_model, random_descriptors, write_database
 from wheretolook.features.registry import all_kinds
 from wheretolook.mapping.colmap_model import model_arrays
-from wheretolook.mapping.descriptors import read_descriptors, read_features
+from wheretolook.mapping.feature_files import read_descriptors, read_features
 from wheretolook.utils.errors import MapError
 
 MODEL, KEYPOINTS = hand_written_model()

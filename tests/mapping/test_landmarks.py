@@ -165,7 +165,8 @@ def test_one_landmark_has_no_ambiguity():
 def test_long_and_short_tracks_against_a_plain_loop(tmp_path):
     """Attributes of many random landmarks, one observation at a time."""
     rng = np.random.default_rng(4)
-    n_images, n_points = 40, 300
+    n_images = 40
+    n_points = 300
     centers = rng.uniform(-3, 3, (n_images, 3))
     points = rng.uniform(-3, 3, (n_points, 3)) + np.array([0, 12, 0])
     tracks = [rng.choice(n_images, rng.integers(2, n_images), replace=False) for _ in range(n_points)]

@@ -20,13 +20,13 @@ from wheretolook.features.registry import all_kinds
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along, transform
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.labelling.localizer import Localizer
+from wheretolook.localization.localizer import Localizer
 from wheretolook.mapping.colmap_model import model_arrays
-from wheretolook.mapping.descriptors import read_features
+from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import Landmarks, features_of, load_colmap_landmarks
 from wheretolook.mapping.triangulation import fill_database, match_pairs
-from wheretolook.methods.features_learnt import folder_for
-from wheretolook.methods.registry import load_scorer
+from wheretolook.scorers.feature_domain import folder_for
+from wheretolook.scorers.registry import load_scorer
 from wheretolook.select.weights import weights_of
 from wheretolook.utils.errors import MapError, MapWarning, OutOfRangeWarning
 from wheretolook.utils.processes import Processes
@@ -242,7 +242,8 @@ def room(kind, n: int = 300) -> tuple[Landmarks, np.ndarray]:
     """Landmarks on a wall at y = 4 with descriptors of a kind, and a pose that sees them."""
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-2, 2, n), rng.uniform(3.5, 4.5, n), rng.uniform(0, 3, n)])
-    ones, zeros = np.ones(n, np.float32), np.zeros((n, 3), np.float32)
+    ones = np.ones(n, np.float32)
+    zeros = np.zeros((n, 3), np.float32)
     landmarks = Landmarks(
         np.arange(n), points, np.full(n, 3, np.int32), ones, 5 * ones, zeros, 0 * ones, 3 * ones, 0.1 * ones,
         kind.store(unit(n, kind.dimension)), 0.5 * ones, 320 * ones, kind.name,
@@ -270,7 +271,8 @@ def test_a_view_of_a_map_of_learned_features_is_localized(kind):
 
 def test_pairs_of_images_are_matched_by_similarity(tmp_path):
     kind = all_kinds()["xfeat"]
-    shared, pixels = unit(40, 64), np.zeros((60, 2), np.float32)
+    shared = unit(40, 64)
+    pixels = np.zeros((60, 2), np.float32)
     images = [(pixels, kind.store(np.concatenate([shared, unit(20, 64, seed)]))) for seed in (1, 2, 3)]
     with Processes(1) as processes:
         found = list(match_pairs(images, np.array([[0, 1], [1, 2]]), tmp_path, processes, False, kind))
@@ -285,7 +287,8 @@ def test_weights_that_have_learnt_by_the_features_of_the_map_score_it():
     theirs = "data/release/weights/aliked/set.safetensors"
     with warnings.catch_warnings():
         warnings.simplefilter("error", OutOfRangeWarning)
-        own, by_folder = load_scorer(looked), load_scorer("data/release/weights", looked)
+        own = load_scorer(looked)
+        by_folder = load_scorer("data/release/weights", looked)
         expected = load_scorer(theirs, looked).score(pose[None])
     assert own.name == "set" and np.isfinite(expected).all()
     np.testing.assert_array_equal(own.score(pose[None]), expected)
@@ -303,7 +306,8 @@ def test_weights_that_have_learnt_by_the_features_of_the_map_score_it():
 @pytest.mark.parametrize("name", ["xfeat", "disk", "superpoint"])
 def test_weights_by_aliked_score_maps_by_other_learned_features_and_say_what_that_costs(name):
     landmarks, pose = room(all_kinds()[name])
-    looked, named = LocalizationMap(landmarks, PinholeCamera()), "data/release/weights"
+    looked = LocalizationMap(landmarks, PinholeCamera())
+    named = "data/release/weights"
     with pytest.warns(OutOfRangeWarning, match=f"learnt from maps by aliked, and this one is by {name}") as said:
         scorer = load_scorer(looked)
     assert len(said) == 1 and said[0].filename == __file__

@@ -18,7 +18,7 @@ from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import colmap_poses, model_arrays, read_model
 from wheretolook.mapping.landmarks import load_colmap_landmarks
-from wheretolook.mapping.plausibility import axes_doubt, scale_doubt
+from wheretolook.mapping.sanity import axes_doubt, scale_doubt
 from wheretolook.utils.errors import MapError, MapWarning
 
 pytestmark = pytest.mark.filterwarnings("error::wheretolook.utils.errors.MapWarning")
@@ -40,7 +40,8 @@ def written(model: pycolmap.Reconstruction, folder: Path, text: bool = False) ->
 
 def rig_model() -> pycolmap.Reconstruction:
     """Two frames of a rig of two cameras 0.2 m apart that look along +y, with points 2 to 5 m ahead."""
-    model, rig = pycolmap.Reconstruction(), pycolmap.Rig(rig_id=1)
+    model = pycolmap.Reconstruction()
+    rig = pycolmap.Rig(rig_id=1)
     for camera_id, width in ((1, 640), (2, 320)):
         params = [width / 2, width / 2, 0.375 * width]
         model.add_camera(
@@ -106,7 +107,8 @@ def test_arrays_are_what_pycolmap_says_of_each_point(tmp_path):
     arrays = model_arrays(read_model(written(model, tmp_path / "model")))
     assert list(arrays.point_ids) == [5, 10, 20, 30, 40]
     for row, point_id in enumerate(arrays.point_ids):
-        point, span = model.points3D[int(point_id)], slice(*arrays.observation_start[row : row + 2])
+        point = model.points3D[int(point_id)]
+        span = slice(*arrays.observation_start[row : row + 2])
         np.testing.assert_array_equal(arrays.points[row], point.xyz)
         assert arrays.errors_px[row] == point.error
         elements = [(element.image_id, element.point2D_idx) for element in point.track.elements]

@@ -16,20 +16,20 @@ from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room, 
 from wheretolook import stages
 from wheretolook.cli import main
 from wheretolook.config import Experiment, ScenesConfig
-from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.viewpoint_table import UNLABELLED, poses
 from wheretolook.geometry.poses import camera_centers
-from wheretolook.mapping import incremental
+from wheretolook.mapping import sfm as incremental
 from wheretolook.mapping.colmap_model import colmap_poses
 from wheretolook.mapping.config import KnownDistance, MapConfig, PhotographsConfig, ScaleConfig
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.photograph_map import map_photographs
 from wheretolook.mapping.scale import fit_similarity
-from wheretolook.methods.visible import VisibleScorer
 from wheretolook.planning.config import ViewpointMapConfig
+from wheretolook.scorers.visible import VisibleScorer
 from wheretolook.space.config import MappedSpaceConfig
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
-from wheretolook.viewpoints.config import SampleConfig
-from wheretolook.viewpoints.table import UNLABELLED, poses
 
 TRUTH = hand_held_poses()
 CENTERS = camera_centers(TRUTH)

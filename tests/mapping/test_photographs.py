@@ -18,7 +18,9 @@ from wheretolook.mapping.photographs import (
 )
 from wheretolook.utils.errors import ConfigError, MapError
 
-ORIENTATION, EXIF_IFD, FOCAL_35MM = 0x0112, 0x8769, 0xA405
+ORIENTATION = 0x0112
+EXIF_IFD = 0x8769
+FOCAL_35MM = 0xA405
 
 
 def save(path: Path, rgb: np.ndarray, orientation: int = 1, focal_mm: int = 0) -> None:

@@ -141,7 +141,8 @@ def test_tables_are_read_and_contradictions_refused(tmp_path: Path) -> None:
 
 
 def test_positions_are_read_from_csv_and_json(tmp_path: Path) -> None:
-    csv, json = tmp_path / "positions.csv", tmp_path / "positions.json"
+    csv = tmp_path / "positions.csv"
+    json = tmp_path / "positions.json"
     csv.write_text("image,x,y,z\na.jpg,1,2,3\n")
     json.write_text('{"a.jpg": [1, 2, 3]}')
     for path in (csv, json):

@@ -19,7 +19,8 @@ class Room:
     """A box with a wall across it at x = 4 m that has a door of a given width at its low end."""
 
     def __init__(self, door_m: float, clearance_m: float = 0.2) -> None:
-        self.door_m, self.clearance_m = door_m, clearance_m
+        self.door_m = door_m
+        self.clearance_m = clearance_m
 
     def is_free(self, points):
         inside = ((points > self.clearance_m) & (points < np.array(SIZE) - self.clearance_m)).all(1)
@@ -43,7 +44,8 @@ class TwoStoreys(Room):
         super().__init__(door_m=99)
 
     def _floors(self, points):
-        x, y = points[:, 0], points[:, 1]
+        x = points[:, 0]
+        y = points[:, 1]
         ramp = (y > 4.5) & (x > 1) & (x <= 4)
         upper = np.where(ramp, 2.6 * (x - 1) / 3, np.where(x > 4, 2.6, 0.0))
         return np.zeros(len(points)), upper

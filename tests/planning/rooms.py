@@ -16,10 +16,10 @@ from wheretolook.geometry.lattices import VoxelGrid, direction_lattice
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.methods.registry import make_scorer
 from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.scorers.registry import make_scorer
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import PlanningError
 from wheretolook.visibility.occlusion import MeshOcclusion, OcclusionModel

@@ -10,7 +10,7 @@ import pytest
 
 from planning.test_path_planning import BOUNDS, Room, looking_north
 from wheretolook.planning.config import PathConfig
-from wheretolook.planning.path_planning import plan_path
+from wheretolook.planning.rrt import plan_path
 from wheretolook.planning.scene_map import shares_below, with_borrowed_views
 from wheretolook.utils.errors import MapFormatError
 

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from planning.rooms import GRID, build, joined, room_landmarks, room_map
-from wheretolook.methods.registry import make_scorer
 from wheretolook.planning.map_building import update_viewpoint_map
 from wheretolook.planning.map_file import ARRAYS, DESCRIPTION, LAYOUT
 from wheretolook.planning.scene_map import shares_below
 from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.scorers.registry import make_scorer
 from wheretolook.utils.errors import MapFormatError
 
 
@@ -46,7 +46,8 @@ def test_what_was_saved_comes_back(viewpoint_map: ViewpointMap, folder: Path, mm
         assert getattr(loaded, name).flags.writeable != mmap
     assert (loaded.grid, loaded.origin) == (viewpoint_map.grid, viewpoint_map.origin)
     point = loaded.locations[3]
-    best, expected = loaded.best(point), viewpoint_map.best(point)
+    best = loaded.best(point)
+    expected = viewpoint_map.best(point)
     assert best is not None and expected is not None
     assert (best.direction_id, best.score, best.n_visible) == (
         expected.direction_id, expected.score, expected.n_visible,
@@ -69,7 +70,8 @@ def test_a_loaded_map_can_be_updated_and_saved_over_itself(folder: Path) -> None
 def test_the_layout_is_all_that_a_reader_needs(viewpoint_map: ViewpointMap, folder: Path) -> None:
     """Reads as LAYOUT.txt says, with no help of NumPy's format."""
     about = json.loads((folder / DESCRIPTION).read_text())
-    grid, sizes = about["grid"], about["sizes"]
+    grid = about["grid"]
+    sizes = about["sizes"]
 
     def number(name: str, kind: str, index: int) -> float:
         data = (folder / f"{name}.npy").read_bytes()
@@ -84,7 +86,8 @@ def test_the_layout_is_all_that_a_reader_needs(viewpoint_map: ViewpointMap, fold
             size = (grid["upper"][axis] - grid["lower"][axis]) / grid["shape"][axis]
             step = min(int((point[axis] - grid["lower"][axis]) // size), grid["shape"][axis] - 1)
             voxel = voxel * grid["shape"][axis] + step
-        row, best = number("row_of_voxel", "i", voxel), viewpoint_map.best(point)
+        row = number("row_of_voxel", "i", voxel)
+        best = viewpoint_map.best(point)
         assert (row < 0) == (best is None)
         if best is not None:
             direction = number("ranked", "H", int(row) * sizes["D"])
@@ -218,7 +221,8 @@ def test_the_old_map_outlives_a_save_that_ends_between_the_two_moves(
 ) -> None:
     """An error puts it back; who is killed leaves it where `load` says it is, and the next save leaves it alone."""
     before = content_of(folder)
-    rename, moves = Path.rename, []
+    rename = Path.rename
+    moves = []
 
     def interrupted(path: Path, target: Path) -> Path:
         moves.append(target)
@@ -245,7 +249,8 @@ def test_the_old_map_outlives_a_save_that_ends_between_the_two_moves(
 
 def test_what_killed_saves_left_is_removed_by_the_next(viewpoint_map: ViewpointMap, folder: Path) -> None:
     """A half-written new map always, the old one once there is a new one."""
-    unfinished, superseded = folder.with_name(".room.abcdefgh"), folder.with_name(".room.ijklmnop")
+    unfinished = folder.with_name(".room.abcdefgh")
+    superseded = folder.with_name(".room.ijklmnop")
     (unfinished / "new").mkdir(parents=True)
     (superseded / "old").mkdir(parents=True)
     for path in (unfinished / "new" / "scores.npy", superseded / "old" / "scores.npy"):

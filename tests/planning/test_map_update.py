@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from methods.test_scorers import weights_of
 from planning.rooms import DIRECTIONS, GRID, build, free_voxels, joined, occlusion, room_landmarks, room_map
+from scorers.test_scorers import weights_of
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.methods.registry import make_scorer, scorers
 from wheretolook.planning.map_building import build_viewpoint_map, update_viewpoint_map
 from wheretolook.planning.scene_map import shares_below
 from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.scorers.registry import make_scorer, scorers
 from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import NoOcclusion, OcclusionModel, StoredOcclusion
@@ -45,7 +45,8 @@ def assert_same(a: ViewpointMap, b: ViewpointMap) -> None:
 
 @pytest.mark.parametrize("method", ["bins", "fisher-trace-exact", "fisher-mineig-gp"])
 def test_added_landmarks_change_the_voxels_that_see_them(method: str) -> None:
-    old, added = build(OLD, method), seen_by_some()
+    old = build(OLD, method)
+    added = seen_by_some()
     kept = old.scores.copy()
     # ids between the old ones: rows move
     added = replace(added, ids=np.arange(len(added)) * 10 + 3)
@@ -120,7 +121,8 @@ def test_every_occlusion_model_updates_exactly(name: str) -> None:
 
 
 def test_another_method_camera_or_geometry_is_refused() -> None:
-    old, landmarks = build(OLD), joined(OLD, seen_by_some())
+    old = build(OLD)
+    landmarks = joined(OLD, seen_by_some())
     with pytest.raises(ConfigError, match="another scorer"):
         update_viewpoint_map(old, make_scorer("random", room_map(landmarks)))
     with pytest.raises(ConfigError, match="another camera"):
@@ -155,7 +157,8 @@ def test_methods_that_call_themselves_local_are(method: str) -> None:
 
 @pytest.mark.parametrize("method", ["trees", "conv", "set", "expected-bins", "fisher-trace-expected"])
 def test_methods_that_have_learnt_update_as_if_built_anew(method: str, tmp_path: Path) -> None:
-    landmarks, needed = joined(OLD, seen_by_some()), scorers()[method].weights
+    landmarks = joined(OLD, seen_by_some())
+    needed = scorers()[method].weights
     weights = weights_of(needed, tmp_path / "some.safetensors", room_map(OLD))
     before, after = (make_scorer(method, room_map(of), weights=weights) for of in (OLD, landmarks))
     old = build_viewpoint_map(before, GRID, free_voxels(), DIRECTIONS)

@@ -13,25 +13,26 @@ import pytest
 from box_scenes import furnished_room
 from planning.rooms import occlusion, patiently, room_landmarks
 from wheretolook.cli import parse_experiment
-from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.methods.base import Scorer
-from wheretolook.methods.registry import make_scorer
-from wheretolook.planning.route_views import PlannedPath
+from wheretolook.planning.routes import PlannedPath
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.scenes.loading import save_glb
+from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.registry import make_scorer
 from wheretolook.stages.plan import plan
 from wheretolook.stages.viewpoint_map import viewpoint_map
 from wheretolook.utils.files import write_json
-from wheretolook.viewpoints.table import poses
 
 LANDMARKS = room_landmarks(300)
 WEIGHTS = Path(__file__).parents[2] / "data" / "release" / "weights" / "set.safetensors"
 OFF_CENTER = PinholeCamera(160, 120, 80.0, 85.0, (74.0, 65.0))
 FISHEYE = ColmapCamera("OPENCV_FISHEYE", 160, 120, (55.0, 55.0, 80.0, 60.0, 0.01, -0.002, 0.0, 0.0))
-START, GOAL = (1.0, 1.0, 1.4), (2.8, 1.6, 1.4)
+START = (1.0, 1.0, 1.4)
+GOAL = (2.8, 1.6, 1.4)
 
 
 @pytest.fixture(autouse=True)

@@ -11,17 +11,17 @@ import pytest
 
 from box_scenes import furnished_room
 from planning.rooms import build, patiently, room_landmarks
-from wheretolook.figures.paths import paths_figure
+from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.planning.config import PathConfig, PathsConfig
-from wheretolook.planning.path_comparison import ComparedPaths, Ways, draw_pairs, plan_pairs
-from wheretolook.planning.path_report import log_paths, summarize_paths
 from wheretolook.planning.scene_map import shares_below
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import ConfigError, PlanningError, SceneError
 from wheretolook.utils.tracking import client, finished_runs
 from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.viewpoints.table import poses
+from wheretolook_paper.figures.paths import paths_figure
+from wheretolook_paper.paths.path_comparison import ComparedPaths, Ways, draw_pairs, plan_pairs
+from wheretolook_paper.paths.path_report import log_paths, summarize_paths
 
 QUICK = PathsConfig(
     pairs=2, min_distance_m=1.5, height_m=(1.0, 1.4), methods=("forward", "bins"), max_turn_deg=30.0, resamples=200,
@@ -80,12 +80,14 @@ def test_ways_lead_round_walls_but_not_through_them() -> None:
             return (x > 0) & (x < 4) & (y > 0) & (y < 2) & (z > 0) & (z < 1) & ~wall
 
         def segments_are_free(self, a, b):
-            a, b = np.atleast_2d(a), np.atleast_2d(b)
+            a = np.atleast_2d(a)
+            b = np.atleast_2d(b)
             t = np.linspace(0, 1, 50)[:, None, None]
             points = a * (1 - t) + b * t
             return self.is_free(points.reshape(-1, 3)).reshape(points.shape[:2]).all(0)
 
-    left, right = (0.5, 0.5, 0.5), (3.5, 0.5, 0.5)
+    left = (0.5, 0.5, 0.5)
+    right = (3.5, 0.5, 0.5)
     assert Ways(Rooms(True), 0.25).joins(left, right)
     closed = Ways(Rooms(False), 0.25)
     assert closed.joins(left, (1.5, 1.5, 0.5)) and not closed.joins(left, right)
@@ -125,7 +127,8 @@ def test_every_method_goes_the_same_way(compared: ComparedPaths, space: FreeSpac
 
 def _labelled() -> tuple[pd.DataFrame, pd.DataFrame]:
     """Two pairs: forward localizes 1 of 4 and 2 of 4 views, ours 4 of 5 and 1 of 5; on the third ours found no way."""
-    paths, views = [], []
+    paths = []
+    views = []
     for pair, method, good, n, length in (
         (0, "forward", 1, 4, 2.0), (1, "forward", 2, 4, 3.0), (2, "forward", 0, 2, 5.0),
         (0, "set", 4, 5, 3.0), (1, "set", 1, 5, 3.0), (2, "set", 0, 0, np.nan),
@@ -178,7 +181,8 @@ def test_what_failed_leaves_the_ratio_alone() -> None:
 
 
 def test_the_same_comparison_is_logged_once(tmp_path: Path) -> None:
-    tracking, summary = TrackingConfig(str(tmp_path / "mlruns")), summarize_paths(*_labelled(), QUICK)
+    tracking = TrackingConfig(str(tmp_path / "mlruns"))
+    summary = summarize_paths(*_labelled(), QUICK)
     summary.to_csv(tmp_path / "paths.csv", index=False)
     runs = [log_paths({"dataset": "a", "seed": seed}, summary, tmp_path, tracking) for seed in (0, 0, 1)]
     assert runs[0] == runs[1] != runs[2]

@@ -10,15 +10,16 @@ from scipy.spatial.transform import Rotation
 
 from wheretolook.geometry.lattices import VoxelGrid, axes_of_angles, fibonacci_sphere
 from wheretolook.geometry.poses import rotation_looking_along
+from wheretolook.planning.camera_turns import pan_tilt_angles, pan_tilt_turns_deg
+from wheretolook.planning.camera_turns import turns_deg as turns_deg_of_cameras
 from wheretolook.planning.config import PathConfig
-from wheretolook.planning.path_planning import improve, plan_path
-from wheretolook.planning.route_views import turned_evenly
-from wheretolook.planning.turns import pan_tilt_angles, pan_tilt_turns_deg
-from wheretolook.planning.turns import turns_deg as turns_deg_of_cameras
+from wheretolook.planning.routes import turned_evenly
+from wheretolook.planning.rrt import improve, plan_path
 from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
 from wheretolook.utils.errors import ConfigError, PlanningError
 
-LOW, HIGH = np.array([0.0, 0.0, 0.5]), np.array([6.0, 4.0, 1.7])
+LOW = np.array([0.0, 0.0, 0.5])
+HIGH = np.array([6.0, 4.0, 1.7])
 WALL = ((2.9, 0.0), (3.1, 3.0))  # from the floor to the ceiling, with a gap at y > 3
 
 
@@ -42,13 +43,15 @@ class Room:
 
 
 BOUNDS = (LOW, HIGH)
-START, GOAL = (1.0, 1.0, 1.1), (5.0, 1.0, 1.1)
+START = (1.0, 1.0, 1.1)
+GOAL = (5.0, 1.0, 1.1)
 QUICK = PathConfig(time_s=1.5, pitch_deg=(-30, 30))
 
 
 def looking_north() -> ViewpointMap:
     """Everywhere the same: the nearer to +y a view looks, the better."""
-    grid, directions = VoxelGrid(tuple(LOW), tuple(HIGH), (6, 4, 2)), fibonacci_sphere(200)
+    grid = VoxelGrid(tuple(LOW), tuple(HIGH), (6, 4, 2))
+    directions = fibonacci_sphere(200)
     scores = np.tile(((1 + directions[:, 1]) / 2) ** 2, (len(grid), 1)).astype(np.float32)
     return ViewpointMap(
         grid=grid,
@@ -95,7 +98,8 @@ def test_forward_takes_the_short_way_through_the_gap() -> None:
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_the_camera_looks_where_it_localizes(seed: int) -> None:
-    views, rng = looking_north(), np.random.default_rng(seed)
+    views = looking_north()
+    rng = np.random.default_rng(seed)
     axis = np.append(rng.normal(size=2), 0.0)
     path = plan_path(START, GOAL, Room(), BOUNDS, views, QUICK, start_axis=axis, progress=False)
     check(path)
@@ -110,7 +114,8 @@ def test_the_camera_looks_where_it_localizes(seed: int) -> None:
 
 def looking_at_random(seed: int, pitch_deg: tuple[float, float]) -> ViewpointMap:
     """Every voxel its own: views near the limits of the pitch are best, here and there."""
-    views, rng = looking_north(), np.random.default_rng(seed)
+    views = looking_north()
+    rng = np.random.default_rng(seed)
     pitch = np.degrees(np.arcsin(views.directions[:, 2]))
     near = np.exp(-np.abs(pitch[:, None] - pitch_deg).min(1) / 3)
     scores = (near * rng.random(views.scores.shape)).astype(np.float32)
@@ -147,7 +152,8 @@ def test_a_pan_tilt_head_turns_no_less_than_the_camera() -> None:
 
 
 def test_routes_are_improved_and_stay_free() -> None:
-    room, rng = Room(), np.random.default_rng(0)
+    room = Room()
+    rng = np.random.default_rng(0)
     detour = np.array([START, (1.0, 3.5, 1.1), (2.0, 3.4, 0.6), (4.5, 3.9, 1.6), GOAL])
     length = np.linalg.norm(np.diff(detour, axis=0), axis=1).sum()
 

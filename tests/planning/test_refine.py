@@ -9,9 +9,9 @@ import pytest
 
 from planning.rooms import DIRECTIONS, GRID, free_voxels, room_landmarks, room_map
 from wheretolook.geometry.poses import Float
-from wheretolook.methods.base import Scorer
-from wheretolook.methods.registry import make_scorer
 from wheretolook.planning.refine import refine_directions, score_directions
+from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.registry import make_scorer
 
 
 class Towards(Scorer):

@@ -10,7 +10,7 @@ import pytest
 from planning.rooms import build, room_landmarks
 from wheretolook.geometry.lattices import axes_of_angles, direction_lattice, yaw_pitch_angles
 from wheretolook.geometry.poses import Float, rotation_angle_deg, rotation_looking_along
-from wheretolook.planning.sequences import TurnLimit, best_sequence, greedy_sequence, resample_path
+from wheretolook.planning.view_sequence import TurnLimit, best_sequence, greedy_sequence, resample_path
 from wheretolook.utils.errors import PlanningError
 
 LATTICES = {"yaw-pitch": direction_lattice(0, "yaw-pitch"), "fibonacci": direction_lattice(300)}
@@ -26,7 +26,8 @@ def turns_of(ids: np.ndarray, directions: Float, start: Float | None = None) -> 
 @pytest.mark.parametrize("seed", range(30))
 def test_no_sequence_is_better(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    n, d = rng.integers(1, 6), rng.integers(2, 7)
+    n = rng.integers(1, 6)
+    d = rng.integers(2, 7)
     directions = rng.normal(size=(d, 3)) + np.array([2, 0, 0]) * (seed % 2)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     scores = np.round(rng.random((n, d)), seed % 3 + 1)  # some are equal
@@ -50,11 +51,14 @@ def test_no_sequence_is_better(seed: int) -> None:
 @pytest.mark.parametrize("lattice", LATTICES)
 @pytest.mark.parametrize("max_turn_deg", [0.0, 20.0, 30.0, 45.0, 180.0])
 def test_limits_hold_and_greedy_never_wins(lattice: str, max_turn_deg: float) -> None:
-    directions, rng = LATTICES[lattice], np.random.default_rng(0)
-    limit, wins = TurnLimit.of(directions, max_turn_deg), 0
+    directions = LATTICES[lattice]
+    rng = np.random.default_rng(0)
+    limit = TurnLimit.of(directions, max_turn_deg)
+    wins = 0
     for _ in range(10):
         scores = rng.random((40, len(directions)))
-        best, greedy = best_sequence(scores, limit), greedy_sequence(scores, limit)
+        best = best_sequence(scores, limit)
+        greedy = greedy_sequence(scores, limit)
         for found in (best, greedy):
             turns = turns_of(found.direction_ids, directions)
             assert turns.max() <= max_turn_deg + 2e-5
@@ -88,8 +92,10 @@ def test_it_is_the_turn_of_the_whole_camera_that_counts() -> None:
 @pytest.mark.parametrize("keep_limit", [True, False])
 def test_the_greedy_rule_is_actlocs(keep_limit: bool) -> None:
     """On rows of pitch and columns of yaw, written out as ActLoc does."""
-    directions, rng = LATTICES["yaw-pitch"], np.random.default_rng(3)
-    limit, scores = TurnLimit.of(directions, 30), rng.random((50, 108))
+    directions = LATTICES["yaw-pitch"]
+    rng = np.random.default_rng(3)
+    limit = TurnLimit.of(directions, 30)
+    scores = rng.random((50, 108))
     found = greedy_sequence(scores, limit, turn_penalty=0.05, keep_limit=keep_limit).direction_ids
     row, column = divmod(int(scores[0].argmax()), 18)
     assert found[0] == row * 18 + column
@@ -106,7 +112,8 @@ def test_the_greedy_rule_is_actlocs(keep_limit: bool) -> None:
 
 def test_what_cannot_be_looked_along_names_the_waypoint() -> None:
     directions = np.eye(3)
-    limit, scores = TurnLimit.of(directions, 30), np.ones((4, 3))
+    limit = TurnLimit.of(directions, 30)
+    scores = np.ones((4, 3))
     with pytest.raises(PlanningError, match="waypoint 0 has no direction that is allowed within 30 degrees of the st"):
         best_sequence(scores, limit, start=(-1, 0, 0))
     with pytest.raises(PlanningError, match="waypoint 0"):
@@ -115,7 +122,8 @@ def test_what_cannot_be_looked_along_names_the_waypoint() -> None:
     scores[2] = -np.inf
     with pytest.raises(PlanningError, match="waypoint 2 has no direction that is allowed within 30 degrees of waypo"):
         best_sequence(scores, limit)
-    scores[2, 1], scores[1, 1] = 1, -np.inf
+    scores[2, 1] = 1
+    scores[1, 1] = -np.inf
     for plan in (best_sequence, greedy_sequence):
         with pytest.raises(PlanningError, match="waypoint 2") as caught:
             plan(scores, limit)
@@ -126,8 +134,10 @@ def test_what_cannot_be_looked_along_names_the_waypoint() -> None:
 
 
 def test_a_start_is_an_axis_or_a_rotation() -> None:
-    directions, scores = LATTICES["fibonacci"], np.random.default_rng(0).random((5, 300))
-    limit, start = TurnLimit.of(directions, 40), np.array([1.0, 2, 0.3])
+    directions = LATTICES["fibonacci"]
+    scores = np.random.default_rng(0).random((5, 300))
+    limit = TurnLimit.of(directions, 40)
+    start = np.array([1.0, 2, 0.3])
     by_axis, by_rotation = (best_sequence(scores, limit, one) for one in (start, rotation_looking_along(start)))
     np.testing.assert_array_equal(by_axis.direction_ids, by_rotation.direction_ids)
     assert turns_of(by_axis.direction_ids, directions, start).max() <= 40
@@ -164,7 +174,8 @@ def test_paths_are_cut_every_20_cm() -> None:
 
 def test_a_path_through_a_viewpoint_map() -> None:
     viewpoint_map = build(room_landmarks(300), directions=LATTICES["fibonacci"])
-    a, b = viewpoint_map.locations[0], viewpoint_map.locations[1]
+    a = viewpoint_map.locations[0]
+    b = viewpoint_map.locations[1]
     waypoints = resample_path([a, b])
     scores = viewpoint_map.scores[viewpoint_map.rows(waypoints)]
     limit = TurnLimit.of(viewpoint_map.directions)

@@ -12,13 +12,13 @@ from planning.rooms import CAMERA, occlusion, room_landmarks
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.methods.base import Scorer
-from wheretolook.methods.registry import make_scorer
 from wheretolook.planning.config import PathConfig, PathsConfig, StopConfig
 from wheretolook.planning.method_paths import path_views
-from wheretolook.planning.route_views import PlannedPath
-from wheretolook.planning.sequences import TurnLimit, best_sequence
+from wheretolook.planning.routes import PlannedPath
 from wheretolook.planning.stops import stops_along, within_pitch
+from wheretolook.planning.view_sequence import TurnLimit, best_sequence
+from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.registry import make_scorer
 from wheretolook.utils.errors import ConfigError
 
 WEIGHTS = Path(__file__).parents[2] / "data" / "release" / "weights" / "set.safetensors"
@@ -89,7 +89,8 @@ def test_the_looks_of_a_path_are_in_the_order_they_are_taken(scorer: Scorer, pat
     )
     some = replace(path, stops=(stops[1], stops[3]))
     places, looks = some.looks
-    first, second = len(stops[1].axes), len(stops[3].axes)
+    first = len(stops[1].axes)
+    second = len(stops[3].axes)
     assert places.tolist() == [0, 1, *[1] * first, 2, 3, *[3] * second, 4]
     assert looks.tolist() == [1, 1, *range(2, 2 + first), 1, 1, *range(2, 2 + second), 1]
     np.testing.assert_array_equal(some.all_axes[looks == 1], path.axes)

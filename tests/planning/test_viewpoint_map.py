@@ -9,9 +9,9 @@ import pytest
 
 from planning.rooms import CAMERA, DIRECTIONS, GRID, build, free_voxels, room_landmarks, room_map
 from wheretolook.geometry.poses import poses_looking_along, rotation_angle_deg, rotation_looking_along
-from wheretolook.methods.registry import make_scorer
 from wheretolook.planning.map_building import build_viewpoint_map, update_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewChoice, ViewpointMap
+from wheretolook.scorers.registry import make_scorer
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
 
 
@@ -72,7 +72,8 @@ def test_queries_equal_brute_force(viewpoint_map: ViewpointMap) -> None:
     for number, point in enumerate(points):
         row = row_by_hand(viewpoint_map, point)
         assert viewpoint_map.row(point) == viewpoint_map.row(point.tolist()) == row
-        best, expected = viewpoint_map.best(point), best_by_hand(viewpoint_map, row, everything)
+        best = viewpoint_map.best(point)
+        expected = best_by_hand(viewpoint_map, row, everything)
         assert id_of(best) == expected
         assert many.found[number] == (row >= 0)
         if best is None:
@@ -92,7 +93,8 @@ def test_queries_equal_brute_force(viewpoint_map: ViewpointMap) -> None:
             assert top is not None and top[0].direction_id == expected
             np.testing.assert_array_equal([c.score for c in top], np.sort(viewpoint_map.scores[row])[::-1][:7])
             assert len(viewpoint_map.best_n(point, 1000) or []) == 60
-        axis, limit = rng.normal(size=3), rng.uniform(1, 90)
+        axis = rng.normal(size=3)
+        limit = rng.uniform(1, 90)
         in_cone = np.degrees(np.arccos(np.clip(DIRECTIONS @ axis / np.linalg.norm(axis), -1, 1))) <= limit
         assert id_of(viewpoint_map.best_in_cone(point, axis, limit)) == best_by_hand(viewpoint_map, row, in_cone)
         near = rotation_angle_deg(rotation_looking_along(axis), rotation_looking_along(DIRECTIONS)) <= limit
@@ -206,7 +208,8 @@ def test_interpolation_meets_the_voxels_at_their_centres(viewpoint_map: Viewpoin
 
 
 def test_interpolation_lies_between_free_neighbours_and_is_trilinear(viewpoint_map: ViewpointMap) -> None:
-    centers, n_between = GRID.centers(), 0
+    centers = GRID.centers()
+    n_between = 0
     for point in points_about(400, seed=2):
         scores = viewpoint_map.interpolated(point)
         if scores is None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from box_scenes import CABINET, ROOM, furnished_room, random_triangles
-from wheretolook.rendering.open3d_renderer import raycasting_scene
+from open3d_renderer import raycasting_scene
 from wheretolook.rendering.raycasting import MeshRaycaster
 
 
@@ -20,7 +20,8 @@ def open3d_rays(origins, directions):
 def test_cast_agrees_with_open3d(seed, device):
     rng = np.random.default_rng(seed)
     mesh = random_triangles(seed)
-    origins, directions = rng.uniform(-2, 2, (4000, 3)), rng.normal(size=(4000, 3))
+    origins = rng.uniform(-2, 2, (4000, 3))
+    directions = rng.normal(size=(4000, 3))
     hits = MeshRaycaster(mesh, device).cast(origins, directions)
     unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     expected = raycasting_scene(mesh).cast_rays(open3d_rays(origins, unit))
@@ -54,8 +55,10 @@ def test_cast_in_a_box_in_closed_form():
 @pytest.mark.parametrize("seed", [0, 1])
 def test_occlusion_agrees_with_open3d(seed, device):
     rng = np.random.default_rng(seed)
-    mesh, margin_m = random_triangles(seed, n_triangles=60), 0.05
-    origins, points = rng.uniform(-3, 3, (7, 3)), rng.uniform(-3, 3, (900, 3))
+    mesh = random_triangles(seed, n_triangles=60)
+    margin_m = 0.05
+    origins = rng.uniform(-3, 3, (7, 3))
+    points = rng.uniform(-3, 3, (900, 3))
     occluded = MeshRaycaster(mesh, device).occluded(origins, points, margin_m)
     rays = points[None] - origins[:, None]
     distance_m = np.linalg.norm(rays, axis=-1)
@@ -92,12 +95,14 @@ def test_distance_to_surface(device):
     np.testing.assert_array_equal(np.isfinite(near), expected < 0.3)
 
     room = MeshRaycaster(furnished_room())
-    left, back = CABINET[0][0], CABINET[1][1]  # 0.3 m and 0.4 m from the cabinet's vertical edge
+    left = CABINET[0][0]  # 0.3 m and 0.4 m from the cabinet's vertical edge
+    back = CABINET[1][1]
     np.testing.assert_allclose(room.distance_to_surface([(left - 0.3, back + 0.4, 1.2)], 9), 0.5, rtol=1e-5)
 
 
 def test_segments_keep_clear_as_densely_sampled_points_do(device):
-    mesh, clearance_m = random_triangles(3, n_triangles=40), 0.2
+    mesh = random_triangles(3, n_triangles=40)
+    clearance_m = 0.2
     rng = np.random.default_rng(4)
     a, b = rng.uniform(-4, 4, (2, 400, 3))
     clear = MeshRaycaster(mesh, device).segments_are_clear(a, b, clearance_m)

@@ -12,9 +12,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from box_scenes import furnished_room, quads_mesh, random_texture, random_triangles
+from open3d_renderer import Open3DRenderer
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along, transform
-from wheretolook.rendering.open3d_renderer import Open3DRenderer
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.utils.errors import ConfigError, SceneError
 
@@ -36,7 +36,8 @@ def facing_wall(camera, texture, distance_m=2.0, texels_per_pixel=(1.0, 1.0), ve
 
 
 def assert_same_images(a, b):
-    hit_a, hit_b = a.depth_m > 0, b.depth_m > 0
+    hit_a = a.depth_m > 0
+    hit_b = b.depth_m > 0
     # Rays through an edge may pass on either side of it.
     assert np.mean(hit_a == hit_b) > 0.9999
     both = hit_a & hit_b
@@ -52,7 +53,8 @@ def assert_same_images(a, b):
 @METHODS
 def test_warp_agrees_with_open3d_on_random_triangles(seed, method, device):
     rng = np.random.default_rng(seed)
-    mesh, camera = random_triangles(seed), PinholeCamera(161, 120, 90.0)
+    mesh = random_triangles(seed)
+    camera = PinholeCamera(161, 120, 90.0)
     poses = poses_looking_along(rng.uniform(-2, 2, (5, 3)), rng.normal(size=(5, 3)))
     images = WarpRenderer(mesh, device, method=method).render(camera, poses)
     assert images.rgb.shape == (5, 120, 161, 3) and images.rgb.dtype == np.uint8
@@ -64,7 +66,8 @@ def test_warp_agrees_with_open3d_on_random_triangles(seed, method, device):
 @METHODS
 def test_warp_agrees_with_open3d_in_a_room(method, device):
     rng = np.random.default_rng(5)
-    mesh, camera = furnished_room(), PinholeCamera(160, 120, 80.0)
+    mesh = furnished_room()
+    camera = PinholeCamera(160, 120, 80.0)
     poses = poses_looking_along(rng.uniform((0.5, 3.5, 0.5), (5.5, 4.5, 2.5), (6, 3)), rng.normal(size=(6, 3)))
     images = WarpRenderer(mesh, device, method=method).render(camera, poses)
     assert (images.depth_m > 0).all(), "a closed room has no misses"
@@ -154,7 +157,8 @@ def test_vertex_colors_multiply_and_both_sides_show(renderer):
 
 
 def test_blocks_do_not_change_the_images(device):
-    mesh, camera = random_triangles(1), PinholeCamera(40, 30, 30.0)
+    mesh = random_triangles(1)
+    camera = PinholeCamera(40, 30, 30.0)
     poses = poses_looking_along(np.zeros((5, 3)), np.random.default_rng(0).normal(size=(5, 3)))
     whole = WarpRenderer(mesh, device).render(camera, poses)
     blocks = WarpRenderer(mesh, device, block_bytes=2 * 40 * 30 * 7).render(camera, poses)
@@ -164,7 +168,8 @@ def test_blocks_do_not_change_the_images(device):
 
 
 def test_blocks_are_smaller_where_a_mesh_has_many_vertices(monkeypatch):
-    mesh, camera = random_triangles(1), PinholeCamera(8, 6, 5.0)
+    mesh = random_triangles(1)
+    camera = PinholeCamera(8, 6, 5.0)
     renderer = WarpRenderer(mesh, block_bytes=3 * (8 * 6 * 15 + 24 * len(mesh.vertices)))
     sizes = []
     draw = renderer._rasterize

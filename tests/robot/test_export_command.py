@@ -13,9 +13,9 @@ from wheretolook.cli import main
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.methods.registry import load_scorer
 from wheretolook.robot.wheretolook_robot import RobotScorer
 from wheretolook.scenes.loading import save_glb
+from wheretolook.scorers.registry import load_scorer
 
 WEIGHTS = Path("data/release/weights/set.safetensors").absolute()
 
@@ -58,7 +58,8 @@ def test_from_a_model_to_scores(model: Path, tmp_path: Path, capsys: pytest.Capt
 
 
 def test_a_mesh_and_a_camera_of_the_robot(model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    mesh, out = tmp_path / "room.glb", tmp_path / "robot"
+    mesh = tmp_path / "room.glb"
+    out = tmp_path / "robot"
     save_glb(furnished_room(), mesh)
     given = ["--map", str(model), "--out", str(out), "--weights", str(WEIGHTS), "--mesh", str(mesh)]
     assert main(["export", *given, "--spacing", "1", "--camera", "PINHOLE,640,480,400,410,320,240"]) == 0

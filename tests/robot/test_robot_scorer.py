@@ -22,16 +22,16 @@ from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, camera_centers, invert_poses, poses_looking_along
 from wheretolook.inputs.channels import ATTRIBUTES
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.learning.landmark_views import AttributeStatistics
-from wheretolook.learning.trained_network import TrainedNetwork
-from wheretolook.learning.training_range import TrainingRange
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.methods.registry import load_scorer
-from wheretolook.methods.set.network import ALL_TOLD, TOLD_ONCE, SetNetwork
 from wheretolook.robot import wheretolook_robot
 from wheretolook.robot.export import export_robot, pinhole_of
 from wheretolook.robot.wheretolook_robot import RobotScorer
+from wheretolook.scorers.registry import load_scorer
+from wheretolook.scorers.set.network import ALL_TOLD, TOLD_ONCE, SetNetwork
 from wheretolook.space.free_space import FreeSpace
+from wheretolook.training.landmark_views import AttributeStatistics
+from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook.training.training_range import TrainingRange
 from wheretolook.utils.errors import CameraError, ConfigError, WeightsError
 from wheretolook.visibility.occlusion import MeshOcclusion, OcclusionModel
 
@@ -70,7 +70,8 @@ def trained(seed: int, attributes: tuple[str, ...] = ATTRIBUTES, **options: obje
     """A network with random weights and statistics, as if it had learnt."""
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
-    mean, std = rng.normal(size=len(attributes)), rng.uniform(0.3, 2, len(attributes))
+    mean = rng.normal(size=len(attributes))
+    std = rng.uniform(0.3, 2, len(attributes))
     network = SetNetwork(AttributeStatistics(tuple(mean.tolist()), tuple(std.tolist()), attributes), **options)
     for module in network.modules():
         if isinstance(module, nn.BatchNorm1d):

@@ -12,11 +12,13 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import invert_poses, poses_looking_along, quaternion_from_rotation
 from wheretolook.rendering.warp_renderer import WarpRenderer
 
-WIDTH, HEIGHT = 160, 120
+WIDTH = 160
+HEIGHT = 120
 COLOR = PinholeCamera(WIDTH, HEIGHT, 525 / 4)  # the nominal cameras of both layouts, at a quarter of their size
 DEPTH = PinholeCamera(WIDTH, HEIGHT, 585 / 4)
 BASELINE_M = np.array([-0.025, 0, 0])  # of the depth camera in the colour camera's frame
-LOW, HIGH = (0.0, 0.0, 0.0), (3.6, 3.0, 2.4)
+LOW = (0.0, 0.0, 0.0)
+HIGH = (3.6, 3.0, 2.4)
 
 
 def room():
@@ -53,7 +55,8 @@ def write_seven_scenes(folder: Path, mesh, poses, world=np.eye(3), depth_scale=1
     renderer = WarpRenderer(mesh)
     of_depth = poses.copy()
     of_depth[:, :, 3] -= BASELINE_M
-    rgb, depth = renderer.render(COLOR, poses).rgb, renderer.render(DEPTH, of_depth).depth_m
+    rgb = renderer.render(COLOR, poses).rgb
+    depth = renderer.render(DEPTH, of_depth).depth_m
     for i, pose in enumerate(invert_poses(turned(of_depth, world))):
         cv2.imwrite(str(folder / f"frame-{i:06d}.color.png"), rgb[i, :, :, ::-1])
         units = np.where(depth[i] > 0, np.rint(depth[i] * depth_scale), 65535)

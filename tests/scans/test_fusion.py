@@ -60,10 +60,13 @@ def copied(folder, to, every=1):
 
 def off_m(found, truth):
     """Distances of the found vertices to the truth, and to what was found of surface that three frames and more saw."""
-    caster, rng, poses = MeshRaycaster(truth), np.random.default_rng(1), walk()
+    caster = MeshRaycaster(truth)
+    rng = np.random.default_rng(1)
+    poses = walk()
     there = caster.distance_to_surface(found.vertices, 1.0)
     walls = rng.uniform(np.add(LOW, 0.1), np.subtract(HIGH, 0.1), (3000, 3))
-    axis, side = rng.integers(0, 3, 3000), rng.integers(0, 2, 3000)
+    axis = rng.integers(0, 3, 3000)
+    side = rng.integers(0, 2, 3000)
     walls[np.arange(3000), axis] = np.where(side, np.array(HIGH)[axis], np.array(LOW)[axis])
     at = transform(poses, walls)
     pixels = COLOR.project(at)
@@ -128,7 +131,8 @@ def test_renders_look_like_the_colour_images(tum, mesh, appearance):
 
 @pytest.mark.slow
 def test_textures_are_sharper_than_colours_at_vertices(tum, mesh):
-    pose, images = walk()[[25]], []
+    pose = walk()[[25]]
+    images = []
     for one in (mesh, scan(tum).mesh, scan(tum, appearance="colors").mesh):
         grey = cv2.cvtColor(WarpRenderer(one).render(COLOR, pose).rgb[0], cv2.COLOR_RGB2GRAY)
         images.append(np.median(np.abs(cv2.Laplacian(grey, cv2.CV_32F))))
@@ -309,9 +313,11 @@ def test_depths_are_corrected_by_the_landmarks_of_a_model(seven_scenes, mesh, tm
             units == 65535, 65535, 1 / (1.02 / np.maximum(units / 1000, 1e-3) - 0.025) * 1000
         )  # +7 cm at 2 m
         cv2.imwrite(str(path), np.rint(read).astype(np.uint16))
-    rng, names = np.random.default_rng(0), [f"frame-{i:06d}.color.png" for i in range(60)]
+    rng = np.random.default_rng(0)
+    names = [f"frame-{i:06d}.color.png" for i in range(60)]
     walls = rng.uniform(LOW, HIGH, (600, 3))
-    walls[:300, 0], walls[300:, 1] = LOW[0], HIGH[1]
+    walls[:300, 0] = LOW[0]
+    walls[300:, 1] = HIGH[1]
     model_of(names, turned(walk(), Y_DOWN), walls @ Y_DOWN, 1.0).write_binary(str(tmp_path))
     found = scan(folder, model=tmp_path, appearance="colors")
     correction = found.report()["depth_correction"]

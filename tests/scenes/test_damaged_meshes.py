@@ -151,13 +151,12 @@ def test_others_are_refused_by_name(name: str, tmp_path: Path) -> None:
 
 
 def test_textures_that_are_too_large_together_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    materials, uses = "", ""
+    materials = ""
+    uses = ""
     for number in range(4):
         Image.new("L", (100, 100), number).save(tmp_path / f"{number}.png")
-        materials, uses = (
-            f"{materials}newmtl m{number}\nmap_Kd {number}.png\n",
-            f"{uses}usemtl m{number}\nf 1/1 2/1 3/1\n",
-        )
+        materials = f"{materials}newmtl m{number}\nmap_Kd {number}.png\n"
+        uses = f"{uses}usemtl m{number}\nf 1/1 2/1 3/1\n"
     path = write(
         tmp_path, {"a.obj": obj("mtllib a.mtl\n", uses + "usemtl m0\nf 1/1 4/1 8/1\n"), "a.mtl": materials.encode()}
     )

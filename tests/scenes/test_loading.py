@@ -58,7 +58,8 @@ def test_glb_with_a_node_transform_and_several_materials(tmp_path, texture):
     mesh = load_mesh(tmp_path / "a.glb")
     assert len(mesh.textures) == 2, "the same image twice is one texture"
     turned = VERTICES * (1, 1, 1)
-    turned[:, 0], turned[:, 1] = -VERTICES[:, 1], VERTICES[:, 0]
+    turned[:, 0] = -VERTICES[:, 1]
+    turned[:, 1] = VERTICES[:, 0]
     expected = [(VERTICES + np.array((10, 20, 30)), texture), (turned, other), (VERTICES - (0, 0, 5), texture)]
     found = mesh.vertices[mesh.triangles].reshape(-1, 2, 3, 3)
     for vertices, image in expected:

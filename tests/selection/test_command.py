@@ -128,7 +128,8 @@ def test_a_first_score_loads_no_training(sparse: Path) -> None:
 def test_kernels_are_compiled_beside_the_start(sparse: Path, at: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     loaded: set[str] = set()
     launched: set[str] = set()
-    load, launch = wp.load_module, wp.launch
+    load = wp.load_module
+    launch = wp.launch
 
     def note_load(module: ModuleType, **options: Any) -> None:
         loaded.add(module.__name__)

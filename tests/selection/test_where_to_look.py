@@ -17,13 +17,13 @@ from wheretolook import WhereToLook as Exported
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import rotation_angle_deg, rotation_looking_along
-from wheretolook.learning.trained_network import TrainedNetwork
-from wheretolook.methods.base import Scorer
-from wheretolook.methods.set.around import ScoresAround
-from wheretolook.methods.set.network import TOLD, SetNetwork
-from wheretolook.methods.set.score import SetScorer
 from wheretolook.scenes.loading import save_glb
+from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.set.batched_directions import ScoresAround
+from wheretolook.scorers.set.network import TOLD, SetNetwork
+from wheretolook.scorers.set.score import SetScorer
 from wheretolook.select.where_to_look import WhereToLook
+from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import (
     ConfigError,
     MapError,
@@ -70,7 +70,8 @@ def test_best_views_are_those_of_the_scorer(look: WhereToLook, scorer: Scorer) -
 def test_all_directions_at_once_score_as_one_by_one(camera: ColmapCamera | None, text: bool, tmp_path: Path) -> None:
     around = LocalizationMap.from_colmap(write_room(tmp_path / "sparse", text), camera, occlusion=HiddenPointRemoval())
     scorer = load_scorer(WEIGHTS, around)
-    slow, fast = all_scores(scorer, POINTS), scorer.score_around(POINTS, AXES)
+    slow = all_scores(scorer, POINTS)
+    fast = scorer.score_around(POINTS, AXES)
     odds = [np.log(scores / (1 - scores)) for scores in (slow, fast)]
     assert np.ptp(slow) > 0.05
     np.testing.assert_allclose(odds[0], odds[1], atol=0.02)
@@ -82,7 +83,8 @@ def test_a_sample_of_the_landmarks_ranks_as_all(tmp_path: Path) -> None:
     poses = poses_looking_along(np.repeat(POINTS, len(AXES), axis=0), np.tile(AXES, (len(POINTS), 1)))
     starts, _ = around.in_view_on_device(poses)
     assert np.diff(starts).max() > 1500
-    slow, fast = all_scores(scorer, POINTS), scorer.score_around(POINTS, AXES)
+    slow = all_scores(scorer, POINTS)
+    fast = scorer.score_around(POINTS, AXES)
     assert np.corrcoef(slow.ravel(), fast.ravel())[0, 1] > 0.999
     rows = np.arange(len(POINTS))
     assert (slow.max(axis=1) - slow[rows, fast.argmax(axis=1)] < 0.01).all()
@@ -97,14 +99,16 @@ def test_all_that_a_network_is_told_is_told_at_once(sparse: Path) -> None:
     network.matchability.load_state_dict(old.network.matchability.state_dict())
     scorer = SetScorer(around, TrainedNetwork("set", network, None))
     assert ScoresAround.serves(scorer.network)
-    slow, fast = all_scores(scorer, POINTS), scorer.score_around(POINTS, AXES)
+    slow = all_scores(scorer, POINTS)
+    fast = scorer.score_around(POINTS, AXES)
     assert np.ptp(slow) > 0.1
     np.testing.assert_allclose(fast, slow, atol=1e-4)
 
 
 def test_the_sequence_is_the_best_of_all(sparse: Path) -> None:
     look = WhereToLook.from_colmap(sparse, weights=WEIGHTS, directions=12, device="cpu")
-    axes, limit = look.directions, 60.0
+    axes = look.directions
+    limit = 60.0
     scores = look.scorer.score_around(POINTS, axes)
     rotations = rotation_looking_along(axes)
     turns = rotation_angle_deg(rotations[:, None], rotations[None])
@@ -198,9 +202,11 @@ def test_depth_images(sparse: Path, tmp_path: Path) -> None:
 
     from wheretolook.rendering.warp_renderer import WarpRenderer
 
-    model, folder = pycolmap.Reconstruction(sparse), tmp_path / "depth"
+    model = pycolmap.Reconstruction(sparse)
+    folder = tmp_path / "depth"
     folder.mkdir()
-    renderer, half = WarpRenderer(furnished_room(), "cpu"), PinholeCamera(320, 240, 160.0)
+    renderer = WarpRenderer(furnished_room(), "cpu")
+    half = PinholeCamera(320, 240, 160.0)
     for image in model.images.values():
         depth = renderer.render(half, image.cam_from_world().matrix()[None]).depth_m[0]
         millimetres = np.nan_to_num(depth, nan=0, posinf=0) * 1000
@@ -282,7 +288,8 @@ def test_ten_lines(sparse: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_looks_chosen_together_are_worth_more_than_one(look: WhereToLook, tmp_path: Path) -> None:
-    one, three = look.best(POINTS, looks=1), look.best(POINTS, looks=3)
+    one = look.best(POINTS, looks=1)
+    three = look.best(POINTS, looks=3)
     assert len(three) == 12 and three.set_score is not None and one.set_score is not None
     np.testing.assert_allclose(one.axes, look.best(POINTS).axes, atol=1e-9)
     np.testing.assert_array_equal(three.rank, np.tile([1, 2, 3], 4))

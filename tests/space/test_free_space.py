@@ -31,8 +31,10 @@ def expected_free(points, clearance_m):
 
 def with_winding(mesh, flip):
     """The mesh with the winding of the triangles in the mask reversed."""
-    triangles, uvs = mesh.triangles.copy(), mesh.corner_uvs.copy()
-    triangles[flip], uvs[flip] = triangles[flip][:, ::-1], uvs[flip][:, ::-1]
+    triangles = mesh.triangles.copy()
+    uvs = mesh.corner_uvs.copy()
+    triangles[flip] = triangles[flip][:, ::-1]
+    uvs[flip] = uvs[flip][:, ::-1]
     return TexturedMesh(mesh.vertices, triangles, uvs, mesh.triangle_texture, mesh.textures)
 
 
@@ -55,7 +57,8 @@ def test_unreliable_winding_is_found_out(winding):
     free_space = FreeSpace(with_winding(mesh, flip))
     assert free_space.two_sided
     points = np.random.default_rng(0).uniform((-1, -1, -1), np.array(ROOM) + 1, (3000, 3))
-    free, expected = free_space.is_free(points), expected_free(points, 0.25)
+    free = free_space.is_free(points)
+    expected = expected_free(points, 0.25)
     # The inside of the cabinet, 1.8 x 1.6 x 2 m, cannot be told from a small room.
     decided = ~inside(points, *CABINET)
     np.testing.assert_array_equal(free[decided], expected[decided])
@@ -100,7 +103,8 @@ def test_outside_and_above_a_house_are_not_free(ceiling, two_sided):
 
 def test_segments():
     free_space = FreeSpace(house())
-    a, b = (1.0, 1.5, 1.2), (5.0, 1.5, 1.2)  # through the middle of the door
+    a = (1.0, 1.5, 1.2)  # through the middle of the door
+    b = (5.0, 1.5, 1.2)
     corner = (1.0, 0.4, 1.2)
     np.testing.assert_array_equal(
         free_space.segments_are_free([a, a, a, a], [b, corner, (5.0, 0.4, 1.2), (3.1, 0.5, 1.2)]),

@@ -10,13 +10,14 @@ from planning.rooms import patiently
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.geometry.tsdf import DepthImage, TsdfConfig, TsdfVolume
 from wheretolook.planning.config import PathConfig
-from wheretolook.planning.path_planning import plan_path
+from wheretolook.planning.rrt import plan_path
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.space.config import FreeSpaceConfig
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.space.tsdf_space import TsdfSpace, seen_through
 
-VOXEL_M, CLEARANCE_M = 0.03, 0.2
+VOXEL_M = 0.03
+CLEARANCE_M = 0.2
 
 
 def space_of(images: list[DepthImage], clearance_m: float = CLEARANCE_M) -> TsdfSpace:
@@ -42,7 +43,8 @@ def random_points(n: int, seed: int = 0, beyond_m: float = 0.5) -> np.ndarray:
 def test_a_camera_is_free_where_it_is_by_the_mesh_but_never_near_a_surface(
     images: list[DepthImage], clearance_m: float
 ) -> None:
-    points, space = random_points(6000), space_of(images, clearance_m)
+    points = random_points(6000)
+    space = space_of(images, clearance_m)
     free = space.is_free(points)
     distance = MeshRaycaster(room()).distance_to_surface(points, 1.0)
     assert not free[distance < clearance_m - VOXEL_M].any()
@@ -55,8 +57,10 @@ def test_a_camera_is_free_where_it_is_by_the_mesh_but_never_near_a_surface(
 def test_ways_never_come_near_a_surface(space: TsdfSpace) -> None:
     ends = random_points(4000, seed=2, beyond_m=0.0)
     ends = ends[space.is_free(ends)]
-    a, b = ends[: len(ends) // 2], ends[len(ends) // 2 : len(ends) // 2 * 2]
-    free, raycaster = space.segments_are_free(a, b), MeshRaycaster(room())
+    a = ends[: len(ends) // 2]
+    b = ends[len(ends) // 2 : len(ends) // 2 * 2]
+    free = space.segments_are_free(a, b)
+    raycaster = MeshRaycaster(room())
     assert not free[~raycaster.segments_are_clear(a, b, CLEARANCE_M - VOXEL_M)].any()
     clear = raycaster.segments_are_clear(a, b, CLEARANCE_M + VOXEL_M)
     assert clear.sum() > 50 and (~clear).sum() > 50 and free[clear].mean() > 0.9
@@ -66,7 +70,8 @@ def test_ways_never_come_near_a_surface(space: TsdfSpace) -> None:
 
 def test_few_images_leave_holes_but_no_way_through_them(images: list[DepthImage]) -> None:
     """A part of the ceiling that no image saw is not free either."""
-    space, points = space_of(images[::4]), random_points(6000, beyond_m=0.0)
+    space = space_of(images[::4])
+    points = random_points(6000, beyond_m=0.0)
     free = space.is_free(points)
     distance = MeshRaycaster(room()).distance_to_surface(points, 1.0)
     assert not free[distance < CLEARANCE_M - VOXEL_M].any()
@@ -77,7 +82,8 @@ def test_what_no_image_saw_is_not_free(images: list[DepthImage]) -> None:
     """The cameras are on one side of the wall, from where a part of the other side is hidden."""
     west = [image for image in images if -image.cam_from_world[:, :3].T[0] @ image.cam_from_world[:, 3] < 1.8]
     points = random_points(6000, beyond_m=0.0)
-    seen, by_mesh = seen_through(points, west, 10.0, progress=False), FreeSpace(room()).is_free(points)
+    seen = seen_through(points, west, 10.0, progress=False)
+    by_mesh = FreeSpace(room()).is_free(points)
     hidden = by_mesh & ~seen & (points[:, 0] > 2.2)
     space = space_of(west)
     assert hidden.sum() > 50 and not space.is_free(points[hidden]).any()
@@ -88,7 +94,8 @@ def test_what_no_image_saw_is_not_free(images: list[DepthImage]) -> None:
 
 def test_a_way_through_what_was_not_seen_is_not_free(images: list[DepthImage]) -> None:
     space = space_of(images)
-    a, b = np.array([[0.6, 0.5, 1.2]]), np.array([[0.6, 1.9, 1.2]])
+    a = np.array([[0.6, 0.5, 1.2]])
+    b = np.array([[0.6, 1.9, 1.2]])
     assert space.segments_are_free(a, b).all()
     near = np.linalg.norm(space.cells.centers() - (a + b) / 2, axis=1) < 0.1
     space.to_unseen_m[near.reshape(space.cells.shape)] = 0.0
@@ -105,7 +112,8 @@ def test_an_image_sees_up_to_its_readings() -> None:
 
 
 def test_a_path_is_planned_in_it(space: TsdfSpace) -> None:
-    start, goal = (0.7, 0.7, 1.2), (3.3, 0.7, 1.2)  # either side of the wall
+    start = (0.7, 0.7, 1.2)  # either side of the wall
+    goal = (3.3, 0.7, 1.2)
     path = patiently(
         lambda seconds: plan_path(start, goal, space, space.bounds, config=PathConfig(time_s=seconds), progress=False),
         seconds=1.0,

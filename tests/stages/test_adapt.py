@@ -12,16 +12,16 @@ import pytest
 from mapping.conftest import box_room
 from synthetic_dataset import make_dataset
 from wheretolook.cli import main
-from wheretolook.dataset.folders import Dataset
-from wheretolook.dataset.stamps import write_stamp
+from wheretolook.dataset.artifact_cache import write_stamp
+from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.viewpoint_table import is_good, poses, write_table
 from wheretolook.evaluation.adaptation import compare_log_odds
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.learning.weights import read_training
-from wheretolook.methods.registry import load_scorer
 from wheretolook.scenes.loading import save_glb
+from wheretolook.scorers.registry import load_scorer
+from wheretolook.training.weights import read_training
 from wheretolook.utils.tracking import finished_runs
 from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.viewpoints.table import is_good, poses, write_table
 
 
 @pytest.fixture
@@ -50,7 +50,8 @@ def test_adapted_weights_are_truer_and_logged(dataset: Dataset, capsys: pytest.C
     assert "the adapted weights are better" in said and path.is_file() and "| regret" in said
     assert path.with_suffix(".md").is_file()
     scene = dataset.scenes[1]
-    around, table = scene.localization_map(scene.camera, "cpu"), scene.read_table()
+    around = scene.localization_map(scene.camera, "cpu")
+    table = scene.read_table()
     good = is_good(table)
     losses = []
     for weights in (None, path):
@@ -119,7 +120,8 @@ def test_too_few_views_are_counted(dataset: Dataset, capsys: pytest.CaptureFixtu
 def test_gains_are_those_of_known_cases() -> None:
     """Two locations of two views: the first chooses wrongly before and rightly after."""
     good = np.array([True, False, True, False])
-    before, after = np.array([-1.0, 1.0, 1.0, -1.0]), np.array([2.0, -2.0, 2.0, -2.0])
+    before = np.array([-1.0, 1.0, 1.0, -1.0])
+    after = np.array([2.0, -2.0, 2.0, -2.0])
     centers = np.array([[0.0, 0, 0], [0, 0, 0], [9, 0, 0], [9, 0, 0]])
     gain = compare_log_odds(before, after, good, np.array([4, 4, 7, 7]), centers)
     assert gain.before["regret"] == 50 and gain.after["regret"] == 0

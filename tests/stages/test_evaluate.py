@@ -14,11 +14,12 @@ from scipy.special import expit, logit
 
 from learning_options import train_config
 from synthetic_dataset import make_dataset
-from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses, write_table
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.results import latest_scores
-from wheretolook.methods.registry import load_scorer
-from wheretolook.methods.visible import VisibleScorer
+from wheretolook.scorers.registry import load_scorer
+from wheretolook.scorers.visible import VisibleScorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
 from wheretolook.utils.errors import ConfigError, SceneError, TableError, WeightsError
@@ -32,7 +33,6 @@ from wheretolook.utils.tracking import (
     ui_command,
 )
 from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.viewpoints.table import UNLABELLED, is_good, poses, write_table
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 
@@ -94,7 +94,8 @@ def test_evaluation_writes_prints_and_logs(
     assert {run.data.params["method"] for run in runs} == {*methods}
     assert len(runs) == 6
     for run, n in ((run, n) for run in runs for n in (1, 5)):
-        params, metrics = run.data.params, run.data.metrics
+        params = run.data.params
+        metrics = run.data.metrics
         row = pooled.loc[(params["method"], n)]
         assert run.info.status == "FINISHED"
         assert metrics[f"top-{n}/raw_0.25m_2deg"] == pytest.approx(row["raw_0.25m_2deg"])
@@ -208,7 +209,8 @@ def test_what_a_location_sees_by_the_mesh_needs_no_mesh_where_it_is_stored(datas
 
 
 def test_neighbours_are_resampled_together(dataset: Dataset, tmp_path: Path) -> None:
-    tracking, key = TrackingConfig(str(tmp_path / "mlruns")), "0.05m_0.4deg"
+    tracking = TrackingConfig(str(tmp_path / "mlruns"))
+    key = "0.05m_0.4deg"
     tables = [
         evaluate(dataset, replace(RULES, block_m=block_m, methods=("random",)), tracking, progress=False).iloc[0]
         for block_m in (0.0, 1e-6, 1.0, 1e3)
@@ -229,7 +231,8 @@ def test_scores_that_are_not_finite_are_named(
 
 @pytest.mark.slow
 def test_the_papers_tables_have_networks_that_do_not_ship(dataset: Dataset, tmp_path: Path) -> None:
-    tracking, results = TrackingConfig(str(tmp_path / "mlruns")), dataset.root / "results"
+    tracking = TrackingConfig(str(tmp_path / "mlruns"))
+    results = dataset.root / "results"
     both = train(
         dataset, train_config("mlp-2d", "mlp-2d+z", epochs=2, hidden=(16,), accelerator="cpu"), tracking, False
     )

@@ -10,19 +10,19 @@ import pandas as pd
 import pytest
 
 from planning.rooms import CAMERA, room_landmarks
-from wheretolook.dataset.folders import SceneFolder
-from wheretolook.dataset.scene import Scene
-from wheretolook.figures.paths import paths_figure
+from wheretolook.dataset.environment import Scene
+from wheretolook.dataset.layout import SceneFolder
+from wheretolook.dataset.viewpoint_table import pose_columns, poses
 from wheretolook.geometry.poses import pose_error, poses_looking_along, rotation_angle_deg
-from wheretolook.labelling.config import LocalizerConfig
-from wheretolook.labelling.estimation import PoseEstimator
-from wheretolook.labelling.odometry import chained, rig_of_last, told_steps
+from wheretolook.localization.config import LocalizerConfig
+from wheretolook.localization.estimation import PoseEstimator
 from wheretolook.planning.config import PathsConfig, StopConfig
-from wheretolook.planning.path_comparison import ComparedPaths
-from wheretolook.planning.path_report import path_markdown, summarize_paths
-from wheretolook.stages.joint_paths import KEY, OUTCOME, check_joint, localize_together
 from wheretolook.utils.errors import ConfigError
-from wheretolook.viewpoints.table import pose_columns, poses
+from wheretolook_paper.commands.joint_paths import KEY, OUTCOME, check_joint, localize_together
+from wheretolook_paper.figures.paths import paths_figure
+from wheretolook_paper.paths.odometry import chained, rig_of_last, told_steps
+from wheretolook_paper.paths.path_comparison import ComparedPaths
+from wheretolook_paper.paths.path_report import path_markdown, summarize_paths
 
 LANDMARKS = room_landmarks(900)
 POSITIONS = np.linspace((1.0, 0.9, 1.3), (3.0, 0.9, 1.3), 6)
@@ -34,7 +34,9 @@ CONFIG = PathsConfig(methods=("forward", "set"), stops=StopConfig(2, 0.7), last_
 
 def seen(cam_from_world: np.ndarray, blind: np.ndarray, seed: int = 0) -> pd.DataFrame:
     """What views (B, 3, 4) match, nothing right where they are blind, and what comes of localizing each alone."""
-    rng, estimator, rows = np.random.default_rng(seed), PoseEstimator(LANDMARKS.points), []
+    rng = np.random.default_rng(seed)
+    estimator = PoseEstimator(LANDMARKS.points)
+    rows = []
     for pose, wrong in zip(cam_from_world, blind, strict=True):
         there = LANDMARKS.points @ pose[:, :3].T + pose[:, 3]
         at = CAMERA.project(there)
@@ -124,10 +126,12 @@ def test_what_was_localized_together_is_used_again(scene: Scene, compared: tuple
         )
         return found.views, (tmp_path / "last-together.parquet").stat().st_mtime_ns
 
-    first, again = views(config, "a"), views(config, "a")
+    first = views(config, "a")
+    again = views(config, "a")
     pd.testing.assert_frame_equal(first[0], again[0])
     assert first[1] == again[1]
-    other, noisy = views(config, "b"), views(replace(config, odometry_m_per_m=0.2), "b")
+    other = views(config, "b")
+    noisy = views(replace(config, odometry_m_per_m=0.2), "b")
     assert again[1] < other[1] < noisy[1]
     last = other[0]["method"].str.contains("last")
     np.testing.assert_allclose(other[0][last]["error_m"], first[0][last]["error_m"], rtol=1e-6)

@@ -11,17 +11,17 @@ import pytest
 from tests.learning_options import train_config
 from tests.synthetic_dataset import make_dataset
 
-from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.learning.fit import EpochRecord
-from wheretolook.learning.runs import keep_histories, train_runs
 from wheretolook.stages.evaluate import evaluate_methods, not_logged
 from wheretolook.stages.label import log_labels
 from wheretolook.stages.train import train_methods
+from wheretolook.training.fit import EpochRecord
 from wheretolook.utils.errors import StorageError, TrackingError, TrackingWarning
 from wheretolook.utils.files import sha256
 from wheretolook.utils.tracking import artifact, client, finished_runs
 from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook_paper.release.training_histories import keep_histories, train_runs
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 
@@ -71,7 +71,8 @@ def test_a_training_that_cannot_be_logged_is_kept_and_logged_later(
         with pytest.warns(TrackingWarning, match=r"the training of mlp-2d.*kept, but not logged.*again"):
             (model,) = train_methods(dataset, SMALL, tracking, progress=False)
     assert model.run_id == "" and not model.reused
-    digest, record = sha256(model.path), json.loads(model.path.with_suffix(".json").read_text())
+    digest = sha256(model.path)
+    record = json.loads(model.path.with_suffix(".json").read_text())
     assert record["weights_sha256"] == digest and record["metrics"] == model.metrics
     assert not list(finished_runs(tracking, "train"))
     with pytest.raises(TrackingError, match="artifacts"):

@@ -9,29 +9,35 @@ import pandas as pd
 import pytest
 
 from synthetic_dataset import CAMERA, make_scene
-from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.dataset.viewpoint_table import poses, read_table, write_table
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.looks import look_table, stopping_table
 from wheretolook.geometry.poses import pose_error
-from wheretolook.labelling.confidence import TOLD, Confidence, told_numbers
-from wheretolook.labelling.estimation import PoseEstimator
-from wheretolook.labelling.look_sets import SET_COLUMNS, label_sets
+from wheretolook.localization.confidence import TOLD, Confidence, told_numbers
+from wheretolook.localization.estimation import PoseEstimator
+from wheretolook.localization.joint_labels import SET_COLUMNS, label_sets
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.methods.registry import load_scorer
-from wheretolook.stages.look_sets import LookConfig, compare_looks, evaluate_looks
+from wheretolook.scorers.registry import load_scorer
 from wheretolook.utils.errors import ConfigError, PoseError, TableError, WeightsError
 from wheretolook.utils.tracking import newest_run
 from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.viewpoints.table import poses, read_table, write_table
+from wheretolook_paper.commands.look_sets import LookConfig, compare_looks, evaluate_looks
+from wheretolook_paper.evaluation.looks import look_table, stopping_table
 
 WEIGHTS = Path(__file__).parents[2] / "data" / "release" / "weights" / "set.safetensors"
 
 
 def with_matches(scene: SceneFolder, outliers: float = 0.5, seed: int = 0) -> pd.DataFrame:
     """The scene's table with matches of what each view sees, half of them wrong, and the labels that follow."""
-    rng, table = np.random.default_rng(seed), read_table(scene.table)
-    points, estimator = Landmarks.load(scene.landmarks).points, PoseEstimator(Landmarks.load(scene.landmarks).points)
-    rows, inliers, pixels, status, errors = [], [], [], [], []
+    rng = np.random.default_rng(seed)
+    table = read_table(scene.table)
+    points = Landmarks.load(scene.landmarks).points
+    estimator = PoseEstimator(Landmarks.load(scene.landmarks).points)
+    rows = []
+    inliers = []
+    pixels = []
+    status = []
+    errors = []
     for pose in poses(table):
         there = points @ pose[:, :3].T + pose[:, 3]
         at = CAMERA.project(there)
@@ -102,7 +108,8 @@ def test_sets_localize_where_their_looks_do_not(table: pd.DataFrame, points: np.
 
 
 def test_what_cannot_be_joined_is_refused(table: pd.DataFrame, points: np.ndarray) -> None:
-    first, other = np.flatnonzero(table["location_id"] == 0), np.flatnonzero(table["location_id"] == 1)
+    first = np.flatnonzero(table["location_id"] == 0)
+    other = np.flatnonzero(table["location_id"] == 1)
     with pytest.raises(PoseError, match="not of one place"):
         label_sets(table, [[first[0], other[0]]], points, CAMERA)
     with pytest.raises(TableError, match="store_pixels true"):
@@ -139,7 +146,8 @@ def test_strategies_are_compared_and_logged(dataset: Dataset, tmp_path: Path) ->
 
 def test_without_pixels_nothing_is_compared(tmp_path: Path) -> None:
     scene = make_scene(tmp_path / "tiny" / "one", "test", 0, n_locations=2)
-    bare, options = Dataset(tmp_path / "tiny", (scene,)), EvaluateConfig(weights=(WEIGHTS,))
+    bare = Dataset(tmp_path / "tiny", (scene,))
+    options = EvaluateConfig(weights=(WEIGHTS,))
     assert evaluate_looks(bare, options, TrackingConfig(tmp_path / "mlruns")) is None
     with pytest.raises(TableError, match="store_pixels"):
         compare_looks(scene, load_scorer(str(WEIGHTS), scene.localization_map()), progress=False)

@@ -15,9 +15,9 @@ import pytest
 from learning_options import train_config
 from synthetic_dataset import make_dataset
 from wheretolook.cli import main
-from wheretolook.dataset.folders import Dataset
-from wheretolook.dataset.stamps import write_stamp
-from wheretolook.stages.one_at_a_time import changing, reading
+from wheretolook.dataset.artifact_cache import write_stamp
+from wheretolook.dataset.dataset_lock import changing, reading
+from wheretolook.dataset.layout import Dataset
 from wheretolook.stages.train import train_methods
 from wheretolook.utils.errors import InUseError
 from wheretolook.utils.tracking_config import TrackingConfig
@@ -25,7 +25,7 @@ from wheretolook.utils.tracking_config import TrackingConfig
 HOLDER = """
 import sys
 from pathlib import Path
-from wheretolook.stages.one_at_a_time import changing
+from wheretolook.dataset.dataset_lock import changing
 with changing(Path(sys.argv[1]), "label"):
     print("held", flush=True)
     sys.stdin.read()

@@ -16,21 +16,21 @@ from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room, 
 from wheretolook import stages
 from wheretolook.cli import main
 from wheretolook.config import Experiment, ScenesConfig
-from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig, PinholeCamera
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.config import ExistingModelConfig, KnownDistance, MapConfig, PhotographsConfig, ScaleConfig
-from wheretolook.mapping.existing_map import map_existing
+from wheretolook.mapping.imported_map import map_existing
 from wheretolook.planning.config import PathConfig, PlanConfig, ViewpointMapConfig
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.loading import save_glb
 from wheretolook.space.config import MappedSpaceConfig
-from wheretolook.stages.inputs import extractor_of
+from wheretolook.stages.preconditions import extractor_of
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError, WeightsError
 from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.viewpoints.config import SampleConfig
 
 SIZE = (6.0, 5.0, 3.0)
 LOOKS = PinholeCamera(320, 240, 200.0)
@@ -43,8 +43,10 @@ def empty_room():
 
 def room_model(n_points: int = 800, cameras: tuple[PinholeCamera, ...] = (LOOKS,)) -> pycolmap.Reconstruction:
     """Points on the walls of a room of `SIZE`, as a camera saw them that walked around in it at 1.4 m."""
-    rng, model = np.random.default_rng(0), pycolmap.Reconstruction()
-    points, rows = rng.uniform((0, 0, 0), SIZE, (n_points, 3)), np.arange(n_points)
+    rng = np.random.default_rng(0)
+    model = pycolmap.Reconstruction()
+    points = rng.uniform((0, 0, 0), SIZE, (n_points, 3))
+    rows = np.arange(n_points)
     wall = rng.integers(0, 2, n_points)  # which axis
     points[rows, wall] = rng.integers(0, 2, n_points) * np.array(SIZE)[wall]
     angle = np.linspace(0, 2 * np.pi, 36, endpoint=False)
@@ -196,7 +198,8 @@ def test_models_do_not_join_generated_scenes(tmp_path):
 
 
 def test_a_turned_and_scaled_model_is_doubted_and_mended(tmp_path):
-    model, truth = room_model(), room_model()
+    model = room_model()
+    truth = room_model()
     turn = pycolmap.Rotation3d(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
     model.transform(pycolmap.Sim3d(37.0, turn, np.array([5.0, 0, 0])))
     folder = save(model, tmp_path / "flat")
@@ -252,7 +255,8 @@ def test_the_command_line_names_what_is_missing(tmp_path, monkeypatch, capsys, a
 @pytest.mark.filterwarnings("error::wheretolook.utils.errors.MapWarning")
 def test_landmarks_are_triangulated_anew_at_known_poses(tmp_path):
     """From poses alone, as of a robot or a phone: no points, photographs twice as large as the cameras say."""
-    poses, model = hand_held_poses(), pycolmap.Reconstruction()
+    poses = hand_held_poses()
+    model = pycolmap.Reconstruction()
     take_photographs(marker_room(), poses, tmp_path / "photos")
     half = replace(CAMERA, width=CAMERA.width // 2, height=CAMERA.height // 2, focal_px=CAMERA.focal_px / 2)
     model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=5, **half.colmap.record()))
@@ -282,7 +286,8 @@ def test_landmarks_are_triangulated_anew_at_known_poses(tmp_path):
 
 def test_weights_of_a_network_that_moved_since_the_map_was_made(tmp_path):
     """Queries are extracted with the file that is named now; without one, the error says how to name it."""
-    was, now = tmp_path / "was.pth", tmp_path / "now.pth"
+    was = tmp_path / "was.pth"
+    now = tmp_path / "now.pth"
     now.write_bytes(b"weights")
     made_with = ExtractorConfig("aliked", max_keypoints=500, weights=str(was))
     files = SceneFolder(tmp_path / "scene", "train")

@@ -20,28 +20,28 @@ from scipy.spatial import cKDTree
 from mask_agreement import MaskAgreement
 from wheretolook import stages
 from wheretolook.cli import main, parse_experiment
-from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.viewpoint_table import is_good, poses, read_table, write_table
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.inputs.channels import CHANNELS
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.labelling import labeller
-from wheretolook.learning.trained_network import TrainedNetwork
-from wheretolook.methods.mlp.network import ViewpointNetwork
-from wheretolook.methods.registry import load_scorer, scorers
-from wheretolook.methods.train_config import TrainConfig
-from wheretolook.planning.path_comparison import draw_pairs
+from wheretolook.localization import labeller
+from wheretolook.scorers.mlp.network import ViewpointNetwork
+from wheretolook.scorers.registry import load_scorer, scorers
+from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.space.tsdf_space import TsdfSpace
-from wheretolook.stages.inputs import open_scene
+from wheretolook.stages.preconditions import open_scene
+from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import fingerprint
 from wheretolook.utils.tracking import artifact, client, finished_runs, newest_run
 from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.viewpoints.table import is_good, poses, read_table, write_table
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import StoredOcclusion
+from wheretolook_paper.paths.path_comparison import draw_pairs
 
 pytestmark = pytest.mark.slow  # the whole line, several times over
 
@@ -143,7 +143,8 @@ def test_the_demo_ends_in_a_sentence_a_picture_and_what_to_do_next(
 
 def test_what_has_changed_is_compared_anew(copy: Path) -> None:
     root = copy / "data" / "tiny"
-    overview, report = root / "results" / "overview.png", root / "results" / "scores.md"
+    overview = root / "results" / "overview.png"
+    report = root / "results" / "scores.md"
 
     def drawn(*options: str) -> int:
         assert run("demo", copy, *options) == 0
@@ -161,7 +162,8 @@ def test_what_has_changed_is_compared_anew(copy: Path) -> None:
 
 
 def test_all_methods_are_trained_and_compared(copy: Path) -> None:
-    methods, learned = EvaluateConfig().methods, TrainConfig().methods
+    methods = EvaluateConfig().methods
+    learned = TrainConfig().methods
     assert run("train", copy, "--train.methods", f"[{','.join(learned)}]") == 0
     assert run("evaluate", copy, "--evaluate.methods", f"[{','.join(methods)}]") == 0
     scores = pd.read_csv(copy / "data" / "tiny" / "results" / "scores.csv")
@@ -186,7 +188,8 @@ def test_the_same_seed_gives_the_same_bytes(
 @pytest.mark.usefixtures("in_this_process", "no_pictures_here")
 def test_a_changed_setting_remakes_what_depends_on_it(copy: Path) -> None:
     scene = Dataset.load(copy / "data" / "tiny").scenes[0]
-    mesh, table = fingerprint(scene.mesh), scene.read_table()
+    mesh = fingerprint(scene.mesh)
+    table = scene.read_table()
     assert run("sample", copy, "--sample.seed", "5") == 0
     assert fingerprint(scene.mesh) == mesh
     assert (scene.read_table()["status"] == "unlabelled").all()
@@ -528,10 +531,12 @@ def test_paths_keep_clear_of_what_depth_images_saw(copy: Path, tmp_path: Path) -
     dataset = Dataset.load(experiment.root)
     scene = dataset.split("test")[0]
     opened = open_scene(experiment, dataset, scene)
-    by_mesh, space = opened.sampled_space, opened.space
+    by_mesh = opened.sampled_space
+    space = opened.space
     assert type(by_mesh) is FreeSpace and isinstance(space, TsdfSpace) and opened.occlusion.name == "tsdf"
     points = np.random.default_rng(0).uniform(*by_mesh.bounds, (4000, 3))
-    free, expected = space.is_free(points), by_mesh.is_free(points)
+    free = space.is_free(points)
+    expected = by_mesh.is_free(points)
     assert free.sum() > 100 and expected[free].mean() > 0.95 and free[expected].mean() < 1
     assert not free[by_mesh.raycaster.distance_to_surface(points, 1.0) < 0.25 - 2 * experiment.occlusion.voxel_m].any()
     pairs = draw_pairs(space, replace(experiment.paths, pairs=20, min_distance_m=0.5))

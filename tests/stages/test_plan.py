@@ -12,12 +12,12 @@ import pytest
 from box_scenes import ROOM, furnished_room
 from planning.rooms import CAMERA, build, occlusion, room_landmarks, room_map
 from wheretolook.cli import main
-from wheretolook.dataset.folders import Dataset, SceneFolder
-from wheretolook.methods.registry import make_scorer
+from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.scene_map import default_weights
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.scenes.loading import save_glb
+from wheretolook.scorers.registry import make_scorer
 from wheretolook.utils.files import write_json
 from wheretolook.utils.shipped import WEIGHTS, shipped
 
@@ -50,7 +50,8 @@ def test_a_scenes_map_is_that_of_its_scorer(dataset: Path, capsys: pytest.Captur
     out = dataset / "a.map"
     assert run(dataset, "--scene", "a", "--method", "bins", "--out", str(out)) == 0
     assert "60 directions at" in capsys.readouterr().out
-    found, expected = ViewpointMap.load(out), build(LANDMARKS)
+    found = ViewpointMap.load(out)
+    expected = build(LANDMARKS)
     np.testing.assert_allclose([found.grid.lower, found.grid.upper], [(0, 0, 0), ROOM], atol=1e-6)
     np.testing.assert_array_equal(found.row_of_voxel, expected.row_of_voxel)
     again = build_viewpoint_map(

@@ -10,7 +10,9 @@ import pytest
 from scans.recordings import COLOR, room, walk, write_seven_scenes
 from wheretolook.cli import main
 from wheretolook.config import Experiment, MeshSource, ScenesConfig
-from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.geometry.camera import CameraConfig
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping.config import MapConfig
@@ -18,8 +20,6 @@ from wheretolook.scans.config import RgbdConfig
 from wheretolook.scenes.loading import load_mesh, save_glb
 from wheretolook.stages import make_maps, make_scenes, sample
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.viewpoints.config import SampleConfig
-from wheretolook.viewpoints.table import poses
 
 
 @pytest.fixture(scope="module")

@@ -16,22 +16,22 @@ import torch
 
 from learning_options import changed, train_config
 from synthetic_dataset import make_dataset
-from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.names import RELEASE_FILE
+from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, UNLABELLED, is_good, write_table
 from wheretolook.inputs.bins import InputStatistics
-from wheretolook.learning.data import BatchLoader, ViewpointDataModule, balance_classes, hold_out_locations
-from wheretolook.learning.fit import EpochRecord
-from wheretolook.learning.provenance import training_fingerprint, was_trained_on
-from wheretolook.learning.scenes import with_also
-from wheretolook.learning.trained_network import TrainedNetwork
-from wheretolook.methods.mlp.network import ViewpointNetwork
-from wheretolook.methods.registry import load_scorer
-from wheretolook.methods.train_config import TrainConfig
+from wheretolook.scorers.mlp.network import ViewpointNetwork
+from wheretolook.scorers.registry import load_scorer
+from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.stages.train import train_methods as train
+from wheretolook.training.data import BatchLoader, ViewpointDataModule, balance_classes, hold_out_locations
+from wheretolook.training.fit import EpochRecord
+from wheretolook.training.provenance import training_fingerprint, was_trained_on
+from wheretolook.training.scenes import with_also
+from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.tracking import client
 from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.viewpoints.table import LOCALIZED, NO_POSE, UNLABELLED, is_good, write_table
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 
@@ -110,7 +110,8 @@ def test_validation_scenes_are_used_where_there_are_some(tmp_path: Path) -> None
 def test_every_pass_visits_every_training_view_once_in_its_own_order(dataset: Dataset) -> None:
     data = data_of(dataset, changed(SMALL, batch_size=100))
     data.setup()
-    loader, again = data.train_dataloader(), data.train_dataloader()
+    loader = data.train_dataloader()
+    again = data.train_dataloader()
     first, second = (torch.cat([batch.labels for batch in loader]) for _ in range(2))
     assert len(first) == len(data.train_rows)
     assert first.sum() == data.views.labels[data.train_rows].sum()
@@ -126,7 +127,8 @@ def test_batches_hold_the_channels_asked_for(dataset: Dataset) -> None:
     batches = list(data.val_dataloader())
     means = data.views.means[data.val_rows]
     torch.testing.assert_close(torch.cat([batch.inputs[0] for batch in batches]), means[:, [4, 0]], rtol=0, atol=0)
-    filled, labels = data.views.filled[data.val_rows], data.views.labels[data.val_rows]
+    filled = data.views.filled[data.val_rows]
+    labels = data.views.labels[data.val_rows]
     assert torch.equal(torch.cat([batch.inputs[1] for batch in batches]), filled)
     assert torch.equal(torch.cat([batch.labels for batch in batches]), labels)
 
@@ -180,7 +182,9 @@ def test_the_choice_of_a_balance_follows_its_seed() -> None:
 def test_labels_of_one_class_are_refused(dataset: Dataset, status: str) -> None:
     for scene in dataset.split("train"):
         table = scene.read_table()
-        table["status"], table["error_m"], table["error_deg"] = status, 0.001, 0.001
+        table["status"] = status
+        table["error_m"] = 0.001
+        table["error_deg"] = 0.001
         write_table(table, scene.table)
     config = changed(SMALL, val_fraction=1e-9)
     with pytest.raises(TableError, match="training labels are of one class") as caught:
@@ -265,7 +269,8 @@ def test_training_learns_the_rule_logs_a_run_and_is_reused(
 
 def test_other_datasets_are_learnt_from_too(dataset: Dataset, store: str) -> None:
     other = make_dataset(dataset.root.parent / "other", ("val", "test", "test", "test", "train"), n_locations=5)
-    tracking, config = TrackingConfig(store, "also"), changed(SMALL, epochs=1, also=("other",))
+    tracking = TrackingConfig(store, "also")
+    config = changed(SMALL, epochs=1, also=("other",))
     (model,) = train(dataset, config, tracking, progress=False)
     about = json.loads(model.path.with_suffix(".json").read_text())["about"]
     together = Dataset(dataset.root, (*dataset.scenes, *other.split("train")))
@@ -308,7 +313,8 @@ def test_a_release_may_ship_weights_of_another_dataset(dataset: Dataset) -> None
 
 
 def test_the_same_seed_gives_the_same_weights(dataset: Dataset, store: str) -> None:
-    config, tracking = changed(SMALL, noise_px=1.0), TrackingConfig(store, "same seed")
+    config = changed(SMALL, noise_px=1.0)
+    tracking = TrackingConfig(store, "same seed")
     torch.manual_seed(123)
     first = train(dataset, config, tracking, progress=False)[0].path.read_bytes()
     torch.manual_seed(456)
@@ -321,7 +327,8 @@ def test_the_same_seed_gives_the_same_weights(dataset: Dataset, store: str) -> N
 @pytest.mark.slow
 def test_two_processes_train_as_one_does(dataset: Dataset, store: str, capfd: pytest.CaptureFixture[str]) -> None:
     # 920 training views: the last batch has one view, so that one of two processes has none
-    tracking, one = TrackingConfig(store, "devices"), changed(SMALL, dropout=0.0, batch_size=919)
+    tracking = TrackingConfig(store, "devices")
+    one = changed(SMALL, dropout=0.0, batch_size=919)
     (alone,) = train(dataset, one, tracking, progress=False)
     expected = load(alone.path).state_dict()
     capfd.readouterr()
@@ -371,7 +378,8 @@ def test_an_interrupted_training_is_reported_as_such(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(EpochRecord, "on_train_epoch_end", stop)
-    tracking, handler = TrackingConfig(store, "interrupted"), signal.getsignal(signal.SIGINT)
+    tracking = TrackingConfig(store, "interrupted")
+    handler = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
         train(dataset, SMALL, tracking, progress=False)
     assert signal.getsignal(signal.SIGINT) is handler

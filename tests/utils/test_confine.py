@@ -4,15 +4,15 @@ from pathlib import Path
 
 import pytest
 
-from wheretolook.benchmark.folder import BenchmarkScene
 from wheretolook.cli import main
 from wheretolook.config import Experiment
-from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.learning.scenes import with_also
+from wheretolook.training.scenes import with_also
 from wheretolook.utils.confine import check_links, entry_of, path_within
 from wheretolook.utils.errors import ConfigError, TableError, WhereToLookError
 from wheretolook.utils.files import write_json
+from wheretolook_paper.benchmark.folder import BenchmarkScene
 
 OUTSIDE = ["../victim", "../../victim", "/victim", "a/../../victim", "..", ".", "", "a/b", "a\0b"]
 

@@ -12,7 +12,7 @@ import pytest
 
 from mapping.test_own_models import rig_model
 from wheretolook.mapping.config import ExistingModelConfig, MapConfig, PhotographsConfig
-from wheretolook.mapping.existing_map import map_existing
+from wheretolook.mapping.imported_map import map_existing
 from wheretolook.mapping.photographs import read_photograph
 from wheretolook.scans.frames import _size
 from wheretolook.select.surroundings import _read_depth

@@ -51,7 +51,8 @@ def test_the_second_is_told_who_holds_it_and_a_killed_one_blocks_nobody(tmp_path
 
 def test_readers_share_and_shut_writers_out(tmp_path: Path) -> None:
     lock = tmp_path / "lock"
-    killed, other = holder(lock, "plan", shared=True), holder(lock, "evaluate", shared=True)
+    killed = holder(lock, "plan", shared=True)
+    other = holder(lock, "evaluate", shared=True)
     killed.kill()
     killed.wait()
     with hold(lock, "train", shared=True), pytest.raises(InUseError) as caught, hold(lock, "label"):
@@ -143,7 +144,8 @@ def test_a_reader_needs_no_folder_and_makes_none(tmp_path: Path) -> None:
 
 
 def test_ctrl_c_at_the_very_end_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    unlink, interrupts = Path.unlink, iter([True])
+    unlink = Path.unlink
+    interrupts = iter([True])
 
     def interrupted(path: Path, missing_ok: bool = False) -> None:
         if next(interrupts, False):

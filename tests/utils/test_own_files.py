@@ -10,17 +10,17 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from wheretolook.dataset.folders import SceneFolder
-from wheretolook.dataset.stamps import forget_stamp, is_done, read_stamp, write_stamp
-from wheretolook.learning.trained_network import TrainedNetwork
-from wheretolook.learning.weights import METADATA_KEY, preference, read_training, read_weights, write_weights
+from wheretolook.dataset.artifact_cache import forget_stamp, is_done, read_stamp, write_stamp
+from wheretolook.dataset.layout import SceneFolder
 from wheretolook.mapping.colmap_model import load_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.methods.matchability.network import LandmarkNetwork
-from wheretolook.methods.set.network import SetNetwork
-from wheretolook.methods.sphere.network import SphereNetwork
+from wheretolook.scorers.matchability.network import LandmarkNetwork
+from wheretolook.scorers.set.network import SetNetwork
+from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook.training.weights import METADATA_KEY, preference, read_training, read_weights, write_weights
 from wheretolook.utils.errors import MapError, TableError, WeightsError
 from wheretolook.visibility.occlusion import StoredOcclusion
+from wheretolook_paper.scorers.sphere.network import SphereNetwork
 
 N = 5  # landmarks
 
@@ -125,7 +125,8 @@ def landmark_arrays() -> dict[str, np.ndarray]:
     ids=["text", "scalar", "shape", "length"],
 )
 def test_damaged_landmarks(name: str, change: Callable[[np.ndarray], np.ndarray], tmp_path: Path) -> None:
-    path, arrays = tmp_path / "landmarks.npz", landmark_arrays()
+    path = tmp_path / "landmarks.npz"
+    arrays = landmark_arrays()
     np.savez(path, **arrays)
     assert len(Landmarks.load(path)) == N
     np.savez(path, **{**arrays, name: change(arrays[name])})
@@ -135,7 +136,8 @@ def test_damaged_landmarks(name: str, change: Callable[[np.ndarray], np.ndarray]
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_landmarks_at_no_place(value: float, tmp_path: Path) -> None:
-    path, arrays = tmp_path / "landmarks.npz", landmark_arrays()
+    path = tmp_path / "landmarks.npz"
+    arrays = landmark_arrays()
     arrays["points"][2, 1] = value
     np.savez(path, **arrays)
     with pytest.raises(MapError, match=r"landmarks\.npz: some landmarks are not at finite places"):

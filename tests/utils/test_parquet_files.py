@@ -12,8 +12,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from wheretolook.dataset.viewpoint_table import has_matches, read_parquet
 from wheretolook.utils import parquet_files
-from wheretolook.viewpoints.table import has_matches, read_parquet
 
 
 def _list(n: int, path: Path) -> None:
@@ -71,7 +71,8 @@ def _wide(path: Path) -> None:
 
 def _described(path: Path, depth: int) -> None:
     """No rows of a column in so many groups, in one another. Arrow overflows the stack at some ten thousand."""
-    group, column = b"\x35\x00\x18\x01a\x15\x02\x00", b"\x15\x02\x25\x00\x18\x01a\x00"
+    group = b"\x35\x00\x18\x01a\x15\x02\x00"
+    column = b"\x15\x02\x25\x00\x18\x01a\x00"
     columns = b"\x19\xfc" + _number(depth + 2) + b"\x48\x01r\x15\x02\x00" + group * depth + column
     description = b"\x15\x02" + columns + b"\x16\x00\x19\x0c\x00"
     path.write_bytes(b"PAR1" + description + struct.pack("<I", len(description)) + b"PAR1")
@@ -95,7 +96,8 @@ def test_bombs_are_refused_before_they_unfold(name: str, tmp_path: Path) -> None
     make, says = BOMBS[name]
     path = tmp_path / "a.parquet"
     make(path)
-    before, start = pa.total_allocated_bytes(), time.process_time()
+    before = pa.total_allocated_bytes()
+    start = time.process_time()
     with pytest.raises(ValueError, match=says):
         read_parquet(path)
     assert time.process_time() - start < 5 and pa.total_allocated_bytes() - before < 2**24
@@ -103,10 +105,12 @@ def test_bombs_are_refused_before_they_unfold(name: str, tmp_path: Path) -> None
 
 
 def test_what_pandas_writes_is_read(tmp_path: Path) -> None:
-    rng, n = np.random.default_rng(0), 30_000
+    rng = np.random.default_rng(0)
+    n = 30_000
     table = pd.DataFrame({"method": rng.choice(["set", "bins"], n), "x": rng.normal(size=n), "n": np.arange(n)})
     table["task"] = table["method"].astype("category")
-    table["good"], table["none"] = table["x"] > 0, None
+    table["good"] = table["x"] > 0
+    table["none"] = None
     table["rows"] = [np.arange(i % 7, dtype=np.int32) for i in range(n)]
     for version in ("1.0", "2.0"):
         for options in ({}, {"compression": None, "row_group_size": 4000}, {"use_dictionary": False}):
@@ -116,7 +120,8 @@ def test_what_pandas_writes_is_read(tmp_path: Path) -> None:
 
 
 def test_headers_tell_of_each_page_what_arrow_wrote(tmp_path: Path) -> None:
-    path, n = tmp_path / "a.parquet", 100_000
+    path = tmp_path / "a.parquet"
+    n = 100_000
     pq.write_table(pa.table({"a": np.arange(n), "b": [f"{i % 50}" for i in range(n)]}), path, data_page_size=2**12)
     group = pq.ParquetFile(path).metadata.row_group(0)
     (described,) = parquet_files._description(path)[4]
@@ -132,7 +137,9 @@ def test_headers_tell_of_each_page_what_arrow_wrote(tmp_path: Path) -> None:
 def test_damaged_descriptions_and_pages_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.parquet"
     pq.write_table(pa.table({"a": np.arange(1000), "b": ["x"] * 1000}), path)
-    whole, rng, refused = path.read_bytes(), np.random.default_rng(0), 0
+    whole = path.read_bytes()
+    rng = np.random.default_rng(0)
+    refused = 0
     for _ in range(400):
         content = bytearray(whole)
         for _ in range(3):

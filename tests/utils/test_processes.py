@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from labelling.rooms import is_running, wait_until, workers_of
+from localization.rooms import is_running, wait_until, workers_of
 from wheretolook.utils.errors import WorkerError
 from wheretolook.utils.processes import Processes
 

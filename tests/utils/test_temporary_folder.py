@@ -31,7 +31,8 @@ def test_ctrl_c_leaves_none_while_it_is_made(tmp_path, monkeypatch):
 
 
 def test_ctrl_c_leaves_none_while_it_is_removed(tmp_path, monkeypatch):
-    remove, calls = shutil.rmtree, []
+    remove = shutil.rmtree
+    calls = []
 
     def interrupted(path, **named):
         calls.append(path)

@@ -138,7 +138,8 @@ def test_an_empty_file_becomes_a_store(tmp_path: Path) -> None:
 
 def test_a_full_disk_is_found_before_work_starts(tmp_path: Path, made: bytes) -> None:
     with small_disk(tmp_path / "disk", 8 * 2**20) as disk:
-        new, old = TrackingConfig(str(disk / "new")), TrackingConfig(str(disk / "old"))
+        new = TrackingConfig(str(disk / "new"))
+        old = TrackingConfig(str(disk / "old"))
         filler = fill(disk, leave=300_000)
         assert "No space left" in str(refused(new))
         assert not [*(disk / "new").rglob("*")]
@@ -154,7 +155,8 @@ def test_a_full_disk_is_found_before_work_starts(tmp_path: Path, made: bytes) ->
 
 def test_a_read_only_disk_is_found_before_work_starts_but_can_be_read(tmp_path: Path, made: bytes) -> None:
     with small_disk(tmp_path / "disk", 8 * 2**20) as disk:
-        new, old = TrackingConfig(str(disk / "new")), TrackingConfig(str(disk / "old"))
+        new = TrackingConfig(str(disk / "new"))
+        old = TrackingConfig(str(disk / "old"))
         old.root.mkdir()
         (old.root / "mlflow.db").write_bytes(made)
         with read_only(disk):
@@ -172,7 +174,8 @@ def test_a_limit_on_files_is_found_before_work_starts(store: TrackingConfig, tmp
 
 
 def test_results_outlive_a_store_that_fails_while_they_are_logged(tmp_path: Path, made: bytes) -> None:
-    note, result = tmp_path / "not_logged.json", tmp_path / "result.bin"
+    note = tmp_path / "not_logged.json"
+    result = tmp_path / "result.bin"
     result.write_bytes(bytes(2**20))
     with small_disk(tmp_path / "disk", 6 * 2**20) as disk:
         tracking = TrackingConfig(str(disk / "mlruns"))

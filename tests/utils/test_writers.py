@@ -15,18 +15,18 @@ from tests.box_scenes import furnished_room
 from tests.disks import file_limit, fill, read_only, small_disk
 from tests.synthetic_dataset import CAMERA, make_landmarks, make_mapping_poses
 
-from wheretolook.figures.moving import save_moving
+from wheretolook.dataset.viewpoint_table import SCHEMA, write_table
+from wheretolook.figures.animation import save_moving
 from wheretolook.figures.style import save_figure
-from wheretolook.learning.weights import write_weights
-from wheretolook.mapping.building import partial_folder
 from wheretolook.mapping.colmap_model import colmap_poses, save_mapping_poses, write_model
+from wheretolook.mapping.rendered_map import partial_folder
 from wheretolook.mapping.triangulation import fill_database
 from wheretolook.scenes.loading import save_glb
+from wheretolook.training.weights import write_weights
 from wheretolook.utils.colmap import storing_in_database
 from wheretolook.utils.errors import StorageError
 from wheretolook.utils.files import copy_file, replacing, write_bytes, write_json, write_text
 from wheretolook.utils.npz_files import load_npy, load_npz, save_npy, save_npz
-from wheretolook.viewpoints.table import SCHEMA, write_table
 from wheretolook.visibility.occlusion import StoredOcclusion
 
 RNG = np.random.default_rng(0)
@@ -94,7 +94,8 @@ def test_a_writer_that_fails_names_the_file_and_leaves_no_part(name: str, disk: 
             stack.enter_context(small_disk(folder, 10 * 2**20))
         path = folder / "there" / name
         write(path)  # it can be written
-        before, others = path.read_bytes(), sorted(path.parent.iterdir())
+        before = path.read_bytes()
+        others = sorted(path.parent.iterdir())
         assert len(before) > LIMIT and others == [path]
         write(folder / "new" / name)
         (folder / "new" / name).unlink()
@@ -170,7 +171,8 @@ def test_a_database_that_colmap_cannot_write_is_named(limit: int, tmp_path: Path
 
 
 def test_a_folder_that_is_moved_later_is_named_as_it_was_to_be(tmp_path: Path) -> None:
-    place, limited = tmp_path / "map", file_limit(LIMIT)
+    place = tmp_path / "map"
+    limited = file_limit(LIMIT)
     with pytest.raises(StorageError) as raised, limited, partial_folder(place) as partial:
         write_bytes(partial / "deep" / "a.bin", NOISE.tobytes())
     assert raised.value.path == place / "deep" / "a.bin" and not list(tmp_path.iterdir())

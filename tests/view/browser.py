@@ -26,7 +26,9 @@ class Tab:
     def __init__(self, address: str, size: tuple[int, int]) -> None:
         from websockets.sync.client import connect
 
-        self._socket, self._number, self.errors = connect(address, max_size=1 << 27), 0, []  # type: ignore[var-annotated]
+        self._socket = connect(address, max_size=1 << 27)  # type: ignore[var-annotated]
+        self._number = 0
+        self.errors = []
         for domain in ("Page", "Runtime", "Log"):
             self.call(f"{domain}.enable")
         self.call(
@@ -135,13 +137,15 @@ class Browser:
         options += ["--remote-allow-origins=*"]
         options += ["--disable-renderer-backgrounding", "--disable-background-timer-throttling"]
         options += ["--disable-backgrounding-occluded-windows"]
-        self.size, self._tabs = size, []  # type: ignore[var-annotated]
+        self.size = size  # type: ignore[var-annotated]
+        self._tabs = []
         self.process = subprocess.Popen(
             [program, *options, f"--window-size={size[0]},{size[1]}", f"--user-data-dir={folder}", "about:blank"],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
-        port, end = folder / "DevToolsActivePort", time.monotonic() + 60
+        port = folder / "DevToolsActivePort"
+        end = time.monotonic() + 60
         while not (port.is_file() and port.read_text().strip()):
             assert time.monotonic() < end and self.process.poll() is None, "Chromium does not start"
             time.sleep(0.1)

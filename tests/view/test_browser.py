@@ -17,7 +17,7 @@ from selection.room import POINTS, WEIGHTS, write_room
 from view.browser import Browser, Tab, chromium
 from wheretolook.geometry.poses import poses_looking_along, rotation_from_quaternion
 from wheretolook.view.opened import open_map
-from wheretolook.view.played import FORWARD, Played, looking_ahead
+from wheretolook.view.paths import FORWARD, Played, looking_ahead
 from wheretolook.view.saving import views_at, views_file
 from wheretolook.view.server import Viewer
 from wheretolook.view.shared import Shared
@@ -118,7 +118,8 @@ def test_waypoints_and_a_picture_are_saved_and_rings_turn_the_camera(
     with Image.open(tmp_path / "wheretolook.png") as picture:
         assert picture.width > 300 and len(picture.convert("RGB").getcolors(1 << 24)) > 50
     tab.press("Look")
-    before, told = session.axis.copy(), session.controls.picture_told.content
+    before = session.axis.copy()
+    told = session.controls.picture_told.content
     turn = poses_looking_along(np.array(at), before)[:, :3].T  # the rings' axes are the camera's
     reach = 3.0 * session.shared.mark_m * RING
     yaw = [np.array(at) + reach * turn @ (np.sin(angle), 0, np.cos(angle)) for angle in np.radians((45, 10))]

@@ -14,11 +14,11 @@ from wheretolook.cli import main
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.scenes.loading import save_glb
 from wheretolook.select.where_to_look import WhereToLook
-from wheretolook.view.film import film
 from wheretolook.view.opened import open_map
-from wheretolook.view.played import FORWARD, Played, looking_ahead
+from wheretolook.view.paths import FORWARD, Played, looking_ahead
 from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
+from wheretolook_paper.commands.film import film
 
 
 def test_a_recording_holds_scene_floor_place_and_paths(tmp_path: Path) -> None:

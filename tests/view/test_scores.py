@@ -36,7 +36,8 @@ def test_a_floor_has_the_best_score_of_each_free_place(room: Opened) -> None:
     raster = floor.raster()
     assert np.isfinite(raster).sum() == len(floor.cells)
     x, y = floor.points[7, :2]
-    column, row = int((x - floor.lower[0]) / floor.cell_m), int((y - floor.lower[1]) / floor.cell_m)
+    column = int((x - floor.lower[0]) / floor.cell_m)
+    row = int((y - floor.lower[1]) / floor.cell_m)
     assert raster[row, column] == floor.scores[7]
 
 
@@ -83,7 +84,8 @@ def test_landmarks_seen_have_chances_that_add_up_to_the_expected_inliers(room: O
 
 def test_chances_come_from_another_scorer_where_the_method_tells_none(room: Opened) -> None:
     pose = poses_looking_along(POINTS[0], (-1.0, -0.5, 0.0))
-    counting, teller = room.look("visible", "none").scorer, room.look("set", "none").scorer
+    counting = room.look("visible", "none").scorer
+    teller = room.look("set", "none").scorer
     assert np.isnan(landmarks_seen(counting, pose).chances).all()
     told = landmarks_seen(counting, pose, teller)
     np.testing.assert_array_equal(told.chances, landmarks_seen(teller, pose).chances)
@@ -92,7 +94,7 @@ def test_chances_come_from_another_scorer_where_the_method_tells_none(room: Open
 def test_labels_are_compared_with_the_scorer(room: Opened) -> None:
     import pandas as pd
 
-    from wheretolook.viewpoints.table import pose_columns
+    from wheretolook.dataset.viewpoint_table import pose_columns
 
     scorer = room.look("set", "none").scorer
     axes = np.array([(-1.0, -0.5, 0.0), (1.0, 0.2, 0.0), (-1.0, 0.0, 0.0), (0.3, 1.0, 0.0)])

@@ -24,6 +24,7 @@ pytest.importorskip("viser")
 from box_scenes import furnished_room
 from selection.room import POINTS, WEIGHTS, write_room
 from wheretolook.cli import main
+from wheretolook.dataset.viewpoint_table import pose_columns
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.scenes.loading import save_glb
 from wheretolook.select.where_to_look import WhereToLook
@@ -32,7 +33,7 @@ from wheretolook.view import drawing
 from wheretolook.view.checks import check_port
 from wheretolook.view.controls import check_value, value_of
 from wheretolook.view.opened import open_map
-from wheretolook.view.played import FORWARD, Played, looking_ahead, read_paths
+from wheretolook.view.paths import FORWARD, Played, looking_ahead, read_paths
 from wheretolook.view.saving import views_at, views_file
 from wheretolook.view.server import Viewer, where_clicked
 from wheretolook.view.session import Session
@@ -41,7 +42,6 @@ from wheretolook.view.state import ViewState
 from wheretolook.view.texts import plain
 from wheretolook.view.turning import Turning
 from wheretolook.view.worker import LATER, NOW, SOON, Worker
-from wheretolook.viewpoints.table import pose_columns
 
 STATE = ViewState("visible", "none", 3, 0.25, 1.4, 2.0, (1.0, 2.0, 1.5), -30.0, 5.0, (0.0, 0.0, 9.0), (1.0, 1.0, 0.0))
 
@@ -195,7 +195,10 @@ def test_waypoints_are_saved_as_select_writes_them(sparse: Path, tmp_path: Path,
 
 
 def test_urgent_work_goes_first_and_what_fails_stops_nothing_else() -> None:
-    worker, done, failed, wait = Worker(), [], [], threading.Event()
+    worker = Worker()
+    done = []
+    failed = []
+    wait = threading.Event()
 
     def steps(name: str, n: int) -> Iterator[None]:
         wait.wait(10)
@@ -227,7 +230,8 @@ def test_urgent_work_goes_first_and_what_fails_stops_nothing_else() -> None:
 
 def test_floors_wait_while_a_view_is_turned_but_not_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("wheretolook.view.worker.PATIENCE_S", 1.0)
-    worker, when = Worker(), []  # type: ignore[var-annotated]
+    worker = Worker()  # type: ignore[var-annotated]
+    when = []
 
     def step(name: str) -> Iterator[None]:
         when.append((name, time.monotonic()))
@@ -327,7 +331,8 @@ def test_a_flood_of_messages_holds_nobody_else_up(sparse: Path) -> None:
 
             ray = {"ray_origin": [1.5, 2.0, 9.0], "ray_direction": [0.01, 0, -1]}
             click = {"type": "ScenePointerMessage", "event_type": "click", "screen_pos": [[0.5, 0.5]], "modifier": None}
-            before, times = threading.active_count(), 400
+            before = threading.active_count()
+            times = 400
             for turn in range(times):
                 good_and_wrong = {
                     "yaw": turn % 180, "step": turn % 80 + 1, "threshold": turn / times, "play": True, "add": True,
@@ -425,7 +430,8 @@ def test_the_slow_picture_that_a_turn_begins_with_does_not_end_it() -> None:
 def test_turns_without_end_do_not_keep_places_and_floors_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("wheretolook.view.worker.PATIENCE_S", 0.5)
     monkeypatch.setattr("wheretolook.view.worker.CLICK_PATIENCE_S", 0.2)
-    worker, done = Worker(), []  # type: ignore[var-annotated]
+    worker = Worker()  # type: ignore[var-annotated]
+    done = []
 
     def step(name: str) -> Iterator[None]:
         done.append(name)
@@ -549,7 +555,8 @@ def test_values_that_no_control_offers_are_told_and_put_back(viewer: Viewer) -> 
         client.send(camera_message())
         _until(lambda: viewer.sessions)
         (session,) = viewer.sessions.values()
-        controls, told = session.controls, []
+        controls = session.controls
+        told = []
         session.failed = told.append  # type: ignore[method-assign]
         nonsense = {"method": "../../weights", "occlusion": "x", "n": 10**9, "height": float("nan"), "format": "/x"}
         nonsense |= {"threshold": float("inf"), "cut": -1e300, "limits": "no", "yaw": 1e9}

@@ -15,11 +15,11 @@ import torch
 import wheretolook
 from selection.room import WEIGHTS, write_room
 from synthetic_dataset import make_dataset
-from wheretolook.dataset.folders import Dataset
-from wheretolook.learning.provenance import training_fingerprint
-from wheretolook.learning.trained_network import TrainedNetwork
-from wheretolook.methods.adapted.network import AdaptedNetwork
-from wheretolook.methods.set.network import SetNetwork
+from wheretolook.dataset.layout import Dataset
+from wheretolook.scorers.adapted.network import AdaptedNetwork
+from wheretolook.scorers.set.network import SetNetwork
+from wheretolook.training.provenance import training_fingerprint
+from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import WeightsError
 from wheretolook.view.opened import find_opened, open_map
 

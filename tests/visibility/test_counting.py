@@ -49,7 +49,8 @@ def count(
 def test_counts_are_those_of_the_plain_twin(
     name: str, distinct_pixels: bool, random_views: RandomViews, device: str
 ) -> None:
-    v, camera = random_views, CAMERAS[name]
+    v = random_views
+    camera = CAMERAS[name]
     rng = np.random.default_rng(5)
     # twins of landmarks share pixels; some landmarks lie around a location closer than the least depth, some at it
     points = np.concatenate(
@@ -75,7 +76,8 @@ def test_the_number_of_cells_changes_nothing(random_views: RandomViews, device: 
 
 def test_a_hundred_thousand_landmarks_on_the_very_border(device: str) -> None:
     """Landmarks made to lie within single precision's error of the sides of some view: each must be decided alike."""
-    camera, rotations = PinholeCamera(), rotation_looking_along(fibonacci_sphere(40))
+    camera = PinholeCamera()
+    rotations = rotation_looking_along(fibonacci_sphere(40))
     rng = np.random.default_rng(0)
     pixels = np.stack([rng.choice([0.0, 640.0], 100_000), rng.uniform(0, 480, 100_000)], 1)
     pixels[::2] = np.stack([rng.uniform(0, 640, 50_000), rng.choice([0.0, 480.0], 50_000)], 1)
@@ -106,7 +108,8 @@ def test_distinct_pixels_by_hand(device: str) -> None:
 
 @pytest.mark.parametrize("name", ["wide", "distorted", "fisheye"])
 def test_moving_map_and_camera_together_changes_nothing(name: str, random_views: RandomViews, device: str) -> None:
-    v, camera = random_views, CAMERAS[name]
+    v = random_views
+    camera = CAMERAS[name]
     rotations = rotation_looking_along(v.directions)
     turn = Rotation.from_rotvec([0.3, -0.5, 1.1]).as_matrix()
     moved = np.concatenate([turn, [[3.0], [-1.0], [2.0]]], axis=1)
@@ -119,8 +122,10 @@ def test_moving_map_and_camera_together_changes_nothing(name: str, random_views:
 def test_a_map_far_from_the_origin_is_counted_alike(device: str) -> None:
     """Coordinates as of a national grid: offsets are taken in double precision."""
     rng = np.random.default_rng(1)
-    points, locations = rng.integers(-4096, 4096, (500, 3)) / 1024, rng.integers(-1024, 1024, (3, 3)) / 1024
-    rotations, far = rotation_looking_along(fibonacci_sphere(20)), np.array([2.0**22, -(2.0**21), 512.0])
+    points = rng.integers(-4096, 4096, (500, 3)) / 1024
+    locations = rng.integers(-1024, 1024, (3, 3)) / 1024
+    rotations = rotation_looking_along(fibonacci_sphere(20))
+    far = np.array([2.0**22, -(2.0**21), 512.0])
     near_counts = count(PinholeCamera(), rotations, locations, points, device=device)
     np.testing.assert_array_equal(
         near_counts, count(PinholeCamera(), rotations, locations + far, points + far, device=device)
@@ -144,14 +149,16 @@ def test_the_table_of_a_field_of_view_is_never_wrong(camera: ColmapCamera) -> No
     rng = np.random.default_rng(0)
     u, v = rng.uniform(-1, 1, (2, 300_000))
     directions = octahedral_directions(u, v)
-    depth, seen = table.depth_rad[cells_of(directions, table.size)], camera.sees(directions)
+    depth = table.depth_rad[cells_of(directions, table.size)]
+    seen = camera.sees(directions)
     assert seen[depth > 0].all() and not seen[depth < 0].any()
     assert np.mean(depth == 0) < 0.02
     # corners of the cells that are only just certain, where a table too sure of itself would err first
     rows, columns = np.divmod(np.flatnonzero((depth_of := table.depth_rad) != 0), table.size)
     just = np.abs(depth_of[rows * table.size + columns]) < 2e-4
     for shift_u, shift_v in ((0.001, 0.001), (0.001, 0.999), (0.999, 0.001), (0.999, 0.999)):
-        u, v = (columns[just] + shift_u) / table.size * 2 - 1, (rows[just] + shift_v) / table.size * 2 - 1
+        u = (columns[just] + shift_u) / table.size * 2 - 1
+        v = (rows[just] + shift_v) / table.size * 2 - 1
         sure = depth_of[rows[just] * table.size + columns[just]]
         np.testing.assert_array_equal(camera.sees(octahedral_directions(u, v)), sure > 0)
 
@@ -178,7 +185,8 @@ def test_a_view_narrower_than_the_tables_cells_is_counted_too(camera: ColmapCame
 
 
 def test_a_pinhole_of_colmap_counts_as_ours(random_views: RandomViews, device: str) -> None:
-    v, rotations = random_views, rotation_looking_along(random_views.directions)
+    v = random_views
+    rotations = rotation_looking_along(random_views.directions)
     colmap = ColmapCamera(
         "SIMPLE_PINHOLE", v.camera.width, v.camera.height, (v.camera.focal_px, v.camera.cx, v.camera.cy)
     )
@@ -189,7 +197,8 @@ def test_a_pinhole_of_colmap_counts_as_ours(random_views: RandomViews, device: s
 
 
 def test_what_cannot_be_counted_is_refused(random_views: RandomViews) -> None:
-    v, rotations = random_views, rotation_looking_along(random_views.directions)
+    v = random_views
+    rotations = rotation_looking_along(random_views.directions)
     for size in (0, -4, 7):
         with pytest.raises(ConfigError, match=f"even number.*{size}"):
             FrustumCounter(v.camera, rotations, 100, size=size)
@@ -204,7 +213,8 @@ def test_what_cannot_be_counted_is_refused(random_views: RandomViews) -> None:
 def test_lists_for_the_camera_that_run_over_change_nothing(
     random_views: RandomViews, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    v, rotations = random_views, rotation_looking_along(random_views.directions)
+    v = random_views
+    rotations = rotation_looking_along(random_views.directions)
     expected = count(DISTORTED, rotations, v.locations, v.points, v.mask, device)
     monkeypatch.setattr(counting, "ASKED_AT_ONCE", 7)
     for entries in (1, 60):  # shorter than the list of one view, and than that of all
@@ -214,7 +224,8 @@ def test_lists_for_the_camera_that_run_over_change_nothing(
 
 
 def test_little_room_for_bitmaps_changes_nothing(random_views: RandomViews, device: str) -> None:
-    v, rotations = random_views, rotation_looking_along(random_views.directions)
+    v = random_views
+    rotations = rotation_looking_along(random_views.directions)
     arguments = v.camera, rotations, v.locations, v.points, v.mask, device
     for scratch in (1, 200_000):  # a view at a time, a few
         np.testing.assert_array_equal(

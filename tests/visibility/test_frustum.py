@@ -98,7 +98,8 @@ def test_the_test_is_the_projection(random_views: RandomViews) -> None:
 def test_collected_landmarks_are_those_of_the_plain_twin(random_views: RandomViews, device: str) -> None:
     v = random_views
     arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
-    kernel, plain = landmarks_in_view(arguments, device=device), landmarks_in_view_plain(arguments)
+    kernel = landmarks_in_view(arguments, device=device)
+    plain = landmarks_in_view_plain(arguments)
     np.testing.assert_array_equal(kernel.starts, plain.starts)
     np.testing.assert_array_equal(kernel.indices, plain.indices)
     assert len(plain.indices) > 500 and len(plain) == len(v.cam_from_world)

@@ -143,7 +143,8 @@ def test_landmarks_in_one_place_get_one_answer(margin_m: float) -> None:
     points, locations = surfaces(4, 1500)
     again = np.random.default_rng(0).permutation(np.tile(np.arange(len(points)), 3))
     model = HiddenPointRemoval(20, margin_m)
-    once, thrice = model.unoccluded(locations, points), model.unoccluded(locations, points[again])
+    once = model.unoccluded(locations, points)
+    thrice = model.unoccluded(locations, points[again])
     np.testing.assert_array_equal(thrice, once[:, again])
     assert 0.1 < once.mean() < 0.9
 
@@ -151,7 +152,8 @@ def test_landmarks_in_one_place_get_one_answer(margin_m: float) -> None:
 def test_scale_turn_shift_and_number_of_threads_change_nothing() -> None:
     points, locations = surfaces(5, 2000)
     seen = HiddenPointRemoval(20, 0.05, threads=1).unoccluded(locations, points)
-    turn, shift = Rotation.from_rotvec([0.3, -2.0, 1.0]).as_matrix(), np.array([30.0, -7, 2])
+    turn = Rotation.from_rotvec([0.3, -2.0, 1.0]).as_matrix()
+    shift = np.array([30.0, -7, 2])
     for scale in (1e-2, 1.0, 1e3):
         moved = [scale * (at @ turn.T + shift) for at in (locations, points)]
         np.testing.assert_array_equal(HiddenPointRemoval(20, 0.05 * scale).unoccluded(*moved), seen)
@@ -166,7 +168,8 @@ def test_against_the_mesh_a_larger_radius_finds_more_and_errs_more() -> None:
     truth = MeshOcclusion(MeshRaycaster(furnished_room())).unoccluded(locations, points)
     found = [MaskAgreement.between(HiddenPointRemoval(radius).unoccluded(locations, points), truth)
              for radius in (2, 20, 200, 2000)]  # fmt: skip
-    precision, recall = [a.precision for a in found], [a.recall for a in found]
+    precision = [a.precision for a in found]
+    recall = [a.recall for a in found]
     assert precision == sorted(precision, reverse=True) and precision[0] > 0.9 and precision[-1] < 0.6
     assert recall == sorted(recall) and recall[0] < 0.7 and recall[-1] > 0.98
     assert max(a.f1 for a in found) > 0.85
@@ -181,7 +184,8 @@ def test_a_huge_radius_hides_only_what_lies_on_one_ray() -> None:
 
 
 def test_what_cannot_be_answered_is_refused_by_name() -> None:
-    model, points = HiddenPointRemoval(), np.eye(3)
+    model = HiddenPointRemoval()
+    points = np.eye(3)
     with pytest.raises(MapError, match=r"no landmarks.*got 0"):
         model.unoccluded(ORIGIN, np.zeros((0, 3)))
     with pytest.raises(MapError, match=r"1 of 2 landmarks are not finite, the first in row 1 \(got \(1.0, nan, 2.0\)"):
@@ -213,8 +217,11 @@ def seen_from(points: np.ndarray, at: np.ndarray, radius: float = 50.0) -> tuple
 @pytest.mark.parametrize("radius", [1.0, 50.0])
 def test_a_building_of_many_landmarks_has_the_hull_of_all(radius: float) -> None:
     rng = np.random.default_rng(0)
-    size, room, n = np.array([30.0, 20.0, 6.0]), np.array([6.0, 5.0, 3.0]), 2 * LEAST_POINTS
-    points, axis = rng.uniform((0, 0, 0), size, (n, 3)), rng.integers(0, 3, n)
+    size = np.array([30.0, 20.0, 6.0])
+    room = np.array([6.0, 5.0, 3.0])
+    n = 2 * LEAST_POINTS
+    points = rng.uniform((0, 0, 0), size, (n, 3))
+    axis = rng.integers(0, 3, n)
     points[np.arange(n), axis] = rng.integers(0, (size / room)[axis].astype(int) + 1) * room[axis]  # on walls
     for at in ((8.0, 7, 1.5), (-5.0, -4, 1)):  # in a room, and outside of all, where the location is a corner
         directions, lengths, margin = seen_from(points, np.array(at), radius)
@@ -235,8 +242,10 @@ def test_many_landmarks_in_a_plane_have_the_hull_of_all() -> None:
 
 
 def test_landmarks_that_change_are_looked_at_anew() -> None:
-    model, points = HiddenPointRemoval(margin_m=0.0), np.array([(1.0, 0, 0), (2.0, 0, 0), (0, 1, 0), (0, 0, 1)])
+    model = HiddenPointRemoval(margin_m=0.0)
+    points = np.array([(1.0, 0, 0), (2.0, 0, 0), (0, 1, 0), (0, 0, 1)])
     assert model.unoccluded(ORIGIN, points).tolist() == [[True, False, True, True]]
-    points[0], points[1] = (3.0, 0, 0), (2.0, 0, 0)
+    points[0] = (3.0, 0, 0)
+    points[1] = (2.0, 0, 0)
     assert model.unoccluded(ORIGIN, points).tolist() == [[False, True, True, True]]
     assert model.unoccluded(ORIGIN, points[1:]).tolist() == [[True, True, True]]

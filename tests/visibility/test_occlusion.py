@@ -15,7 +15,8 @@ from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion, StoredO
 
 def screen(size_m: float = 1.0) -> TexturedMesh:
     """A square in the plane x = 1, centred on the x axis."""
-    y, z = np.array([-1, 1, 1, -1]) * size_m / 2, np.array([-1, -1, 1, 1]) * size_m / 2
+    y = np.array([-1, 1, 1, -1]) * size_m / 2
+    z = np.array([-1, -1, 1, 1]) * size_m / 2
     return TexturedMesh(
         np.column_stack([np.ones(4), y, z]).astype(np.float32),
         np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32),
@@ -50,7 +51,9 @@ def test_without_occlusion_all_is_seen() -> None:
 
 def test_stored_occlusion_comes_back_by_location(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
-    locations, mask, points = rng.normal(size=(6, 3)), rng.random((6, 21)) < 0.5, np.zeros((21, 3))
+    locations = rng.normal(size=(6, 3))
+    mask = rng.random((6, 21)) < 0.5
+    points = np.zeros((21, 3))
     path = tmp_path / "occlusion.npz"
     StoredOcclusion.from_mask(locations, mask).save(path)
     stored = StoredOcclusion.load(path)

@@ -27,7 +27,8 @@ class Given(OcclusionModel):
     """A mask that is known."""
 
     def __init__(self, locations: Float, mask: np.ndarray) -> None:
-        self.locations, self.mask = locations, mask
+        self.locations = locations
+        self.mask = mask
 
     def unoccluded(self, locations: Float, points: Float) -> np.ndarray:
         rows = [int(np.flatnonzero((self.locations == location).all(1))[0]) for location in locations]
@@ -55,7 +56,8 @@ def test_masks_of_every_length_are_packed_as_numpy_packs_them(
     n_points: int, random_views: RandomViews, device: str
 ) -> None:
     v = random_views
-    mask, points = v.mask[:, :n_points], v.points[:n_points]
+    mask = v.mask[:, :n_points]
+    points = v.points[:n_points]
     rotations = rotation_looking_along(v.directions)
     for occlusion, expected in ((Given(v.locations, mask), mask), (NoOcclusion(), np.ones_like(mask))):
         seen = survey(v.camera, rotations, v.locations, points, occlusion, device=device)
@@ -68,8 +70,10 @@ def test_masks_of_every_length_are_packed_as_numpy_packs_them(
 def test_a_mesh_hides_what_is_behind_it_on_the_device_too(device: str) -> None:
     raycaster = MeshRaycaster(boxes(box_quads((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))), device)
     rng = np.random.default_rng(0)
-    points, locations = rng.uniform(-4, 4, (600, 3)), rng.uniform(2, 4, (20, 3))
-    occlusion, rotations = MeshOcclusion(raycaster), rotation_looking_along(fibonacci_sphere(30))
+    points = rng.uniform(-4, 4, (600, 3))
+    locations = rng.uniform(2, 4, (20, 3))
+    occlusion = MeshOcclusion(raycaster)
+    rotations = rotation_looking_along(fibonacci_sphere(30))
     seen = survey(PinholeCamera(), rotations, locations, points, occlusion, device=device)
     mask = occlusion.unoccluded(locations, points)
     assert 0 < (~mask).sum() < mask.size / 2 and seen.occlusion is not None
@@ -80,7 +84,8 @@ def test_a_mesh_hides_what_is_behind_it_on_the_device_too(device: str) -> None:
 def test_blocks_keep_to_the_memory_allowed(
     random_views: RandomViews, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    v, rotations = random_views, rotation_looking_along(random_views.directions)
+    v = random_views
+    rotations = rotation_looking_along(random_views.directions)
     locations = np.random.default_rng(0).uniform(-2, 2, (40, 3))
     whole = survey(v.camera, rotations, locations, v.points, NoOcclusion(), device=device)
     blocks: list[int] = []
@@ -109,7 +114,8 @@ def test_blocks_keep_to_the_memory_allowed(
 
 def test_points_on_the_device_can_be_used_again(random_views: RandomViews, device: str) -> None:
     v = random_views
-    rotations, points = rotation_looking_along(v.directions), DevicePoints(v.points, device)
+    rotations = rotation_looking_along(v.directions)
+    points = DevicePoints(v.points, device)
     for rows in (slice(0, 3), slice(3, 5)):
         seen = survey(v.camera, rotations, v.locations[rows], points, NoOcclusion(), distinct_pixels=True)
         everything = np.ones((len(v.locations[rows]), len(points)), bool)
@@ -150,7 +156,8 @@ def test_bad_input_is_refused_before_any_work(random_views: RandomViews) -> None
 
 @pytest.mark.parametrize("two_sided", [False, True])
 def test_a_location_inside_geometry_is_named(two_sided: bool, device: str) -> None:
-    room, block = box_quads((-3, -3, -3), (3, 3, 3), inward=True), box_quads((0, 0, 0), (1, 1, 1))
+    room = box_quads((-3, -3, -3), (3, 3, 3), inward=True)
+    block = box_quads((0, 0, 0), (1, 1, 1))
     occlusion = MeshOcclusion(MeshRaycaster(boxes(room, block), device), two_sided=two_sided)
     occlusion.check(np.array([[-1.0, -1, -1], [2, 2, 2]]), np.ones((5, 3)))
     with pytest.raises(SceneError, match=r"inside geometry.*1\.0, 0\.5, 0\.5"):

@@ -18,8 +18,10 @@ from wheretolook.visibility.tsdf import TsdfOcclusion
 
 def lines_of_sight(mesh: TexturedMesh, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Locations (30, 3), landmarks (3000, 3) on surfaces, 3 mm off, and which are free by the mesh."""
-    rng, raycaster = np.random.default_rng(seed), MeshRaycaster(mesh)
-    origins, rays = free_points(rng, 3000), rng.normal(size=(3000, 3))
+    rng = np.random.default_rng(seed)
+    raycaster = MeshRaycaster(mesh)
+    origins = free_points(rng, 3000)
+    rays = rng.normal(size=(3000, 3))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     points = origins + raycaster.cast(origins, rays).distance_m[:, None] * rays
     points += rng.normal(scale=0.003, size=points.shape)
@@ -69,7 +71,8 @@ def test_pixels_without_reading_neither_occlude_nor_carve(images: list[DepthImag
     holed = []
     for image in images:
         hole = rng.random(image.depth_m.shape) < 0.02
-        top, left = rng.integers(0, 180), rng.integers(0, 240)
+        top = rng.integers(0, 180)
+        left = rng.integers(0, 240)
         hole[top : top + 60, left : left + 80] = True
         depth = np.where(hole, rng.choice(marks, image.depth_m.shape), image.depth_m)
         holed.append(DepthImage(depth, image.camera, image.cam_from_world))
@@ -90,7 +93,8 @@ def test_what_nothing_has_seen_hides_nothing() -> None:
 
 def test_more_blocks_than_expected_change_nothing(images: list[DepthImage]) -> None:
     config = TsdfConfig(voxel_size_m=0.04)
-    small, large = TsdfVolume(config, expected_blocks=16), TsdfVolume(config, expected_blocks=1 << 15)
+    small = TsdfVolume(config, expected_blocks=16)
+    large = TsdfVolume(config, expected_blocks=1 << 15)
     for image in images[:30]:
         small.integrate(image)
         large.integrate(image)
@@ -103,7 +107,8 @@ def test_more_blocks_than_expected_change_nothing(images: list[DepthImage]) -> N
 
 
 def test_moving_the_world_changes_little(images: list[DepthImage]) -> None:
-    turn, shift = Rotation.from_euler("zyx", [0.7, -0.4, 0.3]).as_matrix(), np.array([12.3, -45.6, 7.8])
+    turn = Rotation.from_euler("zyx", [0.7, -0.4, 0.3]).as_matrix()
+    shift = np.array([12.3, -45.6, 7.8])
     moved = []
     for image in images:
         rotation = image.cam_from_world[:, :3] @ turn.T
@@ -120,7 +125,10 @@ def test_a_location_inside_geometry_is_refused(occlusion: TsdfOcclusion) -> None
     free = free_points(np.random.default_rng(7), 200, clearance_m=0.1)
     occlusion.check(free, free)
     occlusion.check(free[:0], free)
-    inside_wall, inside_cupboard, on_floor, outside = (2.0, 1.0, 1.2), (0.5, 2.6, 0.8), (1.0, 1.0, 0.0), (9.0, 1.0, 1.0)
+    inside_wall = (2.0, 1.0, 1.2)
+    inside_cupboard = (0.5, 2.6, 0.8)
+    on_floor = (1.0, 1.0, 0.0)
+    outside = (9.0, 1.0, 1.0)
     for location in (inside_wall, inside_cupboard, on_floor, outside, (np.nan, 1.0, 1.0)):
         with pytest.raises(SceneError, match=r"inside geometry|not finite") as caught:
             occlusion.check(np.vstack([free, location]), free)

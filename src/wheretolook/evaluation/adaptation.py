@@ -12,7 +12,7 @@ from sklearn.metrics import roc_auc_score
 from wheretolook.evaluation.bootstrap import LocationBootstrap
 from wheretolook.evaluation.calibration import expected_calibration_error
 from wheretolook.geometry.poses import Float
-from wheretolook.methods.adapted.fit import log_losses
+from wheretolook.scorers.adapted.gp_correction import log_losses
 from wheretolook.utils.markdown import markdown_table
 
 RESAMPLES = 2000
@@ -77,12 +77,15 @@ def compare_log_odds(
         np.logical_or.at(possible, row, good)
         return (possible & ~good[chosen]).astype(np.float64) * (times > 1)
 
-    choice, both = np.asarray(times > 1, dtype=np.float64), (before, after)
-    losses, misses = [log_losses(z, good) for z in both], [missed(z) for z in both]
+    choice = np.asarray(times > 1, dtype=np.float64)
+    both = (before, after)
+    losses = [log_losses(z, good) for z in both]
+    misses = [missed(z) for z in both]
     told = []
     for z, loss, miss in zip(both, losses, misses, strict=True):
         auc = float(roc_auc_score(good, z)) if 0 < good.sum() < len(good) else float("nan")
-        regret, error = 100 * float(miss.sum() / max(1.0, choice.sum())), expected_calibration_error(expit(z), good)
+        regret = 100 * float(miss.sum() / max(1.0, choice.sum()))
+        error = expected_calibration_error(expit(z), good)
         told.append({"log_loss": float(loss.mean()), "auc": auc, "regret": regret, "calibration_error": error})
     changed = np.bincount(row, weights=losses[0] - losses[1]).astype(np.float64)
     loss_less = less(changed, times.astype(np.float64))
@@ -96,7 +99,8 @@ def gain_markdown(gain: Gain) -> str:
     for key, text in names.items():
         digits = ".1f" if key == "regret" else ".3f"
         rows.append([text, format(gain.before[key], digits), format(gain.after[key], digits)])
-    loss, regret = gain.log_loss_less, gain.regret_less
+    loss = gain.log_loss_less
+    regret = gain.regret_less
     if np.isnan(regret[1]):
         less = (
             f"Log loss is less by {loss[0]:.3f} [{loss[1]:.3f}, {loss[2]:.3f}]; there is no choice to judge regret by."

@@ -63,7 +63,8 @@ class LocationBootstrap:
         ends = np.full((2, numerator.shape[1]), np.nan)
         if self._sizes.max(initial=0) < 2:
             return ends[0], ends[1]
-        top, bottom = self._times @ self._by_block(numerator), self._times @ self._by_block(denominator)
+        top = self._times @ self._by_block(numerator)
+        bottom = self._times @ self._by_block(denominator)
         ratio = np.divide(top, bottom, out=np.full(top.shape, np.nan), where=bottom > 0)
         known = np.isfinite(ratio)
         whole = known.all(0)

@@ -12,7 +12,7 @@ from scipy.optimize import minimize_scalar
 from scipy.special import expit, logit
 
 from wheretolook.geometry.poses import Float
-from wheretolook.learning.old_names import with_names
+from wheretolook.training.old_names import with_names
 
 Good = NDArray[np.bool_]  # whether each view localizes, (B,)
 BINS = 15  # bins of equal width that probabilities are sorted into

@@ -9,9 +9,9 @@ from typing import Literal
 
 import numpy as np
 
-from wheretolook.methods.registry import methods_named, scorers
+from wheretolook.dataset.thresholds import THRESHOLDS, threshold_key
+from wheretolook.scorers.registry import methods_named, scorers
 from wheretolook.utils.errors import ConfigError
-from wheretolook.viewpoints.thresholds import THRESHOLDS, threshold_key
 from wheretolook.visibility.config import OcclusionName, check_occlusion_names
 
 

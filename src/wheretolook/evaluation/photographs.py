@@ -10,7 +10,8 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.dataset.folders import SceneFolder
+from wheretolook.dataset.layout import SceneFolder
+from wheretolook.dataset.viewpoint_table import LOCALIZED
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.ranking import TestViews
 from wheretolook.evaluation.score_table import PHOTOGRAPHS
@@ -20,7 +21,6 @@ from wheretolook.evaluation.views import CandidateSet
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.utils.errors import TableError
-from wheretolook.viewpoints.table import LOCALIZED
 
 _OF_THE_MAP = ("expected-inliers", "visible")  # methods that give a share of the map's landmarks
 
@@ -60,15 +60,18 @@ def photographs_set(photographs: Sequence[LeftOutPhotographs], config: EvaluateC
         location_scene.append(np.full(len(ids), number))
         location_block.append(views["block"].to_numpy(np.int64)[first])
         has_pose = views["status"].to_numpy() == LOCALIZED
-        error_m, error_deg = views["error_m"].to_numpy(), views["error_deg"].to_numpy()
+        error_m = views["error_m"].to_numpy()
+        error_deg = views["error_deg"].to_numpy()
         within = [has_pose & (error_m < metres) & (error_deg < degrees) for metres, degrees in config.thresholds]
         good.append(np.stack(within, axis=-1))
     names = np.concatenate([one.views["photograph"].to_numpy(np.int64) for one in photographs])
     labels = np.concatenate(good)
     if len(np.unique(labels[:, 0])) < 2:
-        problem, fix = "of the left-out photographs all localize, or none", "Evaluate without evaluate.photographs."
+        problem = "of the left-out photographs all localize, or none"
+        fix = "Evaluate without evaluate.photographs."
         raise TableError(problem, path=photographs[0].scene.map, value=bool(labels[:, 0].any()), fix=fix)
-    scene_of, block_of = np.concatenate(location_scene), np.concatenate(location_block)
+    scene_of = np.concatenate(location_scene)
+    block_of = np.concatenate(location_block)
     found = TestViews(np.concatenate(location), names, labels, scene_of, block_of)
     return CandidateSet(PHOTOGRAPHS, np.ones(len(labels), dtype=bool), found, np.concatenate(location_id))
 

@@ -77,7 +77,8 @@ def choose_at_random(views: TestViews, n: int) -> TopN:
     With g good views of m, min(N, m) g / m of the chosen ones are good, and at least one is with probability
     1 - C(m - g, N) / C(m, N) (hypergeometric).
     """
-    total, good = _n_views(views)[:, None], _sum_by_location(views, views.good)
+    total = _n_views(views)[:, None]
+    good = _sum_by_location(views, views.good)
     chosen = np.minimum(total, n)
     none_possible = total - good >= chosen
     bad = np.where(none_possible, total - good, chosen)

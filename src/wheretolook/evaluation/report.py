@@ -8,11 +8,11 @@ from typing import Any
 
 import pandas as pd
 
+from wheretolook.dataset.thresholds import ALL, threshold_label
 from wheretolook.evaluation.score_table import PHOTOGRAPHS, main_rows, methods_of, reference_of, threshold_keys
 from wheretolook.evaluation.scores import RELEASED_DIVISOR, by_chance
-from wheretolook.methods.styles import ORACLE, method_group, method_style
+from wheretolook.scorers.styles import ORACLE, method_group, method_style
 from wheretolook.utils.markdown import markdown_table
-from wheretolook.viewpoints.thresholds import ALL, threshold_label
 
 Row = Mapping[Any, Any]  # a row of a score table by its columns' names
 
@@ -29,15 +29,18 @@ def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> s
     and by set of candidates if there are several (the tables above are of the first); shares divided by the released
     code's constant; calibration; probes apart. What an older table lacks is left out.
     """
-    main, of_photographs = main_rows(scores), _of_photographs(scores)
+    main = main_rows(scores)
+    of_photographs = _of_photographs(scores)
     if len(main) and not of_photographs.all():
         scores, photographs = scores[~of_photographs], scores[of_photographs]
     else:
         photographs = scores.iloc[:0]
     probe = main["method"].map(method_group) == "probes"
-    methods, probes = main[~probe], main[probe]
+    methods = main[~probe]
+    probes = main[probe]
     pooled = methods[methods["scene"] == ALL]
-    keys, counts = threshold_keys(scores), list(pooled["top_n"].unique())
+    keys = threshold_keys(scores)
+    counts = list(pooled["top_n"].unique())
     first = pooled[pooled["top_n"] == counts[0]]
     parts = [f"# {title}", _about(main), *_explained(first, keys[0])]
     most = [*_score_columns(keys, len(keys)), *_certainty_columns(first, keys[0]), *_RANKING]
@@ -87,7 +90,8 @@ def best_in_words(scores: pd.DataFrame) -> str:
     By the first N, threshold, occlusion model and set of candidates of a score table. Two methods are told apart by the
     interval of their difference where one is the reference, else by whether the intervals of their shares overlap.
     """
-    main, key = main_rows(scores), threshold_keys(scores)[0]
+    main = main_rows(scores)
+    key = threshold_keys(scores)[0]
     pooled = main[(main["scene"] == ALL) & (main["top_n"] == main["top_n"].iloc[0])]
     rows: dict[str, Row] = {row["method"]: row for row in pooled.to_dict("records")}
     methods = [name for name in rows if name != ORACLE and method_group(name) != "probes"]
@@ -116,7 +120,8 @@ def best_in_words(scores: pd.DataFrame) -> str:
 
 def _told_apart(first: Row, second: Row, key: str) -> str:
     """Whether the intervals of two rows, of which the first has the higher share, tell them apart, in a sentence."""
-    names, n_locations = (first["method"], second["method"]), first["n_locations"]
+    names = (first["method"], second["method"])
+    n_locations = first["n_locations"]
     reference = first.get("reference", "")
     if reference in names:
         row, sign = (second, -1) if reference == names[0] else (first, 1)
@@ -126,7 +131,8 @@ def _told_apart(first: Row, second: Row, key: str) -> str:
         if low == high == 0:
             return "The first two chose equally well everywhere."
     else:
-        low, high = first[f"raw_low_{key}"], second[f"raw_high_{key}"]
+        low = first[f"raw_low_{key}"]
+        high = second[f"raw_high_{key}"]
         apart = low > high
         ends = [_ends(row, "raw", key).strip() for row in (first, second)]
         why = f"the 95 % intervals of their shares {'do not overlap' if apart else 'overlap'}, {' and '.join(ends)}"
@@ -154,7 +160,8 @@ def _about(main: pd.DataFrame) -> str:
 
 def _explained(first: pd.DataFrame, key: str) -> list[str]:
     """What the numbers mean, one line for each that is there."""
-    limits, reference = threshold_label(key), reference_of(first)
+    limits = threshold_label(key)
+    reference = reference_of(first)
     lines = [
         "score: share in % of the chosen viewpoints that localize within both limits, divided by the oracle's share "
         "[95 % bootstrap interval over locations, neighbours resampled together] (undivided). Random is an exact "
@@ -252,7 +259,8 @@ def _comparison(scores: pd.DataFrame, column: str, name: str, about: str, key: s
     values = list(scores[column].unique()) if column in scores else []
     if len(values) < 2:
         return []
-    n, others = scores["top_n"].iloc[0], [name for name in ("occlusion", "candidates") if name != column]
+    n = scores["top_n"].iloc[0]
+    others = [name for name in ("occlusion", "candidates") if name != column]
     rows = main_rows(scores[(scores["scene"] == ALL) & (scores["top_n"] == n)], others)
     rows = rows[(rows["method"] != ORACLE) & (rows["method"].map(method_group) != "probes")]
     by_key = {(row["method"], row[column]): row for row in rows.to_dict("records")}

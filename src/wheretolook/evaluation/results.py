@@ -11,15 +11,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.dataset.thresholds import ALL, threshold_key
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.ranking import TestViews
 from wheretolook.evaluation.score_table import main_rows, methods_of, threshold_keys
 from wheretolook.evaluation.scores import Choices, by_chance, read_scores
 from wheretolook.evaluation.views import CandidateSet
 from wheretolook.geometry.poses import Float
-from wheretolook.methods.registry import methods_named, scorers
-from wheretolook.methods.styles import ORACLE
+from wheretolook.scorers.registry import methods_named, scorers
+from wheretolook.scorers.styles import ORACLE
 from wheretolook.utils.files import fingerprint, replacing, temporary_folder
 from wheretolook.utils.tracking import (
     FINGERPRINT_TAG,
@@ -34,11 +35,15 @@ from wheretolook.utils.tracking import (
 )
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.utils.tracking_layout import ALL_METHODS, AUC, BEST_TAG, REGRET, SHARE, joined
-from wheretolook.viewpoints.thresholds import ALL, threshold_key
 from wheretolook.visibility.config import OcclusionConfig
 
-SCORES_CSV, SCORES_MD, SCORES_PNG, OCCLUSION_PNG = "scores.csv", "scores.md", "scores.png", "occlusion.png"
-CALIBRATION_CSV, CALIBRATION_PNG, REGRET_PNG = "calibration.csv", "calibration.png", "regret.png"
+SCORES_CSV = "scores.csv"
+SCORES_MD = "scores.md"
+SCORES_PNG = "scores.png"
+OCCLUSION_PNG = "occlusion.png"
+CALIBRATION_CSV = "calibration.csv"
+CALIBRATION_PNG = "calibration.png"
+REGRET_PNG = "regret.png"
 """Files of an evaluation, in `<dataset>/results/` and as artifacts of its run."""
 
 VARIANTS_CSV = "variants.csv"
@@ -168,7 +173,8 @@ def location_table(
     (whether one is; for random choice both are expectations), and best_score, that of the view chosen first; NaN for
     random choice and the oracle, which choose by no score.
     """
-    views, top = scored.candidates.views, scored.choices[method, n]
+    views = scored.candidates.views
+    top = scored.choices[method, n]
     names = [scenes[number].name for number in views.location_scene]
     columns: dict[str, Any] = {"scene": names, "location_id": scored.candidates.location_id, "top_n": n}
     columns |= {"chosen": top.chosen.astype(np.int64)}
@@ -193,7 +199,8 @@ def log_evaluation(
     The settings of occlusion models are logged if the configuration names any. Nothing is logged if the newest
     evaluation of the dataset was of the same and found the same.
     """
-    views, scenes = evaluation.views, evaluation.scenes
+    views = evaluation.views
+    scenes = evaluation.scenes
     params = evaluation_params(dataset, scenes, evaluation.weights)
     params |= {name: value for name, value in asdict(config).items() if name not in ("weights", "methods", "anywhere")}
     params |= {"anywhere": True} if config.anywhere else {}

@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.dataset.folders import Dataset, SceneFolder
+from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good
 from wheretolook.evaluation.calibration import calibration_rows, fit_temperature
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.photographs import LeftOutPhotographs, photographs_set, score_photographs
@@ -20,10 +21,9 @@ from wheretolook.evaluation.scores import choose, is_probability, score_table
 from wheretolook.evaluation.scoring import Weights, check_unseen, choose_weights, score_scenes
 from wheretolook.evaluation.views import CandidateSet, candidate_sets, views_of
 from wheretolook.geometry.poses import Float
-from wheretolook.learning.provenance import TrainedModel
-from wheretolook.methods.registry import methods_named, scorers
+from wheretolook.scorers.registry import methods_named, scorers
+from wheretolook.training.provenance import TrainedModel
 from wheretolook.utils.errors import TableError
-from wheretolook.viewpoints.table import UNLABELLED, is_good
 from wheretolook.visibility.config import OcclusionConfig
 
 Scores = Mapping[str, Float]  # by method

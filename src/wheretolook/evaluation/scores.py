@@ -9,16 +9,16 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from wheretolook.dataset.thresholds import ALL, threshold_key
 from wheretolook.evaluation.bootstrap import LocationBootstrap
 from wheretolook.evaluation.calibration import expected_calibration_error, scale_probability
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.ranking import TestViews, TopN, choose_at_random, choose_best, choose_by_truth, rank_views
 from wheretolook.geometry.poses import Float
-from wheretolook.learning.old_names import with_names
-from wheretolook.methods.registry import find
-from wheretolook.methods.styles import ORACLE
+from wheretolook.scorers.registry import find
+from wheretolook.scorers.styles import ORACLE
+from wheretolook.training.old_names import with_names
 from wheretolook.utils.errors import ConfigError
-from wheretolook.viewpoints.thresholds import ALL, threshold_key
 
 RELEASED_DIVISOR = 0.527
 """What the paper's released code divides every share by, whatever the threshold, the scenes and N."""
@@ -152,7 +152,8 @@ def _shares(
     any_good = np.stack([top.any_good for top in tops.values()], axis=1)
     chosen = tops[ORACLE].chosen[:, None]  # (L, 1): every method chooses as many
     best = np.broadcast_to(tops[ORACLE].good[:, None], good.shape)
-    n_locations, n_views = len(good), float(chosen.sum())
+    n_locations = len(good)
+    n_views = float(chosen.sum())
     columns = {"good": good.sum(0), "raw": _quotient(good.sum(0), n_views)}
     columns["raw_low"], columns["raw_high"] = _interval(bootstrap, good, chosen)
     columns["normalized"] = _quotient(good.sum(0), best.sum(0))

@@ -10,20 +10,20 @@ import numpy as np
 import pandas as pd
 from tqdm.auto import tqdm
 
-from wheretolook.dataset.folders import Dataset, SceneFolder, views_by_camera
-from wheretolook.dataset.scene import Scene, SceneConfig
+from wheretolook.dataset.environment import Scene, SceneConfig
+from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
+from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.scores import reference_method
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.learning.provenance import TrainedModel, was_trained_on, weights_path
-from wheretolook.learning.weights import method_of_weights, read_training
-from wheretolook.methods.base import Scorer
-from wheretolook.methods.registry import learned, make_scorer, members, methods_named, scorers
+from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.registry import learned, make_scorer, members, methods_named, scorers
+from wheretolook.training.provenance import TrainedModel, was_trained_on, weights_path
+from wheretolook.training.weights import method_of_weights, read_training
 from wheretolook.utils.errors import TableError, WeightsError
 from wheretolook.utils.files import fingerprint
 from wheretolook.utils.shipped import WEIGHTS, shipped
-from wheretolook.viewpoints.table import poses
 from wheretolook.visibility.config import OcclusionConfig
 
 BLOCK = 4096  # views binned and scored at a time
@@ -113,11 +113,13 @@ def score_scenes(
                 opened = Scene(scene, config=SceneConfig(occlusion), device=device, progress=progress)
                 localization_map = replace(localization_map, occlusion=opened.occlusion)
             used.add(localization_map.occlusion.name)
-            cam_from_world, looking = poses(table), None
+            cam_from_world = poses(table)
+            looking = None
             of_scene: dict[str, Float] = {}
             for camera, rows in views_by_camera(scene, table, BLOCK):
                 if camera != looking:
-                    looking, looked_at = camera, localization_map.of_camera(camera)
+                    looking = camera
+                    looked_at = localization_map.of_camera(camera)
                     scorers = scorers_of(looked_at, config, weights)
                     reference_method(scorers, config.reference)  # an unknown one is told before the work
                 block = cam_from_world[rows]

@@ -9,12 +9,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.dataset.folders import SceneFolder
+from wheretolook.dataset.layout import SceneFolder
+from wheretolook.dataset.viewpoint_table import is_good, poses
 from wheretolook.evaluation.config import EvaluateConfig, candidates_label
 from wheretolook.evaluation.ranking import TestViews
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.utils.errors import TableError
-from wheretolook.viewpoints.table import is_good, poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,8 @@ def views_of(
         location_id.append(ids)
         location_scene.append(np.full(len(ids), number))
     viewpoint_id = np.concatenate([table["viewpoint_id"].to_numpy(np.int64) for table in tables])
-    scene_of, block_of = np.concatenate(location_scene), np.concatenate(location_block)
+    scene_of = np.concatenate(location_scene)
+    block_of = np.concatenate(location_block)
     views = TestViews(np.concatenate(location), viewpoint_id, np.concatenate(good), scene_of, block_of)
     return views, np.concatenate(location_id)
 
@@ -79,7 +80,8 @@ def candidate_sets(
             metres, degrees = config.thresholds[0]
             which = f" among the {candidates_label(best)} candidates of each location" if best else ""
             counted = f"of {len(labels)} viewpoints all or none are within {metres:g} m and {degrees:g} degrees"
-            problem, value = f"labels of one class only{which}: {counted}", bool(labels.any())
+            problem = f"labels of one class only{which}: {counted}"
+            value = bool(labels.any())
             fix = "Label more viewpoints, or give other evaluate.thresholds or evaluate.candidates."
             raise TableError(problem, path=scenes[0].table, value=value, fix=fix)
         kept = np.unique(views.location[mask])

@@ -45,19 +45,24 @@ def _detected(detector: Any, scores: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
     A maximum is moved by the mean of its window, weighted by the softmax of scores (ALIKED, Sec. III-C).
     """
-    radius, size = detector.radius, detector.kernel_size
+    radius = detector.radius
+    size = detector.kernel_size
     height, width = scores.shape[2:]
     largest = F.max_pool2d(scores, size, 1, radius)
     candidates = (scores == largest) & (scores > detector.scores_th)
     inside = candidates[:, 0, radius : height - radius, radius : width - radius]
     image, row, column = inside.nonzero().unbind(1)
-    row, column = row + radius, column + radius
+    row = row + radius
+    column = column + radius
     step = torch.arange(-radius, radius + 1, device=scores.device)
     window = (step[:, None] * width + step).flatten()
     middle = (image * height + row) * width + column
     around = scores.flatten()[middle[:, None] + window]
     strict = (around == around.amax(1, keepdim=True)).sum(1) == 1  # of two equal ones neither is a maximum
-    image, row, column, around = image[strict], row[strict], column[strict], around[strict]
+    image = image[strict]
+    row = row[strict]
+    column = column[strict]
+    around = around[strict]
     weights = ((around - around.amax(1, keepdim=True)) / detector.temperature).exp()
     offset = weights @ detector.hw_grid / weights.sum(1, keepdim=True)
     pixels = torch.stack([column, row], 1) + offset
@@ -68,7 +73,8 @@ def _bilinear(scores: Tensor, image: Tensor, pixels: Tensor) -> Tensor:
     """Values of maps (B, 1, H, W) at pixels (N, 2) of images (N,)."""
     _, _, height, width = scores.shape
     x, y = pixels.long().unbind(1)
-    x, y = x.clamp(0, width - 2), y.clamp(0, height - 2)
+    x = x.clamp(0, width - 2)
+    y = y.clamp(0, height - 2)
     right, down = (pixels - torch.stack([x, y], 1)).unbind(1)
     corner = (image * height + y) * width + x
     around = scores.flatten()[corner[:, None] + torch.tensor([0, 1, width, width + 1], device=scores.device)]
@@ -83,7 +89,8 @@ def _described(head: Any, features: Tensor, image: Tensor, pixels: Tensor, count
     with a matrix for each position (ALIKED, Sec. III-B, SDDH).
     """
     n_images, depth, height, width = features.shape
-    most, n = max(counts), len(image)
+    most = max(counts)
+    n = len(image)
     place = torch.cat([torch.arange(count, device=image.device) for count in counts])
     start = (pixels.long() - head.kernel_size / 2 + 1).long()
     limit = torch.tensor([width, height], device=image.device) - 1 - head.kernel_size

@@ -36,7 +36,8 @@ class LearnedExtraction(ABC):
     dimension: int
 
     def __init__(self, config: ExtractorSettings, device: str) -> None:
-        self.config, self.device = config, torch.device(device)
+        self.config = config
+        self.device = torch.device(device)
         # in a batch of 16 an image takes an H100 a sixth of the time that it takes alone; more gain nothing
         self.batch = 1 if self.device.type == "cpu" else 16
         self._network = self.make().eval().to(self.device)

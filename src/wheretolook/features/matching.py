@@ -91,8 +91,10 @@ def _byte_products_pay() -> bool:
     """
     if torch.backends.cpu.get_cpu_capability() == "AVX2":
         return False
-    left, right = torch.full((64, 128), 127), torch.full((128, 64), 127)
-    left[::2], right[:, ::2] = -128, -128
+    left = torch.full((64, 128), 127)
+    right = torch.full((128, 64), 127)
+    left[::2] = -128
+    right[:, ::2] = -128
     try:
         product = torch._int_mm(left.to(torch.int8), right.to(torch.int8))
     except RuntimeError:  # not supported at all

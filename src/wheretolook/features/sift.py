@@ -26,7 +26,8 @@ class OpenCvSift:
 
         # OpenCV divides its contrast threshold by the number of layers. Without the precise upscale, keypoints are
         # biased.
-        contrast, self.config = 3 * config.peak_threshold, config
+        contrast = 3 * config.peak_threshold
+        self.config = config
         self._sift = cv2.SIFT.create(0, 3, contrast, config.edge_threshold, 1.6, enable_precise_upscale=True)
 
     def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
@@ -56,7 +57,8 @@ class ColmapSift:
     def __init__(self, config: ExtractorSettings) -> None:
         import pycolmap
 
-        self.config, options = config, pycolmap.FeatureExtractionOptions()
+        self.config = config
+        options = pycolmap.FeatureExtractionOptions()
         options.num_threads = 1
         options.sift.first_octave = config.first_octave
         options.sift.max_num_features = config.max_keypoints

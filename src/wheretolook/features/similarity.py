@@ -46,7 +46,8 @@ class SimilarityMatcher:
     def _match(self, descriptors: Sequence[NDArray[np.float16]], min_similarity: float) -> list[Matches]:
         """Of images that go together. Their keypoints lie in rows as long as that of the image with most."""
         counts = np.array([len(of_image) for of_image in descriptors])
-        images, most = len(counts), counts.max()
+        images = len(counts)
+        most = counts.max()
         if most == 0 or self.n_landmarks == 0:
             return [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)) for _ in descriptors]
         padded = np.zeros((images, most, self._descriptors.shape[1]), np.float16)
@@ -64,7 +65,8 @@ class SimilarityMatcher:
             keypoint_of.append(product.argmax(1))
             value, row = product.max(2)
             better = value > best
-            best, rows = torch.where(better, value, best), torch.where(better, row + start, rows)
+            best = torch.where(better, value, best)
+            rows = torch.where(better, row + start, rows)
         mutual = torch.cat(keypoint_of, 1).gather(1, rows) == torch.arange(most, device=self.device)
         image, keypoint = (mutual & (best >= min_similarity) & ~missing[..., 0]).nonzero().unbind(1)
         found = torch.stack([image, keypoint, rows[image, keypoint]]).cpu().numpy()

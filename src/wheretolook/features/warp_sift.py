@@ -37,7 +37,9 @@ class WarpSift:
         limits: Any = scale_kernels.Limits()
         # OpenCV rounds the threshold of the extremum itself down to a whole grey value.
         limits.pre_contrast = math.floor(0.5 * config.peak_threshold * 255)
-        limits.contrast, limits.edge, self._limits = config.peak_threshold, config.edge_threshold, limits
+        limits.contrast = config.peak_threshold
+        limits.edge = config.edge_threshold
+        self._limits = limits
         self._space: ScaleSpace | None = None
         self._buffers: dict[str, Any] = {}
 
@@ -114,7 +116,8 @@ class WarpSift:
         self, space: ScaleSpace, places: Any, place: NDArray[np.intp], angle: NDArray[np.float32]
     ) -> NDArray[np.float32]:
         """RootSIFT (N, 128) at rows (N,) of `places`, for orientations (N,) in degrees."""
-        n, cells = len(place), kernels.CELLS * kernels.CELLS
+        n = len(place)
+        cells = kernels.CELLS * kernels.CELLS
         size = cells * kernels.CELL_BINS
         chosen = self._upload("chosen", place.astype(np.int32), wp.int32)
         turned = self._upload("turned", angle, wp.float32)
@@ -163,8 +166,12 @@ class ScaleSpace:
     """
 
     def __init__(self, rows: int, columns: int, n_images: int, first_octave: int, limits: Any, device: str) -> None:
-        self.rows, self.columns, self.n_images, self.device = rows, columns, n_images, device
-        self.first_octave, self.limits = first_octave, limits
+        self.rows = rows
+        self.columns = columns
+        self.n_images = n_images
+        self.device = device
+        self.first_octave = first_octave
+        self.limits = limits
         self.sizes = octave_sizes(rows, columns)
         starts = np.cumsum([0, *(LEVELS * r * c for r, c in self.sizes)])
         self.image_size = int(starts[-1])
@@ -206,7 +213,8 @@ class ScaleSpace:
             for octave in range(1 + self.first_octave, len(self.sizes)):
                 rows, columns = self.sizes[octave]
                 shape = self.filled, LAYERS, rows - 2 * BORDER, columns - 2 * BORDER
-                inputs, outputs = [self.pyramid, octave, self.limits], [self.number, self.keys]
+                inputs = [self.pyramid, octave, self.limits]
+                outputs = [self.number, self.keys]
                 wp.launch(scale_kernels.extrema_kernel, shape, inputs, outputs, device=self.device)
             number = int(self.number.numpy()[0])
             if number <= len(self.keys):
@@ -227,9 +235,12 @@ class ScaleSpace:
             found: Any = scale_kernels.Level()
             found.rows, found.columns = self.sizes[octave]
             if half_smooth:
-                found.values, found.image_size, found.start = self.half_smooth, 4 * self.rows * self.columns, 0
+                found.values = self.half_smooth
+                found.image_size = 4 * self.rows * self.columns
+                found.start = 0
             else:
-                found.values, found.image_size = self.pyramid.values, self.image_size
+                found.values = self.pyramid.values
+                found.image_size = self.image_size
                 found.start = self.starts[octave] + level * found.rows * found.columns
             return found
 

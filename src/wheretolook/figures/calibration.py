@@ -10,10 +10,11 @@ from matplotlib.style import context
 from wheretolook.evaluation.score_table import main_rows, methods_of
 from wheretolook.figures.config import Look
 from wheretolook.figures.style import GREY, INK, RC, new_figure
-from wheretolook.methods.method import MethodStyle
-from wheretolook.methods.styles import method_style
+from wheretolook.scorers.method import MethodStyle
+from wheretolook.scorers.styles import method_style
 
-_BEFORE, _AFTER = "before", "after"
+_BEFORE = "before"
+_AFTER = "after"
 
 
 def calibration_figure(table: pd.DataFrame) -> Figure:

@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 from matplotlib.ticker import MaxNLocator, NullLocator
 
+from wheretolook.dataset.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
 from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure, scene_label
-from wheretolook.labelling.report import POSITIVE, LabelSummary, threshold_sentence
-from wheretolook.viewpoints.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
+from wheretolook.localization.report import POSITIVE, LabelSummary, threshold_sentence
 
 SHADES = ("#08306b", "#86bcdc")
 """Colours of the finest and of the coarsest threshold, so that they can be told apart in greyscale."""
@@ -77,7 +77,8 @@ def _draw_scenes(axes: Axes, shares: pd.DataFrame) -> None:
 
 
 def _draw_errors(axes: Axes, errors: pd.DataFrame, row: Any) -> None:
-    low, high = errors["low"].to_numpy(), errors["high"].to_numpy()
+    low = errors["low"].to_numpy()
+    high = errors["high"].to_numpy()
     edges: Look = {"align": "edge", "edgecolor": INK, "linewidth": 0.5}
     below = np.zeros(len(errors))
     for column, (label, color) in _FOUND.items():

@@ -12,11 +12,11 @@ from matplotlib.style import context
 from numpy.typing import NDArray
 
 from wheretolook.figures.config import Look
-from wheretolook.figures.house_image import Dollhouse, draw_house
-from wheretolook.figures.inputs import frame
+from wheretolook.figures.dollhouse import Dollhouse, draw_house
 from wheretolook.figures.style import BLUE, INK, RC, VERMILION, new_figure
 from wheretolook.geometry.poses import Float
-from wheretolook.planning.turns import pan_tilt_angles
+from wheretolook.planning.camera_turns import pan_tilt_angles
+from wheretolook_paper.figures.inputs import frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,8 @@ def overview_figure(overview: Overview) -> Figure:
 def _draw_plan(axes: Axes, overview: Overview):  # type: ignore[no-untyped-def]
     plan = overview.plan
     draw_house(axes, plan, 0.2)
-    pixels, place = plan.pixels(overview.locations), plan.pixels(overview.place)
+    pixels = plan.pixels(overview.locations)
+    place = plan.pixels(overview.place)
     order = np.argsort(overview.share_good, kind="stable")
     look: Look = {"s": 46, "cmap": "cividis", "vmin": 0, "vmax": 1, "edgecolors": "white", "linewidths": 0.8}
     x, y = pixels[order].T
@@ -87,7 +88,8 @@ def _draw_plan(axes: Axes, overview: Overview):  # type: ignore[no-untyped-def]
     ring: Look = {"markersize": 14, "markerfacecolor": "none", "markeredgecolor": VERMILION, "markeredgewidth": 2.4}
     axes.plot(*place, "o", zorder=3, path_effects=[withStroke(linewidth=4.5, foreground="white")], **ring)
     low, high = plan.pixels(np.stack([overview.place, overview.place + np.array([1.0, 0.0, 0.0])]))
-    metre_px, (width, height) = float(high[0] - low[0]), (plan.rgb.shape[1], plan.rgb.shape[0])
+    metre_px = float(high[0] - low[0])
+    (width, height) = (plan.rgb.shape[1], plan.rgb.shape[0])
     axes.plot([width - metre_px, width], [height * 1.03] * 2, color=INK, linewidth=2, clip_on=False)
     axes.text(width - 1.1 * metre_px, height * 1.03, "1 m", ha="right", va="center")
     return points

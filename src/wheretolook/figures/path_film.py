@@ -10,17 +10,19 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 from numpy.typing import NDArray
 
+from wheretolook.figures.animation import Pixels, pixels_of
 from wheretolook.figures.config import Look
-from wheretolook.figures.moving import Pixels, pixels_of
 from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.geometry.poses import Float
-from wheretolook.methods.styles import method_style
-from wheretolook.planning.route_views import PathView
-from wheretolook.planning.sequences import lengths_along
+from wheretolook.planning.routes import PathView
+from wheretolook.planning.view_sequence import lengths_along
+from wheretolook.scorers.styles import method_style
 
-PATH, SEEN = "#CC3311", "#EE9900"
+PATH = "#CC3311"
+SEEN = "#EE9900"
 FRAME_MS = 125  # how long a view stands
-STILLS, ARROWS = 5, 12
+STILLS = 5
+ARROWS = 12
 
 
 def film_frames(views: Sequence[PathView], landmarks: Float) -> Iterator[Pixels]:
@@ -97,7 +99,8 @@ def _draw_map(
 ) -> None:
     positions = np.array([view.position for view in views])
     low, high = np.percentile(landmarks[:, :2], (1, 99), axis=0)
-    low, high = np.minimum(low, positions[:, :2].min(0)), np.maximum(high, positions[:, :2].max(0))
+    low = np.minimum(low, positions[:, :2].min(0))
+    high = np.maximum(high, positions[:, :2].max(0))
     axes.scatter(landmarks[:, 0], landmarks[:, 1], s=0.5, color="#9a9a9a", linewidths=0, rasterized=True)
     axes.plot(*positions[:, :2].T, color=PATH, linewidth=2.2, zorder=3)
     stops = positions[[view.look == 1 < view.n_looks for view in views], :2]

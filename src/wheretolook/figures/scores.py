@@ -13,12 +13,12 @@ from matplotlib.lines import Line2D
 from matplotlib.style import context
 from matplotlib.ticker import MaxNLocator
 
+from wheretolook.dataset.thresholds import ALL, threshold_label
 from wheretolook.evaluation.score_table import main_rows, methods_of, reference_of, threshold_keys
 from wheretolook.evaluation.scores import by_chance
 from wheretolook.figures.config import Look
 from wheretolook.figures.style import INK, RC, new_figure
-from wheretolook.methods.styles import ORACLE, method_group, method_style
-from wheretolook.viewpoints.thresholds import ALL, threshold_label
+from wheretolook.scorers.styles import ORACLE, method_group, method_style
 
 _MOST = {"Fisher": 3, "probes": 0}  # of a group's methods that a figure shows, the best ones; else all
 _WRAP = 36  # longer names of methods are broken into two lines
@@ -36,7 +36,8 @@ def score_figure(scores: pd.DataFrame) -> Figure:
     `scores` is a table of `wheretolook.evaluation.scores.score_table`; its rows over all scenes are drawn, those of the
     first occlusion model and the first set of candidates if there are several.
     """
-    pooled, keys = _pooled(scores), threshold_keys(scores)
+    pooled = _pooled(scores)
+    keys = threshold_keys(scores)
     shown = methods_to_show(pooled, keys[0])
     columns = {f"normalized_{key}": f"within {threshold_label(key)}" for key in dict.fromkeys((keys[0], keys[-1]))}
     lowest = _ends_of(pooled, _near(pooled, shown, keys[0]), list(columns))[0]
@@ -61,10 +62,12 @@ def regret_figure(scores: pd.DataFrame) -> Figure:
     table has one, with bootstrap intervals, in percentage points of the chosen views. Raises ValueError if the table is
     of an older version, without regret.
     """
-    pooled, key = _pooled(scores), threshold_keys(scores)[0]
+    pooled = _pooled(scores)
+    key = threshold_keys(scores)[0]
     if f"regret_{key}" not in scores:
         raise ValueError("the score table has no regret: evaluate again")
-    shown, reference = methods_to_show(pooled, key), reference_of(pooled)
+    shown = methods_to_show(pooled, key)
+    reference = reference_of(pooled)
     columns = {f"regret_{key}": "regret: oracle minus method\n(lower is better)"}
     if reference:
         columns[f"difference_{key}"] = f"method minus {method_style(reference).label}\n(higher is better)"
@@ -72,7 +75,8 @@ def regret_figure(scores: pd.DataFrame) -> Figure:
         figure, panels = _rows_and_panels(pooled, shown, columns)
         for axes, column in zip(panels, columns, strict=True):
             low, high = _ends_of(pooled, _near(pooled, shown, key), [column])
-            low, high = min(low, 0.0), max(high, 0.0)
+            low = min(low, 0.0)
+            high = max(high, 0.0)
             margin = 0.06 * max(high - low, 1.0)
             axes.set_xlim(low - margin, high + margin)
             axes.axvline(0, color=INK, linewidth=1, linestyle="--", zorder=1)
@@ -92,7 +96,8 @@ def methods_to_show(pooled: pd.DataFrame, key: str) -> list[str]:
     rows = pooled[(pooled["top_n"] == pooled["top_n"].iloc[0]) & (pooled["method"] != ORACLE)]
     shares = rows.set_index("method")[f"normalized_{key}"].fillna(0.0)
     ordered = sorted(methods_of(rows), key=lambda method: -shares[method])
-    shown, seen = [], dict.fromkeys(_MOST, 0)
+    shown = []
+    seen = dict.fromkeys(_MOST, 0)
     for method in ordered:
         group = method_group(method)
         seen[group] = seen.get(group, 0) + 1
@@ -156,7 +161,8 @@ def _rows_and_panels(pooled: pd.DataFrame, shown: Sequence[str], columns: dict[s
         axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
         axes.grid(axis="y", visible=False)
         for y, method in enumerate(shown):
-            style, (value, low, high) = method_style(method), _interval(rows.loc[method], column)
+            style = method_style(method)
+            (value, low, high) = _interval(rows.loc[method], column)
             axes.hlines(y, low, high, color=style.color, linewidth=1.6)
             filled = style.marker in Line2D.filled_markers
             edge: Look = {"markeredgecolor": INK if filled else style.color, "markeredgewidth": 0.5 if filled else 1.6}

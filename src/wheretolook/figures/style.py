@@ -15,13 +15,21 @@ from wheretolook.figures.config import KINDS
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import write_bytes
 
-ONE_COLUMN_IN, TWO_COLUMNS_IN = 3.5, 7.2
+ONE_COLUMN_IN = 3.5
+TWO_COLUMNS_IN = 7.2
 """Widths of figures for one and for two columns of a paper, inches. Their letters are as large as they will be in
 print: `PRINT`. Figures for the screen are wider, with the letters of `RC`."""
 
-INK, GREY, GRID = "#333333", "#7a7a7a", "#d9d9d9"
+INK = "#333333"
+GREY = "#7a7a7a"
+GRID = "#d9d9d9"
 
-BLUE, SKY, GREEN, ORANGE, VERMILION, PURPLE = "#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7"
+BLUE = "#0072B2"
+SKY = "#56B4E9"
+GREEN = "#009E73"
+ORANGE = "#E69F00"
+VERMILION = "#D55E00"
+PURPLE = "#CC79A7"
 """The colours of Okabe and Ito (2008), which colour-blind people can tell apart."""
 
 _INKED = ("axes.edgecolor", "axes.labelcolor", "text.color", "xtick.color", "ytick.color")

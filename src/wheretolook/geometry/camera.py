@@ -291,7 +291,8 @@ def camera_of_record(record: Mapping[str, Any]) -> Camera:
     """The camera of a `record` read from a file. Raises ConfigError, KeyError, TypeError, ValueError if it is none."""
     if "model" in record:
         try:
-            width, height = int(record["width"]), int(record["height"])
+            width = int(record["width"])
+            height = int(record["height"])
         except OverflowError as error:
             raise ValueError(f"no size of an image: {error}") from error
         return camera_of(str(record["model"]), width, height, record["params"])
@@ -361,14 +362,16 @@ def describe_camera(camera: Camera) -> str:
 
 def field_of_view_deg(camera: Camera) -> tuple[float, float]:
     """Angles between the rays through the middles of the image's left and right, and of its upper and lower side."""
-    w, h = camera.width, camera.height
+    w = camera.width
+    h = camera.height
     ends = np.array([[0, h / 2], [w, h / 2], [w / 2, 0], [w / 2, h]])
     middle = camera.unproject([w / 2, h / 2])
     angles = np.degrees(np.arccos(np.clip(camera.unproject(ends) @ middle, -1, 1)))
     return float(angles[0] + angles[1]), float(angles[2] + angles[3])
 
 
-ACROSS_DEG, WIDTHS_PX = (40.0, 120.0), (320, 1280)
+ACROSS_DEG = (40.0, 120.0)
+WIDTHS_PX = (320, 1280)
 PROPORTIONS = ((4, 3), (3, 2), (16, 9), (1, 1), (3, 4), (2, 3), (9, 16))
 OFF_CENTER = 0.05
 
@@ -378,7 +381,8 @@ def draw_camera(rng: np.random.Generator) -> PinholeCamera:
 
     Sides are 4:3, 3:2, 16:9 or 1:1, also upright; the principal point is off the centre by up to 5 % of a side.
     """
-    longer, (a, b) = np.exp(rng.uniform(*np.log(WIDTHS_PX))), PROPORTIONS[rng.integers(len(PROPORTIONS))]
+    longer = np.exp(rng.uniform(*np.log(WIDTHS_PX)))
+    (a, b) = PROPORTIONS[rng.integers(len(PROPORTIONS))]
     width, height = (2 * round(longer * side / max(a, b) / 2) for side in (a, b))
     across = rng.uniform(*ACROSS_DEG)
     focal_px = round(max(width, height) / 2 / np.tan(np.radians(across) / 2), 2)

@@ -35,7 +35,8 @@ class VoxelGrid:
     def __post_init__(self) -> None:
         if min(self.shape) < 1:
             raise ConfigError("a grid needs at least one voxel along every axis", value=self.shape)
-        lower, upper = np.asarray(self.lower, dtype=np.float64), np.asarray(self.upper, dtype=np.float64)
+        lower = np.asarray(self.lower, dtype=np.float64)
+        upper = np.asarray(self.upper, dtype=np.float64)
         if not (np.isfinite(lower).all() and np.isfinite(upper).all() and (lower < upper).all()):
             raise ConfigError("grid bounds must be finite and lower < upper", value=(self.lower, self.upper))
 
@@ -71,10 +72,12 @@ class VoxelGrid:
 
 def check_voxels(shape: tuple[int, int, int]) -> None:
     """Raise ConfigError, which names a grid that would fit, if memory does not hold the locations of this one."""
-    voxels, most = math.prod(shape), min(fitting(BYTES_PER_VOXEL), MOST_VOXELS)
+    voxels = math.prod(shape)
+    most = min(fitting(BYTES_PER_VOXEL), MOST_VOXELS)
     if voxels <= most:
         return
-    fits, shrunk = list(shape), sorted(range(3), key=lambda axis: shape[axis])
+    fits = list(shape)
+    shrunk = sorted(range(3), key=lambda axis: shape[axis])
     for left, axis in zip((3, 2, 1), shrunk, strict=True):  # short sides stay as they are
         others = math.prod(fits[other] for other in shrunk[: 3 - left])
         fits[axis] = max(1, min(fits[axis], math.floor((most / others) ** (1 / left))))
@@ -130,7 +133,8 @@ def fibonacci_sphere(n: int) -> Float:
     """
     index = np.arange(_positive(n))
     z = 1 - (2 * index + 1) / n
-    radius, azimuth = np.sqrt(1 - z * z), GOLDEN_ANGLE * index
+    radius = np.sqrt(1 - z * z)
+    azimuth = GOLDEN_ANGLE * index
     return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1)
 
 
@@ -142,7 +146,8 @@ def azimuth_elevation_lattice(n: int) -> Float:
     """
     rows = max(1, round(np.sqrt(_positive(n) / 2)))
     columns = max(1, round(n / rows))
-    polars, azimuths = (np.arange(rows) + 0.5) * np.pi / rows, np.arange(columns) * 2 * np.pi / columns
+    polars = (np.arange(rows) + 0.5) * np.pi / rows
+    azimuths = np.arange(columns) * 2 * np.pi / columns
     polar, azimuth = (angle.ravel() for angle in np.meshgrid(polars, azimuths, indexing="ij"))
     return np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
 
@@ -153,7 +158,8 @@ def released_lattice(n: int) -> Float:
     R = Rz(azimuth) Rx(elevation), azimuth = arccos(1 - 2 (i + 0.5) / n), elevation = (i + 0.5) * pi * (1 + sqrt 5).
     """
     index = np.arange(_positive(n)) + 0.5
-    azimuth, elevation = np.arccos(1 - 2 * index / n), GOLDEN_ANGLE * index
+    azimuth = np.arccos(1 - 2 * index / n)
+    elevation = GOLDEN_ANGLE * index
     sine = np.sin(elevation)
     return np.stack([np.sin(azimuth) * sine, -np.cos(azimuth) * sine, np.cos(elevation)], axis=-1)
 

@@ -105,7 +105,8 @@ def pose_error(cam_from_world_a: ArrayLike, cam_from_world_b: ArrayLike) -> tupl
 
     The error measure of the Long-Term Visual Localization benchmark (Sattler et al., CVPR 2018), which the paper uses.
     """
-    a, b = np.asarray(cam_from_world_a, dtype=np.float64), np.asarray(cam_from_world_b, dtype=np.float64)
+    a = np.asarray(cam_from_world_a, dtype=np.float64)
+    b = np.asarray(cam_from_world_b, dtype=np.float64)
     error_m = np.linalg.norm(camera_centers(a) - camera_centers(b), axis=-1)
     return error_m, rotation_angle_deg(a[..., :3], b[..., :3])
 

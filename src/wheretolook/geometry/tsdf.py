@@ -27,7 +27,8 @@ _COLOR_BYTES_PER_BLOCK = 12 * 1024  # and with colours so much more
 MAX_BLOCKS = 1 << 20  # more are refused: Open3D's extraction of triangles numbers four entries of each voxel by 32 bits
 
 _TOUCH_STRIDE = 4  # Open3D looks for blocks at every fourth pixel
-_SURVEY_IMAGES, _SURVEY_PIXELS = 100, 5000  # images, and pixels of each, from which the memory is estimated
+_SURVEY_IMAGES = 100  # images, and pixels of each, from which the memory is estimated
+_SURVEY_PIXELS = 5000
 _SURVEY_CELL_M = 0.16  # those pixels are too far apart to count smaller blocks
 _BLOCKS_PER_CELL = 1.7  # a block is also touched by a surface that passes beside it: measured, 1.3 to 1.7
 _OUTWARD_VOXELS = 0.1  # averaging views at a slant rounds edges off by about this much
@@ -82,7 +83,8 @@ class DepthImage:
 
     def __post_init__(self) -> None:
         _ = self.camera.matrix  # raises if the camera has distortion
-        height, width = self.camera.height, self.camera.width
+        height = self.camera.height
+        width = self.camera.width
         if np.shape(self.depth_m) != (height, width):
             problem = f"the camera has {height} x {width} pixels (height x width), the depth image another size"
             fix = "Give the camera of the depth image, or scale one of them."
@@ -136,9 +138,12 @@ class TsdfVolume:
     ) -> None:
         import open3d as o3d
 
-        self.config, self.origin = config or TsdfConfig(), np.asarray(origin, dtype=np.float64)
-        self.colored, self._limit = colored, self.config.memory_limit_bytes or fitting(1)
-        names, sizes = ("tsdf", "weight", "color"), (1, 1, 3)
+        self.config = config or TsdfConfig()
+        self.origin = np.asarray(origin, dtype=np.float64)
+        self.colored = colored
+        self._limit = self.config.memory_limit_bytes or fitting(1)
+        names = ("tsdf", "weight", "color")
+        sizes = (1, 1, 3)
         n = 3 if colored else 2
         layout = names[:n], (o3d.core.float32,) * n, [o3d.core.SizeVector([size]) for size in sizes[:n]]
         size_m = self.config.voxel_size_m
@@ -181,7 +186,8 @@ class TsdfVolume:
         pose = np.vstack([poses_from(image.cam_from_world, self.origin), (0, 0, 0, 1)])
         tensor: Any = core.Tensor
         limits = 1.0, float(self.config.max_depth_m), float(self.config.truncation_voxels)
-        shown, from_where = Image(tensor(np.ascontiguousarray(depth))), (tensor(image.camera.matrix), tensor(pose))
+        shown = Image(tensor(np.ascontiguousarray(depth)))
+        from_where = (tensor(image.camera.matrix), tensor(pose))
         blocks = self._grid.compute_unique_block_coordinates(shown, *from_where, *limits)
         if self.colored:
             assert image.rgb is not None
@@ -217,7 +223,8 @@ class TsdfVolume:
             raise nothing
         triangles = mesh.triangle.indices.numpy().astype(np.int32)
         uvs = np.broadcast_to(np.float32(0), (len(triangles), 3, 2))  # takes no memory
-        texture, white = np.broadcast_to(np.int32(0), (len(triangles),)), (np.full((1, 1, 3), 255, np.uint8),)
+        texture = np.broadcast_to(np.int32(0), (len(triangles),))
+        white = (np.full((1, 1, 3), 255, np.uint8),)
         colors = None
         if self.colored:
             colors = np.clip(np.rint(255 * mesh.vertex.colors.numpy()), 0, 255).astype(np.uint8)
@@ -227,7 +234,8 @@ class TsdfVolume:
 def estimate_blocks(images: Sequence[DepthImage], config: TsdfConfig) -> int:
     """Blocks of voxels that the images' surfaces will touch, from some pixels of up to 100; SceneError without any."""
     cell_m = max(config.block_m, _SURVEY_CELL_M)
-    cells, origin = np.empty(0, dtype=np.int64), _origin_of(images) if len(images) else np.zeros(3)
+    cells = np.empty(0, dtype=np.int64)
+    origin = _origin_of(images) if len(images) else np.zeros(3)
     number = np.array([1, 1 << 21, 1 << 42])  # one number a cell sorts faster than three
     for i in np.unique(np.linspace(0, len(images) - 1, _SURVEY_IMAGES).astype(int)) if len(images) else ():
         image = images[i]

@@ -95,7 +95,8 @@ def bin_views(
         return bin_views_plain(posed, bins, landmarks)
     device = start_warp(device)
     channels = CHANNELS if landmarks is None else ALL_CHANNELS
-    n_views, n_channels = len(posed.cam_from_world), len(channels)
+    n_views = len(posed.cam_from_world)
+    n_channels = len(channels)
     means = np.empty((n_views, n_channels, bins, bins), dtype=np.float32)
     counts = np.empty((n_views, bins, bins), dtype=np.int32)
     directions: Any = wp.empty(0, dtype=wp.vec3, device=device)
@@ -137,23 +138,30 @@ def count_bins(
 
 def _blocks(posed: PosedViews, bins: int, device: str, block: int) -> Iterator[tuple[slice, Any, Any]]:
     """Up to `block` views at a time: which of the views, and `Views` and `BinGrid` of them on the device."""
-    camera, poses = posed.camera, np.asarray(posed.cam_from_world)
+    camera = posed.camera
+    poses = np.asarray(posed.cam_from_world)
     assert isinstance(camera, PinholeCamera)
-    landmarks, sets = frustum.points_on_device(posed.points, device), frustum.sets_on_device(posed.unoccluded, device)
+    landmarks = frustum.points_on_device(posed.points, device)
+    sets = frustum.sets_on_device(posed.unoccluded, device)
     for begin in range(0, len(poses), block):
         rows = slice(begin, min(begin + block, len(poses)))
         grid: Any = BinGrid()
         grid.rotations = wp.array(poses[rows, :, :3].astype(np.float32), dtype=wp.mat33, device=device)
-        grid.focal, grid.center, grid.bins = wp.vec2d(camera.fx, camera.fy), wp.vec2d(camera.cx, camera.cy), bins
-        grid.columns_per_pixel, grid.rows_per_pixel = bins / camera.width, bins / camera.height
+        grid.focal = wp.vec2d(camera.fx, camera.fy)
+        grid.center = wp.vec2d(camera.cx, camera.cy)
+        grid.bins = bins
+        grid.columns_per_pixel = bins / camera.width
+        grid.rows_per_pixel = bins / camera.height
         yield rows, frustum.views_on_device(posed, rows, landmarks, sets, device), grid
 
 
 def bin_views_plain(posed: PosedViews, bins: int = 30, landmarks: Landmarks | None = None) -> BinnedViews:
     """What `bin_views` computes, in NumPy."""
-    camera, channels = posed.camera, CHANNELS if landmarks is None else ALL_CHANNELS
+    camera = posed.camera
+    channels = CHANNELS if landmarks is None else ALL_CHANNELS
     attributes = None if landmarks is None else landmarks.attributes()
-    n_views, n_cells = len(posed.cam_from_world), bins * bins
+    n_views = len(posed.cam_from_world)
+    n_cells = bins * bins
     means = np.zeros((n_views, len(channels), n_cells), dtype=np.float32)
     counts = np.zeros((n_views, n_cells), dtype=np.int32)
     rows = zip(*split_poses(posed.cam_from_world), posed.location_rows, strict=True)
@@ -161,7 +169,8 @@ def bin_views_plain(posed: PosedViews, bins: int = 30, landmarks: Landmarks | No
         candidates = posed.unoccluded[int(location)]
         offsets = frustum.offsets_from(center, posed.points[candidates])
         seen = frustum.in_view(camera, rotation[None], offsets)[0]
-        offsets, seen_rows = offsets[seen], candidates[seen]
+        offsets = offsets[seen]
+        seen_rows = candidates[seen]
         points_cam = frustum.rotate(rotation.astype(np.float32), offsets)
         pixels = frustum.pixels_of(camera, points_cam)
         scale = np.array([bins / camera.width, bins / camera.height])
@@ -203,7 +212,8 @@ class InputStatistics:
         """
         rows = rows.to(means.device)
         total = torch.zeros(len(channels), dtype=torch.float64, device=means.device)
-        n_filled, unknown = torch.zeros_like(total), torch.zeros_like(total)
+        n_filled = torch.zeros_like(total)
+        unknown = torch.zeros_like(total)
         for block in rows.split(STATISTICS_BLOCK):  # empty bins are zero: they add nothing to the sum
             values = means[block]
             n_filled += filled[block].sum()

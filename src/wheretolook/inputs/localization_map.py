@@ -15,7 +15,7 @@ from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.opened_map import open_colmap
-from wheretolook.mapping.plausibility import warn_of_mesh
+from wheretolook.mapping.sanity import warn_of_mesh
 from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility import frustum
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews, landmarks_in_view
@@ -142,7 +142,8 @@ class LocalizationMap:
         return frustum.points_on_device(self.landmarks.points, self.device)
 
     def _views(self, cam_from_world: Float) -> PosedViews:
-        poses, points = check_poses(cam_from_world), self.landmarks.points
+        poses = check_poses(cam_from_world)
+        points = self.landmarks.points
         locations, rows = shared_locations(poses)
         unoccluded = LandmarkSets.from_mask(self.occlusion.unoccluded(locations, points))
         return PosedViews(self.camera, poses, points, unoccluded, rows)

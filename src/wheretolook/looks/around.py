@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.poses import Float
-from wheretolook.looks.choice import TOLERANCE_DEG, ChosenLooks, Turns, Worth, choose_looks
-from wheretolook.looks.union import seen_around
-from wheretolook.looks.worth import SetWorth
+from wheretolook.looks.joint_visibility import seen_around
+from wheretolook.looks.selection import TOLERANCE_DEG, ChosenLooks, Turns, Worth, choose_looks
+from wheretolook.looks.set_score import SetWorth
 from wheretolook.utils.errors import ConfigError
 
 if TYPE_CHECKING:
-    from wheretolook.methods.base import Scorer
+    from wheretolook.scorers.base import Scorer
 
 CANDIDATES = 24
 """Directions of which a set is chosen: those with the best scores of their own that lie apart."""
@@ -61,7 +61,8 @@ def candidates(
         # a camera that does not roll turns at least by the angle of its axis
         order = order[directions[order] @ axis / np.linalg.norm(axis) >= _cosine(max_turn_deg)]
     taken: list[int] = []
-    free, near = np.ones(len(directions), dtype=bool), np.cos(np.radians(APART_DEG))
+    free = np.ones(len(directions), dtype=bool)
+    near = np.cos(np.radians(APART_DEG))
     for row in order:
         if free[row]:
             taken.append(int(row))

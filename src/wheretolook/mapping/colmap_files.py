@@ -106,7 +106,8 @@ def check_text_count(path: Path, found: int) -> None:
 
 def point_starts(data: bytes) -> NDArray[np.int64]:
     """Offsets of the points in the content of a points3D.bin, and where the last one ends; -1 if its end is missing."""
-    count, end = _TRACK_LENGTH.unpack_from(data)[0], 8
+    count = _TRACK_LENGTH.unpack_from(data)[0]
+    end = 8
     starts: list[int] = []
     for _ in range(count):
         if end + POINT.itemsize > len(data):
@@ -137,7 +138,9 @@ class _Bytes:
     """A file's content, read from its beginning on. MapError where it ends too early."""
 
     def __init__(self, data: bytes, path: Path) -> None:
-        self.data, self.path, self.at = data, path, 0
+        self.data = data
+        self.path = path
+        self.at = 0
 
     def take(self, layout: Struct) -> tuple[Any, ...]:
         begin = self.skip(layout.size)
@@ -161,7 +164,8 @@ class _Bytes:
         try:
             self.data[self.at : end].decode()
         except UnicodeDecodeError as error:
-            value, fix = self.data[self.at : end][:100], "Write names in UTF-8."
+            value = self.data[self.at : end][:100]
+            fix = "Write names in UTF-8."
             raise MapError("the name of an image is not text", path=self.path, value=value, fix=fix) from error
         self.at = end + 1
 
@@ -174,9 +178,16 @@ class _Bytes:
         raise MapError("the file is truncated or corrupt", path=self.path, value=size, fix=REBUILD)
 
 
-_COUNT, _CAMERA, _POSE = Struct("<Q"), Struct("<IiQQ"), Struct("<7d")
-_IMAGE, _RIG, _SENSOR, _FRAME, _DATA = Struct("<I7dI"), Struct("<II"), Struct("<iI"), Struct("<II"), Struct("<iIQ")
-_N, _HAS_POSE = Struct("<I"), Struct("<B")
+_COUNT = Struct("<Q")
+_CAMERA = Struct("<IiQQ")
+_POSE = Struct("<7d")
+_IMAGE = Struct("<I7dI")
+_RIG = Struct("<II")
+_SENSOR = Struct("<iI")
+_FRAME = Struct("<II")
+_DATA = Struct("<iIQ")
+_N = Struct("<I")
+_HAS_POSE = Struct("<B")
 _IS_CAMERA = 0  # COLMAP's number of this kind of sensor
 
 
@@ -223,7 +234,8 @@ def _points(file: _Bytes, found: _Found) -> None:
     wrong = ~(np.abs(heads["xyz"]) <= _MAX_COORDINATE).all(axis=1)
     if wrong.any():
         first = heads[np.flatnonzero(wrong)[0]]
-        problem, fix = f"point {first['id']} is NaN, infinite or too far away", "Leave such points out of the model."
+        problem = f"point {first['id']} is NaN, infinite or too far away"
+        fix = "Leave such points out of the model."
         raise MapError(problem, path=file.path, value=first["xyz"].tolist(), fix=fix)
 
 
@@ -348,7 +360,10 @@ def _numbers(texts: list[str], n: int) -> list[float]:
 
 
 def _camera_line(path: Path, words: list[str]) -> None:
-    number, model, width, height = int(words[0]), words[1], _whole(words[2]), _whole(words[3])
+    number = int(words[0])
+    model = words[1]
+    width = _whole(words[2])
+    height = _whole(words[3])
     if model not in _models().values():
         raise MapError(f"camera {number} is of no known model", path=path, value=model, fix=REBUILD)
     _check_camera(path, number, model, width, height, tuple(_numbers(words[4:], len(words) - 4)))
@@ -360,7 +375,8 @@ def _image_line(path: Path, words: list[str]) -> None:
 
 
 def _rig_line(path: Path, words: list[str]) -> None:
-    rig, n_sensors = _whole(words[0]), _whole(words[1])
+    rig = _whole(words[0])
+    n_sensors = _whole(words[1])
     at = 2
     for index in range(n_sensors):
         sensor = f"{_SENSORS[_SENSORS.index(words[at])]} {_whole(words[at + 1])}"
@@ -374,7 +390,8 @@ def _rig_line(path: Path, words: list[str]) -> None:
 
 
 def _frame_line(path: Path, words: list[str]) -> None:
-    frame, _ = _whole(words[0]), _whole(words[1])
+    frame = _whole(words[0])
+    _ = _whole(words[1])
     _check_pose(path, f"frame {frame}", _numbers(words[2:], 7))
     for index in range(_whole(words[9])):
         _SENSORS.index(words[10 + 3 * index])

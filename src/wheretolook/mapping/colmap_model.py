@@ -74,7 +74,8 @@ def read_model(model_dir: str | Path) -> Any:
     Raises MapError if the folder or a file is missing, truncated or corrupt, or holds a camera, pose or point that is
     not finite or that no model can have; it names the file.
     """
-    folder, suffix = Path(model_dir), model_suffix(model_dir)
+    folder = Path(model_dir)
+    suffix = model_suffix(model_dir)
     import pycolmap
 
     n_bytes = sum((folder / (name + suffix)).stat().st_size for name in MODEL_FILES)
@@ -197,7 +198,8 @@ def compact_poses(cam_from_world: Float) -> Float:
 
 def load_mapping_poses(path: str | Path) -> Float:
     """Read what `save_mapping_poses` wrote, (M, 3, 4). MapError if the file is missing, damaged or another."""
-    path, fix = Path(path), "Run the map stage again, or remove it to read the COLMAP model beside it instead."
+    path = Path(path)
+    fix = "Run the map stage again, or remove it to read the COLMAP model beside it instead."
     if not path.is_file():
         raise MapError("there is no file of the mapping images' poses", path=path, fix="Run the map stage again.")
     try:
@@ -234,8 +236,10 @@ def _stored_points(reconstruction: Any) -> _StoredPoints:
     if starts[-1] < 0:  # pycolmap does not notice a full disk
         path = folder / "points3D.bin"
         raise StorageError("cannot be written whole: is the disk full?", path=path, fix=MAKE_ROOM)
-    heads, elements = point_heads(data, starts), track_elements(data, starts).astype(np.int64)
-    lengths, order = heads["n"].astype(np.int64), np.argsort(heads["id"])
+    heads = point_heads(data, starts)
+    elements = track_elements(data, starts).astype(np.int64)
+    lengths = heads["n"].astype(np.int64)
+    order = np.argsort(heads["id"])
     ends = np.cumsum(lengths)
     rows = np.repeat((ends - lengths)[order] - np.cumsum(lengths[order]) + lengths[order], lengths[order])
     elements = elements[rows + np.arange(len(rows))]

@@ -115,7 +115,8 @@ class ScaleConfig:
         if not 0 <= self.marker_size_m < inf:
             raise ConfigError("marker_size_m must not be negative", value=self.marker_size_m)
         if self.marker_size_m > 0 and self.marker_table is not None:
-            sizes, fix = (self.marker_size_m, str(self.marker_table)), "Give marker_size_m or marker_table."
+            sizes = (self.marker_size_m, str(self.marker_table))
+            fix = "Give marker_size_m or marker_table."
             raise ConfigError("markers have one size, or a table of sizes", value=sizes, fix=fix)
         if self.has_marker_sizes + (self.distance is not None) + (self.positions is not None) > 1:
             value = "markers, a distance, positions: more than one was given"

@@ -49,7 +49,8 @@ def find_scale(
     `upright` is the latter but for the scale; positions overrule it. Markers are looked for in the folder of its
     photographs, read as `read_photograph` does. Raises MapError or ConfigError if the scale asked for cannot be found.
     """
-    names, config = registered_names(model), known.config
+    names = registered_names(model)
+    config = known.config
     centers = {name: model.images[number].projection_center() for number, name in names.items()}
     if known.positions:
         return scales.scale_from_positions(centers, known.positions, config.tolerance_percent)
@@ -90,7 +91,8 @@ def _marker_views(
 
 def _place(views: Mapping[int, list[MarkerView]]) -> tuple[list[Marker], dict[str, str]]:
     """Markers placed, and why others could not be placed: a false detection in one photograph must not stop the map."""
-    markers, unused = [], {}
+    markers = []
+    unused = {}
     for marker, seen in views.items():
         try:
             markers.append(place_marker(marker, seen))

@@ -17,7 +17,7 @@ from wheretolook.features.sift import SIFT
 from wheretolook.geometry.local_origin import local_origin
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, read_model
-from wheretolook.mapping.descriptors import read_descriptors
+from wheretolook.mapping.feature_files import read_descriptors
 from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.npz_files import load_npz, save_npz
 
@@ -101,7 +101,8 @@ class Landmarks:
     @classmethod
     def load(cls, path: str | Path) -> Landmarks:
         """Read what `save` wrote, compact or not. MapError if the file is missing, truncated, or not of landmarks."""
-        path, fix = Path(path), "Run the map stage again."
+        path = Path(path)
+        fix = "Run the map stage again."
         if not path.is_file():
             raise MapError("there is no file of landmarks", path=path, fix=fix)
         try:
@@ -200,21 +201,25 @@ def load_colmap_landmarks(
         raise MapError("some points are not finite", path=model_dir, fix="Triangulate the model again.")
     _tell_left_out(observed, len(keep), worst_px, model_dir)
     model = _select_points(model, keep)
-    described_by, descriptors, ambiguity = None, None, np.full(len(keep), np.nan, dtype=np.float32)
+    described_by = None
+    descriptors = None
+    ambiguity = np.full(len(keep), np.nan, dtype=np.float32)
     observations = None if database is None else read_descriptors(database, model_dir, reconstruction, model)
     if observations is not None:
         kind, of_observations = observations
         descriptors = _mean_descriptors(model, of_observations, kind)
         ambiguity = nearest_other_cosine(descriptors, device, progress)
         described_by = None if kind is SIFT else kind.name
-    track_length, errors_px = np.diff(model.observation_start).astype(np.int32), model.errors_px.astype(np.float32)
+    track_length = np.diff(model.observation_start).astype(np.int32)
+    errors_px = model.errors_px.astype(np.float32)
     attributes: Any = {**_viewing_geometry(model), "descriptors": descriptors, "ambiguity": ambiguity}
     attributes["described_by"] = described_by
     return Landmarks(model.point_ids, model.points, track_length, errors_px, **attributes)
 
 
 def _tell_left_out(observed: NDArray[np.bool_], n_kept: int, worst_px: float, model_dir: str | Path) -> None:
-    n_unobserved, n_inaccurate = int((~observed).sum()), int(observed.sum()) - n_kept
+    n_unobserved = int((~observed).sum())
+    n_inaccurate = int(observed.sum()) - n_kept
     if not n_unobserved + n_inaccurate:
         return
     reasons = [f"{n_inaccurate:,} with a mean reprojection error of more than {worst_px:g} px"] if n_inaccurate else []
@@ -230,7 +235,8 @@ def nearest_other_cosine(descriptors: NDArray[Any], device: str = "cpu", progres
     """
     import torch  # takes seconds to load, and most maps are read without it
 
-    n, threads = len(descriptors), torch.get_num_threads()
+    n = len(descriptors)
+    threads = torch.get_num_threads()
     values = torch.as_tensor(descriptors, dtype=torch.float32, device=device)
     lengths = torch.as_tensor(np.linalg.norm(descriptors.astype(np.float64), axis=1), device=device)
     inverse = 1 / torch.where(lengths > 0, lengths, 1).float()
@@ -240,7 +246,8 @@ def nearest_other_cosine(descriptors: NDArray[Any], device: str = "cpu", progres
         tiles = tqdm(range(0, n, _TILE), "landmarks: ambiguity", delay=_SILENT_S, unit="block", disable=not progress)
         for i in tiles:
             for j in range(i, n, _TILE):  # each pair of tiles once: its product serves rows and columns
-                rows, columns = slice(i, min(i + _TILE, n)), slice(j, min(j + _TILE, n))
+                rows = slice(i, min(i + _TILE, n))
+                columns = slice(j, min(j + _TILE, n))
                 cosine = values[rows] @ values[columns].T
                 cosine *= inverse[rows, None] * inverse[columns]
                 if i == j:
@@ -262,7 +269,8 @@ def _select_points(model: ModelArrays, keep: NDArray[np.int64]) -> ModelArrays:
 
 
 def _viewing_geometry(model: ModelArrays) -> dict[str, NDArray[np.float32]]:
-    start, lengths = model.observation_start, np.diff(model.observation_start)
+    start = model.observation_start
+    lengths = np.diff(model.observation_start)
     rays = np.repeat(model.points, lengths, axis=0) - model.image_centers[model.observation_image]
     distance = np.linalg.norm(rays, axis=1)
     rays /= np.maximum(distance, 1e-12)[:, None]

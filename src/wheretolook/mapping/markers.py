@@ -27,7 +27,8 @@ _STEPS_PER_PX = 4  # samples of a profile
 
 # A marker is refused if the root mean square reprojection error of its corners exceeds both this many pixels and this
 # share of the photographs' longer side. That of a marker that was moved, or printed twice, is tens of pixels.
-MAX_ERROR_PX, MAX_ERROR_SHARE = 4.0, 1 / 400
+MAX_ERROR_PX = 4.0
+MAX_ERROR_SHARE = 1 / 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +88,8 @@ def place_marker(marker_id: int, views: Sequence[MarkerView]) -> Marker:
     """
     from scipy.optimize import least_squares
 
-    images, again = tuple(view.image for view in views), "Take another photograph of it from another place."
+    images = tuple(view.image for view in views)
+    again = "Take another photograph of it from another place."
     if len(views) < 2:
         problem = f"marker {marker_id} is seen in one photograph only, which says nothing of its distance"
         raise MapError(problem, value=" ".join(images), fix=again)
@@ -116,7 +118,8 @@ def place_marker(marker_id: int, views: Sequence[MarkerView]) -> Marker:
 
 def _meeting_point(views: Sequence[MarkerView], corner: int) -> Float:
     """The point (3,) with the least sum of squared distances to the rays through a corner."""
-    matrix, vector = np.zeros((3, 3)), np.zeros(3)
+    matrix = np.zeros((3, 3))
+    vector = np.zeros(3)
     for view in views:
         ray = np.asarray(view.camera.cam_ray_from_img(view.corners_px[corner][None]))[0] @ view.cam_from_world[:, :3]
         ray /= np.linalg.norm(ray)

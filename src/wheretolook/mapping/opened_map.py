@@ -9,7 +9,7 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import camera_of_model, colmap_poses, compact_poses, read_model
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
-from wheretolook.mapping.plausibility import warn_of_frame
+from wheretolook.mapping.sanity import warn_of_frame
 
 
 class OpenedMap(NamedTuple):

@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from wheretolook.mapping import building
-from wheretolook.mapping.building import DATABASE_FILE, REPORT_FILE, Clock
+from wheretolook.mapping import rendered_map as building
 from wheretolook.mapping.colmap_model import describe_intrinsics, registered_names, write_model
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.frame import KnownScale, find_scale
 from wheretolook.mapping.gravity import estimate_gravity
-from wheretolook.mapping.incremental import map_incrementally, photograph_features
 from wheretolook.mapping.photographs import photograph_cameras
+from wheretolook.mapping.rendered_map import DATABASE_FILE, REPORT_FILE, Clock
 from wheretolook.mapping.scale import MapScale, Similarity
+from wheretolook.mapping.sfm import map_incrementally, photograph_features
 from wheretolook.mapping.triangulation import color_points
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import copy_file, write_text
@@ -73,7 +73,10 @@ def map_photographs(
     for, or if `out_dir` holds something that is not a map; ConfigError if a table of markers or positions is damaged,
     or there is no such camera model or dictionary.
     """
-    settings, out_dir, work, clock = config.photographs, Path(out_dir), Path(work), Clock()
+    settings = config.photographs
+    out_dir = Path(out_dir)
+    work = Path(work)
+    clock = Clock()
     if settings.images is None:
         raise ConfigError("no folder of photographs was named", fix="Set map.photographs.images.")
     building.refuse_foreign_folder(out_dir)
@@ -81,13 +84,15 @@ def map_photographs(
     work.mkdir(parents=True, exist_ok=True)
     with building.partial_folder(out_dir, replacing) as partial, Processes(workers) as processes:
         with clock("extract"):
-            side_px, extractor = settings.max_side_px, config.extractor
+            side_px = settings.max_side_px
+            extractor = config.extractor
             features = photograph_features(settings.images, work, side_px, extractor, processes, device, progress)
         with clock("map"):
             cameras = photograph_cameras(settings.images, features.names, features.full_sizes, features.sizes, settings)
             matched = settings.exhaustive_up_to, settings.overlap
             mapped = map_incrementally(work, features, cameras, *matched, seed, processes, progress)
-        model, names = mapped.model, registered_names(mapped.model)
+        model = mapped.model
+        names = registered_names(mapped.model)
         with clock("gravity"):
             poses = np.stack([model.images[number].cam_from_world().matrix() for number in names])
             gravity = estimate_gravity(poses, settings.up_in_camera)

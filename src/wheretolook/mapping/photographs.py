@@ -83,7 +83,8 @@ def photograph_cameras(
     Takes width and height (I, 2) of each photograph as taken, upright, and as mapped. Raises ConfigError if COLMAP has
     no such camera, or intrinsics are given for photographs of different sizes.
     """
-    given, different = len(config.camera_params) > 0, np.unique(full_sizes, axis=0).tolist()
+    given = len(config.camera_params) > 0
+    different = np.unique(full_sizes, axis=0).tolist()
     if given and len(different) > 1:
         fix = "Leave camera_params out, or map the photographs of each size apart."
         raise ConfigError("camera_params are for photographs of one size", path=folder, value=different, fix=fix)
@@ -94,7 +95,8 @@ def photograph_cameras(
     cameras: list[pycolmap.Camera] = []
     camera_of = []
     for index, name in enumerate(names):
-        full, reduced = full_sizes[index].tolist(), sizes[index].tolist()
+        full = full_sizes[index].tolist()
+        reduced = sizes[index].tolist()
         focal, is_known = (0.0, True) if given else _exif_focal(folder / name, config.camera_model)
         shared = (str(Path(name).parent), *full, round(focal, 3)) if config.shared_camera else name
         if shared not in keys:

@@ -46,10 +46,12 @@ def fit_similarity(source: ArrayLike, target: ArrayLike) -> Similarity:
     Umeyama, "Least-Squares Estimation of Transformation Parameters Between Two Point Patterns", TPAMI 1991. Raises
     MapError for fewer than three points, or all on a line, which leaves the rotation about it open.
     """
-    a, b = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
+    a = np.asarray(source, dtype=np.float64)
+    b = np.asarray(target, dtype=np.float64)
     if len(a) < 3:
         raise MapError("a similarity needs three points", value=len(a), fix="Give the positions of more photographs.")
-    mean_a, mean_b = a.mean(0), b.mean(0)
+    mean_a = a.mean(0)
+    mean_b = b.mean(0)
     for points in (a - mean_a, b - mean_b):
         spread = np.linalg.svd(points, compute_uv=False)
         if spread[1] <= _FLAT * max(spread[0], 1e-12):
@@ -174,7 +176,8 @@ def read_marker_table(path: Path) -> dict[int, float]:
     sizes: dict[int, float] = {}
     for row in _rows(path, ("id", "size_m")):
         try:
-            marker, size = int(row["id"]), float(row["size_m"])
+            marker = int(row["id"])
+            size = float(row["size_m"])
         except ValueError as error:
             raise ConfigError("not a marker's id and size", path=path, value=row, fix="Write 7,0.15.") from error
         if not 0 < size < np.inf:

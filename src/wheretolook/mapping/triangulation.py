@@ -18,7 +18,7 @@ from wheretolook.features.sift import SIFT
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.local_origin import local_origin
 from wheretolook.geometry.poses import camera_centers, transform
-from wheretolook.mapping.descriptors import name_kind
+from wheretolook.mapping.feature_files import name_kind
 from wheretolook.utils.colmap import quiet_colmap, storing_in_database
 from wheretolook.utils.files import temporary_folder
 from wheretolook.utils.processes import Processes
@@ -54,7 +54,8 @@ def triangulate_known_poses(
     progress: bool,
 ) -> Any:
     """Triangulate what images (I) of one camera see from known poses (I, 3, 4); see `triangulate_model`."""
-    kind, model = kind_of(config.extractor.method), _posed_model(camera, cam_from_world)
+    kind = kind_of(config.extractor.method)
+    model = _posed_model(camera, cam_from_world)
     stored = [stored_keypoints(found, kind) for found in keypoints]
     return triangulate_model(database, model, stored, colors, pairs, config, clock, seed, processes, progress)
 
@@ -82,7 +83,8 @@ def triangulate_model(
     """
     import pycolmap
 
-    folder, kind = database.parent, kind_of(config.extractor.method)
+    folder = database.parent
+    kind = kind_of(config.extractor.method)
     to_local, back = _local_frame(model)
     model.transform(to_local)  # rays that meet far from the origin are ill-conditioned
     seed %= 2**31  # COLMAP keeps it in an int
@@ -124,7 +126,8 @@ def _local_frame(model: Any) -> tuple[Any, Any]:
     import pycolmap
 
     posed = [image.projection_center() for image in model.images.values() if image.has_pose]
-    origin, straight = local_origin(posed), pycolmap.Rotation3d(np.eye(3))
+    origin = local_origin(posed)
+    straight = pycolmap.Rotation3d(np.eye(3))
     return pycolmap.Sim3d(1.0, straight, -origin), pycolmap.Sim3d(1.0, straight, origin)
 
 
@@ -173,7 +176,8 @@ def _run_match_job(job: MatchJob) -> list[NDArray[np.uint32]]:
 
     matching = pycolmap.FeatureMatchingOptions(num_threads=1, skip_geometric_verification=True)
     with temporary_folder(parent=parent) as folder:
-        database, listed = folder / "database.db", Path(folder) / "pairs.txt"
+        database = folder / "database.db"
+        listed = Path(folder) / "pairs.txt"
         # Any camera and poses do: only verification would use them.
         fill_database(database, _posed_model(PinholeCamera(), np.tile(np.eye(3, 4), (len(stored), 1, 1))), stored)
         listed.write_text("".join(f"{image_name(i)} {image_name(j)}\n" for i, j in pairs))
@@ -272,7 +276,8 @@ def surface_overlap(
     share = np.zeros((n, n))
     for j in range(n):
         in_j = transform(cam_from_world[j], points.reshape(-1, 3)).reshape(points.shape)
-        pixel, z = camera.project(in_j), in_j[..., 2]
+        pixel = camera.project(in_j)
+        z = in_j[..., 2]
         inside = (z > 0) & camera.in_image(pixel) & (depth > 0)
         index = np.where(inside[..., None], pixel, 0).astype(np.int64) // DEPTH_STRIDE
         there = depth_m[j, np.minimum(index[..., 1], h - 1), np.minimum(index[..., 0], w - 1)]

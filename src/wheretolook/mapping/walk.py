@@ -35,7 +35,8 @@ class PartOfFloor:
 
     def is_free(self, points: Any) -> NDArray[np.bool_]:
         """Whether a camera can be at points (N, 3); (N,)."""
-        at, part = np.asarray(points, dtype=np.float64)[:, None, :2], np.asarray(self.rectangles, dtype=np.float64)
+        at = np.asarray(points, dtype=np.float64)[:, None, :2]
+        part = np.asarray(self.rectangles, dtype=np.float64)
         free: NDArray[np.bool_] = np.any(((at >= part[:, :2]) & (at <= part[:, 2:])).all(-1), axis=-1)
         free[free] = self.space.is_free(np.asarray(points)[free])
         return free
@@ -121,7 +122,8 @@ def _reachable_places(free_space: FreeSpaceQueries, bounds: Float, config: WalkC
     # Only below the top of the scene: a roof is not a floor to walk on.
     free = eyes[:, 2] < high[2]
     free[free] = free_space.is_free(eyes[free])
-    key, eyes = key[free], eyes[free]
+    key = key[free]
+    eyes = eyes[free]
     if len(eyes) == 0:
         value = f"eye height {config.eye_height_m} m"
         fix = "Check that the scene is in metres with z up, or lower eye_height_m or the clearance of free space."
@@ -132,10 +134,12 @@ def _reachable_places(free_space: FreeSpaceQueries, bounds: Float, config: WalkC
     below = middle[:, 2] - config.eye_height_m - np.asarray(free_space.floor_below(middle), dtype=np.float64)
     drop = np.column_stack([eyes[a, 2] - eyes[b, 2], below])
     near = (np.abs(drop) <= config.max_step_height_m).all(1)  # False where there is no floor (NaN)
-    a, b = a[near], b[near]
+    a = a[near]
+    b = b[near]
     if len(a):
         clear = np.asarray(free_space.segments_are_free(eyes[a], eyes[b]), dtype=bool)
-        a, b = a[clear], b[clear]
+        a = a[clear]
+        b = b[clear]
     length = np.linalg.norm(eyes[a] - eyes[b], axis=1)
     both = (np.concatenate([length, length]), (np.concatenate([a, b]), np.concatenate([b, a])))
     steps = csr_matrix(both, shape=(len(eyes), len(eyes)))
@@ -156,7 +160,8 @@ def _neighbours(key: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.i
     for di, dj in ((0, 1), (1, -1), (1, 0), (1, 1)):
         target = code + di * width + dj
         valid = (key[:, 1] + dj) >= 0
-        first, last = np.searchsorted(code, target, "left"), np.searchsorted(code, target, "right")
+        first = np.searchsorted(code, target, "left")
+        last = np.searchsorted(code, target, "right")
         count = np.where(valid, last - first, 0)
         a = np.repeat(np.arange(len(code)), count)
         b = np.repeat(first, count) + np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
@@ -168,7 +173,8 @@ def _neighbours(key: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.i
 def _visit(places: _Places, start: int, radius_m: float, coverage: float) -> tuple[NDArray[np.int64], float]:
     """Indices of the places along the walk and the share of all places visited."""
     here = start
-    corners, fresh = [here], [here]
+    corners = [here]
+    fresh = [here]
     visited = np.zeros(len(places.eyes), dtype=bool)
     while True:
         reached = dijkstra(places.steps, indices=fresh, min_only=True, limit=radius_m)

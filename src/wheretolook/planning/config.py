@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Literal
 
 from wheretolook.geometry.lattices import ViewLattice
-from wheretolook.looks.choice import MOST_LOOKS
-from wheretolook.methods.forward import ForwardScorer
+from wheretolook.looks.selection import MOST_LOOKS
+from wheretolook.scorers.forward import ForwardScorer
 from wheretolook.utils.errors import ConfigError
 
 FORWARD = ForwardScorer.name

@@ -14,10 +14,10 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.methods.base import Scorer
 from wheretolook.planning.config import MAX_DIRECTIONS
 from wheretolook.planning.refine import score_directions
 from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
+from wheretolook.scorers.base import Scorer
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
 from wheretolook.visibility.survey import survey
@@ -48,7 +48,8 @@ def build_viewpoint_map(
         ConfigError: more than 65,536 directions, ids outside the grid, or neither ids nor a mask of its voxels.
         ValueError: directions that are not (D, 3), not finite or of length 0.
     """
-    axes, rows = _unit(directions), _ids(free, len(grid))
+    axes = _unit(directions)
+    rows = _ids(free, len(grid))
     if len(rows) == 0:
         raise SceneError("no voxel is free", value=len(grid), fix="Refine the grid, or check where it lies.")
     if rows[0] < 0 or rows[-1] >= len(grid):
@@ -79,7 +80,8 @@ def update_viewpoint_map(
             counts changed in a voxel where they cannot, so that weights or geometry must have changed.
         SceneError, MapError: as in `build_viewpoint_map`.
     """
-    landmarks, occlusion = scorer.localization_map.landmarks, scorer.localization_map.occlusion
+    landmarks = scorer.localization_map.landmarks
+    occlusion = scorer.localization_map.occlusion
     if derived := old.origin.derived:
         fix = "Update the one it was derived from, and derive it again."
         raise ConfigError("a viewpoint map derived from another cannot be updated", value=derived, fix=fix)
@@ -87,7 +89,8 @@ def update_viewpoint_map(
     digests = landmark_digests(landmarks)
     origin = _origin(scorer, old.origin.lattice, digests)
     for name in ("scorer", "camera", "occlusion"):
-        now, before = getattr(origin, name), getattr(old.origin, name)
+        now = getattr(origin, name)
+        before = getattr(old.origin, name)
         if now != before:
             fix = f"Use {before!r}, or build it anew."
             raise ConfigError(f"the viewpoint map was built with another {name}", value=now, fix=fix)
@@ -121,7 +124,8 @@ def _score_and_count(
     scorer: Scorer, locations: Float, directions: Float, progress: Text
 ) -> tuple[NDArray[np.uint16], NDArray[np.float32], NDArray[np.uint32]]:
     """Ranked ids, scores and numbers of landmarks in view, each (L, D), of all directions at locations (L, 3) m."""
-    around, rotations = scorer.localization_map, rotation_looking_along(directions)
+    around = scorer.localization_map
+    rotations = rotation_looking_along(directions)
     options: dict[str, Any] = {"keep": 1, "keep_occlusion": False, "device": around.device}
     options["progress"] = progress and f"{progress}: count"
     counted = survey(around.camera, rotations, locations, around.landmarks.points, around.occlusion, **options)
@@ -155,7 +159,8 @@ def _ids(free: ArrayLike, n_voxels: int) -> NDArray[np.int64]:
 
 def _check_landmarks(landmarks: Landmarks) -> None:
     for row in np.flatnonzero(~np.isfinite(landmarks.points).all(axis=1)):
-        problem, value = f"the position of landmark {landmarks.ids[row]} is not finite", landmarks.points[row].tolist()
+        problem = f"the position of landmark {landmarks.ids[row]} is not finite"
+        value = landmarks.points[row].tolist()
         raise MapError(problem, value=tuple(value), fix="Remove it, or run the map stage again.")
 
 
@@ -217,7 +222,8 @@ def _check_unchanged(old: ViewpointMap, scorer: Scorer, rows: NDArray[np.int64])
 
 
 def _origin(scorer: Scorer, lattice: str, digests: NDArray[np.uint64]) -> MapOrigin:
-    around, camera = scorer.localization_map, scorer.localization_map.camera
+    around = scorer.localization_map
+    camera = scorer.localization_map.camera
     digest = hashlib.sha256(around.landmarks.ids.tobytes() + digests.tobytes()).hexdigest()[:16]
     intrinsics = camera.colmap.record()
     if isinstance(camera, PinholeCamera):  # one model for all, as maps always had it

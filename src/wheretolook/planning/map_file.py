@@ -20,9 +20,11 @@ from wheretolook.utils.locks import hold
 from wheretolook.utils.npz_files import save_npy
 from wheretolook.utils.reading import read_json
 
-FORMAT, VERSION = "wheretolook viewpoint map", 1
+FORMAT = "wheretolook viewpoint map"
+VERSION = 1
 
-DESCRIPTION, LAYOUT = "viewpoint_map.json", "LAYOUT.txt"
+DESCRIPTION = "viewpoint_map.json"
+LAYOUT = "LAYOUT.txt"
 
 ARRAYS = {
     "row_of_voxel": ("<i4", "V", "row of each voxel in the arrays by row, -1 if it is not free"),
@@ -119,7 +121,8 @@ def write_map(
                 shutil.rmtree(left, ignore_errors=True)  # of a process that was killed while it wrote, or afterwards
         with storing(folder):
             work = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-        new, old = work / _NEW, work / _OLD
+        new = work / _NEW
+        old = work / _OLD
         try:
             with moved_later(new, folder), storing(folder):
                 new.mkdir()

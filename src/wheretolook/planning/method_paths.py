@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wheretolook.dataset.folders import Dataset
-from wheretolook.dataset.scene import Scene
+from wheretolook.dataset.environment import Scene
+from wheretolook.dataset.layout import Dataset
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.planning.config import FORWARD, PlanConfig
-from wheretolook.planning.path_planning import check_ends, plan_path
-from wheretolook.planning.route_views import PathView, PlannedPath
+from wheretolook.planning.routes import PathView, PlannedPath
+from wheretolook.planning.rrt import check_ends, plan_path
 from wheretolook.planning.scene_map import check_methods, planner_map, planner_scorer, weights_for
 from wheretolook.planning.stops import can_stop, check_stopping, stops_along, within_pitch
 from wheretolook.rendering.warp_renderer import WarpRenderer
@@ -41,7 +41,8 @@ def plan_by_methods(
     the order given. Raises ConfigError if a method needs weights or there is none of that name, or the last cannot
     stop; PlanningError if no path can be found.
     """
-    methods, space = tuple(methods), scene.space
+    methods = tuple(methods)
+    space = scene.space
     check_methods(methods)
     stopping = config.stops.looks > 1
     if stopping and methods and methods[-1]:
@@ -50,17 +51,20 @@ def plan_by_methods(
     paths: dict[str, PlannedPath] = {}
     for number, method in enumerate(methods, 1):
         if method == FORWARD:
-            name, path = method, plan_path(start, goal, space, space.bounds, None, config.planner)
+            name = method
+            path = plan_path(start, goal, space, space.bounds, None, config.planner)
         else:
             weights = weights_for(method, dataset, config.weights)
             scorer = planner_scorer(scene, dataset, method, weights, config.anywhere)
             if stopping and number == len(methods):
                 check_stopping(scorer.name)
             views = planner_map(scene, config, scorer)
-            name, path = method or scorer.name, plan_path(start, goal, space, space.bounds, views, config.planner)
+            name = method or scorer.name
+            path = plan_path(start, goal, space, space.bounds, views, config.planner)
             path = replace(path, scores=scorer.score(poses_looking_along(path.positions, path.axes)))
             if stopping and can_stop(scorer.name):
-                around, about = within_pitch(views.directions, config.planner), (config.stops, config.planner)
+                around = within_pitch(views.directions, config.planner)
+                about = (config.stops, config.planner)
                 stops = stops_along(scorer, path.positions, path.axes, around, *about, progress="stops")
                 path = replace(path, stops=stops)
         paths.pop(name, None)  # a method named twice stands where it was named last
@@ -75,14 +79,18 @@ def path_views(
 
     The further looks of a stop follow the path's view there.
     """
-    camera, points = localization_map.camera, localization_map.landmarks.points
+    camera = localization_map.camera
+    points = localization_map.landmarks.points
     places, looks = path.looks
-    axes, scores = path.all_axes, path.all_scores
+    axes = path.all_axes
+    scores = path.all_scores
     cam_from_world = poses_looking_along(path.positions[places], axes)
     seen = localization_map.landmarks_in_view(cam_from_world)
     images: Any = [None] * len(seen) if renderer is None else renderer.render(camera, cam_from_world).rgb
-    views, size = [], (camera.width, camera.height)
-    n_looks, together = np.bincount(places), path.scores_with_stops
+    views = []
+    size = (camera.width, camera.height)
+    n_looks = np.bincount(places)
+    together = path.scores_with_stops
     for number, (place, pose, image) in enumerate(zip(places.tolist(), cam_from_world, images, strict=True)):
         pixels = camera.project(points[seen[number]] @ pose[:, :3].T + pose[:, 3])
         view = (path.positions[place], axes[number], float(scores[number]))

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.poses import Float, poses_looking_along
-from wheretolook.methods.base import Scorer
-from wheretolook.planning.turns import angles_to_axis_deg
+from wheretolook.planning.camera_turns import angles_to_axis_deg
+from wheretolook.scorers.base import Scorer
 
 COMPASS = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=1)
 """Steps (8, 2) in the plane that touches the sphere at the current axis."""
@@ -34,7 +34,8 @@ def score_directions(scorer: Scorer, locations: ArrayLike, directions: ArrayLike
 
     Raises ValueError if a location or a direction is not finite, or a direction has no length.
     """
-    at, axes = np.asarray(locations, dtype=np.float64).reshape(-1, 3), np.asarray(directions, dtype=np.float64)
+    at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
+    axes = np.asarray(directions, dtype=np.float64)
     poses = poses_looking_along(np.repeat(at, len(axes), axis=0), np.tile(axes, (len(at), 1)))
     return scorer.score(poses).reshape(len(at), len(axes))
 
@@ -65,9 +66,11 @@ def refine_directions(
     if not (max_angle_deg > 0 and first_step_deg > 0 and last_step_deg > 0):
         raise ValueError("angles must be positive")
     start = start / length
-    current, step_deg = start.copy(), np.full(len(start), float(min(first_step_deg, max_angle_deg)))
+    current = start.copy()
+    step_deg = np.full(len(start), float(min(first_step_deg, max_angle_deg)))
     start_scores = scorer.score(poses_looking_along(at, start))
-    scores, n_scored = start_scores.copy(), len(start)
+    scores = start_scores.copy()
+    n_scored = len(start)
     while len(active := np.flatnonzero(step_deg >= last_step_deg)):
         candidates = _around(current[active], step_deg[active])
         candidates = _within(candidates, start[active, None], max_angle_deg)
@@ -78,7 +81,8 @@ def refine_directions(
         value = found[np.arange(len(active)), best]
         better = value > scores[active]
         moved = active[better]
-        current[moved], scores[moved] = candidates[better, best[better]], value[better]
+        current[moved] = candidates[better, best[better]]
+        scores[moved] = value[better]
         step_deg[active[~better]] /= 2
     return RefinedViews(current, scores, start_scores, n_scored)
 

@@ -8,19 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.environment import Scene
+from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.names import RELEASE
-from wheretolook.dataset.scene import Scene
 from wheretolook.geometry.camera import camera_of_record
 from wheretolook.geometry.lattices import ViewLattice
-from wheretolook.learning.provenance import was_trained_on
-from wheretolook.learning.weights import method_of_weights, preference, read_training, read_weights
-from wheretolook.methods.base import Scorer, same_field_of_view
-from wheretolook.methods.features_learnt import folder_for
-from wheretolook.methods.registry import fallback, find, load_scorer, make_scorer, members, methods_named, scorers
 from wheretolook.planning.map_building import build_viewpoint_map
-from wheretolook.planning.path_planning import Space
+from wheretolook.planning.rrt import Space
 from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.scorers.base import Scorer, same_field_of_view
+from wheretolook.scorers.feature_domain import folder_for
+from wheretolook.scorers.registry import fallback, find, load_scorer, make_scorer, members, methods_named, scorers
+from wheretolook.training.provenance import was_trained_on
+from wheretolook.training.weights import method_of_weights, preference, read_training, read_weights
 from wheretolook.utils.errors import ConfigError, WeightsError
 from wheretolook.utils.shipped import WEIGHTS, shipped
 
@@ -78,14 +78,16 @@ def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kinds:
     """
     kinds = kinds or {name for name, method in scorers().items() if method.weights == name}
     own = dataset.root / "weights"
-    others, features = (dataset.root.parent / RELEASE / "weights", shipped(WEIGHTS)), dataset.features
+    others = (dataset.root.parent / RELEASE / "weights", shipped(WEIGHTS))
+    features = dataset.features
     for folder in dict.fromkeys((own, *(folder_for(other, features) for other in others), *others)):
         fitting: dict[Path, tuple[bool, float]] = {}
         for path in sorted(folder.glob("*.safetensors")):
             try:
                 if method_of_weights(path) not in kinds:
                     continue
-                header, training = read_weights(path)[1], read_training(path)
+                header = read_weights(path)[1]
+                training = read_training(path)
                 serves_all = not scorers()[method_of_weights(path)].one_camera
                 trained = None if serves_all else camera_of_record(header["camera"])
                 preferred = preference(path)
@@ -149,9 +151,11 @@ def with_borrowed_views(viewpoint_map: ViewpointMap, space: Space) -> ViewpointM
     A voxel is in reach if a camera can go straight to its centre, so nothing is borrowed through walls. In the result,
     a derived map (`MapOrigin.derived`), voxels share rows, so it can be neither saved nor updated.
     """
-    rows, centers = viewpoint_map.row_of_voxel.copy(), viewpoint_map.grid.centers()
+    rows = viewpoint_map.row_of_voxel.copy()
+    centers = viewpoint_map.grid.centers()
     size = viewpoint_map.grid.voxel_m
-    known, unknown = np.flatnonzero(rows >= 0), np.flatnonzero(rows < 0)
+    known = np.flatnonzero(rows >= 0)
+    unknown = np.flatnonzero(rows < 0)
     points = centers[unknown][:, None] + INSIDE * size
     free = space.is_free(points.reshape(-1, 3)).reshape(len(unknown), len(INSIDE))
     order = np.argsort((INSIDE**2).sum(1), kind="stable")

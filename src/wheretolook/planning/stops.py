@@ -10,20 +10,21 @@ from tqdm.auto import tqdm
 
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.looks.around import APART_DEG, CANDIDATES, candidates
-from wheretolook.looks.choice import Turns, choose_looks, worth_of
-from wheretolook.looks.union import seen_around
-from wheretolook.looks.worth import SetWorth
+from wheretolook.looks.joint_visibility import seen_around
+from wheretolook.looks.selection import Turns, choose_looks, worth_of
+from wheretolook.looks.set_score import SetWorth
 from wheretolook.planning.config import PathConfig, StopConfig
-from wheretolook.planning.route_views import Stop, turning_deg
+from wheretolook.planning.routes import Stop, turning_deg
 from wheretolook.utils.errors import ConfigError, PlanningError
 
 if TYPE_CHECKING:
-    from wheretolook.methods.base import Scorer
+    from wheretolook.scorers.base import Scorer
 
 TURNS_DEG = (45.0, 90.0, 180.0, None)
 """Limits on the turn from the path's view to the last look that are tried one after another; None for no limit."""
 
-NEAR_DEG, NEAR = 60.0, 8
+NEAR_DEG = 60.0
+NEAR = 8
 """So many of the candidates for further looks lie no farther from the path's view, so that small turns are possible."""
 
 LEAST_CHANCE = 1e-3  # of localizing, or of not, that odds are taken of
@@ -74,7 +75,7 @@ def within_pitch(directions: Float, planner: PathConfig) -> Float:
 
 def can_stop(method: str) -> bool:
     """Whether a method's scores are probabilities, which can be asked to reach one."""
-    from wheretolook.methods.registry import find
+    from wheretolook.scorers.registry import find
 
     known = find(method)
     return known is not None and known.probability
@@ -105,10 +106,14 @@ def _stop(
     scores = scorer.score_around(at[None], apart)[0]
     near = np.flatnonzero(apart @ axis > math.cos(math.radians(NEAR_DEG)))
     rows = np.union1d(candidates(apart, scores, CANDIDATES), near[candidates(apart[near], scores[near], NEAR)])
-    looked, alone = np.concatenate([axis[None], apart[rows]]), np.append(own, scores[rows])
-    seen, worth, turns = seen_around(scorer, at, looked, alone), SetWorth.shipped(), Turns(looked, axis)
+    looked = np.concatenate([axis[None], apart[rows]])
+    alone = np.append(own, scores[rows])
+    seen = seen_around(scorer, at, looked, alone)
+    worth = SetWorth.shipped()
+    turns = Turns(looked, axis)
     before = worth_of(seen, worth, [0])
-    best, most = None, 0.0
+    best = None
+    most = 0.0
     for n in range(2, min(config.looks, len(looked)) + 1):
         for limit in TURNS_DEG:
             try:
@@ -124,7 +129,8 @@ def _stop(
             cost = planner.turn_weight_m * math.radians(turn)
             gain = planner.score_weight * metres * (together - own) - cost
             if gain > most:
-                best, most = stop, gain
+                best = stop
+                most = gain
     return best
 
 

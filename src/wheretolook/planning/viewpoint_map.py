@@ -17,14 +17,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, rotation_looking_along
-from wheretolook.learning.old_names import name_of
 from wheretolook.looks.around import best_looks
+from wheretolook.planning.camera_turns import angles_to_axis_deg, check_axis, turns_from_deg, within
 from wheretolook.planning.map_file import ARRAYS, DESCRIPTION, REBUILD, read_map, write_map
-from wheretolook.planning.turns import angles_to_axis_deg, check_axis, turns_from_deg, within
+from wheretolook.training.old_names import name_of
 from wheretolook.utils.errors import ConfigError, MapFormatError
 
 if TYPE_CHECKING:
-    from wheretolook.methods.base import Scorer
+    from wheretolook.scorers.base import Scorer
 
 Point = Sequence[float] | NDArray[Any]
 
@@ -134,9 +134,11 @@ class ViewpointMap:
         try:
             return cls(grid=grid, origin=MapOrigin(**origin), **arrays)
         except (TypeError, ValueError) as error:
-            problem, path = f"the arrays do not fit together: {error}", Path(folder)
+            problem = f"the arrays do not fit together: {error}"
+            path = Path(folder)
             if isinstance(error, TypeError):
-                problem, path = f"damaged description: {error}", path / DESCRIPTION
+                problem = f"damaged description: {error}"
+                path = path / DESCRIPTION
             raise MapFormatError(problem, path=path, fix=REBUILD) from error
 
     def save(self, folder: str | Path) -> None:
@@ -147,7 +149,8 @@ class ViewpointMap:
         """
         origin = asdict(self.origin)
         if derived := origin.pop("derived"):
-            problem, fix = "a map derived from another is not to be saved", "Save the map it was derived from."
+            problem = "a map derived from another is not to be saved"
+            fix = "Save the map it was derived from."
             raise MapFormatError(problem, path=Path(folder), value=derived, fix=fix)
         write_map(folder, self.grid, origin, {name: getattr(self, name) for name in ARRAYS})
 
@@ -167,12 +170,18 @@ class ViewpointMap:
     def row(self, point: Point) -> int:
         """Row of the free voxel that holds a world point (3,) m; -1 if none does."""
         x, y, z = point
-        x, y, z = float(x), float(y), float(z)  # faster than NumPy's scalars
+        x = float(x)  # faster than NumPy's scalars
+        y = float(y)
+        z = float(z)
         x0, y0, z0, x1, y1, z1, dx, dy, dz, nx, ny, nz, rows = self._hash
         if x0 <= x <= x1 and y0 <= y <= y1 and z0 <= z <= z1:
-            i, j, k = int((x - x0) / dx), int((y - y0) / dy), int((z - z0) / dz)
+            i = int((x - x0) / dx)
+            j = int((y - y0) / dy)
+            k = int((z - z0) / dz)
             # the grid is closed at its upper faces, as in `VoxelGrid.location_ids`
-            i, j, k = i if i < nx else nx - 1, j if j < ny else ny - 1, k if k < nz else nz - 1
+            i = i if i < nx else nx - 1
+            j = j if j < ny else ny - 1
+            k = k if k < nz else nz - 1
             return int(rows((i * ny + j) * nz + k))
         if not (isfinite(x) and isfinite(y) and isfinite(z)):
             raise ValueError(f"a point must be finite, got {(x, y, z)}")
@@ -233,7 +242,8 @@ class ViewpointMap:
         row = self.row(point)
         if row < 0:
             return None
-        at, scores = np.asarray(point, dtype=np.float64), np.asarray(self.scores[row])
+        at = np.asarray(point, dtype=np.float64)
+        scores = np.asarray(self.scores[row])
         chosen = best_looks(scorer, at, self.directions, scores, n, max_turn_deg, start)
         return [self._choice(row, look) for look in chosen.looks]
 
@@ -288,7 +298,8 @@ class ViewpointMap:
 
     def _choice(self, row: int, direction: int) -> ViewChoice:
         try:
-            score, n_visible = self.scores.item(row, direction), self.n_visible.item(row, direction)
+            score = self.scores.item(row, direction)
+            n_visible = self.n_visible.item(row, direction)
             return ViewChoice(direction, self._axes[direction], score, n_visible)
         except IndexError as error:
             raise _ranks_nothing(error) from error
@@ -315,7 +326,8 @@ class ViewpointMap:
         best = self.ranked[:, 0].astype(np.int64)
         at = np.arange(len(best)), best
         try:
-            scores, counts = self.scores[at], self.n_visible[at].astype(np.int64)
+            scores = self.scores[at]
+            counts = self.n_visible[at].astype(np.int64)
         except IndexError as error:
             raise _ranks_nothing(error) from error
         return np.append(best, -1), np.append(scores, np.float32(np.nan)), np.append(counts, 0)

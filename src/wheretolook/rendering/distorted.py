@@ -38,14 +38,17 @@ def render_distorted(renderer: Renderer, camera: ColmapCamera, cam_from_world: F
     face, columns_rows, along = _lookup(camera)
     pinhole = _face_camera(camera)
     shape = (len(cam_from_world), camera.height, camera.width)
-    rgb, depth_m = np.zeros((*shape, 3), dtype=np.uint8), np.zeros(shape, dtype=np.float32)
+    rgb = np.zeros((*shape, 3), dtype=np.uint8)
+    depth_m = np.zeros(shape, dtype=np.float32)
     for number in np.unique(face[face >= 0]).tolist():
         seen = renderer.render(pinhole, _FACES[number] @ cam_from_world)
-        there, (x, y) = face == number, columns_rows
+        there = face == number
+        (x, y) = columns_rows
         for view in range(len(cam_from_world)):
             colors = cv2.remap(seen.rgb[view], x, y, cv2.INTER_LINEAR)
             depths = cv2.remap(seen.depth_m[view], x, y, cv2.INTER_NEAREST)
-            rgb[view][there], depth_m[view][there] = colors[there], (depths * along)[there]
+            rgb[view][there] = colors[there]
+            depth_m[view][there] = (depths * along)[there]
     return Rendering(rgb, depth_m)
 
 

@@ -36,7 +36,8 @@ class MeshRaycaster:
         self.device = start_warp(device)
         self.block_rays = block_rays
         wp.load_module(ray_kernels, device=self.device)  # only one thread may do that
-        self.warp_mesh, self.origin = warp_mesh(mesh, self.device), mesh.origin
+        self.warp_mesh = warp_mesh(mesh, self.device)
+        self.origin = mesh.origin
 
     def occluded(self, origins: ArrayLike, points: ArrayLike, margin_m: float = 0.02) -> NDArray[np.bool_]:
         """Whether something lies between each of origins (L, 3) and each of points (N, 3), in metres; (L, N).

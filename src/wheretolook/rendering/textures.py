@@ -47,7 +47,8 @@ def build_pyramids(textures: tuple[NDArray[np.uint8], ...]) -> TexturePyramids:
     for k, texture in enumerate(textures):
         image: NDArray[np.uint8] = texture
         for level in range(n_levels[k]):
-            height, width = max(1, texture.shape[0] >> level), max(1, texture.shape[1] >> level)
+            height = max(1, texture.shape[0] >> level)
+            width = max(1, texture.shape[1] >> level)
             if level > 0:
                 image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
             start = level_start[k, level]
@@ -73,7 +74,8 @@ def texel_gradients(mesh: TexturedMesh) -> NDArray[np.float32]:
     determinant = gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] ** 2
     flat = determinant <= 1e-12 * (gram[:, 0, 0] + gram[:, 1, 1]) ** 2
     adjugate = np.empty_like(gram)
-    adjugate[:, 0, 0], adjugate[:, 1, 1] = gram[:, 1, 1], gram[:, 0, 0]
+    adjugate[:, 0, 0] = gram[:, 1, 1]
+    adjugate[:, 1, 1] = gram[:, 0, 0]
     adjugate[:, 0, 1] = adjugate[:, 1, 0] = -gram[:, 0, 1]
     inverse = adjugate / np.where(flat, 1.0, determinant)[:, None, None]
     gradients = np.swapaxes(changes, 1, 2) @ inverse @ edges

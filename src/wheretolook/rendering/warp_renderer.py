@@ -56,7 +56,8 @@ class WarpRenderer:
             self._vertices: Any = vec3_array(mesh.vertices, self.device)
         else:
             self._mesh = warp_mesh(mesh, self.device)
-        self._appearance, self._origin = self._upload(mesh), mesh.origin
+        self._appearance = self._upload(mesh)
+        self._origin = mesh.origin
 
     def _array(self, values: NDArray[Any], dtype: Any) -> Any:
         return wp.array(values, dtype=dtype, device=self.device)
@@ -81,7 +82,8 @@ class WarpRenderer:
         if isinstance(camera, ColmapCamera):
             return render_distorted(self, camera, poses)
         poses = poses_from(poses, self._origin)
-        height, width = camera.height, camera.width
+        height = camera.height
+        width = camera.width
         rgb = np.empty((len(poses), height, width, 3), dtype=np.uint8)
         depth_m = np.empty((len(poses), height, width), dtype=np.float32)
         bytes_per_pose = height * width * 7
@@ -103,7 +105,8 @@ class WarpRenderer:
         wp.launch(trace_kernel, _tiles(images[1].shape), inputs, images, device=self.device)
 
     def _rasterize(self, camera: PinholeCamera, poses: Float, centers: Float, ray_from_pixel: Any, images: Any) -> None:
-        shape, device = images[1].shape, self.device
+        shape = images[1].shape
+        device = self.device
         pixel_from_world = camera.matrix @ poses  # (B, 3, 4)
         projected: Any = wp.empty((len(poses), self._vertices.shape[0]), dtype=wp.vec3d, device=device)
         nearness = wp.zeros(shape, dtype=wp.float32, device=device)
@@ -112,8 +115,10 @@ class WarpRenderer:
         offset = self._array(pixel_from_world[:, :, 3], wp.vec3d)
         wp.launch(project_kernel, projected.shape, [self._vertices, rotation, offset], [projected], device=device)
         # With a block of one, triangles are drawn one after the other.
-        n_triangles, corners = self._appearance.corner_uvs.shape[0], self._appearance.indices
-        dim, outputs = (len(poses), n_triangles), [nearness, triangle]
+        n_triangles = self._appearance.corner_uvs.shape[0]
+        corners = self._appearance.indices
+        dim = (len(poses), n_triangles)
+        outputs = [nearness, triangle]
         wp.launch(raster_kernel, dim, [projected, corners], outputs, device=device, block_dim=1)
         inputs = [projected, self._vertices, triangle, self._appearance, ray_from_pixel]
         wp.launch(shade_kernel, _tiles(shape), inputs, images, device=device)

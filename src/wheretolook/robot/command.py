@@ -66,7 +66,7 @@ def run(arguments: Sequence[str]) -> int:
 def _export(given: argparse.Namespace) -> None:
     from wheretolook.geometry.camera_text import parse_camera
     from wheretolook.inputs.localization_map import LocalizationMap
-    from wheretolook.mapping.plausibility import warn_of_mesh
+    from wheretolook.mapping.sanity import warn_of_mesh
     from wheretolook.robot.export import export_robot, pinhole_of
     from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion, OcclusionModel
 

@@ -13,11 +13,11 @@ from tqdm.auto import tqdm
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera, describe_camera
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.learning.trained_network import TrainedNetwork
-from wheretolook.learning.training_range import TrainingRange, camera_quantities
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
-from wheretolook.methods.set.network import SetNetwork
-from wheretolook.methods.set.score import MOST
+from wheretolook.scorers.set.network import SetNetwork
+from wheretolook.scorers.set.score import MOST
+from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook.training.training_range import TrainingRange, camera_quantities
 from wheretolook.utils.errors import CameraError, ConfigError
 from wheretolook.utils.files import copy_file, sha256, write_bytes, write_json
 from wheretolook.utils.npz_files import save_npz
@@ -61,7 +61,8 @@ def export_robot(
         raise ConfigError("exporting needs the package onnx", fix="Install it: pip install 'wheretolook[robot]'.")
     from wheretolook.robot.graph import set_graph
 
-    out, weights = Path(out), Path(weights)
+    out = Path(out)
+    weights = Path(weights)
     trained = TrainedNetwork.load(weights, SetNetwork, "set")
     content = set_graph(trained).SerializeToString()
     known = trained.training_range

@@ -16,13 +16,14 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
-from wheretolook.fisher.information import N_NUMBERS, information_matrices
-from wheretolook.learning.trained_network import TrainedNetwork
-from wheretolook.methods.matchability.network import REFERENCE_FOCAL_PX, StandardAttributes
-from wheretolook.methods.set.network import CELLS, PRIOR, SetNetwork
+from wheretolook.geometry.pose_information import N_NUMBERS, information_matrices
+from wheretolook.scorers.matchability.network import REFERENCE_FOCAL_PX, StandardAttributes
+from wheretolook.scorers.set.network import CELLS, PRIOR, SetNetwork
+from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import WeightsError
 
-OPSET, IR_VERSION = 17, 8  # of 2022, so that onnxruntime 1.12 and later reads the file
+OPSET = 17  # of 2022, so that onnxruntime 1.12 and later reads the file
+IR_VERSION = 8
 PARAMETERS = 6  # of a pose: shift and turn
 
 
@@ -88,7 +89,8 @@ class GraphBuilder:
         if isinstance(module, nn.Dropout):
             return tensor
         if isinstance(module, StandardAttributes):
-            mean, scale = module.mean.cpu().numpy(), module.scale.cpu().numpy()
+            mean = module.mean.cpu().numpy()
+            scale = module.scale.cpu().numpy()
             standard = self("Mul", self("Sub", tensor, self.constant(mean)), self.constant(scale))
             return self("Where", self("IsNaN", standard), 0.0, standard)
         if isinstance(module, nn.BatchNorm1d):
@@ -108,7 +110,8 @@ def set_graph(trained: TrainedNetwork[SetNetwork]) -> Any:
 
     Raises a WeightsError if the network has a layer, or is told a statistic, that is not known here.
     """
-    graph, network = GraphBuilder(), trained.network
+    graph = GraphBuilder()
+    network = trained.network
     features = _features(graph, network, _sums(graph, network))
     standard = graph.layers(network.standard, features)
     logits = graph("Add", graph.layers(network.linear, standard), graph.layers(network.decide, standard))
@@ -166,14 +169,18 @@ def _sums(graph: GraphBuilder, network: SetNetwork) -> _Sums:
     kept = graph("Squeeze", graph("Shape", "values", start=1, end=2), graph.constant([0], np.int64))
     place = graph("Range", graph.constant(0, np.int64), kept, graph.constant(1, np.int64))
     own = graph("Less", place, graph("Unsqueeze", "taken", graph.constant([1], np.int64)))  # (B, K)
-    n_visible, taken = graph.double("n_visible"), graph.double("taken")
+    n_visible = graph.double("n_visible")
+    taken = graph.double("taken")
     enlarged = graph("Div", n_visible, graph("Max", taken, graph.number(1)))
     counted = graph("Mul", graph.double(own), graph("Unsqueeze", enlarged, graph.constant([1], np.int64)))
     counted = graph("Unsqueeze", counted, graph.constant([1], np.int64))  # (B, 1, K)
 
-    across, down = network.attributes.index("across"), network.attributes.index("down")
+    across = network.attributes.index("across")
+    down = network.attributes.index("down")
     ray = graph.double(graph.columns(flat, across, down))
-    x, y, squares = graph.columns(ray, 0), graph.columns(ray, 1), graph("Mul", ray, ray)
+    x = graph.columns(ray, 0)
+    y = graph.columns(ray, 1)
+    squares = graph("Mul", ray, ray)
     length2 = graph("Add", graph.sum(squares, 1, keep=True), graph.number(1))
     one = graph("Expand", graph.number(1), graph("Shape", x))
     products = graph.joined(graph.columns(squares, 0), graph("Mul", x, y), x, graph.columns(squares, 1), y, one)
@@ -286,7 +293,8 @@ def _covariance(graph: GraphBuilder, weighted: str) -> dict[str, str]:
     prior = graph("Add", matrix, graph.constant(PRIOR * unit.reshape(-1), np.float64))
     information = graph("Reshape", prior, graph.constant([-1, PARAMETERS, PARAMETERS], np.int64))
     rest = graph("Expand", graph.constant(unit, np.float64), graph("Shape", information))
-    both, log_pivots = graph.joined(information, rest), []
+    both = graph.joined(information, rest)
+    log_pivots = []
     for k in range(PARAMETERS):  # Gauss-Jordan, which needs no pivoting where a matrix is positive definite
         row = graph("Gather", both, graph.constant([k], np.int64), axis=1)  # (B, 1, 12)
         pivot = graph.columns(row, k)

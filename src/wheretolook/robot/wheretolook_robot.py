@@ -106,14 +106,16 @@ class RobotScorer:
         self._serves_camera = bool(about["serves_camera"])
         with np.load(folder / "landmarks.npz") as stored:
             self.points: Array = stored["points"]
-            self._directions, self._attributes = stored["directions"], stored["attributes"]
+            self._directions = stored["directions"]
+            self._attributes = stored["attributes"]
             self.places: Array = stored["places"]
             self._unoccluded = stored["unoccluded"]
         self._columns = np.ascontiguousarray(self.points.T)  # (3, N): whole rows of x, y and z are faster
         if len(self.points) != about["n_landmarks"]:
             raise ValueError(f"{folder / 'landmarks.npz'}: not the landmarks that robot.json tells of. Export again.")
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+        options.intra_op_num_threads = threads
+        options.inter_op_num_threads = 1
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads leave the core alone
         path = str(folder / "scorer.onnx")
         if not Path(path).is_file():
@@ -192,7 +194,8 @@ class RobotScorer:
         number = np.empty(offsets.shape[1], dtype=np.int64)  # of each offset, its row in `values`
         number[described] = np.arange(len(described))
         values = self._values(offsets[:, described], described if free is None else free[described])
-        score, inliers = np.empty(len(rotations)), np.empty(len(rotations), dtype=np.float32)
+        score = np.empty(len(rotations))
+        inliers = np.empty(len(rotations), dtype=np.float32)
         distance_m = np.full(len(rotations), np.nan)
         for block in self._blocks(looked_at):
             taken = np.array([len(looked_at[view]) for view in block], dtype=np.int64)
@@ -262,7 +265,8 @@ class RobotScorer:
             pixel_size_ratio  logarithm of the size that a pixel covers there, over that when it was mapped
             all others        columns of `attributes` in landmarks.npz, as they are
         """
-        known, mapped_along = self._attributes[rows], self._directions[rows].T
+        known = self._attributes[rows]
+        mapped_along = self._directions[rows].T
         column = {name: known[:, place] for place, name in enumerate(self._map_names)}
         distance = np.sqrt((offsets * offsets).sum(axis=0))
         log_distance = np.log(distance)
@@ -316,7 +320,8 @@ def fibonacci_sphere(n: int) -> Array:
     """n unit vectors (n, 3) from +z to -z, spread almost evenly over the sphere (spherical Fibonacci lattice)."""
     index = np.arange(n)
     z = 1 - (2 * index + 1) / n
-    radius, azimuth = np.sqrt(1 - z * z), np.pi * (1 + np.sqrt(5)) * index
+    radius = np.sqrt(1 - z * z)
+    azimuth = np.pi * (1 + np.sqrt(5)) * index
     return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
 
 
@@ -360,9 +365,13 @@ def quaternion_xyzw(rotation: ArrayLike) -> Array:
     if largest == 3:
         found = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], 1 + squares[3]])
     else:
-        i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
+        i = largest
+        j = (largest + 1) % 3
+        k = (largest + 2) % 3
         found = np.empty(4)
-        found[i], found[3] = 1 + r[i, i] - r[j, j] - r[k, k], r[k, j] - r[j, k]
-        found[j], found[k] = r[j, i] + r[i, j], r[k, i] + r[i, k]
+        found[i] = 1 + r[i, i] - r[j, j] - r[k, k]
+        found[3] = r[k, j] - r[j, k]
+        found[j] = r[j, i] + r[i, j]
+        found[k] = r[k, i] + r[i, k]
     found /= np.linalg.norm(found)
     return found if found[3] >= 0 else -found

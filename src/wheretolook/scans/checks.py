@@ -16,7 +16,8 @@ DEPTH_M = (0.2, 20.0)
 """Median reading of depth cameras where people walk: they do not see farther."""
 _AGREE = 0.03  # by which two depths of the same point may differ, of the depth
 _PAIRS = 40  # pairs of frames that are compared
-_LEAST_PAIRS, _LEAST_SHARED = 3, 50  # of them, and readings that the two of a pair share
+_LEAST_PAIRS = 3  # of them, and readings that the two of a pair share
+_LEAST_SHARED = 50
 _FACING = np.cos(np.radians(40.0))  # of the optical axes of a pair
 _STEPS = 83
 _FACTORS = np.geomspace(1 / 12, 12, _STEPS)  # that depths are multiplied with, in steps of 6 %
@@ -122,7 +123,8 @@ def _peak(agreement: Float, best: int) -> float:
 
 def _pairs(cam_from_world: Float) -> list[tuple[int, int]]:
     """Pairs of frames that look the same way from places some way apart."""
-    centers, axes = camera_centers(cam_from_world), cam_from_world[:, 2, :3]
+    centers = camera_centers(cam_from_world)
+    axes = cam_from_world[:, 2, :3]
     first = np.unique(np.linspace(0, len(centers) - 1, _PAIRS).round().astype(int))
     apart = np.linalg.norm(centers[first][:, None] - centers, axis=-1)
     facing = axes[first] @ axes.T > _FACING
@@ -136,7 +138,8 @@ def _pairs(cam_from_world: Float) -> list[tuple[int, int]]:
 
 def _readings_at(survey_m: NDArray[np.float32], camera: PinholeCamera, points_cam: Float) -> Float:
     """Depth of points (N, 3) in a camera, and what its survey reads there, (M, 2), of those where it reads anything."""
-    pixels, z = camera.project(points_cam), points_cam[:, 2]
+    pixels = camera.project(points_cam)
+    z = points_cam[:, 2]
     inside = (z > 0) & camera.in_image(pixels)
     cell = (pixels[inside] // SURVEY_STRIDE).astype(np.int64)
     height, width = survey_m.shape

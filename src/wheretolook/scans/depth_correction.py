@@ -48,7 +48,8 @@ def fit_depth_correction(true_m: Float, read_m: Float) -> DepthCorrection | None
     from scipy.optimize import least_squares
 
     usable = (read_m > _NEAREST_M) & (true_m > _NEAREST_M)
-    true_m, read_m = true_m[usable], read_m[usable]
+    true_m = true_m[usable]
+    read_m = read_m[usable]
     if len(read_m) < LEAST_LANDMARKS or np.quantile(read_m, 0.9) < LEAST_RANGE * np.quantile(read_m, 0.1):
         return None
 

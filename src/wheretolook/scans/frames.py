@@ -56,7 +56,8 @@ class RgbdFrames:
 
     def __init__(self, config: RgbdConfig, progress: bool = True) -> None:
         assert config.folder is not None
-        self.folder, self.layout = config.folder, find_layout(config.folder)
+        self.folder = config.folder
+        self.layout = find_layout(config.folder)
         self.model = None if config.model is None else read_model(config.model)
         frames, self.skipped = frame_files(self.folder, self.layout, need_poses=self.model is None)
         if self.model is not None:
@@ -89,7 +90,8 @@ class RgbdFrames:
 
     def __getitem__(self, index: int) -> RgbdFrame:
         frame = self._frames[index]
-        image, depth = _read(frame.color, cv2.IMREAD_COLOR), self._read_depth(frame.depth)
+        image = _read(frame.color, cv2.IMREAD_COLOR)
+        depth = self._read_depth(frame.depth)
         if image is None or depth is None:
             raise SceneError("an image has vanished while it was used", path=frame.color, fix="Run the stage again.")
         rgb = np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
@@ -170,7 +172,8 @@ class RgbdFrames:
         if image is None:
             return None
         if image.ndim != 2 or image.dtype != np.uint16:
-            value, fix = f"{image.dtype}, shape {image.shape}", "Write depth as PNG of one channel of 16 bits."
+            value = f"{image.dtype}, shape {image.shape}"
+            fix = "Write depth as PNG of one channel of 16 bits."
             raise SceneError("this is no depth image", path=path, value=value, fix=fix)
         read_m = np.where(image == self.layout.no_reading, 0, image).astype(np.float32) / np.float32(self.depth_scale)
         return self.depth_correction.apply(read_m)
@@ -185,7 +188,8 @@ class RgbdFrames:
         nearness = 1 / np.maximum(z, np.float32(1e-3))
         x = np.floor(x * nearness * np.float32(self.camera.fx) + np.float32(self.camera.cx))
         y = np.floor(y * nearness * np.float32(self.camera.fy) + np.float32(self.camera.cy))
-        height, width = self.camera.height, self.camera.width
+        height = self.camera.height
+        width = self.camera.width
         inside = (z > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
         nearest = np.zeros(height * width, dtype=np.float32)
         np.maximum.at(nearest, (y[inside] * width + x[inside]).astype(np.int64), nearness[inside])
@@ -204,7 +208,8 @@ class RgbdFrames:
 def _with_poses_of(model: Any, path: Path | None, frames: list[FrameFiles], skipped: Skipped) -> list[FrameFiles]:
     """The frames that a COLMAP model has by the name of the colour image, or by its last part, with its poses."""
     poses = dict(zip(registered_names(model).values(), colmap_poses("", model), strict=True))
-    by_last, recorded = dict[str, list[str]](), Counter(_last(frame.name) for frame in frames)
+    by_last = dict[str, list[str]]()
+    recorded = Counter(_last(frame.name) for frame in frames)
     for name in poses:
         by_last.setdefault(_last(name), []).append(name)
     found = []
@@ -216,7 +221,8 @@ def _with_poses_of(model: Any, path: Path | None, frames: list[FrameFiles], skip
         else:
             skipped.add("without a pose in the model")
     if not found:
-        value, fix = (next(iter(poses)), frames[0].name), "Give the model that was made of these colour images."
+        value = (next(iter(poses)), frames[0].name)
+        fix = "Give the model that was made of these colour images."
         raise SceneError("the model has none of the recording's colour images", path=path, value=value, fix=fix)
     return found
 
@@ -243,7 +249,8 @@ def _read(path: Path, flags: int, at_most: int = MAX_PIXELS) -> NDArray[Any] | N
 
 def _scaled(intrinsics: tuple[float, ...], size: tuple[int, int]) -> tuple[float, ...]:
     """A layout's intrinsics, which are of 640 x 480 pixels, for images of another size."""
-    x, y = size[0] / 640, size[1] / 480
+    x = size[0] / 640
+    y = size[1] / 480
     return intrinsics[0] * x, intrinsics[1] * y, intrinsics[2] * x, intrinsics[3] * y
 
 

@@ -146,7 +146,8 @@ def _up(config: RgbdConfig, frames: RgbdFrames, mesh: TexturedMesh) -> Float:
 
 def _without_crumbs(mesh: TexturedMesh) -> TexturedMesh:
     """The mesh without small pieces that are connected to nothing, and without vertices that nothing uses."""
-    n, (a, b, c) = len(mesh.vertices), mesh.triangles.T
+    n = len(mesh.vertices)
+    (a, b, c) = mesh.triangles.T
     edges = coo_array((np.ones(2 * len(a), dtype=np.int8), (np.r_[a, b], np.r_[b, c])), shape=(n, n))
     _, piece = connected_components(edges, directed=False)
     piece_of = piece[a]
@@ -165,7 +166,9 @@ class _DepthImages(Sequence[DepthImage]):
     """Frames as the fusion takes them, each read when it is asked for."""
 
     def __init__(self, frames: Frames, camera: PinholeCamera, poses: NDArray[Any]) -> None:
-        self.frames, self.camera, self.poses = frames, camera, poses
+        self.frames = frames
+        self.camera = camera
+        self.poses = poses
 
     def __len__(self) -> int:
         return len(self.poses)

@@ -20,7 +20,8 @@ from wheretolook.utils.reading import read_text
 _MAX_APART_S = 0.02  # between a colour image and its depth image or pose: as TUM's own associate.py has it
 _RIGID = 1e-2  # by which a rotation's entries may be off
 _FAR_M = 1e9  # from the origin; no recording has such coordinates
-_MOST_FRAMES, _MOST_POSES = 100_000, 400_000  # rows of a list: an hour at 30 Hz and at 100 Hz
+_MOST_FRAMES = 100_000  # rows of a list: an hour at 30 Hz and at 100 Hz
+_MOST_POSES = 400_000
 _IMAGES = (".png", ".jpg", ".jpeg")
 
 
@@ -106,7 +107,8 @@ def _color_files(folder: Path) -> Iterator[Path]:
 def _seven_scenes_frames(folder: Path, skipped: Skipped, need_poses: bool) -> Iterator[FrameFiles]:
     for color in sorted(_color_files(folder)):
         stem = color.name.partition(".color.")[0]
-        depth, pose = color.with_name(f"{stem}.depth.png"), color.with_name(f"{stem}.pose.txt")
+        depth = color.with_name(f"{stem}.depth.png")
+        pose = color.with_name(f"{stem}.pose.txt")
         found = _read_pose(pose) if need_poses else np.eye(3, 4)
         if not depth.is_file():
             skipped.add("without a depth image")
@@ -138,14 +140,17 @@ def _checked(world_from_cam: Float) -> Float | None:
 
 def _tum_frames(folder: Path, skipped: Skipped, need_poses: bool) -> Iterator[FrameFiles]:
     rgb, depth = (_read_list(folder / name, 1, _MOST_FRAMES) for name in ("rgb.txt", "depth.txt"))
-    times, poses = list[float](), np.zeros((0, 7))
+    times = list[float]()
+    poses = np.zeros((0, 7))
     if need_poses:
         rows = _read_list(folder / "groundtruth.txt", 7, _MOST_POSES)
         times = [time for time, _ in rows]
         poses = np.array([[_number(value) for value in values] for _, values in rows])
-    depth_of, pose_of = _Times([time for time, _ in depth]), _Times(times)
+    depth_of = _Times([time for time, _ in depth])
+    pose_of = _Times(times)
     for time, (name,) in rgb:
-        at, pose = depth_of.nearest(time), pose_of.nearest(time)
+        at = depth_of.nearest(time)
+        pose = pose_of.nearest(time)
         color = path_within(folder, name, "the name of a colour image")
         distance = None if at is None else path_within(folder, depth[at][1][0], "the name of a depth image")
         if not color.is_file():

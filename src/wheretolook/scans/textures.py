@@ -39,7 +39,8 @@ def textured(
 ) -> TexturedMesh:
     """The mesh with photographs (F) of poses (F, 3, 4) as its textures; vertex colours where none shows a triangle."""
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MAX_PHOTOGRAPHS)).round().astype(int))
-    poses, areas = cam_from_world[chosen], np.zeros((len(chosen), len(mesh.triangles)), dtype=np.float16)
+    poses = cam_from_world[chosen]
+    areas = np.zeros((len(chosen), len(mesh.triangles)), dtype=np.float16)
     renderer = WarpRenderer(mesh, device)
     for row, pose in enumerate(tqdm(poses, desc="find textures", unit="photograph", disable=not progress)):
         areas[row] = _areas_px(mesh, renderer, camera, pose)
@@ -48,12 +49,14 @@ def textured(
     uvs = np.zeros((len(mesh.triangles), 3, 2), dtype=np.float32)
     number = np.zeros(len(mesh.triangles), dtype=np.int32)
     for row in np.unique(photograph[photograph >= 0]).tolist():
-        shown, rgb = np.flatnonzero(photograph == row), frames[int(chosen[row])].rgb
+        shown = np.flatnonzero(photograph == row)
+        rgb = frames[int(chosen[row])].rgb
         pixels = camera.project(
             transform(poses_from(poses[row], mesh.origin), mesh.vertices[mesh.triangles[shown]].reshape(-1, 3))
         )
         pixels = pixels.reshape(-1, 3, 2)
-        uvs[shown], number[shown] = pixels / (camera.width, camera.height), len(textures)
+        uvs[shown] = pixels / (camera.width, camera.height)
+        number[shown] = len(textures)
         textures.append(_as_exposed(rgb, pixels.mean(1), mesh, shown))
     rest = np.flatnonzero(photograph < 0)
     if len(rest):
@@ -68,14 +71,17 @@ def _areas_px(mesh: TexturedMesh, renderer: WarpRenderer, camera: PinholeCamera,
     depth = renderer.render(camera, pose[None]).depth_m[0]
     nearest = cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), np.ones((_EDGE_PX, _EDGE_PX), np.uint8))
     points = transform(poses_from(pose, mesh.origin), mesh.vertices)
-    pixels, z = camera.project(points), points[:, 2]
-    low, high = _MARGIN_PX, np.array([camera.width, camera.height]) - _MARGIN_PX
+    pixels = camera.project(points)
+    z = points[:, 2]
+    low = _MARGIN_PX
+    high = np.array([camera.width, camera.height]) - _MARGIN_PX
     seen = (z > 0) & ((pixels >= low) & (pixels < high)).all(1)
     column, row = pixels[seen].astype(np.int64).T
     seen[seen] = z[seen] < nearest[row, column] + _BEHIND_M
     whole = np.flatnonzero(seen[mesh.triangles].all(1))
     a, b, c = np.moveaxis(pixels[mesh.triangles[whole]], 1, 0)
-    (ux, uy), (vx, vy) = (b - a).T, (c - a).T
+    (ux, uy) = (b - a).T
+    (vx, vy) = (c - a).T
     areas = np.zeros(len(mesh.triangles), dtype=np.float16)
     areas[whole] = np.clip((uy * vx - ux * vy) / 2, 0, 60_000)  # fronts are clockwise where y points down
     return areas

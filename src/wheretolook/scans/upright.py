@@ -25,7 +25,8 @@ def find_up(cam_from_world: Float, mesh: TexturedMesh) -> Float:
     units = normals / np.maximum(area, 1e-12)[:, None]
     for limit_deg in _ROUNDS_DEG:
         along = units @ up
-        level, upright = np.abs(along) > np.cos(np.radians(limit_deg)), np.abs(along) < np.sin(np.radians(limit_deg))
+        level = np.abs(along) > np.cos(np.radians(limit_deg))
+        upright = np.abs(along) < np.sin(np.radians(limit_deg))
         scatter = _scatter(units[upright], area[upright]) - _scatter(units[level], area[level])
         found = np.linalg.eigh(scatter)[1][:, 0]
         up = found if found @ up > 0 else -found

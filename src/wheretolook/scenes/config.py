@@ -62,7 +62,8 @@ class ApartmentConfig:
 
     def key(self) -> dict[str, Any]:
         """What decides an apartment, but for its seed; options that came later only where they are not the default."""
-        later, default = ("repetition", "enlarged", "vary"), asdict(ApartmentConfig())
+        later = ("repetition", "enlarged", "vary")
+        default = asdict(ApartmentConfig())
         return {name: value for name, value in asdict(self).items() if name not in later or value != default[name]}
 
     def of_seed(self, seed: int) -> ApartmentConfig:

@@ -15,7 +15,8 @@ def cut_above(mesh: TexturedMesh, height_m: float) -> TexturedMesh:
     height_m -= float(mesh.origin[2])
     below = mesh.vertices[mesh.triangles][..., 2] <= height_m
     n_below = below.sum(1)
-    whole, rows = n_below == 3, np.flatnonzero((n_below == 1) | (n_below == 2))
+    whole = n_below == 3
+    rows = np.flatnonzero((n_below == 1) | (n_below == 2))
     # In each triangle that is cut, the corner that is alone on its side of the plane comes first.
     lone = np.where(n_below[rows] == 1, below[rows].argmax(1), (~below[rows]).argmax(1))
     order = (lone[:, None] + np.arange(3)) % 3
@@ -34,7 +35,8 @@ def cut_above(mesh: TexturedMesh, height_m: float) -> TexturedMesh:
         return np.concatenate([values, new.reshape(-1, values.shape[1]).astype(values.dtype)])
 
     first, second, third = corners.T
-    tip, trunk = n_below[rows] == 1, n_below[rows] == 2
+    tip = n_below[rows] == 1
+    trunk = n_below[rows] == 2
     pieces = [
         (tip, (first, on_second, on_third), (uvs[:, 0], cut_uvs[0], cut_uvs[1])),
         (trunk, (second, third, on_third), (uvs[:, 1], uvs[:, 2], cut_uvs[1])),
@@ -44,7 +46,8 @@ def cut_above(mesh: TexturedMesh, height_m: float) -> TexturedMesh:
     corner_uvs = [mesh.corner_uvs[whole], *(np.stack(at, axis=1)[keep] for keep, _, at in pieces)]
     texture = [mesh.triangle_texture[whole], *(mesh.triangle_texture[rows[keep]] for keep, _, _ in pieces)]
     used, renamed = np.unique(np.concatenate(triangles), return_inverse=True)
-    vertices, numbered = with_cuts(mesh.vertices)[used], renamed.reshape(-1, 3).astype(np.int32)
+    vertices = with_cuts(mesh.vertices)[used]
+    numbered = renamed.reshape(-1, 3).astype(np.int32)
     colors = None if mesh.vertex_colors is None else with_cuts(mesh.vertex_colors)[used]
     uv = np.concatenate(corner_uvs).astype(np.float32)
     return TexturedMesh(vertices, numbered, uv, np.concatenate(texture), mesh.textures, colors, mesh.origin)

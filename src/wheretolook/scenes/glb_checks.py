@@ -34,7 +34,8 @@ def check_glb_images(tree: Any, path: Path, begin: int) -> list[int]:
     """
     pixels = []
     for index, image in enumerate(tree.get("images", [])):
-        name, uri = f"texture {index}", image.get("uri")
+        name = f"texture {index}"
+        uri = image.get("uri")
         if "bufferView" not in image and not isinstance(uri, str):
             raise SceneError(f"the glTF file is corrupt: {name} is nowhere", path=path, value=str(image)[:80], fix=_FIX)
         if "bufferView" not in image and not uri.startswith("data:"):
@@ -43,7 +44,8 @@ def check_glb_images(tree: Any, path: Path, begin: int) -> list[int]:
         if "bufferView" not in image:
             pixels.append(check_image(io.BytesIO(_decoded(uri, name, path)), name, path))
             continue
-        mime_type, views = image.get("mimeType", ""), tree.get("bufferViews", [])
+        mime_type = image.get("mimeType", "")
+        views = tree.get("bufferViews", [])
         if mime_type not in _READABLE:
             fix = "Use the GLB with JPEG or PNG textures; a .basis.glb holds compressed ones"
             raise SceneError("a texture is in a format that is not supported", path=path, value=mime_type, fix=fix)
@@ -58,7 +60,8 @@ def check_glb_images(tree: Any, path: Path, begin: int) -> list[int]:
 
 def _view_bytes(view: dict[str, Any], uri: str | None, name: str, path: Path, begin: int) -> bytes:
     """What a view holds of the file's own data, of a `data:` URI, or of a file beside it."""
-    start, length = view.get("byteOffset", 0), view["byteLength"]
+    start = view.get("byteOffset", 0)
+    length = view["byteLength"]
     if uri is not None and uri.startswith("data:"):
         return _decoded(uri, name, path)[start : start + length]
     with (path if uri is None else path.parent / uri).open("rb") as file:
@@ -102,19 +105,23 @@ def _check(tree: Any, path: Path, n_bytes: int) -> None:
             refuse(f"{name} is no list of objects", str(items)[:80])
     views, accessors, nodes = (tree.get(name, []) for name in ("bufferViews", "accessors", "nodes"))
     for index, view in enumerate(views):
-        begin, length = view.get("byteOffset", 0), view["byteLength"]
+        begin = view.get("byteOffset", 0)
+        length = view["byteLength"]
         room = _bytes_of(tree["buffers"][_index(view["buffer"], tree["buffers"])], path, n_bytes)
         if not (_is_whole(begin) and _is_whole(length)) or begin + length > room:
             refuse(f"view {index} lies outside of the file", (begin, length))
     for index, accessor in enumerate(accessors):
-        count, begin = accessor["count"], accessor.get("byteOffset", 0)
+        count = accessor["count"]
+        begin = accessor.get("byteOffset", 0)
         if not _is_whole(count) or count == 0 or not _is_whole(begin):
             refuse(f"accessor {index} has no such number of elements", count)
         size = _COMPONENT_BYTES[accessor["componentType"]] * _COMPONENTS[accessor["type"]]
-        room, stride = n_bytes, size
+        room = n_bytes
+        stride = size
         if "bufferView" in accessor:
             view = views[_index(accessor["bufferView"], views)]
-            room, stride = view["byteLength"], view.get("byteStride", size)
+            room = view["byteLength"]
+            stride = view.get("byteStride", size)
             if not _is_whole(stride) or stride < 1:
                 refuse(f"accessor {index} has no such stride", stride)
         if begin + (count - 1) * stride + size > room:

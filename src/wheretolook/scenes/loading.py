@@ -153,7 +153,10 @@ def _part(geometry: Any, matrix: NDArray[np.float64]) -> _Part:
         raise ValueError(f"a triangle has vertex {triangles.max()} of {len(vertices)}")
 
     visual = geometry.visual
-    uvs, colors, texture, colored = None, None, _WHITE, False
+    uvs = None
+    colors = None
+    texture = _WHITE
+    colored = False
     if visual.kind == "texture":
         colors = visual.vertex_attributes.get("color")
         image, factor = _material(visual.material)
@@ -166,7 +169,8 @@ def _part(geometry: Any, matrix: NDArray[np.float64]) -> _Part:
             texture = np.rint(texture * factor).astype(np.uint8)
         colored = uvs is not None or factor is not None or colors is not None
     elif visual.kind in ("vertex", "face"):
-        colors, colored = visual.vertex_colors, True
+        colors = visual.vertex_colors
+        colored = True
     if colors is not None:
         colors = _as_uint8(np.asarray(colors)[:, :3])
         if colors.shape != (len(vertices), 3):
@@ -177,7 +181,8 @@ def _part(geometry: Any, matrix: NDArray[np.float64]) -> _Part:
 def _material(material: Any) -> tuple[Image.Image | None, NDArray[np.float64] | None]:
     """A material's image, and the colour (3,) in sRGB 0..1 that multiplies it; each None if there is none."""
     if isinstance(material, trimesh.visual.material.PBRMaterial):
-        image, factor = material.baseColorTexture, material.baseColorFactor
+        image = material.baseColorTexture
+        factor = material.baseColorFactor
         if factor is None:
             return image, None
         linear = np.asarray(factor, dtype=np.float64)[:3] / 255  # glTF factors are linear, and trimesh keeps 8 bits
@@ -207,7 +212,9 @@ def _merge(parts: list[_Part], rotation: NDArray[np.float64]) -> TexturedMesh:
     """One mesh of all parts; parts that share an image share a texture."""
     textures: dict[tuple[tuple[int, ...], bytes], int] = {}
     images: list[NDArray[np.uint8]] = []
-    triangle_texture, corner_uvs, triangles = [], [], []
+    triangle_texture = []
+    corner_uvs = []
+    triangles = []
     n_vertices = 0
     for part in parts:
         key = (part.texture.shape, hashlib.sha256(np.ascontiguousarray(part.texture).data).digest())
@@ -227,7 +234,8 @@ def _merge(parts: list[_Part], rotation: NDArray[np.float64]) -> TexturedMesh:
         world = np.concatenate([part.vertices for part in parts]) @ rotation.T
         origin = local_origin(world)
         vertices = (world - origin).astype(np.float32)
-    indices, all_uvs = np.concatenate(triangles).astype(np.int32), np.concatenate(corner_uvs).astype(np.float32)
+    indices = np.concatenate(triangles).astype(np.int32)
+    all_uvs = np.concatenate(corner_uvs).astype(np.float32)
     return TexturedMesh(vertices, indices, all_uvs, np.concatenate(triangle_texture), tuple(images), colors, origin)
 
 
@@ -235,7 +243,8 @@ def _check(mesh: TexturedMesh, path: Path) -> None:
     for what, values in (("vertices", mesh.vertices), ("texture coordinates", mesh.corner_uvs)):
         bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
         if bad.any():
-            first, fix = values[np.flatnonzero(bad)[0]].tolist(), "Clean the mesh, for instance in MeshLab"
+            first = values[np.flatnonzero(bad)[0]].tolist()
+            fix = "Clean the mesh, for instance in MeshLab"
             raise SceneError(f"{bad.sum()} {what} are NaN or infinite", path=path, value=first, fix=fix)
 
 

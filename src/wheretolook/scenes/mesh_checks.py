@@ -46,7 +46,8 @@ def _most_pixels() -> int:
 
 def check_all_images(pixels: Iterable[int], path: Path) -> None:
     """Raise SceneError if memory does not hold textures of so many pixels each."""
-    total, most = sum(pixels), fitting(BYTES_PER_PIXEL)
+    total = sum(pixels)
+    most = fitting(BYTES_PER_PIXEL)
     if total > most:
         fix = f"Scale them down: there is room for {most:,} pixels"
         raise SceneError("the textures are too large together", path=path, value=f"{total:,} pixels", fix=fix)
@@ -96,7 +97,9 @@ def check_obj(path: Path) -> list[Path]:
     Raises SceneError if a library of materials is missing, damaged, or outside of the mesh's folder, or the file has
     too many parts.
     """
-    textures, libraries, parts = [], [], dict.fromkeys(("usemtl", "o", "g"), 0)
+    textures = []
+    libraries = []
+    parts = dict.fromkeys(("usemtl", "o", "g"), 0)
     with path.open(encoding="utf-8", errors="replace") as file:
         for line in file:
             if line.startswith("mtllib "):

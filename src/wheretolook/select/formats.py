@@ -129,8 +129,10 @@ def _is_ours(folder: Path) -> bool:
 
 def _rows(views: Views) -> list[dict[str, Any]]:
     """One record a view; None for expected inliers where the method does not tell them."""
-    wxyz, positions = views.quaternions_wxyz, views.positions
-    yaw, pitch = views.yaw_deg, views.pitch_deg
+    wxyz = views.quaternions_wxyz
+    positions = views.positions
+    yaw = views.yaw_deg
+    pitch = views.pitch_deg
     rows = []
     for row in range(len(views)):
         w, x, y, z = (float(value) for value in wxyz[row])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from numbers import Integral
 
-from wheretolook.looks.choice import MOST_LOOKS
+from wheretolook.looks.selection import MOST_LOOKS
 from wheretolook.utils.errors import ConfigError
 
 

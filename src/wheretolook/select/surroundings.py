@@ -137,7 +137,8 @@ def _scaled(camera: Camera, width: int, height: int, path: Path) -> PinholeCamer
         matrix = camera.matrix
     except ConfigError as error:
         raise ConfigError(error.problem, path=path, value=error.value, fix=error.fix) from error
-    across, down = width / camera.width, height / camera.height
+    across = width / camera.width
+    down = height / camera.height
     center = (float(matrix[0, 2] * across), float(matrix[1, 2] * down))
     return PinholeCamera(width, height, float(matrix[0, 0] * across), float(matrix[1, 1] * down), center)
 

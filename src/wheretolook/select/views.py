@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation
-from wheretolook.planning.turns import pan_tilt_angles
+from wheretolook.planning.camera_turns import pan_tilt_angles
 from wheretolook.select.formats import save_views
 
 

@@ -18,14 +18,14 @@ def weights_of(method: str, given: str | Path | None, features: str = "") -> Pat
     """The file of weights that a method scores with, of the file or folder given or of those that ship.
 
     An empty method stands for that of the best weights; None for a method without any. Of a folder those are preferred
-    that have learnt by the features of the map (`wheretolook.methods.features_learnt.folder_for`).
+    that have learnt by the features of the map (`wheretolook.scorers.feature_domain.folder_for`).
 
     Raises a ConfigError if there is no such method, a WeightsError if there are no weights of it, or they cannot be
     read.
     """
-    from wheretolook.learning.weights import method_of_weights
-    from wheretolook.methods.features_learnt import folder_for
-    from wheretolook.methods.registry import best_weights, check_method, members, scorers
+    from wheretolook.scorers.feature_domain import folder_for
+    from wheretolook.scorers.registry import best_weights, check_method, members, scorers
+    from wheretolook.training.weights import method_of_weights
 
     kinds = {known.weights for known in members(method, scorers()) or ([check_method(method)] if method else [])}
     if "" in kinds:

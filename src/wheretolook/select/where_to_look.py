@@ -15,12 +15,12 @@ from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, check_poses, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.looks.around import best_looks
-from wheretolook.mapping.plausibility import warn_of_mesh
+from wheretolook.mapping.sanity import warn_of_mesh
+from wheretolook.planning.camera_turns import pan_tilt_angles
 from wheretolook.planning.config import StopConfig
-from wheretolook.planning.route_views import PlannedPath
-from wheretolook.planning.sequences import TurnLimit, best_sequence
+from wheretolook.planning.routes import PlannedPath
 from wheretolook.planning.stops import check_stopping, stops_along
-from wheretolook.planning.turns import pan_tilt_angles
+from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook.select.limits import check_limits
 from wheretolook.select.surroundings import grid_waypoints, map_space, surroundings, usable_waypoints
 from wheretolook.select.views import SelectedViews, joined
@@ -28,10 +28,10 @@ from wheretolook.select.waypoints import Waypoints
 from wheretolook.select.weights import weights_of
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError
-from wheretolook.visibility.remembered import RememberedOcclusion
+from wheretolook.visibility.cached_occlusion import RememberedOcclusion
 
 if TYPE_CHECKING:
-    from wheretolook.methods.base import Scorer
+    from wheretolook.scorers.base import Scorer
 
 VIEWS_AT_ONCE = {
     "cpu": 1 << 13,
@@ -58,7 +58,8 @@ class WhereToLook:
     """
 
     def __init__(self, scorer: Scorer, directions: ArrayLike | None = None, space: Any = None) -> None:
-        self.scorer, self._space = scorer, space
+        self.scorer = scorer
+        self._space = space
         axes = direction_lattice(500) if directions is None else np.asarray(directions, dtype=np.float64)
         self.directions = axes / np.linalg.norm(axes, axis=1, keepdims=True)
         self.views: SelectedViews | None = None  # those found last
@@ -112,9 +113,10 @@ class WhereToLook:
             ConfigError: no such method, camera, occlusion, lattice or device.
         """
         from wheretolook.geometry.camera_text import camera_of_view, parse_camera
-        from wheretolook.methods.registry import load_scorer, make_scorer
+        from wheretolook.scorers.registry import load_scorer, make_scorer
 
-        model, device = Path(path), usable_device(device)
+        model = Path(path)
+        device = usable_device(device)
         if camera is not None and fov_deg is not None:
             raise ConfigError("a camera is described in two ways", value=fov_deg, fix="Give camera or fov_deg.")
         axes = direction_lattice(directions, lattice)
@@ -187,7 +189,7 @@ class WhereToLook:
             pitch_deg: lowest and highest pitch in degrees, 90 straight up.
             max_turn_deg: greatest rotation between a view and the next, in the order of the points. The views are then
                 those with the greatest sum of scores of all sequences that keep the limit, exactly
-                (`wheretolook.planning.sequences.best_sequence`).
+                (`wheretolook.planning.view_sequence.best_sequence`).
             skip: leave out points outside the map or inside geometry.
             progress: show a progress bar.
             looks: instead of n, how many looks to choose together, for a camera that turns there and whose looks are
@@ -231,7 +233,8 @@ class WhereToLook:
 
     def _described(self, waypoints: Waypoints, rows: NDArray[np.int64], axes: Float, n: int) -> SelectedViews:
         """The n best of views along axes (W, K, 3) at some of the waypoints, with all that is told of them."""
-        scorer, k = self.scorer, axes.shape[1]
+        scorer = self.scorer
+        k = axes.shape[1]
         poses = poses_looking_along(np.repeat(waypoints.points[rows], k, axis=0), axes.reshape(-1, 3))
         told = scorer.report(poses)
         order = np.argsort(-told.score.reshape(-1, k), axis=1, kind="stable")[:, :n]
@@ -264,7 +267,8 @@ class WhereToLook:
         at = waypoints.points[rows]
         pairs = tqdm(zip(at, scores, strict=True), total=len(at), desc="looks", unit="waypoint", disable=not progress)
         sets = [best_looks(self.scorer, place, axes, values, n, max_turn_deg) for place, values in pairs]
-        looked, rank = axes[[look for found in sets for look in found.looks]], np.tile(np.arange(1, n + 1), len(rows))
+        looked = axes[[look for found in sets for look in found.looks]]
+        rank = np.tile(np.arange(1, n + 1), len(rows))
         worths = np.repeat([found.worth for found in sets], n)
         return self._reported(waypoints, np.repeat(rows, n), rank, looked, worths)
 
@@ -311,7 +315,8 @@ class WhereToLook:
     def _scores_around(self, locations: Float, axes: Float, progress: bool) -> Float:
         """Scores (L, D) of all directions (D, 3) at locations (L, 3)."""
         kind = self.localization_map.device.partition(":")[0]
-        scores, step = np.empty((len(locations), len(axes))), max(1, VIEWS_AT_ONCE[kind] // len(axes))
+        scores = np.empty((len(locations), len(axes)))
+        step = max(1, VIEWS_AT_ONCE[kind] // len(axes))
         with tqdm(total=len(locations), desc="score", unit="waypoint", disable=not progress) as bar:
             for begin in range(0, len(locations), step):
                 block = locations[begin : begin + step]

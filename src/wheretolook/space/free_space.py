@@ -98,7 +98,8 @@ def _around() -> NDArray[np.float64]:
     """Unit directions (34, 3): 16 level, 8 rising and 8 falling by 45 degrees, up, down."""
     rings = []
     for count, elevation in ((16, 0.0), (8, np.pi / 4), (8, -np.pi / 4)):
-        azimuth, level = np.arange(count) * 2 * np.pi / count, np.cos(elevation)
+        azimuth = np.arange(count) * 2 * np.pi / count
+        level = np.cos(elevation)
         ring = [np.cos(azimuth) * level, np.sin(azimuth) * level, np.full(count, np.sin(elevation))]
         rings.append(np.stack(ring, axis=1))
     return np.concatenate([*rings, [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]])

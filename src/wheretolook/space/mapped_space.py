@@ -25,10 +25,14 @@ class MappedSpace:
         self.config = config or MappedSpaceConfig()
         points, centers = (np.asarray(values, dtype=np.float64).reshape(-1, 3) for values in (landmarks, cameras))
         if not len(points) or not len(centers):
-            value, fix = (len(points), len(centers)), "Run the map stage again."
+            value = (len(points), len(centers))
+            fix = "Run the map stage again."
             raise MapError("the map has no landmarks or no cameras", value=value, fix=fix)
-        self._landmarks, self._cameras = cKDTree(points), cKDTree(centers)
-        reach, lowest, highest = self.config.max_camera_distance_m, centers.min(0), centers.max(0)
+        self._landmarks = cKDTree(points)
+        self._cameras = cKDTree(centers)
+        reach = self.config.max_camera_distance_m
+        lowest = centers.min(0)
+        highest = centers.max(0)
         low, high = np.quantile(points, (_OUTLIERS, 1 - _OUTLIERS), axis=0)
         lower = np.maximum(lowest - reach, np.minimum(low, lowest))
         upper = np.minimum(highest + reach, np.maximum(high, highest))

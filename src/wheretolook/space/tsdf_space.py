@@ -95,11 +95,13 @@ def seen_through(
     seen = np.zeros(len(points), dtype=bool)
     for index in tqdm(range(len(images)), desc="seen space", unit="image", disable=not progress):
         image = images[index]
-        depth, rows = image.readings(max_depth_m), np.flatnonzero(~seen)
+        depth = image.readings(max_depth_m)
+        rows = np.flatnonzero(~seen)
         pose = np.asarray(image.cam_from_world, dtype=np.float64)
         in_camera = points[rows] @ pose[:, :3].T + pose[:, 3]
         in_front = in_camera[:, 2] > 0
-        rows, in_camera = rows[in_front], in_camera[in_front]
+        rows = rows[in_front]
+        in_camera = in_camera[in_front]
         pixels = np.floor((in_camera @ image.camera.matrix.T)[:, :2] / in_camera[:, 2:])
         inside = ((pixels >= 0) & (pixels < (image.camera.width, image.camera.height))).all(axis=1)
         column, row = pixels[inside].astype(np.int64).T

@@ -5,18 +5,18 @@ result was made from: called again, a stage reuses what is there if its settings
 """
 
 from wheretolook.stages.adapt import adapt
-from wheretolook.stages.compare_paths import compare_paths
 from wheretolook.stages.evaluate import evaluate
-from wheretolook.stages.figures import figures
 from wheretolook.stages.label import label
-from wheretolook.stages.log_release import log_release
 from wheretolook.stages.map import make_maps
 from wheretolook.stages.plan import plan
-from wheretolook.stages.release import release
 from wheretolook.stages.sample import sample
 from wheretolook.stages.scenes import make_scenes
 from wheretolook.stages.train import train
 from wheretolook.stages.viewpoint_map import viewpoint_map
+from wheretolook_paper.commands.compare_paths import compare_paths
+from wheretolook_paper.commands.figures import figures
+from wheretolook_paper.commands.log_release import log_release
+from wheretolook_paper.commands.release import release
 
 __all__ = [
     "adapt",

@@ -15,15 +15,15 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from wheretolook.config import Experiment
-from wheretolook.dataset.folders import Dataset, SceneFolder, views_by_camera
-from wheretolook.dataset.scene import Scene
-from wheretolook.dataset.stamps import read_stamp
+from wheretolook.dataset.artifact_cache import read_stamp
+from wheretolook.dataset.dataset_lock import reading
+from wheretolook.dataset.environment import Scene
+from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.config import ExistingModelConfig
-from wheretolook.methods.features_learnt import folder_for
-from wheretolook.stages.inputs import Say, Tick, extractor_of, open_scene, refuse_release
-from wheretolook.stages.left_out import check_name, knows_photographs, leave_photographs_out
-from wheretolook.stages.one_at_a_time import reading
+from wheretolook.scorers.feature_domain import folder_for
+from wheretolook.stages.holdout_photos import check_name, knows_photographs, leave_photographs_out
+from wheretolook.stages.preconditions import Say, Tick, extractor_of, open_scene, refuse_release
 from wheretolook.utils.errors import ConfigError, MapError, OutOfRangeWarning, SceneError, TableError, WeightsError
 from wheretolook.utils.files import fingerprint, write_text
 from wheretolook.utils.locks import hold
@@ -34,13 +34,15 @@ from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
 if TYPE_CHECKING:
     from wheretolook.evaluation.adaptation import Gain
     from wheretolook.inputs.localization_map import LocalizationMap
-    from wheretolook.labelling.labeller import LabelTask
-    from wheretolook.methods.adapted.fit import Adapted, LocalizedViews
-    from wheretolook.methods.base import Scorer
+    from wheretolook.localization.labeller import LabelTask
+    from wheretolook.scorers.adapted.gp_correction import Adapted, LocalizedViews
+    from wheretolook.scorers.base import Scorer
     from wheretolook.visibility.occlusion import OcclusionModel
 
 FOLDER = "adapted"  # of a dataset: adapted weights, and what they have gained
-LEAST_VIEWS, LEAST_LOCATIONS, LEAST_OF_A_KIND = 100, 10, 10
+LEAST_VIEWS = 100
+LEAST_LOCATIONS = 10
+LEAST_OF_A_KIND = 10
 _AT_ONCE = 128  # views between two looks at the clock
 _PLACE = 256  # landmarks by which the place is known again
 
@@ -113,7 +115,7 @@ def _to_start_from(features: str) -> Path:
 
 def _adapt_map(experiment: Experiment, model: Path, weights: Path, say: Say, tick: Tick) -> Path | None:
     """Adapt to a COLMAP map by its photographs alone."""
-    from wheretolook.check.source import folder_of_check
+    from wheretolook.holdout.photo_map import folder_of_check
     from wheretolook.mapping.colmap_model import model_arrays, read_model
     from wheretolook.mapping.scale import read_scale
     from wheretolook.select.surroundings import surroundings
@@ -127,7 +129,8 @@ def _adapt_map(experiment: Experiment, model: Path, weights: Path, say: Say, tic
         fix = "Map it with a scale (map.photographs.scale), or pass --map.photographs.assume_metric true."
         raise MapError("the map has no scale, and this needs metres", path=model, value=scale.source, fix=fix)
     points = model_arrays(read_model(model)).points
-    device, asked = experiment.warp_device, experiment.occlusion.model
+    device = experiment.warp_device
+    asked = experiment.occlusion.model
     hides, _ = surroundings(None, None, 1000.0, "none" if asked == "none" else "hidden-points", model, device)
     views = _left_out(experiment, model, hides, weights, name, say)
     _check_enough(views, model)
@@ -139,11 +142,12 @@ def _left_out(
     experiment: Experiment, model: Path, occlusion: OcclusionModel, weights: Path, name: str, say: Say
 ) -> LocalizedViews:
     """A map's photographs, left out in blocks: in the folder of its check, so that neither does it again."""
-    from wheretolook.check.learning import photographed_views
+    from wheretolook.holdout.holdout_views import photographed_views
 
     _set_scorer_file(weights)  # refused now, not after the work
     settings = experiment.adapt
-    mesh, given = occlusion.name == "mesh", (settings.images, settings.database)
+    mesh = occlusion.name == "mesh"
+    given = (settings.images, settings.database)
     source, left_out = leave_photographs_out(experiment, "adapt", model, name, True, mesh, *given, say, True)
     return photographed_views(source, left_out, weights, occlusion, experiment.warp_device)
 
@@ -153,9 +157,11 @@ def _learn(
 ) -> Path | None:
     """Learn from a place's views; keep, tell and log what came of it."""
     from wheretolook.evaluation.adaptation import compare_log_odds, gain_markdown
-    from wheretolook.methods.adapted.fit import adapt as learn
+    from wheretolook.scorers.adapted.gp_correction import adapt as learn
 
-    name, path, seed = place.name, place.path, experiment.adapt.seed
+    name = place.name
+    path = place.path
+    seed = experiment.adapt.seed
     photographs = views.photograph >= 0
     kinds = {"rendered views": ~photographs, "left-out photographs": photographs}
     told = " and ".join(f"{rows.sum():,} {kind}" for kind, rows in kinds.items() if rows.any())
@@ -168,7 +174,8 @@ def _learn(
         return compare_log_odds(some.log_odds, learnt.held_out[rows], *judged)
 
     gain = gain_of(np.ones(len(views), dtype=bool))
-    text, is_better = gain_markdown(gain), gain.is_better
+    text = gain_markdown(gain)
+    is_better = gain.is_better
     if photographs.any() and not photographs.all():
         of_photographs = gain_of(photographs)
         is_better = is_better and not of_photographs.is_worse
@@ -234,10 +241,11 @@ def _labelled(
 
 def _label_for(experiment: Experiment, files: SceneFolder, scene: Scene, say: Say) -> pd.DataFrame:
     """Label views for so many minutes, one location after the other in random order. What was labelled is kept."""
-    from wheretolook.labelling.labeller import LabelTask, label_scenes
-    from wheretolook.labelling.shard import SceneJob
+    from wheretolook.localization.labeller import LabelTask, label_scenes
+    from wheretolook.localization.shard import SceneJob
 
-    config, label = experiment.adapt, experiment.label
+    config = experiment.adapt
+    label = experiment.label
     table = files.read_table()
     if table.empty:
         return table
@@ -272,7 +280,7 @@ def _label_for(experiment: Experiment, files: SceneFolder, scene: Scene, say: Sa
 
 def _remove_stale(folder: Path, tasks: list[LabelTask]) -> None:
     """Remove shards of other viewpoints, maps or settings; the others wait for a run that goes on."""
-    from wheretolook.labelling.labeller import MANIFEST
+    from wheretolook.localization.labeller import MANIFEST
 
     for path in folder.iterdir():
         if path not in {task.shards for task in tasks}:
@@ -286,23 +294,25 @@ def _remove_stale(folder: Path, tasks: list[LabelTask]) -> None:
 
 def labelled_views(files: SceneFolder, scene: Scene, table: pd.DataFrame, weights: Path) -> LocalizedViews:
     """The labelled views, and what the weights to start from think of them."""
+    from wheretolook.dataset.viewpoint_table import is_good, poses
     from wheretolook.geometry.poses import camera_centers
-    from wheretolook.methods.adapted.fit import LocalizedViews
-    from wheretolook.methods.adapted.score import log_odds_of
-    from wheretolook.viewpoints.table import is_good, poses
+    from wheretolook.scorers.adapted.gp_correction import LocalizedViews
+    from wheretolook.scorers.adapted.score import log_odds_of
 
-    cam_from_world, log_odds = poses(table), np.empty(len(table))
+    cam_from_world = poses(table)
+    log_odds = np.empty(len(table))
     for camera, rows in views_by_camera(files, table):
         scorer = _scorer(weights, files.localization_map(camera, scene.device))
         with warnings.catch_warnings():  # how far the weights hold here is what is measured
             warnings.simplefilter("ignore", OutOfRangeWarning)
             log_odds[rows] = log_odds_of(scorer.score(cam_from_world[rows]))
-    axes, group = cam_from_world[:, 2, :3], table["location_id"].to_numpy(np.int64)
+    axes = cam_from_world[:, 2, :3]
+    group = table["location_id"].to_numpy(np.int64)
     return LocalizedViews(log_odds, is_good(table), camera_centers(cam_from_world), axes, group)
 
 
 def _scorer(weights: Path, localization_map: LocalizationMap) -> Scorer:
-    from wheretolook.methods.registry import load_scorer
+    from wheretolook.scorers.registry import load_scorer
 
     _set_scorer_file(weights)
     return load_scorer(weights, localization_map)
@@ -310,7 +320,7 @@ def _scorer(weights: Path, localization_map: LocalizationMap) -> Scorer:
 
 def _set_scorer_file(weights: Path) -> None:
     """Raise WeightsError unless a file has weights of a set network."""
-    from wheretolook.learning.weights import method_of_weights
+    from wheretolook.training.weights import method_of_weights
 
     if (kind := method_of_weights(weights)) != "set":
         fix = "Give weights of the method set, or leave them out for those that ship."
@@ -318,8 +328,10 @@ def _set_scorer_file(weights: Path) -> None:
 
 
 def _check_enough(views: LocalizedViews, source: Path) -> None:
-    n_good, n_locations = int(views.good.sum()), len(np.unique(views.group))
-    of_a_kind, rendered = min(n_good, len(views) - n_good), views.photograph < 0
+    n_good = int(views.good.sum())
+    n_locations = len(np.unique(views.group))
+    of_a_kind = min(n_good, len(views) - n_good)
+    rendered = views.photograph < 0
     few = rendered.any() and (len(views) < LEAST_VIEWS or n_locations < LEAST_LOCATIONS)
     if few or of_a_kind < LEAST_OF_A_KIND:
         if not rendered.any():
@@ -339,11 +351,12 @@ def _check_enough(views: LocalizedViews, source: Path) -> None:
 def _save(place: _Place, points: Float, learnt: Adapted, views: LocalizedViews, gain: Gain) -> None:
     import torch
 
-    from wheretolook.learning.trained_network import TrainedNetwork
-    from wheretolook.methods.adapted.network import AdaptedNetwork
-    from wheretolook.methods.set.network import SetNetwork
+    from wheretolook.scorers.adapted.network import AdaptedNetwork
+    from wheretolook.scorers.set.network import SetNetwork
+    from wheretolook.training.trained_network import TrainedNetwork
 
-    base, found = TrainedNetwork.load(place.weights, SetNetwork, "set"), learnt.adaptation
+    base = TrainedNetwork.load(place.weights, SetNetwork, "set")
+    found = learnt.adaptation
     some = points[np.arange(min(_PLACE, len(points))) * len(points) // max(1, min(_PLACE, len(points)))]
     sizes = len(found.weights), len(some)
     kernel = base.scale, base.offset, found.length_m, found.sharpness

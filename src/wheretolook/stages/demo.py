@@ -16,16 +16,16 @@ from tqdm.auto import tqdm
 
 from wheretolook import stages
 from wheretolook.config import Experiment
-from wheretolook.dataset.folders import Dataset
-from wheretolook.dataset.stamps import STAGES, stage_key
+from wheretolook.dataset.artifact_cache import STAGES, stage_key
+from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.report import best_in_words
 from wheretolook.evaluation.results import SCORES_CSV, SCORES_MD, SCORES_PNG, results_folder
 from wheretolook.evaluation.scores import read_scores
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
-from wheretolook.methods.features_learnt import folder_for
-from wheretolook.methods.registry import best_weights, load_scorer, methods_named, scorers
+from wheretolook.scorers.feature_domain import folder_for
+from wheretolook.scorers.registry import best_weights, load_scorer, methods_named, scorers
 from wheretolook.stages.evaluate import not_logged
-from wheretolook.stages.inputs import Say, Tick, dataset_after, open_scene
+from wheretolook.stages.preconditions import Say, Tick, dataset_after, open_scene
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import fingerprint, write_json
 from wheretolook.utils.reading import read_json
@@ -66,7 +66,8 @@ def run_demo(experiment: Experiment) -> None:
         for number, (name, step) in enumerate(steps.items(), 1):
             bar.set_description_str(f"demo {number}/{len(steps)} {name}")
             step(experiment, say=partial(_say, name), tick=partial(_tick, bar, SECONDS[name]))
-        given, own = experiment.evaluate.weights, experiment.root / "weights"
+        given = experiment.evaluate.weights
+        own = experiment.root / "weights"
         known = (experiment.root / "results" / OVERVIEW).is_file()  # `compare` removes one that is out of date
         if not known and (given or any(own.glob("*.safetensors"))):
             draw_overview(experiment, given[-1] if given else own)
@@ -79,13 +80,17 @@ def compare(experiment: Experiment, say: Say, tick: Tick) -> None:
 
     Raises as `wheretolook.stages.evaluate.evaluate_methods`.
     """
-    dataset, config, tracking = dataset_after(experiment, "label"), experiment.evaluate, experiment.tracking
-    results, stamp = results_folder(dataset, config), experiment.root / STAMP
+    dataset = dataset_after(experiment, "label")
+    config = experiment.evaluate
+    tracking = experiment.tracking
+    results = results_folder(dataset, config)
+    stamp = experiment.root / STAMP
     folders = (experiment.root / "weights", folder_for(shipped(WEIGHTS), dataset.features))
     files = config.weights or [path for folder in folders for path in sorted(folder.glob("*.safetensors"))]
     made_from: list[Any] = [dataset.fingerprint(), [fingerprint(path) for path in files if path.is_file()]]
     made_from += [asdict(config), asdict(experiment.occlusion), VERSION]
-    scores, report = results / SCORES_CSV, results / SCORES_MD
+    scores = results / SCORES_CSV
+    report = results / SCORES_MD
 
     def made() -> dict[str, str]:
         content = [fingerprint(path) for path in (scores, report)]
@@ -102,7 +107,8 @@ def compare(experiment: Experiment, say: Say, tick: Tick) -> None:
 
         models = list(config.weights) or [*own_weights(dataset), best_weights(shipped(WEIGHTS), dataset.features)]
         (results / OVERVIEW).unlink(missing_ok=True)
-        device, occlusion = experiment.warp_device, experiment.occlusion
+        device = experiment.warp_device
+        occlusion = experiment.occlusion
         evaluate_methods(dataset, config, tracking, models, device=device, occlusion=occlusion, show=False)
         write_json(stamp, made())
     say(f"{'reusing' if known else 'all methods compared ->'} {report}")
@@ -112,16 +118,16 @@ def compare(experiment: Experiment, say: Say, tick: Tick) -> None:
 def draw_overview(experiment: Experiment, weights: Path) -> None:
     """Draw `<dataset>/results/overview.png`: the last scene's map, and what a network thinks of one place in it.
 
-    The place is one where to look matters (`wheretolook.viewpoints.table.instructive_location`). The weights are a
+    The place is one where to look matters (`wheretolook.dataset.viewpoint_table.instructive_location`). The weights are a
     file, or a folder of files of which the best is taken, for a camera of the dataset's field of view. Raises
     TableError if there is no dataset or its last scene is not labelled, WeightsError if the weights cannot be used.
     """
-    from wheretolook.figures.house_image import dollhouse
+    from wheretolook.dataset.viewpoint_table import instructive_location, outcome_in_words, poses, shares_good
+    from wheretolook.figures.dollhouse import dollhouse
     from wheretolook.figures.overview import Overview, overview_figure
     from wheretolook.figures.style import save_figure, scene_label
-    from wheretolook.methods.styles import method_style
-    from wheretolook.release.showcase_figures import rendered_views
-    from wheretolook.viewpoints.table import instructive_location, outcome_in_words, poses, shares_good
+    from wheretolook.scorers.styles import method_style
+    from wheretolook_paper.release.showcase_figures import rendered_views
 
     dataset = Dataset.load(experiment.root)
     scene = open_scene(experiment, dataset, dataset.scenes[-1])
@@ -161,7 +167,7 @@ def _ends(candidates: pd.DataFrame, scores: Float) -> tuple[pd.DataFrame, Float]
     The lowest is that of a camera held about level, if there is one: what a robot sees that looks ahead, and not the
     bare ceiling.
     """
-    from wheretolook.viewpoints.table import poses
+    from wheretolook.dataset.viewpoint_table import poses
 
     pitch = np.arcsin(np.clip(poses(candidates)[:, 2, 2], -1, 1))
     level = np.abs(pitch) <= np.radians(LEVEL_DEG)

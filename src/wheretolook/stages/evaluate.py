@@ -10,22 +10,22 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from wheretolook.config import Experiment
-from wheretolook.dataset.folders import Dataset
-from wheretolook.dataset.stamps import read_stamp
+from wheretolook.dataset.artifact_cache import read_stamp
+from wheretolook.dataset.dataset_lock import reading, reads_dataset
+from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.stages.inputs import Say, Tick, dataset_after, open_scene
-from wheretolook.stages.left_out import check_name, knows_photographs, leave_photographs_out
-from wheretolook.stages.look_sets import evaluate_looks
-from wheretolook.stages.one_at_a_time import reading, reads_dataset
+from wheretolook.stages.holdout_photos import check_name, knows_photographs, leave_photographs_out
+from wheretolook.stages.preconditions import Say, Tick, dataset_after, open_scene
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
 from wheretolook.visibility.config import OcclusionConfig
+from wheretolook_paper.commands.look_sets import evaluate_looks
 
 if TYPE_CHECKING:
     from wheretolook.evaluation.photographs import LeftOutPhotographs
-    from wheretolook.learning.provenance import TrainedModel
+    from wheretolook.training.provenance import TrainedModel
 
 
 @reads_dataset("evaluate")
@@ -34,7 +34,8 @@ def evaluate(experiment: Experiment, say: Say = print, tick: Tick = lambda work:
 
     Where labels keep where landmarks were matched, also `looks.csv` and `looks.md`: sets of looks localized together.
     """
-    config, device = experiment.evaluate, experiment.warp_device
+    config = experiment.evaluate
+    device = experiment.warp_device
     dataset = dataset_after(experiment, "label", knows_photographs if config.photographs else lambda scene: False)
     check_store(experiment.tracking)  # before the imports of what scores, which take seconds
     how: dict[str, Any] = {"device": device, "occlusion": experiment.occlusion}
@@ -50,14 +51,15 @@ def evaluate(experiment: Experiment, say: Say = print, tick: Tick = lambda work:
 
 def _photographs(experiment: Experiment, dataset: Dataset, say: Say) -> list[LeftOutPhotographs]:
     """The photographs of the maps of a split's scenes, left out of them."""
-    from wheretolook.check.learning import evaluated_photographs
-    from wheretolook.check.source import says_metric
+    from wheretolook.holdout.holdout_views import evaluated_photographs
+    from wheretolook.holdout.photo_map import says_metric
 
     found = []
     for files in dataset.split(experiment.evaluate.split):
         if knows_photographs(files):
             metric = experiment.map.photographs.assume_metric or not files.is_photographed or says_metric(files.map)
-            name, keep_frame = check_name(experiment, files), files.mesh.is_file()
+            name = check_name(experiment, files)
+            keep_frame = files.mesh.is_file()
             how = (metric, keep_frame, None, None, say)
             source, left_out = leave_photographs_out(experiment, "evaluate", files.map, name, *how)
             hides = open_scene(experiment, dataset, files).occlusion
@@ -131,18 +133,19 @@ def not_logged(dataset: Dataset) -> Path:
 def write_results(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, title: str) -> None:
     """Write tables, report, calibration curves (if any) and figures; those of an earlier evaluation go."""
     from wheretolook.evaluation import results
-    from wheretolook.evaluation.paper_tables import write_paper_tables
     from wheretolook.evaluation.report import score_markdown
     from wheretolook.evaluation.score_table import main_rows
     from wheretolook.evaluation.scores import read_scores
     from wheretolook.figures.calibration import calibration_figure
-    from wheretolook.figures.occlusion import occlusion_figure
     from wheretolook.figures.scores import regret_figure, score_figure
     from wheretolook.figures.style import save_figure
+    from wheretolook_paper.evaluation.paper_tables import write_paper_tables
+    from wheretolook_paper.figures.occlusion import occlusion_figure
 
     write_text(folder / results.SCORES_CSV, table.to_csv(index=False))
     write_text(folder / results.SCORES_MD, score_markdown(table, title))
-    variants, papers = folder / results.VARIANTS_CSV, table
+    variants = folder / results.VARIANTS_CSV
+    papers = table
     if variants.is_file():  # the paper's tables have a row for each of the network's inputs, which a release knows
         others = main_rows(read_scores(variants))
         papers = pd.concat([table, others[~others["method"].isin(table["method"])]], ignore_index=True)

@@ -11,30 +11,38 @@ from pathlib import Path
 import pandas as pd
 
 from wheretolook.config import Experiment
-from wheretolook.dataset.folders import Dataset, SceneFolder
-from wheretolook.dataset.stamps import forget_stamp, is_done, read_stamp, stage_key, write_stamp
-from wheretolook.labelling.report import LABELS_CSV, LABELS_MD, LABELS_PNG, LabelSummary, label_markdown, label_summary
-from wheretolook.stages.inputs import Say, Tick, dataset_after, existing, extractor_of, open_scene
-from wheretolook.stages.one_at_a_time import changes_dataset
+from wheretolook.dataset.artifact_cache import forget_stamp, is_done, read_stamp, stage_key, write_stamp
+from wheretolook.dataset.dataset_lock import changes_dataset
+from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.dataset.thresholds import ALL
+from wheretolook.dataset.viewpoint_table import is_good, write_table
+from wheretolook.localization.report import (
+    LABELS_CSV,
+    LABELS_MD,
+    LABELS_PNG,
+    LabelSummary,
+    label_markdown,
+    label_summary,
+)
+from wheretolook.stages.preconditions import Say, Tick, dataset_after, existing, extractor_of, open_scene
 from wheretolook.utils.errors import MapError, SceneError, TableError
 from wheretolook.utils.files import write_json, write_text
 from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.tracking import log, start_run
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
-from wheretolook.viewpoints.table import is_good, write_table
-from wheretolook.viewpoints.thresholds import ALL
 
 
 @changes_dataset("label")
 def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
     """Stage 4: every viewpoint rendered and localized; status and errors into `<scene>/viewpoints.parquet`.
 
-    Resumes after an interruption, see `wheretolook.labelling.labeller.label_scenes`. How the labels came out goes to
+    Resumes after an interruption, see `wheretolook.localization.labeller.label_scenes`. How the labels came out goes to
     `<dataset>/results/labels.*` and an MLflow run. Raises SceneError if a mesh is missing, or a scene is known from
     photographs alone.
     """
-    dataset, config = dataset_after(experiment, "sample"), experiment.label
+    dataset = dataset_after(experiment, "sample")
+    config = experiment.label
     for files in dataset.scenes:
         if files.is_photographed:
             problem = "this scene is known from photographs alone: without a mesh its viewpoints cannot be rendered, "
@@ -72,10 +80,11 @@ def _label(
     experiment: Experiment, dataset: Dataset, to_label: list[tuple[SceneFolder, str]], say: Say, tick: Tick
 ) -> dict[str, float]:
     """Label scenes and stamp them with their keys. Returns the seconds that each step took."""
-    from wheretolook.labelling.labeller import LabelTask, label_scenes
-    from wheretolook.labelling.shard import SceneJob
+    from wheretolook.localization.labeller import LabelTask, label_scenes
+    from wheretolook.localization.shard import SceneJob
 
-    config, keys = experiment.label, {files.name: (files, key) for files, key in to_label}
+    config = experiment.label
+    keys = {files.name: (files, key) for files, key in to_label}
     tasks: list[LabelTask] = []
     for files, _ in to_label:
         scene = open_scene(experiment, dataset, files)
@@ -84,7 +93,8 @@ def _label(
         job = SceneJob(files.mesh, files.landmarks, scene.camera, *options, cameras, config.store_pixels)
         tasks.append(LabelTask(scene.name, job, files.read_table(), _shards(files)))
     seconds: dict[str, float] = {}
-    start, replacing = time.monotonic(), False
+    start = time.monotonic()
+    replacing = False
     with closing(label_scenes(tasks, config)) as results:  # so that Ctrl-C here ends the workers
         for labelled in results:
             files, key = keys[labelled.task.name]
@@ -131,7 +141,8 @@ def log_labels(
         raise TableError("the dataset has no scene", path=dataset.root, fix="Run the scenes stage.")
     tables = {scene.name: _labelled_table(scene) for scene in dataset.scenes}
     summary = label_summary(tables, {scene.name: scene.split for scene in dataset.scenes})
-    folder, note = dataset.root / "results", _not_logged(dataset)
+    folder = dataset.root / "results"
+    note = _not_logged(dataset)
     if not seconds and note.is_file():
         seconds = _seconds_of(note)
     write_json(note, seconds or {})  # before the files, which are taken as logged without it

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from wheretolook.config import NOT_SCENES, Experiment
-from wheretolook.dataset.folders import Dataset, SceneFolder
-from wheretolook.dataset.stamps import forget_stamp, is_done, read_stamp, stage_key, write_stamp
+from wheretolook.dataset.artifact_cache import forget_stamp, is_done, read_stamp, stage_key, write_stamp
+from wheretolook.dataset.dataset_lock import changes_dataset
+from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, describe_camera, draw_camera
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.config import MapConfig, ScaleConfig
 from wheretolook.mapping.scale import read_scale
-from wheretolook.stages.inputs import (
+from wheretolook.stages.preconditions import (
     Say,
     Tick,
     dataset_after,
@@ -26,7 +27,6 @@ from wheretolook.stages.inputs import (
     open_scene,
     refuse_release,
 )
-from wheretolook.stages.one_at_a_time import changes_dataset
 from wheretolook.utils.confine import check_folder_name, entry_of, path_within
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.utils.files import fingerprint
@@ -54,21 +54,23 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
         scene = open_scene(experiment, dataset, files)
         seed = _seed(files)
         made_from = existing(files.mesh, SceneError, "scenes")
-        floor, camera = files.mapped_floor(), _mapping_camera(experiment.map, scene.camera, seed)
+        floor = files.mapped_floor()
+        camera = _mapping_camera(experiment.map, scene.camera, seed)
         shown_by = [asdict(scene.config.free_space), camera.record(), seed, made_from, *([floor] if floor else [])]
         key = stage_key("map", [settings, *shown_by])
         model = [files.map / name for name in ("cameras.bin", "images.bin", "points3D.bin")]
         if is_done(files, "map", key, files.landmarks, *model):
             say(f"{scene.name}: reusing {files.map}")
         else:
-            from wheretolook.mapping.building import build_map
+            from wheretolook.mapping.rendered_map import build_map
             from wheretolook.mapping.walk import PartOfFloor
 
             taken = _poses_of_recording(files, experiment.map.n_images)
             with naming_scene(files.mesh):
                 space = PartOfFloor(scene.mesh_space, floor) if floor else scene.mesh_space
                 shown = (scene.mesh, scene.renderer, space, camera)
-                workers, device = experiment.n_workers, scene.device
+                workers = experiment.n_workers
+                device = scene.device
                 how = (scene.raycaster, workers, device)
                 forget = partial(forget_stamp, files, "map")
                 report = build_map(*shown, experiment.map, seed, files.map, *how, replacing=forget, poses=taken)
@@ -123,7 +125,8 @@ def _map_photographs(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
     """
     from wheretolook.mapping.photographs import list_photographs
 
-    settings, root = experiment.map.photographs, experiment.root
+    settings = experiment.map.photographs
+    root = experiment.root
     assert settings.images is not None
     name = settings.name or settings.images.resolve().name
     check_folder_name("a scene's name, map.photographs.name,", name, NOT_SCENES)
@@ -167,7 +170,9 @@ def _map_existing(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
     """
     from wheretolook.mapping.colmap_model import read_model
 
-    settings, photographs, root = experiment.map.existing, experiment.map.photographs, experiment.root
+    settings = experiment.map.existing
+    photographs = experiment.map.photographs
+    root = experiment.root
     assert settings.model is not None
     name = settings.scene_name
     check_folder_name("a scene's name, map.existing.name,", name, NOT_SCENES)
@@ -191,8 +196,8 @@ def _map_existing(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
     if is_done(scene, "map", key, scene.landmarks, scene.mapping_cameras, *([scene.mesh] if mesh else [])):
         say(f"{scene.name}: reusing {scene.map}")
     else:
-        from wheretolook.mapping.existing_map import map_existing
-        from wheretolook.mapping.plausibility import warn_of_mesh
+        from wheretolook.mapping.imported_map import map_existing
+        from wheretolook.mapping.sanity import warn_of_mesh
         from wheretolook.rendering.raycasting import MeshRaycaster
         from wheretolook.scenes.loading import load_mesh, save_glb
 
@@ -242,7 +247,8 @@ def _with_photographs(scene: SceneFolder, experiment: Experiment) -> Dataset:
         scenes += [other for other in known.scenes if other.name != scene.name]
         if not all(read_scale(other.map) for other in known.scenes):  # maps of meshes have none
             problem = "this dataset holds scenes with meshes, which photographs do not join"
-            names, fix = [other.name for other in known.scenes], "Give the photographs a dataset of their own: --name."
+            names = [other.name for other in known.scenes]
+            fix = "Give the photographs a dataset of their own: --name."
             raise ConfigError(problem, path=root, value=names, fix=fix)
         others = [other for other in known.scenes if not (other.own_camera or scene.own_camera)]
         for other in others:

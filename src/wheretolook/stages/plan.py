@@ -9,21 +9,21 @@ import numpy as np
 import pandas as pd
 
 from wheretolook.config import Experiment
-from wheretolook.dataset.folders import Dataset
+from wheretolook.dataset.dataset_lock import reads_dataset
+from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.viewpoint_table import pose_columns
 from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.stages.inputs import Say, Tick, dataset_after, open_scene
-from wheretolook.stages.one_at_a_time import reads_dataset
+from wheretolook.stages.preconditions import Say, Tick, dataset_after, open_scene
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.locks import hold
 from wheretolook.utils.tracking import log, start_run
 from wheretolook.utils.tracking_layout import joined
 from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
-from wheretolook.viewpoints.table import pose_columns
 
 if TYPE_CHECKING:
-    from wheretolook.planning.route_views import PathView, PlannedPath
+    from wheretolook.planning.routes import PathView, PlannedPath
 
 
 @reads_dataset("plan")
@@ -41,7 +41,8 @@ def plan(experiment: Experiment, say: Say = print, tick: Tick = lambda work: Non
     from wheretolook.figures.path_film import score_text
     from wheretolook.planning.method_paths import path_views, plan_by_methods
 
-    dataset, config = dataset_after(experiment, "map"), experiment.plan
+    dataset = dataset_after(experiment, "map")
+    config = experiment.plan
     files = dataset.scenes[0] if not config.scene and len(dataset.scenes) == 1 else dataset.scene(config.scene)
     if config.start is None or config.goal is None:
         fix = "Give plan.start and plan.goal, such as --plan.start '[1, 1, 1.4]'."
@@ -82,11 +83,12 @@ Film = Literal["gif", "mp4", "none"]
 
 def _draw(views: dict[str, list[PathView]], landmarks: np.ndarray, title: str, folder: Path, film: Film) -> list[str]:
     """Draw the last of several methods' paths, and all side by side. Returns the names of the files written."""
-    from wheretolook.figures.moving import save_moving
+    from wheretolook.figures.animation import save_moving
     from wheretolook.figures.path_film import FRAME_MS, film_frames, methods_figure, still_figure
     from wheretolook.figures.style import save_figure
 
-    written, seen = ["path.png"], list(views.values())[-1]
+    written = ["path.png"]
+    seen = list(views.values())[-1]
     save_figure(still_figure(seen, landmarks, title), folder / "path.png")
     if len(views) > 1:
         save_figure(methods_figure(views, landmarks), folder / "methods.png")
@@ -122,7 +124,8 @@ def _table(path: PlannedPath, stopping: bool) -> pd.DataFrame:
     `together` is the score of all looks of the stop (empty elsewhere).
     """
     places, looks = path.looks
-    at, along = path.positions[places], path.all_axes
+    at = path.positions[places]
+    along = path.all_axes
     positions = dict(zip(("x_m", "y_m", "z_m"), at.T, strict=True))
     axes = dict(zip(("axis_x", "axis_y", "axis_z"), along.T, strict=True))
     poses = pose_columns(poses_looking_along(at, along))
@@ -138,7 +141,7 @@ def _table(path: PlannedPath, stopping: bool) -> pd.DataFrame:
 def _stops_told(path: PlannedPath) -> str:
     """Where the path stops, in words."""
     from wheretolook.figures.path_film import score_text
-    from wheretolook.planning.sequences import lengths_along
+    from wheretolook.planning.view_sequence import lengths_along
 
     if not path.stops:
         return ", no stops"

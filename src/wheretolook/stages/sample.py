@@ -8,14 +8,14 @@ from dataclasses import asdict
 import numpy as np
 
 from wheretolook.config import Experiment
-from wheretolook.dataset.folders import Dataset
-from wheretolook.dataset.scene import Scene
-from wheretolook.dataset.stamps import forget_stamp, is_done, stage_key, write_stamp
+from wheretolook.dataset.artifact_cache import forget_stamp, is_done, stage_key, write_stamp
+from wheretolook.dataset.dataset_lock import changes_dataset
+from wheretolook.dataset.environment import Scene
+from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.geometry.camera import Camera, draw_camera, write_cameras
-from wheretolook.stages.inputs import Say, Tick, dataset_after, existing, naming_scene, open_scene
-from wheretolook.stages.one_at_a_time import changes_dataset
+from wheretolook.stages.preconditions import Say, Tick, dataset_after, existing, naming_scene, open_scene
 from wheretolook.utils.errors import MapError, SceneError
-from wheretolook.viewpoints.config import SampleConfig
 
 
 @changes_dataset("sample")
@@ -27,7 +27,8 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
     hidden-point removal tells what is occluded. Raises SceneError if no location is free, MapError if there is no map,
     or one without a scale.
     """
-    dataset, config = dataset_after(experiment, "map"), experiment.sample
+    dataset = dataset_after(experiment, "map")
+    config = experiment.sample
     for files in dataset.scenes:
         scene = open_scene(experiment, dataset, files)
         key = _key(scene, config)
@@ -41,10 +42,13 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
 
 
 def _key(scene: Scene, config: SampleConfig) -> str:
-    files, space, stage = scene.files, asdict(scene.config.free_space), "scenes"
+    files = scene.files
+    space = asdict(scene.config.free_space)
+    stage = "scenes"
     if scene.is_photographed:
         scene.require_metres()
-        space, stage = asdict(scene.config.mapped_space), "map"
+        space = asdict(scene.config.mapped_space)
+        stage = "map"
     elif files.is_scanned:
         space = asdict(scene.config.mapped_space)
     chosen = {name: value for name, value in asdict(config).items() if name != "memory_gb"}
@@ -65,8 +69,8 @@ def _cameras(scene: Scene, config: SampleConfig) -> Camera | dict[int, Camera]:
 
 
 def _sample(scene: Scene, config: SampleConfig, say: Say) -> None:
-    from wheretolook.viewpoints.sampling import sample_viewpoints
-    from wheretolook.viewpoints.table import write_table
+    from wheretolook.dataset.sampling import sample_viewpoints
+    from wheretolook.dataset.viewpoint_table import write_table
 
     files = scene.files
     with naming_scene(scene.source):

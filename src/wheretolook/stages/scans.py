@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from wheretolook.config import NOT_SCENES, Experiment
-from wheretolook.dataset.folders import Dataset, SceneFolder
-from wheretolook.dataset.stamps import forget_stamp, is_done, read_stamp, stage_key, write_stamp
+from wheretolook.dataset.artifact_cache import forget_stamp, is_done, read_stamp, stage_key, write_stamp
+from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import CameraConfig, camera_of_record, describe_camera
 from wheretolook.scans.config import RgbdConfig
-from wheretolook.stages.inputs import Say, Tick
+from wheretolook.stages.preconditions import Say, Tick
 from wheretolook.utils.confine import check_folder_name, entry_of
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.files import write_json
@@ -26,7 +26,8 @@ def scan_scene(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
     The scene joins those of the dataset that have meshes. The recording's colour camera looks, unless the settings name
     another. Raises what `make_scan` does, and ConfigError if the dataset holds scenes without meshes.
     """
-    settings, root = experiment.scenes.rgbd, experiment.root
+    settings = experiment.scenes.rgbd
+    root = experiment.root
     check_folder_name("a scene's name, scenes.rgbd.name,", settings.scene_name, NOT_SCENES)
     scene = SceneFolder(entry_of(root, settings.scene_name, "a scene's name"), settings.split, experiment.camera.camera)
     others = _others(root, scene)

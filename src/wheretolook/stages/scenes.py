@@ -5,17 +5,18 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from functools import partial
+from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.config import Experiment, MeshSource
-from wheretolook.dataset.folders import Dataset, MappedFloor, SceneFolder
-from wheretolook.dataset.stamps import forget_stamp, is_done, stage_key, write_stamp
+from wheretolook.dataset.artifact_cache import forget_stamp, is_done, stage_key, write_stamp
+from wheretolook.dataset.dataset_lock import changes_dataset
+from wheretolook.dataset.layout import Dataset, MappedFloor, SceneFolder
+from wheretolook.dataset.sampling_config import Split
 from wheretolook.scenes.config import SceneKind
-from wheretolook.stages.inputs import Say, Tick, mesh_fingerprint, refuse_release
-from wheretolook.stages.one_at_a_time import changes_dataset
+from wheretolook.stages.preconditions import Say, Tick, mesh_fingerprint, refuse_release
 from wheretolook.utils.confine import entry_of
-from wheretolook.utils.errors import SceneError
-from wheretolook.viewpoints.config import Split
+from wheretolook.utils.errors import ConfigError, SceneError
 
 if TYPE_CHECKING:
     from wheretolook.geometry.mesh import TexturedMesh
@@ -29,7 +30,9 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
     Raises SceneError if a mesh in `scenes.meshes` or the recording cannot be used or two scenes have the same name,
     ConfigError if the dataset's folder holds a release.
     """
-    config, root, camera = experiment.scenes, experiment.root, experiment.camera.camera
+    config = experiment.scenes
+    root = experiment.root
+    camera = experiment.camera.camera
     refuse_release(root)
     if config.rgbd.folder is not None:
         from wheretolook.stages.scans import scan_scene
@@ -69,7 +72,8 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
         tick(1)
     dataset = Dataset(root, tuple(sources))
     if (root / "dataset.json").is_file():
-        before, made = Dataset.load(root).scenes, {scene.name for scene in sources}
+        before = Dataset.load(root).scenes
+        made = {scene.name for scene in sources}
         scans = [scene for scene in before if scene.is_scanned and scene.name not in made]  # which no setting names
         dataset = Dataset(root, (*sources, *scans))
         cameras = {scene.name: scene.camera for scene in before}
@@ -80,10 +84,20 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
     return dataset
 
 
-def _generate(experiment: Experiment, kind: SceneKind, seed: int) -> tuple[TexturedMesh, MappedFloor]:
-    from wheretolook.scenes.procedural.generator import generate_scene
+def scene_generator() -> Callable[..., tuple[TexturedMesh, MappedFloor]]:
+    """Return the installed generator of scenes, `generate(kind, config, seed, device=...)`.
 
-    return generate_scene(kind, experiment.scenes.apartment, seed, device=experiment.warp_device)
+    Raises ConfigError if no package registers one in the entry-point group `wheretolook.scene_generators`.
+    """
+    for entry in entry_points(group="wheretolook.scene_generators"):
+        generator: Callable[..., tuple[TexturedMesh, MappedFloor]] = entry.load()
+        return generator
+    raise ConfigError("no generator of scenes is installed", fix="Install wheretolook again, or name scenes.meshes.")
+
+
+def _generate(experiment: Experiment, kind: SceneKind, seed: int) -> tuple[TexturedMesh, MappedFloor]:
+    generate = scene_generator()
+    return generate(kind, experiment.scenes.apartment, seed, device=experiment.warp_device)
 
 
 def _load(source: MeshSource) -> tuple[TexturedMesh, MappedFloor]:

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.config import Experiment
-from wheretolook.dataset.folders import Dataset
-from wheretolook.methods.method import Method
-from wheretolook.methods.train_config import TrainConfig
-from wheretolook.stages.inputs import Say, Tick, dataset_after
-from wheretolook.stages.one_at_a_time import reading, reads_dataset
+from wheretolook.dataset.dataset_lock import reading, reads_dataset
+from wheretolook.dataset.layout import Dataset
+from wheretolook.scorers.method import Method
+from wheretolook.scorers.train_config import TrainConfig
+from wheretolook.stages.preconditions import Say, Tick, dataset_after
 from wheretolook.utils.confine import entry_of
 from wheretolook.utils.errors import TrackingError
 from wheretolook.utils.files import sha256, temporary_folder, write_json, write_text
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from mlflow import MlflowClient
 
-    from wheretolook.learning.provenance import TrainedModel
+    from wheretolook.training.provenance import TrainedModel
 
 Values = dict[str, Any]
 
@@ -63,8 +63,8 @@ def train_methods(
         TrackingError: the tracking store cannot be used. If it fails later, weights and records are kept, a
             TrackingWarning says that the training is not logged, and the next call logs it.
     """
-    from wheretolook.learning.provenance import about_training, trained_before, weights_path
-    from wheretolook.learning.scenes import with_also
+    from wheretolook.training.provenance import about_training, trained_before, weights_path
+    from wheretolook.training.scenes import with_also
 
     shared: dict[str, Any] = {"progress": progress, "kept": {}}
     models = []
@@ -95,19 +95,21 @@ def _train(
     from lightning.pytorch import seed_everything
     from lightning.pytorch.utilities.seed import isolate_rng
 
-    from wheretolook.learning.fit import RunLog
-    from wheretolook.learning.learner import Task
-    from wheretolook.learning.provenance import TrainedModel, weights_path
-    from wheretolook.learning.runs import NOT_LOGGED, kept_metrics, params_of
+    from wheretolook.training.fit import RunLog
+    from wheretolook.training.learner import Task
+    from wheretolook.training.provenance import TrainedModel, weights_path
+    from wheretolook_paper.release.training_histories import NOT_LOGGED, kept_metrics, params_of
 
     assert method.learn is not None
-    path, title = weights_path(dataset, method.name), f"train {method.name}"  # the title is that of its progress bar
+    path = weights_path(dataset, method.name)  # the title is that of its progress bar
+    title = f"train {method.name}"
     devices = {"devices": config.devices}
     record: Values = {}
     try:
         with start_run(tracking, method.name, "train", params_of(about) | devices) as (client, run_id), isolate_rng():
             seed_everything(config.seed, verbose=False)
-            options, run_log = config.options_of(method), RunLog(tracking, run_id)
+            options = config.options_of(method)
+            run_log = RunLog(tracking, run_id)
             learnt = method.learn(Task(dataset, method.name, config, options, title, run_log=run_log, **shared))
             learnt.model.save(path, about)
             history = "" if learnt.history is None else learnt.history.to_csv(index=False)
@@ -129,8 +131,14 @@ def _train(
 
 def _log_later(model: TrainedModel, tracking: TrackingConfig) -> TrainedModel:
     """Log a training whose weights and record lie on disk, from the record, as training itself does."""
-    from wheretolook.learning.runs import NOT_LOGGED, history_not_logged, kept_metrics, log_history, params_of
-    from wheretolook.learning.weights import read_record
+    from wheretolook.training.weights import read_record
+    from wheretolook_paper.release.training_histories import (
+        NOT_LOGGED,
+        history_not_logged,
+        kept_metrics,
+        log_history,
+        params_of,
+    )
 
     record = read_record(model.path)
     kept = record.pop(NOT_LOGGED, {})
@@ -149,14 +157,15 @@ def _log_later(model: TrainedModel, tracking: TrackingConfig) -> TrainedModel:
 
 def _log_artifacts(client: MlflowClient, run_id: str, weights: Path, history: pd.DataFrame | None, method: str) -> None:
     from wheretolook.figures.style import save_figure
-    from wheretolook.figures.training import training_figure
-    from wheretolook.learning.runs import HISTORY_CSV
+    from wheretolook_paper.figures.training import training_figure
+    from wheretolook_paper.release.training_histories import HISTORY_CSV
 
     client.log_artifact(run_id, str(weights))
     if history is None:
         return
     with temporary_folder() as folder:
-        table, curves = folder / HISTORY_CSV, Path(folder) / "curves.png"
+        table = folder / HISTORY_CSV
+        curves = Path(folder) / "curves.png"
         write_text(table, history.to_csv(index=False))
         save_figure(training_figure({method: history}), curves)
         for file in (table, curves):

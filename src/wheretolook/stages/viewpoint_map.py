@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from wheretolook.config import Experiment
-from wheretolook.stages.inputs import Say, Tick, dataset_after, naming_scene, open_scene
-from wheretolook.stages.one_at_a_time import reads_dataset
+from wheretolook.dataset.dataset_lock import reads_dataset
+from wheretolook.stages.preconditions import Say, Tick, dataset_after, naming_scene, open_scene
 
 if TYPE_CHECKING:
     from wheretolook.planning.viewpoint_map import ViewpointMap
@@ -25,7 +25,8 @@ def viewpoint_map(experiment: Experiment, say: Say = print, tick: Tick = lambda 
     """
     from wheretolook.planning.scene_map import default_weights, scene_scorer, scene_viewpoint_map
 
-    dataset, config = dataset_after(experiment, "map"), experiment.viewpoint_map
+    dataset = dataset_after(experiment, "map")
+    config = experiment.viewpoint_map
     if not config.method and config.weights is None and (weights := default_weights(dataset, say)) is not None:
         say(f"scored by {weights}")
         config = replace(config, weights=weights)

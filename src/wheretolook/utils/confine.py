@@ -47,7 +47,8 @@ def check_links(folder: Path, depth: int) -> None:
 
     What is written where such a link lies would be written elsewhere. The folder itself may be one.
     """
-    root, pending = folder.resolve(), [(folder, depth)]
+    root = folder.resolve()
+    pending = [(folder, depth)]
     while pending:
         within, left = pending.pop()
         with os.scandir(within) as entries:

@@ -41,7 +41,8 @@ def check_device_name(device: str) -> None:
 def _driver_gpus() -> int:
     """GPUs that NVIDIA's driver shows to this process; it is asked directly, which takes milliseconds."""
     try:
-        driver, count = ctypes.CDLL("libcuda.so.1"), ctypes.c_int()
+        driver = ctypes.CDLL("libcuda.so.1")
+        count = ctypes.c_int()
         found = driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0
     except (OSError, AttributeError):
         return 0

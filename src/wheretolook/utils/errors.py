@@ -15,7 +15,10 @@ class WhereToLookError(Exception):
     def __init__(
         self, problem: str, *, path: str | PathLike[str] | None = None, value: object = None, fix: str | None = None
     ) -> None:
-        self.problem, self.path, self.value, self.fix = problem, path, value, fix
+        self.problem = problem
+        self.path = path
+        self.value = value
+        self.fix = fix
         message = problem if path is None else f"{path}: {problem}"
         if value is not None:
             message += f" (got {value!r})"

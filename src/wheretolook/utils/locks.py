@@ -41,7 +41,8 @@ def hold(lock: Path, what: str, *, shared: bool = False, wait_s: float = 0.0) ->
     deadline = time.monotonic() + wait_s
     while (file := _locked(lock, shared)) is _TAKEN:
         if time.monotonic() >= deadline:
-            who, fix = _holders(lock), "Wait until it has ended, or end it, and run again."
+            who = _holders(lock)
+            fix = "Wait until it has ended, or end it, and run again."
             raise InUseError("another run is at work here", path=lock, value=who, fix=fix)
         time.sleep(0.05)
     if file is None:

@@ -61,7 +61,8 @@ def all_options(settings: type, prefix: str = "") -> dict[str, Option]:
     texts = _texts(settings)
     found = {}
     for field in dataclasses.fields(settings):
-        name, text = f"{prefix}{field.name}", texts.get(field.name, "")
+        name = f"{prefix}{field.name}"
+        text = texts.get(field.name, "")
         group = field.default_factory if field.default_factory is not MISSING else type(field.default)
         if isinstance(group, type) and dataclasses.is_dataclass(group):
             found[name] = Option(name, text, is_group=True)
@@ -152,7 +153,8 @@ def short_lines(options: Mapping[str, Option]) -> str:
 
 def grouped(options: Iterable[Option]) -> str:
     """All of some options with all that is said of them, those of one group together."""
-    lines, group = [], None
+    lines = []
+    group = None
     for option in options:
         if option.is_fixed:
             continue
@@ -204,7 +206,8 @@ def _texts(settings: type) -> dict[str, str]:
     """What the docstrings of a dataclass, and of those it extends, say of each field."""
     texts: dict[str, str] = {}
     for base in reversed(settings.__mro__):
-        name, inside = "", False
+        name = ""
+        inside = False
         for line in inspect.cleandoc(vars(base).get("__doc__") or "").splitlines():
             if line and not line.startswith(" "):
                 inside = line in ("Args:", "Attributes:")

@@ -28,8 +28,11 @@ MAX_HEADER_BYTES = 2**16  # of a page; Arrow keeps no statistics of long values 
 
 _AT_ONCE = 1 << 16  # rows that are read together
 _WIDTHS = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "INT96": 12, "FLOAT": 4, "DOUBLE": 8, "BYTE_ARRAY": 8}
-_OF_DICTIONARY, _OF_PREFIXES = (2, 8), 7  # encodings of values that are repeated, or begin as the one before
-_DATA, _DICTIONARY, _DATA_2 = 5, 7, 8  # fields of a page's header, by the kind of the page
+_OF_DICTIONARY = (2, 8)  # encodings of values that are repeated, or begin as the one before
+_OF_PREFIXES = 7
+_DATA = 5  # fields of a page's header, by the kind of the page
+_DICTIONARY = 7
+_DATA_2 = 8
 _DEPTH = 16  # of structures and lists in one another, of which a description has nine
 _DAMAGED = "its description is damaged"
 _KINDS = {_DATA: 2, _DICTIONARY: 2, _DATA_2: 4}  # and in these, the field of the encoding
@@ -103,7 +106,9 @@ def _check_columns(description: dict[int, Any]) -> None:
 
 def _check_unfolded(file: pq.ParquetFile, path: Path, names: Sequence[str]) -> None:
     """Raise ValueError if columns would unfold to far more than a file has bytes, or have too many pages."""
-    n_bytes, unfolded, n_pages = path.stat().st_size, 0, 0
+    n_bytes = path.stat().st_size
+    unfolded = 0
+    n_pages = 0
     columns = [file.schema.column(number) for number in range(len(file.schema))]
     wanted = [
         number
@@ -120,7 +125,8 @@ def _check_unfolded(file: pq.ParquetFile, path: Path, names: Sequence[str]) -> N
                 raise ValueError(_DAMAGED)
             for number in wanted:
                 pages = _pages(stream.fileno(), n_bytes, chunks[number], MAX_PAGES - n_pages)
-                n_pages, unfolded = n_pages + len(pages), unfolded + _unfolded(columns[number], pages)
+                n_pages = n_pages + len(pages)
+                unfolded = unfolded + _unfolded(columns[number], pages)
                 if unfolded > max(FREE_BYTES, MAX_RATIO * n_bytes):
                     raise ValueError(f"its {n_bytes:,} bytes would unfold to more than {unfolded:,}")
 
@@ -155,7 +161,8 @@ def _pages(file: int, n_bytes: int, chunk: Any, at_most: int) -> list[_Page]:
         raise ValueError(_DAMAGED)
     if isinstance(dictionary, int) and (0 < dictionary < start or start == 0 < dictionary):  # without rows, no data
         start = dictionary
-    end, found = start + length, list[_Page]()
+    end = start + length
+    found = list[_Page]()
     if not 0 <= start <= end <= n_bytes:
         raise ValueError(f"a column from byte {start:,} to {end:,} of {n_bytes:,}")
     while start < end:
@@ -163,7 +170,8 @@ def _pages(file: int, n_bytes: int, chunk: Any, at_most: int) -> list[_Page]:
             raise ValueError(f"it has more than {MAX_PAGES:,} pages")
         header, length = _header(file, start, min(MAX_HEADER_BYTES, end - start))
         kind = next((kind for kind in _KINDS if kind in header), 0)
-        about, encoding = header.get(kind), _KINDS.get(kind, 0)
+        about = header.get(kind)
+        encoding = _KINDS.get(kind, 0)
         about = about if isinstance(about, dict) else {1: 0, encoding: 0}  # of an index, which has no values
         numbers = header.get(2), header.get(3), about.get(1), about.get(encoding)
         if not all(isinstance(number, int) and number >= 0 for number in numbers):
@@ -188,11 +196,13 @@ class _Compact:
     """Thrift's compact protocol. IndexError where the bytes end; https://github.com/apache/thrift, doc/specs."""
 
     def __init__(self, content: bytes) -> None:
-        self.content, self.at = content, 0
+        self.content = content
+        self.at = 0
 
     def struct(self, depth: int = 0) -> dict[int, Any]:
         """The fields of a structure by their numbers: integers, structures and lists; of others nothing is kept."""
-        fields, number = dict[int, Any](), 0
+        fields = dict[int, Any]()
+        number = 0
         while (head := self._byte()) & 0x0F:
             number = number + (head >> 4) if head >> 4 else self._integer()
             if number in fields:  # Arrow might take the other one

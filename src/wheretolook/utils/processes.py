@@ -45,7 +45,8 @@ class Processes:
         if self._pool is None:  # here, since the thread that begins to use it starts the processes
             context = multiprocessing.get_context("spawn")
             self._pool = ProcessPoolExecutor(self.workers, context, _start_worker, (in_main_thread(),))
-        source, pending = iter(items), deque[Future[Result]]()
+        source = iter(items)
+        pending = deque[Future[Result]]()
         try:
             while True:
                 for item in islice(source, 4 * self.workers - len(pending)):

@@ -44,9 +44,11 @@ STAGE_TAG = "stage"
 
 PARENT_TAG = "mlflow.parentRunId"  # tag by which MLflow knows what run another is nested in
 FINGERPRINT_TAG = "fingerprint"  # of what a run was made from and what came out, see `fingerprint_of`
-LAYOUT_TAG, LAYOUT = "made_by", "wheretolook"  # of experiments of a dataset and purpose, not of other programs
+LAYOUT_TAG = "made_by"  # of experiments of a dataset and purpose, not of other programs
+LAYOUT = "wheretolook"
 OLD_EXPERIMENT = "wheretolook"  # all runs lay here before datasets and purposes had experiments of their own
-KIND_TAG, KIND = "mlflow.experimentKind", "custom_model_development"  # MLflow then opens on the table of runs
+KIND_TAG = "mlflow.experimentKind"  # MLflow then opens on the table of runs
+KIND = "custom_model_development"
 AT_ONCE = 800  # metrics logged at a time: MLflow takes 1000 of metrics and parameters together
 PAGE = 50  # runs searched at a time
 
@@ -106,7 +108,8 @@ def start_run(
     two decide its experiment. The stage is stored as a tag beside `tags`. Yields the client and the run's id, for
     `client.log_metric(run_id, ...)` and its kin.
     """
-    mlflow_client, dataset = client(tracking), str((params or {}).get("dataset", ""))
+    mlflow_client = client(tracking)
+    dataset = str((params or {}).get("dataset", ""))
     all_tags = {STAGE_TAG: stage, **code_version(), **(tags or {})}
     experiment = experiment_id(mlflow_client, tracking, stage, dataset)
     with _open_run(mlflow_client, experiment, run_name(what, stage, dataset), all_tags) as run_id:

@@ -14,7 +14,9 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-REGRET, SHARE, AUC = "1_regret", "1_share", "1_auc"
+REGRET = "1_regret"
+SHARE = "1_share"
+AUC = "1_auc"
 """Metrics to sort runs by: the first view chosen (N = 1), at the strictest threshold. MLflow orders columns by name,
 digits first."""
 
@@ -173,7 +175,8 @@ def views_of(stage: str) -> dict[str, str]:
     return {f"{_SHARED}{name}": view.state() for name, view in views.items()}
 
 
-_SHARED, _SHARED_BY = "mlflow.sharedViewState.", "viewStateShareKey"  # as of MLflow 3
+_SHARED = "mlflow.sharedViewState."  # as of MLflow 3
+_SHARED_BY = "viewStateShareKey"
 
 
 def run_name(what: str, stage: str, dataset: str) -> str:

@@ -44,7 +44,8 @@ def check_store(tracking: TrackingConfig) -> None:
     or holds a database that is damaged, of another version of MLflow, or read-only; or if there is no room for another
     megabyte.
     """
-    root, database = tracking.root, tracking.root / "mlflow.db"
+    root = tracking.root
+    database = tracking.root / "mlflow.db"
     opened_client(tracking)
     with _told(root):
         if not os.access(database, os.W_OK):
@@ -185,7 +186,8 @@ class _Client:
     """An MLflow client that raises TrackingErrors, and copies artifacts whole or not at all."""
 
     def __init__(self, root: Path, wrapped: MlflowClient) -> None:
-        self._root, self._wrapped = root, wrapped
+        self._root = root
+        self._wrapped = wrapped
 
     def log_artifact(self, run_id: str, local_path: str, artifact_path: str = "") -> None:
         """Copy a file to the artifacts of a run."""

@@ -70,7 +70,8 @@ def _keep_freed_memory() -> None:
 
 
 _PR_SET_PDEATHSIG = 1  # of sys/prctl.h
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
+_M_TRIM_THRESHOLD = -1  # of malloc.h
+_M_MMAP_THRESHOLD = -3
 
 
 def _wait_and_exit(parent: BaseProcess) -> None:

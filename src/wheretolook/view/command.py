@@ -75,7 +75,8 @@ def parser() -> argparse.ArgumentParser:
 
 def run(arguments: Sequence[str]) -> int:
     """Run the command. Returns the exit code 0; raises a WhereToLookError for bad input."""
-    options, start = parser().parse_args(arguments), time.monotonic()
+    options = parser().parse_args(arguments)
+    start = time.monotonic()
     _refuse(options)
     from dataclasses import replace
 
@@ -84,7 +85,7 @@ def run(arguments: Sequence[str]) -> int:
     state = ViewState.parse(options.state)
     if options.method:
         state = replace(state, method=options.method)
-    from wheretolook.view.played import read_paths
+    from wheretolook.view.paths import read_paths
     from wheretolook.view.shared import Shared
 
     paths = None if options.path is None else read_paths(options.path, options.pair)
@@ -100,7 +101,7 @@ def run(arguments: Sequence[str]) -> int:
         print(f"{told}, in {time.monotonic() - start:.0f} s: {options.record}")
         return 0
     if options.film is not None:
-        from wheretolook.view.film import film
+        from wheretolook_paper.commands.film import film
 
         n_frames = film(Shared(opened, paths), options.film, state)
         print(f"{told}, {n_frames} pictures in {time.monotonic() - start:.0f} s: {options.film}")
@@ -155,7 +156,8 @@ def _open(options: argparse.Namespace) -> Opened:
     from wheretolook.utils.devices import usable_device
     from wheretolook.view.opened import find_opened, open_map
 
-    device, camera = usable_device(options.device), _camera(options)
+    device = usable_device(options.device)
+    camera = _camera(options)
     if options.map is not None:
         given = options.map, options.mesh, camera, options.images, options.weights, device
         return open_map(*given, options.data)

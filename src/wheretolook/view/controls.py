@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from wheretolook.dataset.thresholds import THRESHOLDS, threshold_key, threshold_label
 from wheretolook.utils.errors import ConfigError
 from wheretolook.view.drawing import legend
 from wheretolook.view.shared import STEP_M, Shared
 from wheretolook.view.state import MOST_VIEWS, ViewState
 from wheretolook.view.texts import plain
-from wheretolook.viewpoints.thresholds import THRESHOLDS, threshold_key, threshold_label
 
 if TYPE_CHECKING:
     from viser import GuiApi
@@ -74,7 +74,8 @@ def build(gui: GuiApi, shared: Shared, state: ViewState) -> Controls:
     """Make the panel for one client, as its state says."""
     opened = shared.opened
     made: dict[str, Any] = {}
-    low, high = shared.low_m, shared.high_m
+    low = shared.low_m
+    high = shared.high_m
     blank = np.full((270, 360, 3), (38, 40, 46), np.uint8)
     tabs = gui.add_tab_group()
     with tabs.add_tab("Look"):
@@ -138,14 +139,16 @@ def build(gui: GuiApi, shared: Shared, state: ViewState) -> Controls:
 def _span(shared: Shared) -> tuple[float, float]:
     """From the lowest to the highest of what is shown."""
     points = shared.opened.landmarks.points[:, 2]
-    low, high = float(points.min()), float(points.max())
+    low = float(points.min())
+    high = float(points.max())
     if shared.opened.mesh is not None:
         low, high = (float(z) for z in shared.opened.mesh.bounds[:, 2])
     return low, max(high, low + 2 * STEP_M)
 
 
 def _slider(gui: GuiApi, label: str, low: float, high: float, value: float | None) -> Any:
-    low, high = np.floor(low / STEP_M) * STEP_M, np.ceil(high / STEP_M) * STEP_M
+    low = np.floor(low / STEP_M) * STEP_M
+    high = np.ceil(high / STEP_M) * STEP_M
     high = max(high, low + STEP_M)
     chosen = high if value is None else round(_within(value, low, high) / STEP_M) * STEP_M
     return gui.add_slider(label, round(low, 3), round(high, 3), STEP_M, round(_within(chosen, low, high), 3))
@@ -174,5 +177,6 @@ def value_of(handle: Any, known: T) -> T:
 
 
 def _offers(handle: Any, value: Any) -> bool:
-    options, most = getattr(handle, "options", None), getattr(handle, "max", None)
+    options = getattr(handle, "options", None)
+    most = getattr(handle, "max", None)
     return bool((options is None or value in options) and (most is None or handle.min <= value <= most))

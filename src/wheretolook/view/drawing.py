@@ -16,7 +16,10 @@ from wheretolook.geometry.poses import Float
 Rgb = NDArray[np.uint8]
 
 UNKNOWN = (120, 120, 120)  # of what nothing is known
-GOOD, BAD, PROMISED, MISSED = (0, 158, 115), (150, 150, 150), (213, 94, 0), (0, 114, 178)
+GOOD = (0, 158, 115)
+BAD = (150, 150, 150)
+PROMISED = (213, 94, 0)
+MISSED = (0, 114, 178)
 """Labelled views: localized as said, not localized as said, said to localize and not, not said to and localized."""
 
 FADE = 0.65  # share of grey in the colour of a place below the threshold
@@ -108,7 +111,7 @@ def mesh_glb(mesh: TexturedMesh, cut_m: float | None, largest_px: int = 2048) ->
 
 def frusta(camera: Camera, cam_from_world: Float, depth_m: float) -> Float:
     """Edges (S, 2, 3) m of cameras, evenly chosen if there are too many to be drawn."""
-    from wheretolook.figures.house_image import frustum_segments
+    from wheretolook.figures.dollhouse import frustum_segments
 
     rows = np.unique(np.linspace(0, len(cam_from_world) - 1, min(len(cam_from_world), MOST_FRUSTA)).astype(int))
     return frustum_segments(camera, np.asarray(cam_from_world, dtype=np.float64)[rows], depth_m).reshape(-1, 2, 3)
@@ -122,7 +125,8 @@ def picture(rgb: Rgb | None, camera: Camera, pixels: Float, values: Float, dots:
     size = (PICTURE_PX, max(1, round(camera.height * scale)))
     ground = Image.new("RGB", size, (38, 40, 46)) if rgb is None else Image.fromarray(rgb).resize(size)
     if dots:
-        draw, radius = ImageDraw.Draw(ground), 1.6
+        draw = ImageDraw.Draw(ground)
+        radius = 1.6
         order = np.argsort(np.nan_to_num(values, nan=0.0), kind="stable")  # the likely ones on top
         colors = score_colors(values)
         for row in order:

@@ -20,7 +20,7 @@ from wheretolook.visibility.config import OcclusionConfig
 if TYPE_CHECKING:  # nothing that is imported here may load torch or Warp: the page is to be there before them
     import pandas as pd
 
-    from wheretolook.dataset.folders import SceneFolder
+    from wheretolook.dataset.layout import SceneFolder
     from wheretolook.geometry.mesh import TexturedMesh
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.mapping.landmarks import Landmarks
@@ -64,7 +64,7 @@ class Opened:
     @cached_property
     def doubts(self) -> tuple[str, ...]:
         """Why it seems not to be in metres with z up, or the mesh not in its frame: the scores then say nothing."""
-        from wheretolook.mapping.plausibility import frame_doubts, mesh_doubt
+        from wheretolook.mapping.sanity import frame_doubts, mesh_doubt
 
         found: tuple[str, ...] = ()
         if self.mapping_poses is not None and len(self.mapping_poses) > 0:
@@ -138,10 +138,11 @@ class Opened:
 
         Raises ConfigError if there is no such method or occlusion, WeightsError if its weights cannot be used.
         """
-        from wheretolook.methods.registry import check_method, make_scorer
+        from wheretolook.scorers.registry import check_method, make_scorer
         from wheretolook.select.where_to_look import WhereToLook
 
-        method, occlusion = method or self.methods[0], occlusion or self.occlusions[0]
+        method = method or self.methods[0]
+        occlusion = occlusion or self.occlusions[0]
         key = (method, occlusion, directions)
         if key not in self._looks:
             weights = self.weights.files.get(check_method(method).weights)
@@ -153,9 +154,9 @@ class Opened:
         return self._looks[key]
 
     def _occlusion(self, name: str) -> OcclusionModel:
+        from wheretolook.visibility.cached_occlusion import RememberedOcclusion
         from wheretolook.visibility.hidden_points import HiddenPointRemoval
         from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion
-        from wheretolook.visibility.remembered import RememberedOcclusion
 
         config = OcclusionConfig()
         if name == "none":
@@ -188,9 +189,9 @@ def open_map(
     Raises MapError if there is no usable model, SceneError if the mesh cannot be used, ConfigError without such a
     camera, WeightsError if the weights cannot be used.
     """
-    from wheretolook.mapping.beside import photographs_of
     from wheretolook.mapping.opened_map import open_colmap
-    from wheretolook.mapping.plausibility import warn_of_mesh
+    from wheretolook.mapping.sanity import warn_of_mesh
+    from wheretolook.mapping.sources import photographs_of
     from wheretolook.view.photographs import Photographs
 
     landmarks, camera, poses = open_colmap(path, camera)
@@ -220,11 +221,11 @@ def open_scene(
     Raises MapError or TableError if it is half made: `wheretolook map` has not been run; WeightsError if the weights
     cannot be used.
     """
-    from wheretolook.dataset.scene import Scene, SceneConfig
-    from wheretolook.mapping.beside import photographs_of
+    from wheretolook.dataset.environment import Scene, SceneConfig
+    from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED
     from wheretolook.mapping.colmap_model import holds_model
+    from wheretolook.mapping.sources import photographs_of
     from wheretolook.view.photographs import Photographs
-    from wheretolook.viewpoints.table import CAMERA_ID, UNLABELLED
 
     if not files.landmarks.is_file():
         fix = "Run `wheretolook map` for its dataset."
@@ -243,7 +244,8 @@ def open_scene(
     shown = Photographs.of_model(files.map, folder) if folder is not None and holds_model(files.map) else None
     if mesh is None and scene.mapping_poses is None:
         raise SceneError("neither a mesh nor the map's cameras are known", path=files.folder, fix="Map it again.")
-    points, features = scene.landmarks.points, scene.landmarks.features
+    points = scene.landmarks.points
+    features = scene.landmarks.features
     known = scene_weights(files, points, features) if weights is None else given_weights(weights, features)
     return Opened(
         files.name, scene.landmarks, scene.camera, scene.mapping_poses, known, mesh, space,
@@ -254,8 +256,8 @@ def open_scene(
 def find_opened(
     data: Path, name: str, dataset: str, camera: Camera | None, weights: Path | None, device: str
 ) -> Opened:
-    """The scene of a name in a folder of datasets; raises as `wheretolook.check.source.find_scene`, `open_scene`."""
-    from wheretolook.check.source import find_scene
+    """The scene of a name in a folder of datasets; raises as `wheretolook.holdout.photo_map.find_scene`, `open_scene`."""
+    from wheretolook.holdout.photo_map import find_scene
 
     if not data.is_dir():
         fix = "Make a scene first, such as by `wheretolook demo`, or name a model: --map SPARSE."

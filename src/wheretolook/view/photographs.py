@@ -31,7 +31,8 @@ class Photographs:
         """Those of a COLMAP model's images that lie in a folder; None if none does."""
         from wheretolook.mapping.colmap_model import read_model
 
-        names, poses = [], []
+        names = []
+        poses = []
         for image in read_model(model).images.values():
             if image.has_pose and _file(folder, image.name) is not None:
                 names.append(image.name)

@@ -17,7 +17,7 @@ from wheretolook.view.texts import plain
 from wheretolook.view.worker import SOON
 
 if TYPE_CHECKING:
-    from wheretolook.methods.base import ViewReport
+    from wheretolook.scorers.base import ViewReport
 
 STEP_S = 0.25  # between two steps, at least
 
@@ -30,10 +30,13 @@ class Player:
     """The cameras of all methods go from step to step together; one whose path is shorter waits at its end."""
 
     def __init__(self, session: Session) -> None:
-        self.session, self.paths = session, session.shared.paths
+        self.session = session
+        self.paths = session.shared.paths
         self.length = max(map(len, self.paths.values()))
         self._reports: dict[tuple[str, str, str], ViewReport] = {}
-        self._playing, self._shown, self._lock = threading.Event(), threading.Event(), threading.Lock()
+        self._playing = threading.Event()
+        self._shown = threading.Event()
+        self._lock = threading.Lock()
         self._thread: threading.Thread | None = None  # that plays: one at most, however often the button is pressed
         for name, color in zip(self.paths, self._colors(), strict=False):
             line = camera_centers(self.paths[name].cam_from_world)
@@ -93,14 +96,17 @@ class Player:
 
     def _steps(self, step: int) -> Iterator[None]:
         session = self.session
-        opened, state, camera = session.opened, session.state, session.opened.camera
+        opened = session.opened
+        state = session.state
+        camera = session.opened.camera
         look = session.shared.look(state.method, state.occlusion)
         for (name, played), color in zip(self.paths.items(), self._colors(), strict=False):
             key = (name, state.method, state.occlusion)
             if key not in self._reports:
                 self._reports[key] = look.scorer.report(played.cam_from_world)
                 yield
-            report, at = self._reports[key], min(step, len(played) - 1)
+            report = self._reports[key]
+            at = min(step, len(played) - 1)
             pose: Float = played.cam_from_world[at]
             seen = landmarks_seen(look.scorer, pose, session.shared.teller(state.occlusion))
             image, _ = opened.picture(pose, seen)

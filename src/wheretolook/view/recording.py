@@ -72,9 +72,12 @@ def _floor(rerun: Any, stream: Any, shared: Shared, state: ViewState) -> None:
             bar.update(floor.n_scored - bar.n)
     if not len(floor.cells):
         return
-    at, low, high = floor.points, 0.0, 1.0
+    at = floor.points
+    low = 0.0
+    high = 1.0
     if not shared.is_probability(state.method):
-        low, high = float(floor.scores.min()), float(floor.scores.max())
+        low = float(floor.scores.min())
+        high = float(floor.scores.max())
     at[:, 2] = floor.height_m if floor.ground_m is None else floor.ground_m + 0.03
     colors = drawing.score_colors(floor.scores, low, high)
     half = (floor.cell_m / 2, floor.cell_m / 2, 0.005)

@@ -56,7 +56,8 @@ class WaypointList:
     """The waypoints of one client."""
 
     def __init__(self, session: Session) -> None:
-        self.session, self.points = session, []  # type: ignore[var-annotated]
+        self.session = session
+        self.points: list[Float] = []
         controls = session.controls
         session.on(controls.add, self._add_place, "on_click")
         session.on(controls.clear, self._clear, "on_click")
@@ -79,7 +80,8 @@ class WaypointList:
         self._draw()
 
     def _draw(self) -> None:
-        scene, size = self.session.scene, self.session.shared.mark_m
+        scene = self.session.scene
+        size = self.session.shared.mark_m
         rows = [f"{k + 1}. {x:.2f}, {y:.2f}, {z:.2f}" for k, (x, y, z) in enumerate(self.points)]
         self.session.controls.waypoints.content = "\n".join(rows) or "No waypoints yet."
         if not self.points:
@@ -126,7 +128,8 @@ class PictureButton:
 
     def _save_picture(self) -> None:
         client = self.session.client
-        height, width = client.camera.image_height or 1080, client.camera.image_width or 1920
+        height = client.camera.image_height or 1080
+        width = client.camera.image_width or 1920
         scale = min(1.0, LARGEST_PX / max(height, width))
         try:
             size = max(1, round(height * scale)), max(1, round(width * scale))

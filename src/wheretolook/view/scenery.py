@@ -33,17 +33,23 @@ class Scenery:
     """
 
     def __init__(self, scene: SceneApi, shared: Shared, controls: Controls) -> None:
-        self.scene, self.shared, self.controls = scene, shared, controls
-        self.range, self.drawn_m = (0.0, 1.0), shared.usual_m
+        self.scene = scene
+        self.shared = shared
+        self.controls = controls
+        self.range = (0.0, 1.0)
+        self.drawn_m = shared.usual_m
         self._floor: Floor | None = None
         self._mesh: bytes | None = None
         self._mesh_name = ""
-        self._less, self._drawing = 0, threading.Lock()  # of landmarks; drawn and thinned in several threads
+        self._less = 0  # of landmarks; drawn and thinned in several threads
+        self._drawing = threading.Lock()
 
     def draw(self, state: ViewState, inside: bool = False) -> None:
         """Draw mesh, landmarks and mapping cameras, as far as they are to be seen; the mesh whole and nothing else for
         one who stands inside."""
-        shown, cut, opened = self.controls.shown, None if inside else state.cut, self.shared.opened
+        shown = self.controls.shown
+        cut = None if inside else state.cut
+        opened = self.shared.opened
         self._draw_mesh(self.shared.mesh(cut) if shown["mesh"].value else None)
         points = opened.landmarks.points
         rows = np.arange(len(points)) if cut is None else np.flatnonzero(points[:, 2] <= cut)
@@ -62,7 +68,8 @@ class Scenery:
         """Put a mesh in place of the one that is drawn, which stays until the browser has read the new one."""
         if mesh is self._mesh:
             return
-        old, self._mesh = self._mesh_name, mesh
+        old = self._mesh_name
+        self._mesh = mesh
         if mesh is not None:
             self._mesh_name = "/mesh/a" if old != "/mesh/a" else "/mesh/b"
             self.scene.add_glb(self._mesh_name, mesh, cast_shadow=False, receive_shadow=False)
@@ -177,7 +184,8 @@ class Scenery:
         colors = np.where(told.good[:, None], drawing.GOOD, drawing.BAD)
         text = f"{len(told.good):,} labelled views, {100 * told.good.mean():.0f} % localize."
         if self.shared.is_probability(state.method):
-            colors[told.promised], colors[told.missed] = drawing.PROMISED, drawing.MISSED
+            colors[told.promised] = drawing.PROMISED
+            colors[told.missed] = drawing.MISSED
             text += f" Wrong at {state.threshold:.2f}: {told.promised.sum()} promised and lost (orange), "
             text += f"{told.missed.sum()} localized against it (blue)."
         segments = drawing.label_arrows(told.positions, told.axes, colors, self.shared.mark_m)

@@ -15,7 +15,7 @@ from wheretolook.geometry.poses import Float, poses_looking_along
 if TYPE_CHECKING:
     import pandas as pd
 
-    from wheretolook.methods.base import Scorer, ViewReport
+    from wheretolook.scorers.base import Scorer, ViewReport
     from wheretolook.select.views import SelectedViews
     from wheretolook.select.where_to_look import WhereToLook
 
@@ -76,7 +76,8 @@ class Floor:
         axes = look.directions
         found = look.scorer.score_around(self.points[rows], axes)
         best = found.argmax(axis=1)
-        self.scores[rows], self.axes[rows] = found.max(axis=1), axes[best]
+        self.scores[rows] = found.max(axis=1)
+        self.axes[rows] = axes[best]
         self.n_scored = rows.stop
         return True
 
@@ -96,7 +97,8 @@ def floor_at(space: Any, hides: Any, height_m: float) -> Floor:
     """The free places at a height, of a `space` with `bounds` and `is_free`, none inside geometry of the occlusion."""
     (x0, y0, _), (x1, y1, _) = np.asarray(space.bounds, dtype=np.float64)
     cell = max(LEAST_CELL_M, float(np.sqrt((x1 - x0) * (y1 - y0) / FLOOR_CELLS)))
-    columns, rows = max(1, ceil((x1 - x0) / cell)), max(1, ceil((y1 - y0) / cell))
+    columns = max(1, ceil((x1 - x0) / cell))
+    rows = max(1, ceil((y1 - y0) / cell))
     lower = np.array([(x0 + x1) / 2 - columns * cell / 2, (y0 + y1) / 2 - rows * cell / 2])
     floor = Floor(height_m, lower, cell, (rows, columns), np.arange(rows * columns))
     free = space.is_free(floor.points)
@@ -207,7 +209,7 @@ def judged_labels(
 
     A view is good if it localized with errors below limits in metres and degrees.
     """
-    from wheretolook.viewpoints.table import is_good, poses
+    from wheretolook.dataset.viewpoint_table import is_good, poses
 
     cam_from_world = poses(table)
     scores = np.empty(len(cam_from_world))

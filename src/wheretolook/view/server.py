@@ -21,7 +21,8 @@ from wheretolook.view.checks import check_port, require
 from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
 
-PORT, HOST = 8080, "127.0.0.1"
+PORT = 8080
+HOST = "127.0.0.1"
 LOCAL = ("localhost", "127.0.0.1", "::1")  # names of this machine alone
 HEADERS = ("Host", "Origin", "X-Forwarded-Host")
 
@@ -36,7 +37,9 @@ class Viewer:
     ) -> None:
         require("viser")
         check_port(host, port)
-        self.shared, self.state, self.dark = shared, state, dark
+        self.shared = shared
+        self.state = state
+        self.dark = dark
         self.sessions: dict[int, Any] = {}
         self._lock = threading.Lock()
         self.server = _server(host, port, f"wheretolook · {shared.opened.name}")
@@ -74,7 +77,8 @@ class Viewer:
     def _view_from(self, shared: Shared) -> None:
         """Clients begin above one corner, so that all of the floor is in the picture."""
         low, high = shared.seen_box
-        middle, size_m = (low + high) / 2, float(np.linalg.norm(high - low))
+        middle = (low + high) / 2
+        size_m = float(np.linalg.norm(high - low))
         camera = self.server.initial_camera
         camera.far = max(1000.0, 20 * shared.size_m)
         camera.near = min(0.01, shared.size_m / 1000)
@@ -95,7 +99,8 @@ class Viewer:
                 self._refuse(client, headers)
                 return
             host = headers.get("Host", "") if re.fullmatch(r"[\w.:\[\]-]{1,255}", headers.get("Host", "")) else ""
-            state, problem = self.state, None
+            state = self.state
+            problem = None
             try:
                 state = ViewState.of_path(path) or state
             except ConfigError as error:
@@ -110,7 +115,8 @@ class Viewer:
             if self.shared.paths:
                 Player(session)
             if state.eye is not None and state.target is not None:
-                client.camera.position, client.camera.look_at = np.array(state.eye), np.array(state.target)
+                client.camera.position = np.array(state.eye)
+                client.camera.look_at = np.array(state.target)
             client.scene.on_click()(session.newest(lambda event: self._clicked(session, waypoints, event)))
             if problem is not None:
                 session.failed(problem)
@@ -160,7 +166,8 @@ class Viewer:
 
 def where_clicked(origin: Any, direction: Any, height_m: float) -> np.ndarray | None:
     """Where a ray meets the level plane at a height, (3,) m; None if it does not."""
-    start, along = np.asarray(origin, dtype=np.float64), np.asarray(direction, dtype=np.float64)
+    start = np.asarray(origin, dtype=np.float64)
+    along = np.asarray(direction, dtype=np.float64)
     if start.shape != (3,) or along.shape != (3,) or not np.isfinite([start, along]).all() or abs(along[2]) < 1e-9:
         return None
     distance = (height_m - start[2]) / along[2]
@@ -207,9 +214,12 @@ class _OneLine(logging.Filter):
             now = time.monotonic()
             if now - self._told < 1.0:
                 return False
-            self._told, error = now, record.exc_info[1]
-            record.msg, record.args = f"what a client sent was of no use: {type(error).__name__}: {error}", ()
-            record.exc_info, record.exc_text = None, None
+            self._told = now
+            error = record.exc_info[1]
+            record.msg = f"what a client sent was of no use: {type(error).__name__}: {error}"
+            record.args = ()
+            record.exc_info = None
+            record.exc_text = None
         return True
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from wheretolook.geometry.lattices import axes_of_angles
 from wheretolook.geometry.poses import Float, poses_looking_along, quaternion_from_rotation, rotation_from_quaternion
-from wheretolook.planning.turns import pan_tilt_angles
+from wheretolook.planning.camera_turns import pan_tilt_angles
 from wheretolook.utils.errors import ConfigError, TableError, WhereToLookError
 from wheretolook.view import drawing
 from wheretolook.view.controls import build, check_value, value_of
@@ -42,8 +42,11 @@ class Session:
     """What one client sees. Callbacks note what was chosen; all computing is the worker's."""
 
     def __init__(self, client: ClientHandle, shared: Shared, state: ViewState, host: str) -> None:
-        self.client, self.shared, self.host = client, shared, host
-        self.scene, self.opened = client.scene, shared.opened
+        self.client = client
+        self.shared = shared
+        self.host = host
+        self.scene = client.scene
+        self.opened = shared.opened
         method = state.method if state.method in self.opened.methods else self.opened.methods[0]
         occlusion = state.occlusion if state.occlusion in self.opened.occlusions else self.opened.occlusions[0]
         height = shared.usual_m if state.height is None else state.height
@@ -52,7 +55,9 @@ class Session:
         self.state = replace(state, method=method, occlusion=occlusion, height=height)
         self.place: Place | None = None
         self.axis: Float | None = None
-        self.closed, self._lock, self._inbox = False, Lock(), Worker(f"client {client.client_id}")
+        self.closed = False
+        self._lock = Lock()
+        self._inbox = Worker(f"client {client.client_id}")
         self._failed = -NOTICE_S  # when this client was told what went wrong
         self._follows = 0.0  # when the browser's camera was last put somewhere by the program
         self._gizmo: Any = None
@@ -163,7 +168,8 @@ class Session:
     def _slid(self) -> None:
         c = self.controls
         before = self.state
-        height, threshold = value_of(c.height, before.height), value_of(c.threshold, before.threshold)
+        height = value_of(c.height, before.height)
+        threshold = value_of(c.threshold, before.threshold)
         self.note(height=height, threshold=float(threshold))
         self.fill_floor()
         if before.threshold != self.state.threshold:
@@ -184,7 +190,8 @@ class Session:
 
     def _look_through(self) -> None:
         """Stand at the place with the camera's field of view, or look from outside again."""
-        through, camera = bool(self.controls.through.value), self.client.camera
+        through = bool(self.controls.through.value)
+        camera = self.client.camera
         if self.place is None or self.axis is None:
             self.controls.through.value = False
             return
@@ -217,7 +224,8 @@ class Session:
     def _camera_moved(self) -> None:
         camera = self.client.camera
         (ex, ey, ez), (tx, ty, tz) = (map(float, point) for point in (camera.position, camera.look_at))
-        eye, target = (ex, ey, ez), (tx, ty, tz)
+        eye = (ex, ey, ez)
+        target = (tx, ty, tz)
         if np.isfinite((eye, target)).all():
             self._turning_camera.moved(eye, target)
             self.note(eye=eye, target=target)
@@ -263,7 +271,8 @@ class Session:
         self.note(place=(float(position[0]), float(position[1]), float(position[2])))
         low, high = self.scenery.range if self.shared.is_probability(self.state.method) else (0.0, 0.0)
         if low == high:
-            low, high = float(place.scores.min()), float(place.scores.max())
+            low = float(place.scores.min())
+            high = float(place.scores.max())
         mark = self.shared.mark_m
         glb = drawing.sphere_glb(place.directions, place.scores, low, high, mark)
         self.scene.add_glb("/sphere", glb, position=position, cast_shadow=False, receive_shadow=False)
@@ -309,7 +318,8 @@ class Session:
         self.submit("view", NOW, self._view(self.place.position, self.axis, rings, sliders))
 
     def _view(self, position: Float, axis: Float, rings: bool, sliders: bool) -> Iterator[None]:
-        c, mark = self.controls, self.shared.mark_m
+        c = self.controls
+        mark = self.shared.mark_m
         look = self.shared.look(self.state.method, self.state.occlusion)
         report = report_of(look.scorer, position, axis)
         score = float(report.score[0])
@@ -342,7 +352,8 @@ class Session:
             self._gizmo.wxyz = wxyz
         yaw, pitch = (float(np.degrees(angle)) for angle in pan_tilt_angles(axis))
         if not sliders:
-            c.yaw.value, c.pitch.value = round(yaw * 2) / 2, round(pitch * 2) / 2
+            c.yaw.value = round(yaw * 2) / 2
+            c.pitch.value = round(pitch * 2) / 2
         self.note(yaw=round(yaw, 1), pitch=round(pitch, 1))
         yield
         seen = landmarks_seen(look.scorer, pose, self.shared.teller(self.state.occlusion))
@@ -363,7 +374,8 @@ class Session:
             self.scene.remove_by_name("/seen")
         yield
         image, what = self.opened.picture(pose, seen)
-        c.picture.image, c.picture.visible = image, True
+        c.picture.image = image
+        c.picture.visible = True
         c.picture.label = what
         self.tell_state()
 

@@ -13,15 +13,16 @@ from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import WhereToLookError
 from wheretolook.view.drawing import mesh_glb, size_of
 from wheretolook.view.opened import Opened, centers_of
-from wheretolook.view.played import Paths
+from wheretolook.view.paths import Paths
 from wheretolook.view.scores import FLOOR_DIRECTIONS, Floor, floor_at, heights_of
 from wheretolook.view.worker import Worker
 
 if TYPE_CHECKING:
-    from wheretolook.methods.base import Scorer
+    from wheretolook.scorers.base import Scorer
     from wheretolook.select.where_to_look import WhereToLook
 
-KEPT_FLOORS, KEPT_MESHES = 64, 4
+KEPT_FLOORS = 64
+KEPT_MESHES = 4
 STEP_M = 0.05  # heights of floors and cuts are multiples of this
 
 T = TypeVar("T")
@@ -31,7 +32,9 @@ class Shared:
     """Made once. `floor`, `look` and `teller` are for the thread that computes alone."""
 
     def __init__(self, opened: Opened, paths: Paths | None = None) -> None:
-        self.opened, self.paths, self.worker = opened, paths or {}, Worker()
+        self.opened = opened
+        self.paths = paths or {}
+        self.worker = Worker()
         self.low_m, self.high_m, self.usual_m = heights_of(opened.space, centers_of(opened))
         self.size_m = size_of(opened.landmarks.points)
         self.doubts = opened.doubts
@@ -54,7 +57,7 @@ class Shared:
 
     def is_probability(self, method: str) -> bool:
         """Whether a method's scores are probabilities, so that a threshold says something."""
-        from wheretolook.methods.registry import find
+        from wheretolook.scorers.registry import find
 
         known = find(method)
         return known is not None and known.probability
@@ -74,7 +77,8 @@ class Shared:
         """The mesh below a height as a GLB file, None without a mesh; for any thread."""
         if self.opened.mesh is None:
             return None
-        mesh, key = self.opened.mesh, None if cut_m is None else round(cut_m / STEP_M) * STEP_M
+        mesh = self.opened.mesh
+        key = None if cut_m is None else round(cut_m / STEP_M) * STEP_M
         with self._lock:
             return _kept(self._meshes, key, KEPT_MESHES, lambda: mesh_glb(mesh, key))
 

@@ -11,10 +11,12 @@ from collections.abc import Callable
 
 Point = tuple[float, float, float]
 
-SLOW_S, IN_A_ROW = 1 / 15, 3
+SLOW_S = 1 / 15
+IN_A_ROW = 3
 """A browser tells its camera with each picture it draws, at most fifty times a second: so many so far apart, and it
 draws slowly. Then it is shown less and less, until it draws smoothly or there is nothing to leave out."""
-SMOOTH_S, LAST = 1 / 28, 5  # the median of so many gaps
+SMOOTH_S = 1 / 28  # the median of so many gaps
+LAST = 5
 LEAST = 0.02  # that the camera moves in a gap, of its distance: where it moves less, the hand is slow, not the browser
 PAUSE_S = 2.0  # hardly a picture takes so long: the camera stood still
 STILL_S = 0.3  # after which all is shown again
@@ -26,8 +28,11 @@ class Turning:
     """
 
     def __init__(self, show: Callable[[int], None], most: int) -> None:
-        self._show, self._most, self._lock = show, most, threading.Lock()
-        self._moved, self._less = -PAUSE_S, 0  # when the camera has; how much less is shown while it moves
+        self._show = show
+        self._most = most
+        self._lock = threading.Lock()
+        self._moved = -PAUSE_S  # when the camera has; how much less is shown while it moves
+        self._less = 0
         self._eye: Point = (0.0, 0.0, 0.0)  # where it was then, and the point it looked at
         self._target = self._eye
         self._slow_s = 0.0  # between pictures when it was found slow
@@ -37,11 +42,14 @@ class Turning:
     def moved(self, eye: Point, target: Point) -> None:
         """The camera is at a place and looks at a point. While a hand turns it, a browser tells each camera twice."""
         with self._lock:
-            way, now = math.dist(eye, self._eye) + math.dist(target, self._target), time.monotonic()
+            way = math.dist(eye, self._eye) + math.dist(target, self._target)
+            now = time.monotonic()
             if way == 0:
                 return
-            gap_s, self._moved = now - self._moved, now
-            self._eye, self._target = eye, target
+            gap_s = now - self._moved
+            self._moved = now
+            self._eye = eye
+            self._target = target
             if gap_s < PAUSE_S:
                 self._gaps_s.append(gap_s if way > LEAST * math.dist(eye, target) else 0.0)
             changed = self._less < self._most and self._is_slow()

@@ -12,10 +12,13 @@ from wheretolook.utils.errors import WeightsError
 from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped
 
 if TYPE_CHECKING:
-    from wheretolook.dataset.folders import SceneFolder
+    from wheretolook.dataset.layout import SceneFolder
     from wheretolook.geometry.poses import Float
 
-GIVEN, ADAPTED, TRAINED, SHIPPED = "given", "adapted to this place", "trained with this dataset", "that ship"
+GIVEN = "given"
+ADAPTED = "adapted to this place"
+TRAINED = "trained with this dataset"
+SHIPPED = "that ship"
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,7 @@ class KnownWeights:
 
     def told(self, method: str) -> str:
         """With which weights a method scores; empty if it has learnt nothing."""
-        from wheretolook.methods.registry import scorers
+        from wheretolook.scorers.registry import scorers
 
         kind = scorers()[method].weights
         return f"weights {self.sources[kind]}: {self.files[kind].name}" if kind in self.files else ""
@@ -35,7 +38,7 @@ class KnownWeights:
     @property
     def methods(self) -> tuple[str, ...]:
         """Names of the methods that can score with these or without any, that of the first file first."""
-        from wheretolook.methods.registry import scorers
+        from wheretolook.scorers.registry import scorers
 
         able = [
             name
@@ -59,11 +62,12 @@ def scene_weights(files: SceneFolder, landmarks: Float, features: str = "") -> K
 
     `landmarks` (N, 3) m are those of the scene's map, by these features.
     """
-    own, root = [], files.folder.parent
+    own = []
+    root = files.folder.parent
     if _are_of(adapted := root / "adapted" / f"{files.name}.safetensors", landmarks):
         own.append((adapted, ADAPTED))
     if any((root / "weights").glob("*.safetensors")):
-        from wheretolook.dataset.folders import Dataset
+        from wheretolook.dataset.layout import Dataset
         from wheretolook.planning.scene_map import default_weights
 
         trained = default_weights(Dataset.load(root))
@@ -81,11 +85,12 @@ def map_weights(model: Path, data: Path, landmarks: Float, features: str = "") -
 
 
 def _known(own: Iterable[tuple[Path, str]], features: str) -> KnownWeights:
-    from wheretolook.learning.weights import method_of_weights
-    from wheretolook.methods.features_learnt import folder_for
-    from wheretolook.methods.registry import best_weights
+    from wheretolook.scorers.feature_domain import folder_for
+    from wheretolook.scorers.registry import best_weights
+    from wheretolook.training.weights import method_of_weights
 
-    known, all_places = KnownWeights({}, {}), [*own, (shipped(WEIGHTS), SHIPPED)]
+    known = KnownWeights({}, {})
+    all_places = [*own, (shipped(WEIGHTS), SHIPPED)]
     # of a folder first those that have learnt from such features
     places = [(part, source) for place, source in all_places for part in (folder_for(place, features), place)]
     for place, source in dict.fromkeys(places):
@@ -96,7 +101,8 @@ def _known(own: Iterable[tuple[Path, str]], features: str) -> KnownWeights:
                 files.setdefault(method_of_weights(path), path)
         for kind, path in files.items():
             if kind not in known.files:
-                known.files[kind], known.sources[kind] = path, source
+                known.files[kind] = path
+                known.sources[kind] = source
     return known
 
 
@@ -106,7 +112,7 @@ def _are_of(path: Path, landmarks: Float) -> bool:
         return False
     from safetensors import SafetensorError, safe_open
 
-    from wheretolook.methods.adapted.place import LEAST_SAME, share_of_place
+    from wheretolook.scorers.adapted.place import LEAST_SAME, share_of_place
 
     try:
         with safe_open(path, framework="np") as file:

@@ -10,10 +10,13 @@ import time
 from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass, field
 
-NOW, SOON, LATER = 0, 1, 2
+NOW = 0
+SOON = 1
+LATER = 2
 """Urgency of work: a view turned by hand, a place clicked, a floor that fills."""
 
-QUIET_S, PATIENCE_S = 0.4, 4.0
+QUIET_S = 0.4
+PATIENCE_S = 4.0
 """So long after a view was turned nothing is begun that can wait, as the next turn would have to wait for its step;
 unless for so long nothing of that kind was done: where many look, somebody always turns."""
 
@@ -42,7 +45,9 @@ class Worker:
 
     def __init__(self, name: str = "scores") -> None:
         self._jobs: dict[tuple[Hashable, Hashable], _Job] = {}
-        self._turns, self._wake, self._stopped = itertools.count(), threading.Condition(), False
+        self._turns = itertools.count()
+        self._wake = threading.Condition()
+        self._stopped = False
         self._done = dict.fromkeys((NOW, SOON, LATER), -math.inf)  # when one as urgent was done last
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
@@ -81,7 +86,8 @@ class Worker:
                     self._wake.wait()
                 if self._stopped:
                     return
-                job, now = self._next(), time.monotonic()
+                job = self._next()
+                now = time.monotonic()
                 until = min(self._done[NOW] + QUIET_S, self._done[LATER] + PATIENCE_S) - now
                 if job.urgency == LATER and until > 0:
                     self._wake.wait(until)

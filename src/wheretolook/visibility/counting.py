@@ -45,7 +45,9 @@ class FrustumCounter:
         size: int | None = None,
         scratch_bytes: int = 1 << 28,
     ) -> None:
-        self.camera, self.distinct_pixels, self.scratch_bytes = camera, distinct_pixels, scratch_bytes
+        self.camera = camera
+        self.distinct_pixels = distinct_pixels
+        self.scratch_bytes = scratch_bytes
         self.rotations = np.asarray(rotations, dtype=np.float32)
         if self.rotations.shape[1:] != (3, 3) or not np.isfinite(self.rotations).all():
             raise ConfigError("rotations must be finite and of shape (D, 3, 3)", value=self.rotations.shape)
@@ -108,7 +110,9 @@ class FrustumCounter:
 
     def _sorted(self, at: Float, points: Any, unoccluded: Any | None) -> tuple[Any, Any]:
         """Landmarks sorted into cells around locations (L, 3), and their places (L, N), see `cell_kernel`."""
-        device, n_cells, shape = self.device, self.size**2 + 1, (len(at), points.shape[0])
+        device = self.device
+        n_cells = self.size**2 + 1
+        shape = (len(at), points.shape[0])
         centers: Any = wp.array(at, dtype=wp.vec3d, device=device)
         places: Any = wp.empty(shape, dtype=wp.vec2i, device=device)
         numbers: Any = wp.zeros(len(at) * n_cells + 1, dtype=wp.int32, device=device)
@@ -121,14 +125,19 @@ class FrustumCounter:
         inputs = [centers, points, places, starts, self.size]
         wp.launch(counting_kernel.sort_kernel, shape, inputs, [offsets], device=device)
         landmarks: Any = counting_kernel.SortedLandmarks()
-        landmarks.size, landmarks.starts, landmarks.offsets = self.size, starts, offsets
-        landmarks.inside_starts, landmarks.inside = self.cells.inside.starts, self.cells.inside.cells
-        landmarks.border_starts, landmarks.border = self.cells.border.starts, self.cells.border.cells
+        landmarks.size = self.size
+        landmarks.starts = starts
+        landmarks.offsets = offsets
+        landmarks.inside_starts = self.cells.inside.starts
+        landmarks.inside = self.cells.inside.cells
+        landmarks.border_starts = self.cells.border.starts
+        landmarks.border = self.cells.border.cells
         return landmarks, places
 
     def _count_pixels(self, landmarks: Any, counts: Any) -> Any:
         assert isinstance(self.camera, PinholeCamera)
-        camera, n_views = self.camera, counts.shape[0] * counts.shape[1]
+        camera = self.camera
+        n_views = counts.shape[0] * counts.shape[1]
         words = (camera.width * camera.height + 31) // 32
         block = min(n_views, max(1, self.scratch_bytes // (words * 4)))
         bits: Any = wp.empty((block, words), dtype=wp.uint32, device=self.device)
@@ -143,16 +152,21 @@ class FrustumCounter:
 
     def _count_by_field(self, landmarks: Any, counts: Any) -> Any:
         assert self._field is not None
-        device, shared = self.device, [self._axes, self._depth, self._field.size, landmarks]
-        views, n_views = counts.flatten(), counts.shape[0] * counts.shape[1]
-        capacity, first, block = max(1, self.scratch_bytes // UNSURE_BYTES), 0, n_views
+        device = self.device
+        shared = [self._axes, self._depth, self._field.size, landmarks]
+        views = counts.flatten()
+        n_views = counts.shape[0] * counts.shape[1]
+        capacity = max(1, self.scratch_bytes // UNSURE_BYTES)
+        first = 0
+        block = n_views
         number: Any = wp.empty(1, dtype=wp.int32, device=device)
         pairs: Any = wp.empty(capacity, dtype=wp.vec2i, device=device)
         unsure: Any = wp.empty(capacity, dtype=wp.vec3, device=device)
         while first < n_views:
             block = min(block, n_views - first)
             number.zero_()
-            inputs, outputs = [*shared, first, self.lanes], [counts, number, pairs, unsure]
+            inputs = [*shared, first, self.lanes]
+            outputs = [counts, number, pairs, unsure]
             wp.launch(counting_kernel.count_field_kernel, (block, self.lanes), inputs, outputs, device=device)
             n = int(number.numpy()[0])
             if n <= capacity:
@@ -187,7 +201,8 @@ def count_plain(
     distinct_pixels: bool = False,
 ) -> NDArray[np.int32]:
     """What `FrustumCounter.count` computes, (L, D), in NumPy: every landmark (N, 3) against every orientation."""
-    rotations, points = np.asarray(rotations), np.asarray(points)
+    rotations = np.asarray(rotations)
+    points = np.asarray(points)
     counts = np.zeros((len(unoccluded), len(rotations)), dtype=np.int32)
     for row, location in enumerate(np.asarray(locations)):
         offsets = frustum.offsets_from(location, points[unoccluded[row]])

@@ -17,11 +17,13 @@ from scipy.spatial import cKDTree
 from wheretolook.geometry.camera import ColmapCamera
 from wheretolook.geometry.poses import Float
 
-COARSEST_SIZE, REFINEMENT = 256, 4  # cells along the first table's side, and of a cell's side in the next
+COARSEST_SIZE = 256  # cells along the first table's side, and of a cell's side in the next
+REFINEMENT = 4
 TABLE_SIZE = 1024  # cells along a side of the table: 0.06 to 0.19 degrees from a cell's centre to its farthest corner
 MAX_DEPTH_RAD = 0.25  # deeper than this is not told apart: cells of the sphere that need more are small in number
 
-EDGE_SAMPLES, GRID_SAMPLES = 2048, 512  # pixels sampled along each edge of the image, and each side of a grid over it
+EDGE_SAMPLES = 2048  # pixels sampled along each edge of the image, and each side of a grid over it
+GRID_SAMPLES = 512
 BISECTIONS = 20  # of the gap between neighbouring centres on either side of the border, which is found to 1e-8 rad
 
 
@@ -83,10 +85,13 @@ def _neighbours(cells: NDArray[np.int64], size: int) -> tuple[NDArray[np.int64],
     """Pairs of cells (n,) and (n,) that share a side, of which at least one is among the given."""
     row, column = np.divmod(np.tile(cells, 4), size)
     step = np.repeat(((0, 1), (1, 0), (0, -1), (-1, 0)), len(cells), axis=0)
-    row, column = row + step[:, 0], column + step[:, 1]
+    row = row + step[:, 0]
+    column = column + step[:, 1]
     # the map's edge folds onto itself, mirrored: beyond (row, size - 1) lies (size - 1 - row, size - 1)
-    across, along = (column < 0) | (column >= size), (row < 0) | (row >= size)
-    row, column = np.where(across, size - 1 - row, row), np.where(along, size - 1 - column, column)
+    across = (column < 0) | (column >= size)
+    along = (row < 0) | (row >= size)
+    row = np.where(across, size - 1 - row, row)
+    column = np.where(along, size - 1 - column, column)
     return np.tile(cells, 4), row.clip(0, size - 1) * size + column.clip(0, size - 1)
 
 
@@ -110,7 +115,8 @@ def _border_between(camera: ColmapCamera, seen: Float, unseen: Float) -> Float:
         middle = seen + unseen
         middle /= np.linalg.norm(middle, axis=1, keepdims=True)
         is_seen = camera.sees(middle)[:, None]
-        seen, unseen = np.where(is_seen, middle, seen), np.where(is_seen, unseen, middle)
+        seen = np.where(is_seen, middle, seen)
+        unseen = np.where(is_seen, unseen, middle)
     return seen
 
 
@@ -118,7 +124,8 @@ def octahedral_directions(u: ArrayLike, v: ArrayLike) -> Float:
     """Directions (..., 3) with |x| + |y| + |z| = 1 of points (u, v) of the octahedral map, each in [-1, 1]."""
     u, v = np.broadcast_arrays(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
     z = 1 - np.abs(u) - np.abs(v)
-    sign_u, sign_v = np.where(u >= 0, 1.0, -1.0), np.where(v >= 0, 1.0, -1.0)
+    sign_u = np.where(u >= 0, 1.0, -1.0)
+    sign_v = np.where(v >= 0, 1.0, -1.0)
     x = np.where(z >= 0, u, (1 - np.abs(v)) * sign_u)
     y = np.where(z >= 0, v, (1 - np.abs(u)) * sign_v)
     return np.stack([x, y, z], axis=-1)
@@ -126,7 +133,8 @@ def octahedral_directions(u: ArrayLike, v: ArrayLike) -> Float:
 
 def cell_centers(size: int) -> tuple[Float, Float]:
     """Unit directions (size^2, 3) of cells' centres, and the angle (size^2,) rad from each to its farthest corner."""
-    middle, edge = (np.arange(size) + 0.5) / size * 2 - 1, np.arange(size + 1) / size * 2 - 1
+    middle = (np.arange(size) + 0.5) / size * 2 - 1
+    edge = np.arange(size + 1) / size * 2 - 1
     centers = octahedral_directions(middle[None, :], middle[:, None])
     corners = octahedral_directions(edge[None, :], edge[:, None])
     centers /= np.linalg.norm(centers, axis=-1, keepdims=True)
@@ -139,7 +147,8 @@ def cells_of(directions: ArrayLike, size: int) -> NDArray[np.int64]:
     """Cells (...) of directions (..., 3) of any length but zero: what `cell_of` in the kernels computes, in NumPy."""
     at = np.asarray(directions, dtype=np.float64)
     x, y, z = np.moveaxis(at / np.abs(at).sum(-1, keepdims=True), -1, 0)
-    sign_x, sign_y = np.where(x >= 0, 1.0, -1.0), np.where(y >= 0, 1.0, -1.0)
+    sign_x = np.where(x >= 0, 1.0, -1.0)
+    sign_y = np.where(y >= 0, 1.0, -1.0)
     u = np.where(z >= 0, x, (1 - np.abs(y)) * sign_x)
     v = np.where(z >= 0, y, (1 - np.abs(x)) * sign_y)
     column, row = (np.clip(((part + 1) / 2 * size).astype(np.int64), 0, size - 1) for part in (u, v))

@@ -73,7 +73,10 @@ def frustum_sides(camera: PinholeCamera, rotations: ArrayLike) -> NDArray[np.flo
     with right and bottom is positive (pixel `width` is not), and its depth exceeds `MIN_DEPTH_M`.
     """
     right, down, forward = np.moveaxis(np.asarray(rotations, dtype=np.float64), -2, 0)
-    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    fx = camera.fx
+    fy = camera.fy
+    cx = camera.cx
+    cy = camera.cy
     horizontal = [fx * right + cx * forward, (camera.width - cx) * forward - fx * right]
     vertical = [fy * down + cy * forward, (camera.height - cy) * forward - fy * down]
     return np.stack([*horizontal, *vertical, forward], axis=-2).astype(np.float32)
@@ -107,7 +110,8 @@ def in_view(camera: Camera, rotations: ArrayLike, offsets: NDArray[np.float32]) 
             single = np.asarray(rotations, dtype=np.float32)
             return np.stack([camera.sees(rotate(rotation, offsets)) for rotation in single])
         seen = np.empty((len(np.asarray(rotations)), len(offsets)), dtype=np.bool_)
-        finite, columns = np.isfinite(offsets).all(-1), np.ascontiguousarray(offsets.T)
+        finite = np.isfinite(offsets).all(-1)
+        columns = np.ascontiguousarray(offsets.T)
         for row, sides in enumerate(frustum_sides(camera, rotations)):
             left, right, top, bottom, depth = (_dot(side, columns) for side in sides)
             in_sides = (left >= 0) & (right > 0) & (top >= 0) & (bottom > 0)
@@ -160,11 +164,13 @@ def views_on_device(views: PosedViews, rows: slice, points: Any, unoccluded: tup
     rotations, centers = split_poses(views.cam_from_world[rows])
     there: Any = Views()
     sides = frustum_sides(views.camera, rotations)
-    there.sides, there.rounding = wp.array(sides, dtype=wp.vec3, device=device), sides_rounding(sides)
+    there.sides = wp.array(sides, dtype=wp.vec3, device=device)
+    there.rounding = sides_rounding(sides)
     there.centers = wp.array(centers, dtype=wp.vec3d, device=device)
     location_rows = np.asarray(views.location_rows[rows], dtype=np.int32)
     there.location_rows = wp.array(location_rows, dtype=wp.int32, device=device)
-    there.points, there.min_depth = points, MIN_DEPTH_M
+    there.points = points
+    there.min_depth = MIN_DEPTH_M
     there.starts, there.unoccluded = unoccluded
     return there
 
@@ -174,7 +180,9 @@ def in_view_on_device(posed: PosedViews, points: Any, device: str = "cpu") -> tu
 
     The points are those of `points_on_device`.
     """
-    device, rows, unoccluded = start_warp(device), posed.location_rows, posed.unoccluded
+    device = start_warp(device)
+    rows = posed.location_rows
+    unoccluded = posed.unoccluded
     views = views_on_device(posed, slice(None), points, sets_on_device(unoccluded, device), device)
     lengths: Any = wp.empty(len(rows), dtype=wp.int32, device=device)
     # A single view is collected at once, with room for all its candidates; several are counted first.

@@ -70,15 +70,19 @@ class HiddenPointRemoval(OcclusionModel):
             raise ConfigError("the margin must be a distance of at least 0 m", value=margin_m)
         if threads < 0:
             raise ConfigError("threads must be >= 0", value=threads)
-        self.radius, self.margin_m, self.threads = float(radius), float(margin_m), threads
+        self.radius = float(radius)
+        self.margin_m = float(margin_m)
+        self.threads = threads
         self._places: _Places | None = None  # of the landmarks that were asked about last
 
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
         """(L, N), True where no surface that the landmarks suggest stands between; raises what `check` raises."""
-        at, landmarks = np.asarray(locations, dtype=np.float64), np.asarray(points, dtype=np.float64)
+        at = np.asarray(locations, dtype=np.float64)
+        landmarks = np.asarray(points, dtype=np.float64)
         self.check(at, landmarks)
         known = self._places_of(landmarks)
-        places, place = known.distinct, known.place
+        places = known.distinct
+        place = known.place
         free = np.empty((len(at), len(landmarks)), dtype=bool)
 
         def fill(row: int) -> None:

@@ -31,7 +31,8 @@ def may_be_near_hull(directions: Float, lengths: Float, margin: float) -> NDArra
     if len(lengths) < LEAST_POINTS:
         return every
     size = 2 * min(_MOST_CELLS // 2, round(np.sqrt(len(lengths) / _POINTS_IN_CELL) / 2))
-    cells, farthest = cells_of(directions, size), np.zeros(size**2)
+    cells = cells_of(directions, size)
+    farthest = np.zeros(size**2)
     np.maximum.at(farthest, cells, lengths)
     chosen = lengths >= farthest[cells]
     try:
@@ -102,7 +103,8 @@ def leaving_facets(hull: ConvexHull, directions: Float) -> tuple[NDArray[np.int6
         values = np.einsum("ijk,ik->ij", dual[neighbours], directions[climbing])
         best = values.argmax(axis=1)
         better = values.max(axis=1) > value[climbing]
-        climbing, best = climbing[better], best[better]
+        climbing = climbing[better]
+        best = best[better]
         facet[climbing] = neighbours[better, best]
         value[climbing] = values[better, best]
     return facet, value

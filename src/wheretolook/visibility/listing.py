@@ -47,7 +47,8 @@ def in_view_by_table(posed: PosedViews, points: Any, device: str = "cpu") -> Lan
     """
     assert isinstance(posed.camera, ColmapCamera)
     wp.load_module(listing_kernel, device=device)
-    field, (rotations, centers) = tabulate(posed.camera), split_poses(posed.cam_from_world)
+    field = tabulate(posed.camera)
+    (rotations, centers) = split_poses(posed.cam_from_world)
     single = rotations.astype(np.float32)
     inputs = [
         wp.array(single, dtype=wp.mat33, device=device),
@@ -106,7 +107,8 @@ class FrustumLister(FrustumCounter):
         Landmarks (N,) of vec3d and mask (L, N) of bool are Warp arrays on the device; without a mask all lines of sight
         are free.
         """
-        at, n_cells = np.asarray(locations, dtype=np.float64).reshape(-1, 3), self.size**2 + 1
+        at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
+        n_cells = self.size**2 + 1
         landmarks, places = self._sorted(at, points, unoccluded)
         rows: Any = wp.empty(int(landmarks.starts[len(at) * n_cells :].numpy()[0]), dtype=wp.int32, device=self.device)
         inputs = [places, landmarks.starts, n_cells]
@@ -154,7 +156,8 @@ class FrustumLister(FrustumCounter):
             return listed
         entries[unsure] = -1 - entries[unsure]
         of_view = np.searchsorted(listed.starts, unsure, side="right") - 1
-        offsets, kept = around.offsets.numpy(), np.ones(len(entries), dtype=bool)
+        offsets = around.offsets.numpy()
+        kept = np.ones(len(entries), dtype=bool)
         for begin in range(0, len(unsure), ASKED_AT_ONCE):
             part = slice(begin, begin + ASKED_AT_ONCE)
             rotations = self.rotations[views[of_view[part], 1]]

@@ -65,7 +65,8 @@ def morton_codes(positions: NDArray[np.float64]) -> NDArray[np.int64]:
     codes = np.zeros(len(positions), dtype=np.int64)
     if not finite.any():
         return codes
-    low, high = positions[finite].min(0) / 2, positions[finite].max(0) / 2  # halves: their difference is finite
+    low = positions[finite].min(0) / 2  # halves: their difference is finite
+    high = positions[finite].max(0) / 2
     share = (positions[finite] / 2 - low) / np.maximum(high - low, 1e-12)
     cells = (share * ((1 << MORTON_BITS) - 1)).astype(np.int64)
     for bit in range(MORTON_BITS):
@@ -146,7 +147,9 @@ class MeshOcclusion(OcclusionModel):
     def __init__(self, raycaster: MeshRaycaster, margin_m: float = 0.05, two_sided: bool = True) -> None:
         if not 0 <= margin_m < np.inf:
             raise ConfigError("the margin must be a distance of at least 0 m", value=margin_m)
-        self.raycaster, self.margin_m, self.two_sided = raycaster, margin_m, two_sided
+        self.raycaster = raycaster
+        self.margin_m = margin_m
+        self.two_sided = two_sided
 
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
         """(L, N), True where no triangle stands between location and landmark."""
@@ -184,7 +187,9 @@ class StoredOcclusion(OcclusionModel):
 
     def __init__(self, locations: ArrayLike, packed: NDArray[np.uint8], n_landmarks: int, model: str = "mesh") -> None:
         self.locations = np.asarray(locations, dtype=np.float64)
-        self.packed, self.n_landmarks, self.name = packed, n_landmarks, model
+        self.packed = packed
+        self.n_landmarks = n_landmarks
+        self.name = model
         if packed.shape != (len(self.locations), (n_landmarks + 7) // 8):
             raise ValueError(f"{packed.shape} bytes for {len(self.locations)} locations and {n_landmarks} landmarks")
         self._tree = cKDTree(self.locations)
@@ -227,7 +232,9 @@ class StoredOcclusion(OcclusionModel):
         """Read what `save` wrote. Raises TableError if the file is missing or damaged."""
         try:
             data = load_npz(path)
-            locations, mask, n_landmarks = data["locations"], data["mask"], data["n_landmarks"]
+            locations = data["locations"]
+            mask = data["mask"]
+            n_landmarks = data["n_landmarks"]
             if locations.dtype.kind != "f" or locations.shape[1:] != (3,) or not np.isfinite(locations).all():
                 raise ValueError(
                     f"locations of type {locations.dtype} and shape {locations.shape} are no places (L, 3)"

@@ -79,7 +79,8 @@ class SphereCells:
 
 
 def _runs(classes: Any, size: int, wanted: int) -> CellRuns:
-    device, rows = classes.device, (classes.shape[0], size)
+    device = classes.device
+    rows = (classes.shape[0], size)
     n_rows = rows[0] * rows[1]
     numbers: Any = wp.zeros(n_rows + 1, dtype=wp.int32, device=device)
     none: list[Any] = [wp.empty(0, dtype=dtype, device=device) for dtype in (wp.int32, wp.vec2i)]

@@ -71,7 +71,8 @@ def survey(
     n_points = len(landmarks)
     on_gpu = wp.get_device(landmarks.device).is_cuda
     workers = 1 if on_gpu or occlusion.uses_all_cores else (threads or len(os.sched_getaffinity(0)))
-    scratch, orientations = max(1, memory_bytes // (4 * workers)), np.asarray(rotations)
+    scratch = max(1, memory_bytes // (4 * workers))
+    orientations = np.asarray(rotations)
     counter = FrustumCounter(camera, orientations, n_points, landmarks.device, distinct_pixels, scratch_bytes=scratch)
     n_directions = len(counter.rotations)
     keep = min(keep or n_directions, n_directions)

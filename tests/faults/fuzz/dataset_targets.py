@@ -13,19 +13,19 @@ from safetensors.torch import save, save_file
 
 from faults.fuzz.execution import Target
 from synthetic_dataset import CAMERA, make_landmarks, make_scene
-from wheretolook.dataset.folders import Dataset, SceneFolder
-from wheretolook.dataset.stamps import STAGES, read_stamp, write_stamp
+from wheretolook.dataset.artifact_cache import STAGES, read_stamp, write_stamp
+from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.dataset.viewpoint_table import has_matches, read_table, write_table
 from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.inputs.landmarks_in_view import POOLED
+from wheretolook.inputs.landmark_features import POOLED
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.learning.provenance import trained_before
-from wheretolook.learning.weights import METADATA_KEY, preference, read_training, read_weights
-from wheretolook.methods.registry import load_scorer
-from wheretolook.methods.trees.learn import BoostedTrees
-from wheretolook.release.copy import _manifest, read_about
-from wheretolook.stages.inputs import extractor_of
-from wheretolook.viewpoints.table import has_matches, read_table, write_table
+from wheretolook.scorers.registry import load_scorer
+from wheretolook.stages.preconditions import extractor_of
+from wheretolook.training.provenance import trained_before
+from wheretolook.training.weights import METADATA_KEY, preference, read_training, read_weights
 from wheretolook.visibility.occlusion import NoOcclusion, StoredOcclusion
+from wheretolook_paper.release.copy import _manifest, read_about
+from wheretolook_paper.scorers.trees.learn import BoostedTrees
 
 _WEIGHTS = Path(__file__).parents[3] / "data" / "release" / "weights"
 
@@ -68,7 +68,7 @@ def _read_description(path: Path) -> None:
     elif path.name == "report.json":
         extractor_of(SceneFolder(path.parent.parent, "train"))
     else:
-        from wheretolook.learning.weights import read_record
+        from wheretolook.training.weights import read_record
 
         trained_before(path.with_suffix(".safetensors"), {})
         read_record(path)

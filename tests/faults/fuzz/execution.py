@@ -68,7 +68,8 @@ class Execution:
     """Runs a target in a folder of its own, in this process, whose limits it sets if it is told to."""
 
     def __init__(self, target: Target, folder: Path, limits: bool = False) -> None:
-        self.target, self.folder = target, folder.resolve()
+        self.target = target
+        self.folder = folder.resolve()
         self.files = [self.folder / name for name in target.files]
         (self.folder / "tmp").mkdir(parents=True, exist_ok=True)
         tempfile.tempdir = str(self.folder / "tmp")
@@ -78,7 +79,8 @@ class Execution:
         self.written: list[str] = []
         self._changed = 0  # the file that is not whole
         warnings.simplefilter("ignore")
-        self.limits, self._watches = limits, False
+        self.limits = limits
+        self._watches = False
         self._resolve_all()
         if limits:
             _limit_addresses()
@@ -97,7 +99,8 @@ class Execution:
         if len(self.files) > 1:
             if not data:
                 return False
-            number, data = data[0] % len(self.files), data[1:]
+            number = data[0] % len(self.files)
+            data = data[1:]
         if not self.target.in_memory:
             if number != self._changed:
                 self._write(self._changed, self.whole[self._changed])
@@ -114,13 +117,15 @@ class Execution:
         if self.limits and 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) > MEMORY_BYTES:
             return Finding("more than 1 GB of memory", "")
         if self.written:
-            what, self.written = self.written[0], []
+            what = self.written[0]
+            self.written = []
             return Finding(f"not confined: {what}", "")
         return found
 
     def _write(self, number: int, data: bytes) -> None:
         """Replace what a file holds, also where a reader has replaced the file."""
-        path, file = self.files[number], self._open[number]
+        path = self.files[number]
+        file = self._open[number]
         found = os.stat(path) if path.is_file() and not path.is_symlink() else None
         if found is None or found.st_ino != os.fstat(file).st_ino:
             os.close(file)

@@ -94,7 +94,9 @@ def _fuzz(name: str, seconds: float, options: argparse.Namespace) -> dict[str, A
     folder = options.out / name
     (folder / "findings").mkdir(parents=True, exist_ok=True)
     state = _State(folder / "state", new=True)
-    starts, seed, took = 0, options.seed, 0.0
+    starts = 0
+    seed = options.seed
+    took = 0.0
     while (left := seconds - took) > 0 and starts < _MOST_STARTS:
         command = [sys.executable, str(Path(__file__).resolve()), "--worker", name, "--out", str(options.out)]
         command += ["--seconds", f"{left:.1f}", "--seed", str(seed + starts), "--engine", options.engine]
@@ -141,14 +143,16 @@ def _stop() -> None:
 
 def _wait(process: subprocess.Popen[bytes], state: _State) -> str:
     """How a process has ended that should not have ended so; "" if its time was over."""
-    last, since = state.counts()[0], time.monotonic()
+    last = state.counts()[0]
+    since = time.monotonic()
     while True:
         try:
             code = process.wait(1)
         except subprocess.TimeoutExpired:
             now = state.counts()[0]
             if now != last:
-                last, since = now, time.monotonic()
+                last = now
+                since = time.monotonic()
             elif state.ready() and time.monotonic() - max(since, state.ready()) > _IDLE_S:
                 process.kill()
                 process.wait()
@@ -193,7 +197,8 @@ class _State:
 
 def _work(options: argparse.Namespace) -> int:
     """Be one process of a target."""
-    name, folder = options.worker, options.out / options.worker
+    name = options.worker
+    folder = options.out / options.worker
     memory = Path("/dev/shm")
     scratch = Path(tempfile.mkdtemp(prefix="fuzz-", dir=memory if memory.is_dir() else None))
     try:
@@ -212,7 +217,8 @@ def _loop(name: str, folder: Path, scratch: Path, options: argparse.Namespace) -
         target = _target(name)
     from faults.fuzz.execution import Execution, Finding
 
-    execution, state = Execution(target, scratch / name, limits=True), _State(folder / "state")
+    execution = Execution(target, scratch / name, limits=True)
+    state = _State(folder / "state")
     counts = list(state.counts())
     state.start(time.monotonic())
 
@@ -236,12 +242,14 @@ def _loop(name: str, folder: Path, scratch: Path, options: argparse.Namespace) -
     if options.engine == "bytes":
         from faults.fuzz.mutate import mutated
 
-        rng, seeds = random.Random(options.seed), execution.seeds
+        rng = random.Random(options.seed)
+        seeds = execution.seeds
         while time.monotonic() < end:
             one(mutated(rng.choice(seeds), rng)[:longest])
         state.begin(counts, b"")
         return 0
-    corpus, words = folder / "corpus", folder / "words.txt"
+    corpus = folder / "corpus"
+    words = folder / "words.txt"
     corpus.mkdir(exist_ok=True)
     for seed in execution.seeds:
         (corpus / hashlib.sha1(seed).hexdigest()).write_bytes(seed)

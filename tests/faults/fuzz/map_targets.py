@@ -24,7 +24,7 @@ from wheretolook.mapping.colmap_model import (
     read_model,
     save_mapping_poses,
 )
-from wheretolook.mapping.descriptors import read_descriptors
+from wheretolook.mapping.feature_files import read_descriptors
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.scale import read_positions, read_scale
 from wheretolook.planning.viewpoint_map import ViewpointMap

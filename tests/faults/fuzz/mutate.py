@@ -51,7 +51,8 @@ def _byte(data: bytes, rng: random.Random) -> bytes:
 
 
 def _overwrite(data: bytes, rng: random.Random) -> bytes:
-    at, word = rng.randrange(len(data)), rng.choice(WORDS)
+    at = rng.randrange(len(data))
+    word = rng.choice(WORDS)
     return data[:at] + word + data[at + len(word) :]
 
 
@@ -74,7 +75,9 @@ def _cut(data: bytes, rng: random.Random) -> bytes:
 
 
 def _repeat(data: bytes, rng: random.Random) -> bytes:
-    begin, length, to = rng.randrange(len(data)), rng.randrange(1, 65), rng.randrange(len(data) + 1)
+    begin = rng.randrange(len(data))
+    length = rng.randrange(1, 65)
+    to = rng.randrange(len(data) + 1)
     return data[:to] + data[begin : begin + length] * rng.choice((1, 1, 1, 3, 40)) + data[to:]
 
 

@@ -24,7 +24,8 @@ def test_what_was_found_is_read_or_refused(name: str, tmp_path: Path, monkeypatc
     with warnings.catch_warnings():
         execution = Execution(TARGETS[name], tmp_path / "target")
         for path in sorted((FOUND / name).iterdir()):
-            data, begin = path.read_bytes(), time.monotonic()
+            data = path.read_bytes()
+            begin = time.monotonic()
             found = execution.run(data)
             assert not isinstance(found, Finding), f"{path.name}: {found.kind}\n{found.text}"
             assert time.monotonic() - begin < SECONDS, path.name

@@ -12,10 +12,9 @@ import numpy as np
 import pandas as pd
 
 from faults.fuzz.execution import Target
-from wheretolook.benchmark.files import read_errors, read_poses
-from wheretolook.benchmark.scores import Scores
 from wheretolook.cli import _check_file, parse_experiment
 from wheretolook.config import Experiment
+from wheretolook.dataset.viewpoint_table import pose_columns
 from wheretolook.geometry.camera import Camera, camera_of_record, read_cameras
 from wheretolook.geometry.camera_text import camera_of_view, parse_camera, parse_size
 from wheretolook.geometry.poses import check_poses
@@ -24,9 +23,10 @@ from wheretolook.select.command import _camera, parser
 from wheretolook.select.waypoints import parse_points, read_waypoints
 from wheretolook.utils.options import all_options
 from wheretolook.utils.reading import parse_json_object
-from wheretolook.view.played import read_paths
+from wheretolook.view.paths import read_paths
 from wheretolook.view.state import ViewState
-from wheretolook.viewpoints.table import pose_columns
+from wheretolook_paper.benchmark.files import read_errors, read_poses
+from wheretolook_paper.benchmark.scores import Scores
 
 _CONFIGS = Path(__file__).parents[3] / "configs"
 _PARSER = parser()

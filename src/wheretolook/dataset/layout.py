@@ -1,0 +1,307 @@
+"""Where a dataset keeps its files: `<data>/<dataset>/<scene>/`, and which scene belongs to which split."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from wheretolook.dataset.names import NO_DATASET
+from wheretolook.dataset.sampling_config import Split
+from wheretolook.dataset.viewpoint_table import CAMERA_ID, read_table
+from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of_record, read_cameras
+from wheretolook.geometry.poses import Float
+from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, compact_poses, holds_model, load_mapping_poses
+from wheretolook.mapping.scale import read_scale
+from wheretolook.utils.confine import check_links, entry_of
+from wheretolook.utils.errors import ConfigError, SceneError, TableError
+from wheretolook.utils.files import fingerprint, write_json
+from wheretolook.utils.reading import read_json_object
+
+if TYPE_CHECKING:
+    from wheretolook.inputs.localization_map import LocalizationMap
+    from wheretolook.mapping.landmarks import Landmarks
+
+MappedFloor = tuple[tuple[float, float, float, float], ...]
+"""The floor that a map is made from: rectangles (x0, y0, x1, y1) in metres; empty for all of it."""
+
+
+@dataclass(frozen=True)
+class SceneFolder:
+    """Files of one scene."""
+
+    folder: Path  # `<data>/<dataset>/<scene>`
+    split: Split  # the whole scene belongs to it
+    camera: Camera = PinholeCamera()  # the one that looks, where a viewpoint names none of `cameras.txt`
+    own_camera: bool = False  # whether that is the map's own, which settings that name no camera leave as it is
+
+    @property
+    def name(self) -> str:
+        """Name of the scene."""
+        return self.folder.name
+
+    @property
+    def mesh(self) -> Path:
+        """Textured mesh, GLB, metres, z up."""
+        return self.folder / "mesh.glb"
+
+    @property
+    def map(self) -> Path:
+        """Folder of the COLMAP model, with `landmarks.npz` and `cameras.npz` beside it."""
+        return self.folder / "map"
+
+    @property
+    def landmarks(self) -> Path:
+        """Landmarks with their attributes."""
+        return self.map / "landmarks.npz"
+
+    @property
+    def mapping_cameras(self) -> Path:
+        """Poses of the mapping images."""
+        return self.map / CAMERAS_FILE
+
+    @property
+    def table(self) -> Path:
+        """Table of viewpoints."""
+        return self.folder / "viewpoints.parquet"
+
+    @property
+    def cameras_file(self) -> Path:
+        """Cameras that viewpoints name by their `camera_id`, in COLMAP's text format; only if there are several."""
+        return self.folder / "cameras.txt"
+
+    def cameras(self) -> dict[int, Camera]:
+        """The cameras that look, by `camera_id`: those of `cameras.txt`, or the scene's one camera as number 0.
+
+        Raises:
+            TableError: the file is damaged.
+        """
+        return read_cameras(self.cameras_file) if self.cameras_file.is_file() else {0: self.camera}
+
+    @property
+    def label_manifest(self) -> Path:
+        """What the labels were made with: versions, settings, fingerprints, shards."""
+        return self.folder / "labels.json"
+
+    @property
+    def adapt_shards(self) -> Path:
+        """Views that the adapt stage has labelled, while the label stage has not."""
+        return self.folder / "adapt-shards"
+
+    @property
+    def occlusion(self) -> Path:
+        """Which landmark each sampled location has a free line of sight to."""
+        return self.folder / "occlusion.npz"
+
+    @property
+    def frames(self) -> Path:
+        """COLMAP model of the frames of the recording that the mesh was fused from; only if it was."""
+        return self.folder / "frames"
+
+    @property
+    def is_scanned(self) -> bool:
+        """Whether the mesh was fused from a recording, and so shows what its camera saw, not a whole room."""
+        return self.mesh.is_file() and holds_model(self.frames)
+
+    @property
+    def is_photographed(self) -> bool:
+        """Whether the scene is known from photographs alone, or a model of such.
+
+        Raises MapError if it has no mesh, and its map's report is damaged.
+        """
+        return not self.mesh.is_file() and read_scale(self.map) is not None
+
+    def mapped_floor(self) -> MappedFloor:
+        """What `save_mapped_floor` has kept. Raises SceneError if its file is damaged."""
+        if not self._about.is_file():
+            return ()
+        try:
+            rectangles = read_json_object(self._about)["mapped_floor"]
+            return tuple((float(x0), float(y0), float(x1), float(y1)) for x0, y0, x1, y1 in rectangles)
+        except (ValueError, KeyError, TypeError) as error:
+            fix = "Remove it with the mesh beside it, and run the scenes stage again."
+            raise SceneError("damaged description of a scene", path=self._about, fix=fix) from error
+
+    def save_mapped_floor(self, floor: MappedFloor) -> None:
+        """Keep the floor that the map is to be made from, as `scene.json` beside the mesh, if it is not all."""
+        if floor:
+            write_json(self._about, {"mapped_floor": floor})
+        else:
+            self._about.unlink(missing_ok=True)
+
+    @property
+    def _about(self) -> Path:
+        return self.folder / "scene.json"
+
+    def read_table(self, matches: bool = False) -> pd.DataFrame:
+        """The scene's viewpoints, on request with their matches; see `wheretolook.dataset.viewpoint_table.read_table`."""
+        return read_table(self.table, matches)
+
+    def mapping_poses(self) -> Float | None:
+        """Poses cam_from_world (M, 3, 4) of the mapping images; None if neither their file nor a model is left.
+
+        Maps made before there was such a file have a COLMAP model, which tells the same. Raises MapError if the file or
+        the model is damaged.
+        """
+        if self.mapping_cameras.is_file():
+            return load_mapping_poses(self.mapping_cameras)
+        return compact_poses(colmap_poses(self.map)) if holds_model(self.map) else None
+
+    def read_landmarks(self) -> Landmarks:
+        """The map's landmarks. Raises MapError if there is no file of them, or it is damaged."""
+        from wheretolook.mapping.landmarks import Landmarks
+
+        landmarks = Landmarks.load(self.landmarks)
+        if landmarks.mapping_focal_px is not None:
+            return landmarks
+        # before it was told, the camera that looks was the one that mapped
+        focal_px = np.full(len(landmarks), self.camera.mean_focal_px, dtype=np.float32)
+        return replace(landmarks, mapping_focal_px=focal_px)
+
+    def localization_map(self, camera: Camera | None = None, device: str = "cpu") -> LocalizationMap:
+        """The scene's map with the occlusion stored for its sampled locations; the mesh is not needed.
+
+        For the scene's camera, unless another one looks.
+        """
+        from wheretolook.inputs.localization_map import LocalizationMap
+        from wheretolook.visibility.occlusion import StoredOcclusion
+
+        landmarks = self.read_landmarks()
+        occlusion = StoredOcclusion.load(self.occlusion)
+        return LocalizationMap(landmarks, camera or self.camera, occlusion, device, self.mapping_poses())
+
+
+def views_by_camera(
+    scene: SceneFolder, table: pd.DataFrame, at_most: int = 0
+) -> Iterator[tuple[Camera, NDArray[np.int64]]]:
+    """Rows of a table of a scene's viewpoints that look with one camera, ascending, and this camera.
+
+    With `at_most` the rows come in blocks of so many.
+
+    Raises:
+        TableError: a viewpoint names a camera that the scene has not.
+    """
+    cameras = scene.cameras()
+    if CAMERA_ID not in table:
+        numbers = np.full(len(table), next(iter(cameras)))
+        if len(cameras) > 1:
+            problem = "the scene has several cameras, and its viewpoints name none"
+            fix = "Run the sample stage again."
+            raise TableError(problem, path=scene.table, fix=fix)
+    else:
+        numbers = table[CAMERA_ID].to_numpy()
+    for number in np.unique(numbers).tolist():
+        if number not in cameras:
+            fix = "Run the sample stage again."
+            raise TableError("a viewpoint's camera is missing", path=scene.cameras_file, value=number, fix=fix)
+        rows = np.flatnonzero(numbers == number)
+        for begin in range(0, len(rows), at_most or len(rows)):
+            yield cameras[number], rows[begin : begin + (at_most or len(rows))]
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A folder of scenes."""
+
+    root: Path  # `<data>/<dataset>`
+    scenes: tuple[SceneFolder, ...]  # in the order they were made
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """All that look in its scenes, each once."""
+        return tuple(dict.fromkeys(camera for scene in self.scenes for camera in scene.cameras().values()))
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that looks in all scenes. Raises ConfigError if there are several, or none."""
+        if len(self.cameras) != 1:
+            fix = "Use a method that serves every camera, such as set, or a dataset of one camera."
+            raise ConfigError("not one camera looks in this dataset", path=self.root, value=len(self.cameras), fix=fix)
+        return self.cameras[0]
+
+    @property
+    def features(self) -> str:
+        """Name of the features that all its maps are by; "" if they differ, or there is no map.
+
+        Raises:
+            MapError: a file of landmarks is damaged.
+        """
+        from wheretolook.mapping.landmarks import features_of
+
+        found = {features_of(scene.landmarks) for scene in self.scenes if scene.landmarks.is_file()}
+        return found.pop() if len(found) == 1 else ""
+
+    @property
+    def name(self) -> str:
+        """Name of the dataset."""
+        return self.root.name
+
+    def split(self, split: Split) -> tuple[SceneFolder, ...]:
+        """Scenes of one split."""
+        return tuple(scene for scene in self.scenes if scene.split == split)
+
+    def scene(self, name: str) -> SceneFolder:
+        """The scene of a name. Raises ConfigError if there is none."""
+        known = {scene.name: scene for scene in self.scenes}
+        if name in known:
+            return known[name]
+        fix = f"There are {', '.join(known)}."
+        raise ConfigError("there is no such scene", path=self.root, value=name, fix=fix)
+
+    def fingerprint(self) -> str:
+        """16 hexadecimal digits that change with any scene's table, landmarks or occlusion."""
+        digest = hashlib.sha256()
+        for scene in self.scenes:
+            parts = [
+                fingerprint(path)
+                for path in (scene.table, scene.landmarks, scene.occlusion, scene.cameras_file)
+                if path.is_file()
+            ]
+            digest.update("".join([scene.name, scene.split, *parts]).encode())
+        return digest.hexdigest()[:16]
+
+    def save(self) -> None:
+        """Write `dataset.json`, which makes the folder a dataset."""
+        scenes: list[dict[str, Any]] = []
+        for scene in self.scenes:
+            own = {"own_camera": True} if scene.own_camera else {}
+            scenes.append({"name": scene.name, "split": scene.split, **own})
+        content: dict[str, Any] = {"scenes": scenes}
+        if len({scene.camera for scene in self.scenes}) == 1:
+            content = {"camera": self.scenes[0].camera.record(), **content}
+        else:
+            for scene, entry in zip(self.scenes, scenes, strict=True):
+                entry["camera"] = scene.camera.record()
+        write_json(self.root / "dataset.json", content)
+
+    @classmethod
+    def load(cls, root: Path) -> Dataset:
+        """Read a dataset folder.
+
+        Raises TableError if there is no valid `dataset.json`, ConfigError if a link in the folder leads out of it.
+        """
+        path = root / "dataset.json"
+        try:
+            content = read_json_object(path)
+            scenes = []
+            for entry in content["scenes"]:
+                camera = camera_of_record(entry["camera"] if "camera" in entry else content["camera"])
+                own = bool(entry.get("own_camera", False))
+                folder = entry_of(root, entry["name"], "a scene's name")
+                if entry["split"] not in get_args(Split):
+                    raise ValueError(f"a scene's split is {', '.join(get_args(Split))}, not {entry['split']!r}")
+                scenes.append(SceneFolder(folder, entry["split"], camera, own))
+        except FileNotFoundError as error:
+            raise TableError("this folder is no dataset", path=path, fix=NO_DATASET) from error
+        except (OSError, ConfigError, ValueError, KeyError, TypeError, AttributeError) as error:
+            problem = f"damaged dataset description: {error}"
+            fix = "Run the scenes stage again."
+            raise TableError(problem, path=path, fix=fix) from error
+        check_links(root, depth=3)
+        return cls(root, tuple(scenes))

@@ -1,0 +1,140 @@
+"""Samples a table of viewpoints in a map: the K directions of each location that see most (paper, Sec. 3.1-3.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+
+from wheretolook.dataset.sampling_config import SampleConfig, Split
+from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED, pose_columns
+from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.lattices import VoxelGrid
+from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.memory import fitting
+from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
+from wheretolook.visibility.survey import Survey, survey
+
+BYTES_PER_VIEWPOINT = 600  # while a table of viewpoints is made and written
+
+if TYPE_CHECKING:
+    from wheretolook.space.free_space import FreeSpace
+    from wheretolook.space.mapped_space import MappedSpace
+
+
+def free_locations(grid: VoxelGrid, free_space: FreeSpace | MappedSpace) -> NDArray[np.int64]:
+    """Ids of the grid's locations in free space, ascending. Raises SceneError if there is none."""
+    ids = np.flatnonzero(free_space.is_free(grid.centers()))
+    if len(ids) == 0:
+        problem = f"none of the {len(grid)} locations is in free space"
+        fix = "Refine sample.grid, lower the clearance, or check the scene's units (metres) and up axis."
+        raise SceneError(problem, value=(grid.lower, grid.upper), fix=fix)
+    return ids
+
+
+def sample_viewpoints(
+    grid: VoxelGrid,
+    location_ids: ArrayLike,
+    landmarks: Landmarks,
+    cameras: Camera | Mapping[int, Camera],
+    occlusion: OcclusionModel,
+    config: SampleConfig | None = None,
+    device: str = "cpu",
+    progress: str | None = None,
+    split: Split = "train",
+) -> tuple[pd.DataFrame, StoredOcclusion]:
+    """Choose viewpoints by how many landmarks they see, at locations (L,) of the grid, the centres of its voxels.
+
+    At every location all directions of the lattice are ranked by the number of landmarks in view (descending, then by
+    direction id), and the best K are kept. Some options differ by the scene's split. Of several cameras, by number,
+    each location looks with one, in turn, and the table says with which. The progress bar has a text; None shows none.
+    Returns the table of viewpoints, unlabelled, in the order of their ids (location id times the number of directions,
+    plus direction id), and the occlusion of the table's locations, for later stages.
+
+    Raises:
+        SceneError: no viewpoint sees enough landmarks, or a location lies inside geometry.
+        MapError: there are no landmarks.
+        ConfigError: so many viewpoints do not fit into memory.
+    """
+    config = config or SampleConfig()
+    rng = np.random.default_rng(config.seed)
+    ids = np.sort(_subset(np.asarray(location_ids, dtype=np.int64), config.max_locations, rng))
+    locations = grid.centers()[ids]
+    directions = config.axes()
+    options: dict[str, Any] = {"keep": config.keep, "distinct_pixels": config.distinct_pixels, "progress": progress}
+    options |= {"device": device, "memory_bytes": round(config.memory_gb * 1e9)}
+    several = cameras if isinstance(cameras, Mapping) else {0: cameras}
+    numbers = np.array(list(several))[np.arange(len(ids)) % len(several)]
+    if len(several) > 1:
+        rng.shuffle(numbers)
+    around = (rotation_looking_along(directions), locations, landmarks.points, occlusion)
+    seen = _survey_by_camera(several, numbers, *around, **options)
+    counts = seen.counts
+    rank = np.full(seen.counts.shape, -1, dtype=np.int32)
+    np.put_along_axis(rank, seen.best, np.arange(seen.best.shape[1])[None], axis=1)
+
+    kept_directions = []
+    for row, best in enumerate(seen.best):
+        kept = best[counts[row, best] >= config.min_visible]
+        kept_directions.append(np.sort(_subset(kept, config.directions_of(split), rng)))
+    row_index = np.repeat(np.arange(len(ids)), [len(kept) for kept in kept_directions])
+    direction = np.concatenate(kept_directions)
+    if len(direction) == 0:
+        n_landmarks = len(landmarks.points)
+        fix = "Lower sample.min_visible, or map the scene with more images."
+        problem = f"from no location does a viewpoint see {config.min_visible} of the {n_landmarks} landmarks"
+        raise SceneError(problem, value=int(counts.max(initial=0)), fix=fix)
+    if len(direction) > (most := fitting(BYTES_PER_VIEWPOINT)):
+        fix = f"Set sample.max_directions to {max(1, most // len(ids)):,} or less, or sample.max_locations."
+        raise ConfigError("the table has more viewpoints than there is memory for", value=len(direction), fix=fix)
+    columns = {
+        "viewpoint_id": ids[row_index] * len(directions) + direction,
+        "location_id": ids[row_index],
+        "direction_id": direction,
+        **pose_columns(poses_looking_along(locations[row_index], directions[direction])),
+        "n_visible": counts[row_index, direction],
+        "visibility_rank": rank[row_index, direction],
+    }
+    if isinstance(cameras, Mapping):
+        columns[CAMERA_ID] = numbers[row_index].astype(np.int32)
+    nan = np.float32(np.nan)
+    assert seen.occlusion is not None
+    table = pd.DataFrame(columns).assign(status=UNLABELLED, error_m=nan, error_deg=nan, n_inliers=0)
+    return table, seen.occlusion
+
+
+def _survey_by_camera(
+    cameras: Mapping[int, Camera],
+    numbers: NDArray[np.integer[Any]],
+    rotations: Float,
+    locations: Float,
+    points: Float,
+    occlusion: OcclusionModel,
+    **options: Any,
+) -> Survey:
+    """`survey` of locations (L, 3), each looked from with the camera of its number (L,)."""
+    if len(cameras) == 1:
+        return survey(next(iter(cameras.values())), rotations, locations, points, occlusion, **options)
+    groups = [np.flatnonzero(numbers == number) for number in cameras]
+    parts = [
+        survey(camera, rotations, locations[rows], points, occlusion, **options)
+        for camera, rows in zip(cameras.values(), groups, strict=True)
+        if len(rows)
+    ]
+    order = np.argsort(np.concatenate(groups))
+    stored = [part.occlusion for part in parts if part.occlusion is not None]
+    packed = np.concatenate([part.packed for part in stored])[order]
+    joined = StoredOcclusion(locations, packed, stored[0].n_landmarks, stored[0].name)
+    counts, best = (np.concatenate([getattr(part, name) for part in parts])[order] for name in ("counts", "best"))
+    return Survey(counts, best, joined)
+
+
+def _subset(values: NDArray[np.int64], at_most: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    if at_most == 0 or len(values) <= at_most:
+        return values
+    return rng.choice(values, at_most, replace=False)

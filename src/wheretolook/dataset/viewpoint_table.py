@@ -1,0 +1,219 @@
+"""The table of viewpoints: one Parquet file a scene, one row a viewpoint, joined by ids and never by file order.
+
+A compact table holds the same rows in a third of the space; `read_table` reads both. The landmarks that each view
+matched can be stored too, see `MATCH_FIELDS`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation, rotation_from_quaternion
+from wheretolook.utils.errors import TableError
+from wheretolook.utils.files import replacing
+from wheretolook.utils.parquet_files import open_parquet, read_columns
+
+POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
+CENTER_COLUMNS = ("x_m", "y_m", "z_m")
+
+_COLUMNS = {"viewpoint_id": pa.int64(), "location_id": pa.int32(), "direction_id": pa.int32()}
+_COLUMNS |= dict.fromkeys(POSE_COLUMNS, pa.float64())
+_COLUMNS |= {"n_visible": pa.int32(), "visibility_rank": pa.int32(), "status": pa.string()}
+_COLUMNS |= {"error_m": pa.float32(), "error_deg": pa.float32(), "n_inliers": pa.int32()}
+SCHEMA = pa.schema(_COLUMNS)
+"""Columns of `viewpoints.parquet`. The pose is cam_from_world (quaternion wxyz, translation in metres), rank 0 is the
+direction that sees most landmarks at its location. Until a viewpoint is labelled its status is "unlabelled"; afterwards
+it is "localized", "too_few_matches" or "no_pose". Errors are those of the pose that RANSAC found, even if it has too
+few inliers to be accepted ("no_pose"); NaN if there is none."""
+
+_COMPACT_NAMES = dict(zip(POSE_COLUMNS[4:], CENTER_COLUMNS, strict=True))
+COMPACT_SCHEMA = pa.schema([field.with_name(_COMPACT_NAMES.get(field.name, field.name)) for field in SCHEMA])
+"""Columns of a compact table: in place of the translation, which differs in every row, the camera's centre in the world
+(metres), which the viewpoints of a location share. The translation follows: t = -R c."""
+
+MATCH_FIELDS = pa.schema([("matched_rows", pa.list_(pa.int32())), ("inlier_rows", pa.list_(pa.int32()))])
+"""Two ragged columns that a table may have in addition to `SCHEMA`, if labelling was asked for them: the landmarks that
+were matched in each view, and the inliers among them, as rows of the scene's `landmarks.npz`, ascending. A view without
+matches has two empty lists. Compact tables leave them out."""
+
+PIXEL_FIELD = pa.schema([("matched_pixels", pa.list_(pa.float32()))])
+"""A ragged column that a table with `MATCH_FIELDS` may have besides: x and y in turn of the pixel at which each of
+`matched_rows` was found, in their order. With it several views of a place can be localized together (`looks/`)."""
+
+CAMERA_FIELD = pa.schema([("camera_id", pa.int32())])
+"""A column that a table may have in addition to `SCHEMA`, where a scene's viewpoints look with several cameras: the
+number of the camera in the scene's `cameras.txt`."""
+
+(CAMERA_ID,) = CAMERA_FIELD.names
+(PIXELS,) = PIXEL_FIELD.names
+
+CENTER_DECIMALS = 12  # of a metre; the centres of a location's viewpoints, each computed from its pose, differ by less
+
+_ENCODINGS = {"viewpoint_id": "DELTA_BINARY_PACKED", "error_m": "BYTE_STREAM_SPLIT", "error_deg": "BYTE_STREAM_SPLIT"}
+_COMPACT_FORMAT = {
+    "compression_level": 19,
+    "use_dictionary": [name for name in COMPACT_SCHEMA.names if name not in _ENCODINGS],  # they repeat few values
+    "column_encoding": _ENCODINGS,
+}
+
+UNLABELLED = "unlabelled"
+LOCALIZED = "localized"
+TOO_FEW_MATCHES = "too_few_matches"
+NO_POSE = "no_pose"
+
+
+def poses(table: pd.DataFrame) -> Float:
+    """cam_from_world poses (B, 3, 4) of a table's rows."""
+    rotation = rotation_from_quaternion(table[list(POSE_COLUMNS[:4])].to_numpy(np.float64))
+    return np.concatenate([rotation, table[list(POSE_COLUMNS[4:])].to_numpy(np.float64)[..., None]], axis=-1)
+
+
+def pose_columns(cam_from_world: Float) -> dict[str, Float]:
+    """Pose columns, by name, of poses (B, 3, 4)."""
+    values = np.concatenate([quaternion_from_rotation(cam_from_world[..., :3]), cam_from_world[..., 3]], axis=-1)
+    return dict(zip(POSE_COLUMNS, values.T, strict=True))
+
+
+def is_good(table: pd.DataFrame, max_error_m: float = 0.05, max_error_deg: float = 0.4) -> np.ndarray:
+    """Labels (B,): True if localized with both errors below their limits. Raises TableError if one has no label yet."""
+    unlabelled = int((table["status"] == UNLABELLED).sum())
+    if unlabelled:
+        raise TableError("viewpoints without labels", value=unlabelled, fix="Run the label stage (it resumes).")
+    good = (table["status"] == LOCALIZED) & (table["error_m"] < max_error_m) & (table["error_deg"] < max_error_deg)
+    return good.to_numpy()
+
+
+def shares_good(table: pd.DataFrame) -> tuple[NDArray[np.int64], Float]:
+    """Ids (L,) of a table's locations, ascending, and the share of each one's viewpoints that localize, (L,)."""
+    ids, rows = np.unique(table["location_id"].to_numpy(np.int64), return_inverse=True)
+    return ids, np.bincount(rows, weights=is_good(table)) / np.bincount(rows)
+
+
+def instructive_location(table: pd.DataFrame) -> int:
+    """The first location whose share of viewpoints that localize is nearest to 0.5: where to look matters there."""
+    ids, shares = shares_good(table)
+    return int(ids[np.argmin(np.abs(shares - 0.5))])
+
+
+def outcome_in_words(label: pd.Series) -> str:
+    """The result of localizing a row of a table, in words; empty if it was not tried."""
+    status = str(label["status"])
+    if status == UNLABELLED:
+        return ""
+    if status != LOCALIZED:
+        return status.replace("_", " ")
+    if label["error_m"] < 1:
+        return f"pose found, {100 * label['error_m']:.1f} cm and {label['error_deg']:.2f}° off"
+    return f"wrong pose found, {label['error_m']:.1f} m and {label['error_deg']:.0f}° off"
+
+
+def outcome_in_brief(label: pd.Series) -> str:
+    """As `outcome_in_words`, for narrow pictures: only the error of the pose, if one was found."""
+    if str(label["status"]) != LOCALIZED:
+        return outcome_in_words(label)
+    if label["error_m"] < 1:
+        return f"{100 * label['error_m']:.1f} cm, {label['error_deg']:.2f}° off"
+    return f"{label['error_m']:.1f} m, {label['error_deg']:.0f}° off"
+
+
+def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
+    """Write a table atomically as zstd Parquet with checksums; the same rows give the same bytes.
+
+    Columns are those of `SCHEMA`, and of `CAMERA_FIELD`, `MATCH_FIELDS` and `PIXEL_FIELD` if they are there. A
+    compact table has `COMPACT_SCHEMA`, about 18 bytes a row; read back, its poses agree to 1e-12 and all else exactly.
+    """
+    schema, options = (COMPACT_SCHEMA, _COMPACT_FORMAT) if compact else (SCHEMA, {})
+    if compact:
+        table = table.assign(**dict(zip(CENTER_COLUMNS, _shared_centers(table).T, strict=True)))
+    further = [CAMERA_FIELD] if compact else [CAMERA_FIELD, MATCH_FIELDS, PIXEL_FIELD]
+    schema = pa.schema(
+        [*schema, *(field for part in further if set(part.names) <= set(table.columns) for field in part)]
+    )
+    content = pa.Table.from_pandas(table, schema=schema, preserve_index=False)
+    content = content.replace_schema_metadata(None)  # it describes the data frame, not the rows
+    with replacing(path) as partial:
+        pq.write_table(content, partial, compression="zstd", write_page_checksum=True, **options)
+
+
+def _shared_centers(table: pd.DataFrame) -> Float:
+    """Camera centres (B, 3) in metres, exactly equal for all viewpoints of a location."""
+    centers = camera_centers(poses(table))
+    _, first, rows = np.unique(table["location_id"], return_index=True, return_inverse=True)
+    shared = centers[first][rows]
+    apart = np.abs(shared - centers) > 0.5 * 10.0**-CENTER_DECIMALS  # a location with several centres keeps them
+    return np.round(np.where(apart, centers, shared), CENTER_DECIMALS) + 0.0  # no negative zero
+
+
+def read_parquet(path: Path) -> pd.DataFrame:
+    """Read any table in a Parquet file. ValueError if it is none, or unfolds to far more than it has bytes."""
+    try:
+        with open_parquet(path, page_checksum_verification=True) as file:
+            frame: pd.DataFrame = read_columns(file, path, file.schema_arrow.names).to_pandas()
+            return frame
+    except ValueError as error:
+        raise ValueError(f"not a readable Parquet file: {error}") from error
+
+
+def has_matches(path: Path, pixels: bool = False) -> bool:
+    """Whether a table holds `MATCH_FIELDS`, with `pixels` also `PIXEL_FIELD`; a file that cannot be read does not."""
+    try:
+        with open_parquet(path) as file:
+            return {*MATCH_FIELDS.names, *(PIXEL_FIELD.names if pixels else [])} <= {*file.schema_arrow.names}
+    except ValueError:
+        return False
+
+
+def read_table(path: Path, matches: bool = False, pixels: bool = False) -> pd.DataFrame:
+    """Read the columns of `SCHEMA` of a table of viewpoints, compact or not, and of `CAMERA_FIELD` if it has that.
+
+    With `matches` also those of `MATCH_FIELDS`: in each row two int32 arrays, (M,) of the landmarks matched and (I,) of
+    the inliers among them; with `pixels` also that of `PIXEL_FIELD`, (2 M,) float32. Raises TableError if the file is
+    missing, truncated, not a Parquet file, or lacks columns that were asked for.
+    """
+    if not path.is_file():
+        raise TableError("there is no table of viewpoints", path=path, fix="Run the sample stage first.")
+    try:
+        with open_parquet(path, page_checksum_verification=True) as file:
+            names = file.schema_arrow.names  # matches take long to read, so only if they are asked for
+            unwanted = ([] if matches or pixels else MATCH_FIELDS.names) + ([] if pixels else PIXEL_FIELD.names)
+            table = read_columns(file, path, [name for name in names if name not in unwanted])
+    except ValueError as error:
+        fix = "It may be truncated: get it anew, or delete it and run the stage that writes it."
+        raise TableError(f"not a readable Parquet file: {error}", path=path, fix=fix) from error
+    compact = any(name in names for name in CENTER_COLUMNS)
+    schema, columns = (COMPACT_SCHEMA, CENTER_COLUMNS) if compact else (SCHEMA, POSE_COLUMNS[4:])
+    missing = [name for name in schema.names if name not in names]
+    if missing:
+        raise TableError("columns are missing", path=path, value=missing, fix="Run the sample stage again.")
+    wanted = (MATCH_FIELDS.names if matches or pixels else []) + (PIXEL_FIELD.names if pixels else [])
+    further = [name for name in CAMERA_FIELD.names if name in names] + wanted
+    if further:
+        extra = pa.unify_schemas([CAMERA_FIELD, MATCH_FIELDS, PIXEL_FIELD])
+        schema = pa.schema([*schema, *(extra.field(name) for name in further)])
+    if missing := [name for name in wanted if name not in names]:
+        option = "pixels" if PIXELS in missing else "matches"
+        fix = f"Label again with `--label.store_{option} true`; compact tables never hold them."
+        raise TableError("it is not stored which landmarks were matched", path=path, value=missing, fix=fix)
+    try:
+        frame: pd.DataFrame = table.select(schema.names).cast(schema).to_pandas()
+    except pa.ArrowException as error:
+        raise TableError(f"columns of another type: {error}", path=path, fix="Run the sample stage again.") from error
+    length = np.linalg.norm(frame[list(POSE_COLUMNS[:4])].to_numpy(), axis=1)
+    position = frame[list(columns)].to_numpy()
+    bad = ~(np.abs(length - 1) < 1e-6) | ~np.isfinite(position).all(1)
+    if bad.any():
+        first = [float(value) for value in frame[[*POSE_COLUMNS[:4], *columns]].iloc[int(np.argmax(bad))]]
+        fix = "The file is damaged: run the sample stage again."
+        raise TableError("a pose is no rigid transform", path=path, value=first, fix=fix)
+    if compact:
+        rotation = rotation_from_quaternion(frame[list(POSE_COLUMNS[:4])].to_numpy())
+        translation = -(rotation @ position[..., None])[..., 0]
+        frame = frame.assign(**dict(zip(POSE_COLUMNS[4:], translation.T, strict=True)))
+        frame = frame[[*SCHEMA.names, *further]]
+    return frame

@@ -1,0 +1,134 @@
+"""A picture of a scene from obliquely above, without its ceiling and the near walls, and drawing on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from numpy.typing import ArrayLike, NDArray
+
+from wheretolook.geometry.camera import Camera, PinholeCamera
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.poses import Float, invert_poses, poses_looking_along, rotation_looking_along, transform
+from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.scenes.cutting import cut_above
+from wheretolook.utils.errors import ConfigError, SceneError
+
+FAR = 25.0  # distance of the eye in diagonals of the scene: so far that parallel lines stay parallel in the picture
+
+
+@dataclass(frozen=True, eq=False)
+class Dollhouse:
+    """A picture of a scene on which world points can be drawn, with the camera that took it and its pose."""
+
+    rgb: NDArray[np.uint8]  # (H, W, 3); white where there is no surface
+    depth_m: NDArray[np.float32]  # (H, W), from the eye; 0 where there is no surface
+    camera: PinholeCamera
+    cam_from_world: Float  # (3, 4)
+
+    def pixels(self, points: ArrayLike) -> Float:
+        """Pixels (..., 2) of world points (..., 3) in metres."""
+        world = np.asarray(points, dtype=np.float64)
+        return self.camera.project(transform(self.cam_from_world, world.reshape(-1, 3))).reshape(*world.shape[:-1], 2)
+
+    def shows(self, points: ArrayLike, margin_m: float = 0.1) -> NDArray[np.bool_]:
+        """Which world points (N, 3) in metres lie on a surface in the picture, to the margin; (N,).
+
+        Not, then, points of what is hidden, and of walls that are cut off or left out: they would float.
+        """
+        in_camera = transform(self.cam_from_world, points)
+        pixels = self.camera.project(in_camera)
+        inside = self.camera.in_image(pixels)
+        column, row = np.where(inside[:, None], pixels, 0).astype(int).T
+        depth = self.depth_m[row, column]
+        return inside & (np.abs(in_camera[:, 2] - depth) <= margin_m)
+
+
+def dollhouse(
+    mesh: TexturedMesh,
+    azimuth_deg: float = -110.0,
+    elevation_deg: float = 55.0,
+    cut_m: float | None = None,
+    width_px: int = 1400,
+    one_sided: bool = True,
+    device: str = "cpu",
+) -> Dollhouse:
+    """Render a scene from outside.
+
+    The azimuth of the eye counts counter-clockwise from +x. Its elevation is in (0, 90]; 90 gives a plan with +x to the
+    right and +y up, whatever the azimuth. What lies above the world height `cut_m` is cut off. With `one_sided`, for
+    meshes that are wound reliably, triangles that turn their backs to the eye are left out, such as ceilings. Raises
+    ConfigError if the elevation or width is out of range, SceneError if no triangle is left.
+    """
+    if not 0 < elevation_deg <= 90 or width_px < 2:
+        raise ConfigError("the eye must be above the scene, and the picture wide", value=(elevation_deg, width_px))
+    low, high = mesh.bounds
+    if cut_m is not None:
+        mesh = cut_above(mesh, cut_m)
+    azimuth = np.radians(azimuth_deg)
+    elevation = np.radians(elevation_deg)
+    to_eye = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    if elevation_deg == 90:
+        to_eye = np.array([0.0, 0.0, 1.0])
+    if one_sided:
+        mesh = mesh.only(mesh.normals @ to_eye > 0)
+    if len(mesh.triangles) == 0:
+        raise SceneError("nothing of the scene is left to be seen", value=cut_m, fix="Cut higher.")
+    corners = np.stack(np.meshgrid(*np.stack([low, high], axis=1), indexing="ij"), axis=-1).reshape(-1, 3)
+    rotation = rotation_looking_along(-to_eye)
+    in_eye_frame = corners @ rotation.T
+    extent = np.ptp(in_eye_frame[:, :2], axis=0)
+    center = (in_eye_frame.min(0) + in_eye_frame.max(0)) / 2 @ rotation
+    distance = FAR * float(np.linalg.norm(high - low))
+    focal_px = 0.98 * width_px * distance / extent[0]
+    height_px = max(2, int(np.ceil(width_px * extent[1] / extent[0])))
+    camera = PinholeCamera(width_px, height_px, float(focal_px))
+    pose = poses_looking_along(center + distance * to_eye, -to_eye)
+    rendering = WarpRenderer(mesh, device).render(camera, pose[None])
+    rgb = rendering.rgb[0]
+    depth_m = rendering.depth_m[0]
+    rgb[depth_m == 0] = 255
+    return Dollhouse(rgb, depth_m, camera, pose)
+
+
+def draw_house(axes: Axes, house: Dollhouse, fade: float = 0.5) -> None:
+    """Draw the picture, with axes in its pixels; `fade` makes it paler, from 0 (as it is) to 1 (white)."""
+    height, width = house.rgb.shape[:2]
+    rgb = 255 * (house.rgb / 255.0) ** 0.7  # rooms without a lamp are dark
+    axes.imshow((rgb + fade * (255 - rgb)).astype(np.uint8), extent=(0, width, height, 0))
+    axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal")
+    axes.axis("off")
+
+
+def draw_points(axes: Axes, house: Dollhouse, points: ArrayLike, **style: Any) -> None:
+    """Draw world points (N, 3) m as dots."""
+    pixels = house.pixels(points).reshape(-1, 2)
+    axes.scatter(pixels[:, 0], pixels[:, 1], **{"linewidths": 0, **style})
+
+
+def draw_segments(axes: Axes, house: Dollhouse, segments: ArrayLike, **style: Any) -> LineCollection:
+    """Draw lines between pairs of world points (..., 2, 3) m."""
+    pixels = house.pixels(np.asarray(segments)).reshape(-1, 2, 2)
+    lines = LineCollection(list(pixels), **{"capstyle": "round", **style})
+    axes.add_collection(lines, autolim=False)
+    return lines
+
+
+def frustum_corners(camera: Camera, cam_from_world: ArrayLike, depth_m: float) -> Float:
+    """Corners (B, 5, 3) m of cameras (B, 3, 4): centre, then the image's corners at a depth, from top left."""
+    pixels = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (camera.width, camera.height)
+    rays = camera.unproject(pixels)
+    if isinstance(camera, PinholeCamera):  # a fisheye's corners can lie behind it: it is drawn to a distance
+        rays = rays / rays[:, 2:]
+    corners = np.concatenate([np.zeros((1, 3)), depth_m * rays])
+    world_from_cam = invert_poses(np.asarray(cam_from_world, dtype=np.float64).reshape(-1, 3, 4))
+    return corners @ np.swapaxes(world_from_cam[..., :3], -1, -2) + world_from_cam[:, None, :, 3]
+
+
+def frustum_segments(camera: Camera, cam_from_world: ArrayLike, depth_m: float) -> Float:
+    """The eight edges (B, 8, 2, 3) m of camera frusta down to a depth."""
+    edges = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
+    return frustum_corners(camera, cam_from_world, depth_m)[:, edges]

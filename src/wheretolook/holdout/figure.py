@@ -1,0 +1,151 @@
+"""What a check with a map's own photographs found, in one picture."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.style import context
+
+from wheretolook.evaluation.calibration import reliability
+from wheretolook.figures.style import BLUE, INK, RC, VERMILION, new_figure
+
+if TYPE_CHECKING:
+    from wheretolook.holdout.report import CheckReport
+
+_GOOD = BLUE
+_BAD = VERMILION
+_UNTESTED = "#999999"
+_DOTS = 20_000  # landmarks that are drawn
+_CURVE = 10  # bins of the reliability curve: fewer than of the error, as photographs are few
+
+
+def check_figure(report: CheckReport) -> Figure:
+    """The map from above with all photographs, localized or not; and predicted against found, of views and of blocks.
+
+    On the map a photograph has the colour of the time that it was left out with few others; numbers are those of parts
+    that relocalize badly.
+    """
+    with context(RC):
+        figure = new_figure(12.5, 6.6)
+        grid = figure.add_gridspec(2, 3, width_ratios=(2.1, 1, 1))
+        _draw_map(figure.add_subplot(grid[:, 0]), report)
+        _draw_calibration(figure.add_subplot(grid[0, 1]), report)
+        _draw_inliers(figure.add_subplot(grid[0, 2]), report)
+        _draw_blocks(figure.add_subplot(grid[1, 1:]), report)
+        figure.suptitle(_title(report), fontsize=11)
+        return figure
+
+
+def _title(report: CheckReport) -> str:
+    words = f"{report.source.name}: {report.sentence()}".split(" ")
+    lines = [""]
+    for word in words:
+        if len(lines[-1]) + len(word) > 120:
+            lines.append("")
+        lines[-1] += f" {word}" if lines[-1] else word
+    return "\n".join(lines)
+
+
+def _draw_map(axes: Axes, report: CheckReport) -> None:
+    source = report.source
+    table = report.photographs
+    points = source.arrays.points / source.from_model.scale
+    centers = source.own_centers @ source.from_model.rotation.T
+    looks = source.poses[:, 2, :3]
+    low, high = np.percentile(points[:, :2], (2, 98), axis=0)
+    low = np.minimum(low, centers[:, :2].min(0))
+    high = np.maximum(high, centers[:, :2].max(0))
+    margin = 0.04 * (high - low).max()
+    step = max(1, len(points) // _DOTS)
+    axes.scatter(points[::step, 0], points[::step, 1], s=1, color="#c4c4c4", linewidths=0, rasterized=True, zorder=1)
+    length = 0.035 * float((high - low).max())
+    localized = table["localized"].to_numpy(dtype=float, na_value=np.nan)
+    kinds = [(np.isnan(localized), _UNTESTED, "not looked at"), (localized == 1, _GOOD, "localized")]
+    kinds.append((localized == 0, _BAD, "not localized"))
+    for mask, color, label in kinds:
+        if not mask.any():
+            continue
+        at = centers[mask, :2]
+        along = looks[mask, :2] * length
+        axes.quiver(
+            *at.T, *along.T, color=color, angles="xy", scale_units="xy", scale=1, width=0.0025, headwidth=3, zorder=3
+        )
+        axes.scatter(at[:, 0], at[:, 1], s=14, color=color, label=f"{label} ({mask.sum()})", zorder=4, linewidths=0)
+    for part in report.parts:
+        middle = np.median(centers[part.rows, :2], axis=0)
+        out = np.median(looks[part.rows, :2], axis=0) * -2.2 * length
+        style: dict[str, Any] = {"arrowstyle": "-", "color": INK, "linewidth": 0.8}
+        box: dict[str, Any] = {"boxstyle": "circle,pad=0.2", "facecolor": "white", "edgecolor": _BAD}
+        axes.annotate(
+            str(part.number), tuple(middle), tuple(middle + out), fontsize=9, ha="center", va="center", zorder=5,
+            arrowprops=style, bbox=box,
+        )  # fmt: skip
+    axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), aspect="equal")
+    upright = ", turned upright" if source.is_turned else ""
+    axes.set(xlabel=f"x ({source.unit})", ylabel=f"y ({source.unit})")
+    axes.set_title(f"from above{upright}; left out with their neighbours, photographs are", pad=24)
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, handletextpad=0.1, borderaxespad=0.2)
+
+
+def _draw_calibration(axes: Axes, report: CheckReport) -> None:
+    numbers = report.numbers
+    views = report.views
+    if numbers["ece"] is None:
+        good = views["good"].to_numpy(dtype=bool)
+        for mask, color, label in ((good, _GOOD, "localized"), (~good, _BAD, "not localized")):
+            axes.hist(views["score"][mask], bins=20, color=color, alpha=0.6, label=label)
+        axes.set(xlabel=f"score of {report.method}", ylabel="views", title="scores")
+        axes.legend()
+        return
+    curve = reliability(views["score"].to_numpy(), views["good"].to_numpy(dtype=bool), _CURVE)
+    known = curve[curve["n"] > 0]
+    axes.plot([0, 1], [0, 1], color=INK, linewidth=1, linestyle="--")
+    axes.plot(known["mean_predicted"], known["share_good"], color=_GOOD, zorder=3)
+    sizes = 12 + 140 * known["n"] / known["n"].max()
+    axes.scatter(known["mean_predicted"], known["share_good"], s=sizes, color=_GOOD, zorder=3, clip_on=False)
+    axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="predicted probability", ylabel="share that localizes")
+    axes.set_title(f"calibration error {numbers['ece']['value']:.2f}")
+
+
+def _draw_inliers(axes: Axes, report: CheckReport) -> None:
+    views = report.views
+    expected = views["expected_inliers"].to_numpy(np.float64)
+    found = views["n_inliers"].to_numpy(np.float64)
+    label = "landmarks expected to be found"
+    if not np.isfinite(expected).all():
+        expected = views["n_visible"].to_numpy(np.float64)
+        label = "landmarks in view"
+    good = views["good"].to_numpy(dtype=bool)
+    most = 1.3 * max(float(expected.max(initial=1)), float(found.max(initial=1)), 10.0)
+    axes.plot([1, most], [1, most], color=INK, linewidth=1, linestyle="--")
+    for mask, color in ((good, _GOOD), (~good, _BAD)):
+        axes.scatter(
+            np.maximum(expected[mask], 0.5), np.maximum(found[mask], 0.5), s=9, color=color, alpha=0.6, linewidths=0
+        )
+    axes.set(xscale="log", yscale="log", xlabel=label, ylabel="inliers found", title="expected and found")
+    axes.set(xlim=(0.4, most), ylim=(0.4, most))
+
+
+def _draw_blocks(axes: Axes, report: CheckReport) -> None:
+    blocks = report.blocks
+    at = np.arange(len(blocks))
+    axes.bar(at, blocks["share_localized"], color=_GOOD, alpha=0.45, width=0.7, label="share that localizes")
+    if report.numbers["ece"] is not None:
+        axes.plot(at, blocks["mean_score"], color=INK, marker="o", linestyle="", markersize=5, label="predicted")
+    axes.set_xticks(at, [f"{row.left_out}" for row in blocks.itertuples()])
+    axes.set(ylim=(0, 1.02), ylabel="share of the views")
+    first = int((blocks["kind"] == "part").sum())
+    axes.set_xlabel(
+        f"photographs left out ({first} blocks that share out all, {len(blocks) - first} that are grown)\n"
+        "in the bars: landmarks that the rest still has of what a photograph shows"
+    )
+    if 0 < first < len(blocks):
+        axes.axvline(first - 0.5, color=INK, linewidth=0.8, linestyle=":")
+    for place, row in enumerate(blocks.itertuples()):
+        axes.annotate(f"{row.median_kept:.0f}", (place, 0.02), ha="center", fontsize=8)
+    axes.set_title("blocks", loc="left", pad=22)
+    axes.grid(axis="x", visible=False)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.08), ncols=2, borderaxespad=0)

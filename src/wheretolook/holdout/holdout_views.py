@@ -1,0 +1,60 @@
+"""Photographs that were left out of a map as views to learn from, and as views of an evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from wheretolook.dataset.layout import SceneFolder
+from wheretolook.evaluation.photographs import LeftOutPhotographs
+from wheretolook.geometry.poses import camera_centers
+from wheretolook.holdout.holdout import LeftOut
+from wheretolook.holdout.metrics import places_of
+from wheretolook.holdout.photo_map import MAX_ERROR_M, PhotographedMap
+from wheretolook.holdout.report import place_radius
+from wheretolook.holdout.scores import Scoring, maps_without, score_views
+from wheretolook.scorers.adapted.gp_correction import LocalizedViews
+from wheretolook.scorers.adapted.score import log_odds_of
+from wheretolook.visibility.occlusion import OcclusionModel
+
+
+def photographed_views(
+    source: PhotographedMap, left_out: Sequence[LeftOut], weights: Path, occlusion: OcclusionModel, device: str = "cpu"
+) -> LocalizedViews:
+    """The photographs of all blocks, each scored on the map without its block; groups are blocks."""
+    _, views = score_views(source, left_out, Scoring(weights=weights), occlusion, device)
+    row = views["row"].to_numpy(np.int64)
+    block = views["block"].to_numpy(np.int64)
+    poses = source.poses[row]
+    centers = camera_centers(poses)
+    place = places_of(centers, block, place_radius(source))
+    log_odds = log_odds_of(views["score"].to_numpy(np.float64))
+    good = views["good"].to_numpy(bool)
+    return LocalizedViews(log_odds, good, centers, poses[:, 2, :3], block, row, place)
+
+
+def evaluated_photographs(
+    scene: SceneFolder,
+    source: PhotographedMap,
+    left_out: Sequence[LeftOut],
+    occlusion: OcclusionModel,
+    device: str = "cpu",
+) -> LeftOutPhotographs:
+    """The photographs of all blocks of a scene's map as views of an evaluation.
+
+    Where metres are not known, errors are brought to those of a map in which each limit is 5 cm.
+    """
+    views = pd.concat([one.views.assign(block=one.block.number) for one in left_out], ignore_index=True)
+    poses = source.poses[views["row"].to_numpy()]
+    maps = []
+    begin = 0
+    for one in left_out:
+        maps += [(begin + rows, around) for rows, around in maps_without(source, one, occlusion, device)]
+        begin += len(one.views)
+    place = places_of(camera_centers(poses), views["block"].to_numpy(np.int64), place_radius(source))
+    error_m = views["error_m"] * (MAX_ERROR_M / views["limit_m"])
+    views = views.assign(photograph=views["row"], place=place, error_m=error_m)
+    return LeftOutPhotographs(scene, views, poses, maps)

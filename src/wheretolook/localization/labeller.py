@@ -1,0 +1,209 @@
+"""Labels tables of viewpoints in shards, which are kept when the work is interrupted."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from tqdm.auto import tqdm
+
+from wheretolook.dataset.viewpoint_table import CAMERA_ID, SCHEMA, read_table, write_table
+from wheretolook.localization.config import LabelConfig
+from wheretolook.localization.shard import LabelledShard, SceneJob, Shard
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.utils.errors import MapError, SceneError, StorageError, TableError
+from wheretolook.utils.files import fingerprint, sha256, write_json
+from wheretolook.utils.version import VERSION
+
+MANIFEST = "manifest.json"
+"""File in the folder of shards that says what the labels are made with; later `labels.json` beside the table."""
+
+VIEWS_OF_A_CAMERA = 16
+"""Least views of each of several cameras in a shard, as a mean, where a GPU labels it."""
+
+LABELS = ("status", "error_m", "error_deg", "n_inliers")
+"""Columns of a table that labelling fills in."""
+
+
+@dataclass(frozen=True, eq=False)
+class LabelTask:
+    """A scene to label: its name, what workers need, its viewpoints (`viewpoints.table.SCHEMA`), folder of shards."""
+
+    name: str
+    job: SceneJob
+    table: pd.DataFrame
+    shards: Path
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledScene:
+    """A scene all of whose viewpoints are labelled.
+
+    Attributes:
+        task: the scene that was to be labelled.
+        table: the viewpoints with status, error_m, error_deg and n_inliers; the paper's label y follows from them by
+            `viewpoints.table.is_good`. If the job stores matches, also `viewpoints.table.MATCH_FIELDS`, and if
+            it stores pixels `PIXEL_FIELD`.
+        manifest: versions, settings and fingerprints of what made the labels, and each shard's name and SHA-256.
+        seconds: the workers' time in each step, for shards made in this run.
+    """
+
+    task: LabelTask
+    table: pd.DataFrame
+    manifest: dict[str, Any]
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def label_scenes(
+    tasks: Sequence[LabelTask], config: LabelConfig, progress: bool = True, description: str = "label"
+) -> Generator[LabelledScene, None, None]:
+    """Render every viewpoint, localize its image against the map and measure the error (paper, Sec. 3.3).
+
+    Work is cut into shards. A finished shard is a file named by a hash of all that decides its labels (viewpoints,
+    mesh, landmarks, settings, versions). A run that was interrupted or killed therefore goes on where it stopped and
+    ends with the same table, for any engine and any number of workers, which go from one scene to the next without
+    pause. `description` is the title of the progress bar, one for all scenes. Yields scenes as they are finished; the
+    caller stores their tables, and may then remove their shards.
+
+    Raises a SceneError or MapError if a mesh or landmarks cannot be used; a TableError if a table is empty; a
+    WorkerError if workers were killed repeatedly, or something failed in one; a StorageError if a shard or its manifest
+    cannot be written, as when the disk is full; a ConfigError if the Ray engine cannot be used.
+    """
+    scenes = [_SceneInProgress.of(task, config.shard_size) for task in tasks]
+    scene_of_shard = {shard: scene for scene in scenes for shard in scene.missing}
+    missing = list(scene_of_shard)
+    total = sum(len(task.table) for task in tasks)
+    left = sum(len(shard.rows) for shard in missing)
+    bar = tqdm(total=total, initial=total - left, desc=description, unit="view", disable=not progress, smoothing=0.05)
+    with bar, closing(_run(missing, config, bar.update)) as results:  # closing: an error here ends the workers
+        for scene in scenes:
+            if not scene.missing:
+                yield scene.result()
+        for shard, labelled in results:
+            write_table(labelled.rows, shard.path)
+            scene = scene_of_shard[shard]
+            scene.missing.remove(shard)
+            for step, seconds in labelled.seconds.items():
+                scene.seconds[step] = scene.seconds.get(step, 0.0) + seconds
+            bar.set_postfix_str(scene.task.name, refresh=False)
+            if not scene.missing:
+                yield scene.result()
+
+
+@cache
+def versions() -> dict[str, str]:
+    """Versions of the packages that decide a label."""
+    found = {"wheretolook": VERSION}
+    for package in ("poselib", "pycolmap", "opencv-python-headless", "warp-lang", "numpy", "torch"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:  # installed some other way
+            found[package] = "unknown"
+    return found
+
+
+@dataclass(eq=False)
+class _SceneInProgress:
+    """A scene whose shards are being labelled; `missing` are those without a file yet."""
+
+    task: LabelTask
+    settings: dict[str, Any]
+    shards: list[Shard]
+    missing: list[Shard]
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, task: LabelTask, shard_size: int) -> _SceneInProgress:
+        job = task.job
+        table = task.table
+        if table.empty:
+            raise TableError("no viewpoints to label", value=task.name, fix="Run the sample stage with other settings.")
+        if not job.mesh.is_file():
+            raise SceneError("there is no such mesh", path=job.mesh, fix="Run the scenes stage first.")
+        if Landmarks.load(job.landmarks).descriptors is None:
+            fix = "Build the map again."
+            raise MapError("landmarks without descriptors cannot be matched", path=job.landmarks, fix=fix)
+        settings: dict[str, Any] = {"versions": versions()}
+        settings |= {"localizer": job.localizer.record(), "extractor": job.extractor.record()}
+        settings["camera"] = job.camera.record()
+        settings |= {"renderer": _renderer_name(job.device)}
+        settings |= {"mesh": fingerprint(job.mesh), "landmarks": fingerprint(job.landmarks)}
+        if job.cameras:
+            settings["cameras"] = {number: camera.record() for number, camera in job.cameras}
+        if job.store_matches:  # only then, so that shards without matches keep their names from earlier versions
+            settings["store_matches"] = True
+        if job.store_pixels:
+            settings["store_pixels"] = True
+        text = json.dumps(settings, sort_keys=True).encode()
+        # a shard's file holds them all
+        inputs = [name for name in (*SCHEMA.names, CAMERA_ID) if name not in LABELS and name in table]
+        shards = []
+        if job.device != "cpu":  # a batch is of one camera, and a GPU wants large ones
+            shard_size = max(shard_size, VIEWS_OF_A_CAMERA * len(job.cameras))
+        for begin in range(0, len(table), shard_size):
+            rows = table.iloc[begin : begin + shard_size]
+            content = pd.util.hash_pandas_object(rows[inputs], index=False).to_numpy()
+            digest = hashlib.sha256(text + content.tobytes()).hexdigest()[:16]
+            shards.append(Shard(job, task.shards / f"{begin:08d}-{digest}.parquet", rows))
+        scene = cls(task, settings, shards, [shard for shard in shards if _finished(shard) is None])
+        write_json(task.shards / MANIFEST, scene.manifest())
+        return scene
+
+    def manifest(self) -> dict[str, Any]:
+        shards = {shard.path.name: len(shard.rows) for shard in self.shards}
+        return {**self.settings, "n_viewpoints": len(self.task.table), "shards": shards}
+
+    def result(self) -> LabelledScene:
+        parts = []
+        for shard in self.shards:
+            rows = _finished(shard)
+            if rows is None:
+                fix = "Run again: it is made anew."
+                raise StorageError("a finished shard was damaged or removed", path=shard.path, fix=fix)
+            parts.append(rows)
+        contents = {shard.path.name: {"n": len(shard.rows), "sha256": sha256(shard.path)} for shard in self.shards}
+        manifest = {**self.manifest(), "shards": contents}
+        return LabelledScene(self.task, pd.concat(parts, ignore_index=True), manifest, self.seconds)
+
+
+def _renderer_name(device: str) -> str:
+    """Kind of device and rendering method: they differ in the rounding of some pixels."""
+    from wheretolook.rendering.warp_renderer import method_on
+
+    kind = device.partition(":")[0]
+    return f"{kind} {method_on(kind)}"
+
+
+def _run(
+    shards: Sequence[Shard], config: LabelConfig, tick: Callable[[int], Any]
+) -> Generator[tuple[Shard, LabelledShard], None, None]:
+    if config.engine == "ray" and shards:
+        from wheretolook.localization.ray_engine import run_ray
+
+        yield from run_ray(shards, config.ray_address, tick)
+    elif shards:
+        from wheretolook.localization.local_engine import run_local
+
+        yield from run_local(shards, config.workers or len(os.sched_getaffinity(0)), tick)
+
+
+def _finished(shard: Shard) -> pd.DataFrame | None:
+    """A shard's labelled rows, or None if its file is missing or of other viewpoints; a damaged file is removed."""
+    if not shard.path.exists():
+        return None
+    try:
+        done = read_table(shard.path, shard.job.store_matches, shard.job.store_pixels)
+    except TableError:
+        shard.path.unlink()
+        return None
+    return done if np.array_equal(done["viewpoint_id"], shard.rows["viewpoint_id"]) else None

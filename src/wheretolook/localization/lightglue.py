@@ -1,0 +1,147 @@
+"""Matches queries with mapping images by LightGlue (Lindenberger et al., ICCV 2023), as hloc localizes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.learned import kornia_feature, load_state, one_thread
+from wheretolook.features.matching import Matches
+from wheretolook.features.registry import all_extractors
+from wheretolook.mapping.colmap_model import model_arrays, read_model
+from wheretolook.mapping.feature_files import read_features
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.utils.errors import ConfigError, MapError
+
+OWN = "kornia"  # in place of a file: kornia's own weights
+_DATABASE = "database.db"
+
+
+@dataclass(frozen=True, eq=False)
+class _MappingImages:
+    """Keypoints of the mapping images, by row of the image."""
+
+    stored: list[tuple[NDArray[np.float32], NDArray[Any]]]
+    sizes: NDArray[np.int64]  # (I, 2) width and height
+    rows: list[NDArray[np.int64]]  # of each keypoint its landmark's row, -1 for none
+    start: NDArray[np.int64]  # (N + 1,); observers[start[i] : start[i + 1]] are the images that observe landmark i
+    observers: NDArray[np.int64]
+
+
+class LightGlueMatcher:
+    """Matches queries with the mapping images that observe most of the landmarks they seem to show.
+
+    Raises ConfigError if LightGlue does not know the map's features or kornia is not installed, MapError if the map's
+    folder has no model or database, WeightsError if the weights cannot be used.
+    """
+
+    def __init__(self, landmarks: Landmarks, map_dir: Path | None, weights: str, device: str = "cpu") -> None:
+        self.landmarks = landmarks
+        self.map_dir = map_dir
+        self.device = torch.device(device)
+        records = all_extractors().values()
+        self.kind = next(record.descriptors for record in records if record.descriptors.name == landmarks.features)
+        named = {record.descriptors.name: record.lightglue for record in records if record.lightglue}
+        if landmarks.features not in named:
+            fix = f"Leave label.localizer.lightglue out, or map with one of {', '.join(named)}."
+            raise ConfigError("LightGlue is not known for these features", value=landmarks.features, fix=fix)
+        self._network = _network(named[landmarks.features], "" if weights == OWN else weights).to(self.device)
+        if map_dir is None or not (map_dir / _DATABASE).is_file():
+            fix = "Map again with --map.keep_database true."
+            raise MapError("LightGlue matches mapping images, whose keypoints are not there", path=map_dir, fix=fix)
+
+    def match(self, query: Keypoints, size: tuple[int, int], likely: NDArray[np.int64], n_images: int) -> Matches:
+        """2D-3D matches of a query of some width and height, given rows (M,) of landmarks that it seems to show.
+
+        Of a keypoint that several images lead to different landmarks the surest counts, and so of a landmark.
+        """
+        images = self._images
+        spans = [images.observers[images.start[row] : images.start[row + 1]] for row in likely]
+        votes = np.bincount(np.concatenate([*spans, np.zeros(0, np.int64)]), minlength=len(images.stored))
+        best = np.argsort(-votes, kind="stable")[:n_images]
+        found = [self._with(query, size, int(image)) for image in best[votes[best] > 0]]
+        none = np.zeros(0, dtype=np.int64)
+        if not found:
+            return none, none
+        keypoints, rows, scores = (np.concatenate(part) for part in zip(*found, strict=True))
+        surest = np.lexsort((rows, keypoints, -scores))
+        for values in (keypoints, rows):  # each keypoint once, then each landmark once
+            surest = surest[np.sort(np.unique(values[surest], return_index=True)[1])]
+        order = surest[np.argsort(keypoints[surest])]
+        return keypoints[order], rows[order]
+
+    def _with(
+        self, query: Keypoints, size: tuple[int, int], image: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
+        """Keypoints, landmarks and scores of matches with one mapping image."""
+        pixels, stored = self._images.stored[image]
+        sides = (
+            (query.pixels, query.descriptors, size),
+            (pixels, self.kind.restore(stored), self._images.sizes[image]),
+        )
+        data = {}
+        for name, (at, descriptors, width_height) in zip(("image0", "image1"), sides, strict=True):
+            limit = np.asarray(width_height, dtype=np.float32)
+            data[name] = {
+                "keypoints": torch.from_numpy(np.clip(at, 0, limit)).to(self.device)[None],
+                "descriptors": torch.from_numpy(descriptors).to(self.device)[None],
+                "image_size": torch.from_numpy(limit).to(self.device)[None],
+            }
+        with torch.inference_mode(), one_thread():
+            said = self._network(data)
+        pairs = said["matches"][0].cpu().numpy()
+        scores = said["scores"][0].float().cpu().numpy()
+        rows = self._images.rows[image][pairs[:, 1]]
+        return pairs[rows >= 0, 0], rows[rows >= 0], scores[rows >= 0]
+
+    @cached_property
+    def _images(self) -> _MappingImages:
+        assert self.map_dir is not None
+        model = read_model(self.map_dir)
+        arrays = model_arrays(model)
+        kind, stored = read_features(self.map_dir / _DATABASE, arrays.image_names)
+        if kind is not self.kind:
+            problem = f"the database holds {kind.name}, the landmarks are of {self.kind.name}"
+            raise MapError(problem, path=self.map_dir / _DATABASE, fix="Map again.")
+        point = np.repeat(arrays.point_ids, np.diff(arrays.observation_start))
+        row = np.minimum(np.searchsorted(self.landmarks.ids, point), len(self.landmarks) - 1)
+        known = self.landmarks.ids[row] == point
+        row = row[known]
+        image = arrays.observation_image[known]
+        keypoint = arrays.observation_keypoint[known]
+        rows = [np.full(len(pixels), -1, dtype=np.int64) for pixels, _ in stored]
+        for number, of_image in enumerate(rows):
+            of_image[keypoint[image == number]] = row[image == number]
+        order = np.argsort(row, kind="stable")
+        start = np.searchsorted(row[order], np.arange(len(self.landmarks) + 1))
+        cameras = [model.cameras[model.images[int(number)].camera_id] for number in arrays.image_ids]
+        sizes = np.array([(camera.width, camera.height) for camera in cameras], dtype=np.int64)
+        return _MappingImages(stored, sizes, rows, start, image[order])
+
+
+def _network(features: str, weights: str) -> Any:
+    """LightGlue for some features, with weights from a file, or kornia's own."""
+    made = kornia_feature().LightGlue
+    settings = {name: value for name, value in made.features[features].items() if name != "weights"}
+    network = made(features=None, **settings)
+    name = "xfeat-lighterglue.pt" if features == "xfeat" else f"{features}_lightglue.pth"
+    url = f"https://huggingface.co/kornia/lightglue/resolve/main/{name}"
+
+    def prepare(state: dict[str, Any]) -> dict[str, Any]:
+        own = network.state_dict()
+        renamed = {}
+        for key, value in state.items():
+            words = key.removeprefix("matcher.").split(".")
+            if words[0] in ("self_attn", "cross_attn"):  # as the authors' files call them
+                words = ["transformers", words[1], words[0], *words[2:]]
+            renamed[".".join(words)] = value
+        return {key: value for key, value in renamed.items() if key in own}  # XFeat's file holds its extractor, too
+
+    return load_state(network, weights, name, [url], prepare, "--label.localizer.lightglue").eval()

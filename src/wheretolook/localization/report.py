@@ -1,0 +1,261 @@
+"""Report on the labels of a dataset: their balance, the pose errors, and how much the labels depend on thresholds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from wheretolook.dataset.sampling_config import Split
+from wheretolook.dataset.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
+from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, is_good, poses
+from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.utils.markdown import markdown_table
+
+LABELS_CSV = "labels.csv"
+LABELS_MD = "labels.md"
+LABELS_PNG = "labels.png"
+"""Files of a report on labels, in `<dataset>/results/` and as artifacts of its run."""
+
+STATUSES = (LOCALIZED, TOO_FEW_MATCHES, NO_POSE)
+POSITIVE = tuple(f"positive_{threshold_key(threshold)}" for threshold in THRESHOLDS)
+"""Columns of the shares of positives, from the finest threshold (the label) to the coarsest.
+
+Positives at one threshold are positives at all coarser ones.
+"""
+
+BINS_A_DECADE = 5
+ERROR_EDGES_M = np.logspace(-4, 2, 6 * BINS_A_DECADE + 1)
+ERROR_EDGES_DEG = np.logspace(-3, 2.4, 27 + 1)
+"""Edges of the error histograms, metres and degrees. Errors beyond an end count in the last bin there."""
+
+VISIBLE_EDGES = (0, 1, 10, 30, 100, 300, 1000, 3000, np.inf)
+"""Edges of the bands of the number of landmarks in view."""
+
+HEIGHT_BANDS_M = (0.5, 1.0, 2.0, 5.0, 10.0)
+MAX_HEIGHT_BANDS = 7
+"""Possible widths of a height band, of which the narrowest is taken that gives at most this many bands."""
+
+COINCIDE = 0.95
+NEARLY_COINCIDE = 0.8
+"""Of the coarsest threshold's positives, the shares that must also be positive at the finest for these verdicts."""
+
+
+@dataclass(frozen=True, eq=False)
+class LabelSummary:
+    """Statistics of the labels of a dataset. Every share is in [0, 1].
+
+    Attributes:
+        shares: one row for each scene; then, with `ALL` for the scene's name, one for each split and, with `ALL` for
+            the split too, one for all scenes. Columns: `scene`, `split`, `n_views`, `n_locations`; the share of
+            viewpoints of each status (`STATUSES`) and without any pose (`without_pose`); of positives at each threshold
+            (`POSITIVE`); `locations_positive`, the share of locations with a positive at the finest;
+            `finest_of_coarsest`, the share of the coarsest's positives that are positive at the finest;
+            `same_label_share`, the share of viewpoints whose labels are all equal; `spearman`, the rank correlation of
+            the finest and the coarsest label; median errors of the poses found for the coarsest's positives
+            (`median_within_m`, `median_within_deg`) and for the others (`median_beyond_m`, `median_beyond_deg`). NaN
+            where there is nothing to count.
+        by_height: one row for each band of the camera's height above its scene's lowest location: `low`, `high` in
+            metres, `n_views`, shares of positives. Bands within the range may be empty.
+        by_visible: the same by the number of landmarks in view; `high` is exclusive, infinite in the last.
+        errors_m: one row for each bin of the position error: `low`, `high` in metres, and the number of viewpoints with
+            such an error whose pose was `localized` or `disbelieved` (with too few inliers: status "no_pose").
+        errors_deg: the same of the rotation error, in degrees.
+    """
+
+    shares: pd.DataFrame
+    by_height: pd.DataFrame
+    by_visible: pd.DataFrame
+    errors_m: pd.DataFrame
+    errors_deg: pd.DataFrame
+
+    @property
+    def overall(self) -> dict[str, Any]:
+        """The row of `shares` over all scenes."""
+        return {str(name): value for name, value in self.shares.iloc[-1].items()}
+
+
+def label_summary(tables: Mapping[str, pd.DataFrame], splits: Mapping[str, Split]) -> LabelSummary:
+    """Summarize the labels of scenes: viewpoints and split of each by its name; at least one, none empty.
+
+    Raises TableError if some viewpoint has no label yet.
+    """
+    views = pd.concat([_views(name, table, splits[name]) for name, table in tables.items()], ignore_index=True)
+    groups = [(name, splits[name], views[views["scene"] == name]) for name in tables]
+    groups += [(ALL, split, views[views["split"] == split]) for split in dict.fromkeys(splits[name] for name in tables)]
+    shares = [{"scene": scene, "split": split, **_shares(part)} for scene, split, part in [*groups, (ALL, ALL, views)]]
+
+    height = views["height_m"].to_numpy()
+    width = next((w for w in HEIGHT_BANDS_M if height.max() < w * MAX_HEIGHT_BANDS), HEIGHT_BANDS_M[-1])
+    return LabelSummary(
+        shares=pd.DataFrame(shares),
+        by_height=_by_band(views, height, width * np.arange(height.max() // width + 2)),
+        by_visible=_by_band(views, views["n_visible"].to_numpy(), np.array(VISIBLE_EDGES)),
+        errors_m=_histogram(views, "error_m", ERROR_EDGES_M),
+        errors_deg=_histogram(views, "error_deg", ERROR_EDGES_DEG),
+    )
+
+
+def _views(scene: str, table: pd.DataFrame, split: str) -> pd.DataFrame:
+    """The columns that the summary needs, with heights and the label at each threshold."""
+    height = camera_centers(poses(table))[:, 2]
+    height = np.round(height - height.min(), 6)  # so that all views of a location fall into one band
+    labels = {name: is_good(table, *limits) for name, limits in zip(POSITIVE, THRESHOLDS, strict=True)}
+    columns = table[["location_id", "n_visible", "status", "error_m", "error_deg"]]
+    return columns.assign(scene=scene, split=split, height_m=height, **labels)
+
+
+def _shares(views: pd.DataFrame) -> dict[str, Any]:
+    finest, coarsest = (views[name].to_numpy() for name in (POSITIVE[0], POSITIVE[-1]))
+    by_location = views.groupby(["scene", "location_id"])[POSITIVE[0]].any()
+    positives = views[list(POSITIVE)].to_numpy()
+    medians: dict[str, float] = {}
+    for name, rows in (("within", coarsest), ("beyond", ~coarsest)):
+        medians |= {f"median_{name}_{unit}": views.loc[rows, f"error_{unit}"].median() for unit in ("m", "deg")}
+    return {
+        "n_views": len(views),
+        "n_locations": len(by_location),
+        **{status: (views["status"] == status).mean() for status in STATUSES},
+        "without_pose": views["error_m"].isna().mean(),
+        **{name: views[name].mean() for name in POSITIVE},
+        "locations_positive": by_location.mean(),
+        "finest_of_coarsest": (finest & coarsest).sum() / coarsest.sum() if coarsest.any() else np.nan,
+        "same_label_share": (positives == positives[:, :1]).all(axis=1).mean(),
+        "spearman": _correlation(finest, coarsest),
+        **medians,
+    }
+
+
+def _correlation(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
+    """Correlation of two labels (B,). Of binary values, Spearman's and Pearson's are the same."""
+    spread = a.std() * b.std()
+    return float(((a & b).mean() - a.mean() * b.mean()) / spread) if spread > 0 else np.nan
+
+
+def _by_band(views: pd.DataFrame, values: Float, edges: Float) -> pd.DataFrame:
+    """Views and positives of each band, from the first to the last that is not empty. No value is beyond the edges."""
+    band = np.digitize(values, edges) - 1
+    kept = np.arange(band.min(), band.max() + 1)
+    by_band = views.groupby(band)
+    bands = pd.DataFrame({"low": edges[kept], "high": edges[kept + 1]}, index=kept)
+    bands["n_views"] = by_band.size().reindex(kept, fill_value=0)
+    return bands.join(by_band[list(POSITIVE)].mean()).reset_index(drop=True)
+
+
+def _histogram(views: pd.DataFrame, column: str, edges: Float) -> pd.DataFrame:
+    counts = {}
+    for name, rows in (("localized", views["status"] == LOCALIZED), ("disbelieved", views["status"] != LOCALIZED)):
+        error = views.loc[rows, column].dropna().to_numpy(np.float64)
+        bins = np.clip(np.digitize(error, edges) - 1, 0, len(edges) - 2)
+        counts[name] = np.bincount(bins, minlength=len(edges) - 1)
+    return pd.DataFrame({"low": edges[:-1], "high": edges[1:], **counts})
+
+
+def threshold_sentence(summary: LabelSummary) -> str:
+    """A sentence on how much the labels depend on the threshold, from the numbers over all scenes."""
+    row = summary.overall
+    labels = _labels()
+    if not row[POSITIVE[-1]]:
+        return f"No viewpoint is within {labels[-1]}: all are negative at every threshold."
+    if row["finest_of_coarsest"] >= COINCIDE:
+        verdict = "The thresholds all but coincide"
+    elif row["finest_of_coarsest"] >= NEARLY_COINCIDE:
+        verdict = "The thresholds differ little"
+    else:
+        verdict = "The thresholds differ"
+    shares = [_percent(row[name] / row[POSITIVE[-1]]) for name in POSITIVE[:-1]]
+    finer = [f"{share} % are within {label}" for share, label in zip(shares, labels[:-1], strict=True)]
+    medians = [(row[f"median_{name}_m"], row[f"median_{name}_deg"]) for name in ("within", "beyond")]
+    within, beyond = (_median_error(*median) for median in medians)
+    errors = f"Their median errors are {within}"
+    if pd.notna(row["median_beyond_m"]):
+        errors += f"; those of the other poses found are {beyond}"
+    same = f"{_percent(row['same_label_share'])} % of the viewpoints have the same label at all {len(POSITIVE)}"
+    return f"{verdict}: {same}. Of those within {labels[-1]}, {', '.join(finer)}. {errors}."
+
+
+def label_markdown(summary: LabelSummary, title: str = "Labels") -> str:
+    """The summary as tables in Markdown, under a title and `threshold_sentence`."""
+    row = summary.overall
+    labels = _labels()
+    header = ["scene", "split", "views", "locations", *labels, "locations with a positive"]
+    header += ["localized", "too few matches", "no pose", "finest of coarsest", "same label", "Spearman"]
+    percents = [*POSITIVE, "locations_positive", *STATUSES, "finest_of_coarsest", "same_label_share"]
+    lines = []
+    for part in summary.shares.to_dict("records"):
+        counts = [f"{part['n_views']:,}", f"{part['n_locations']:,}"]
+        shares = [_percent(part[name]) for name in percents]
+        lines.append([part["scene"], part["split"], *counts, *shares, _or_dash(part["spearman"], ".2f")])
+    errors = (("position error (m)", summary.errors_m), ("rotation error (°)", summary.errors_deg))
+    sections = [
+        f"# {title}",
+        threshold_sentence(summary),
+        f"{row['n_views']:,} viewpoints at {row['n_locations']:,} locations; shares in % of viewpoints. Positive at "
+        f"a threshold: localized with both errors under its limits; the label is that at the first, {labels[0]}, and a "
+        "location with a positive has a viewpoint with this label. Finest of coarsest: how many of the last "
+        "threshold's positives are positive at the first. Same label: equal at all thresholds. Spearman: the rank "
+        "correlation of the first and the last label.",
+        markdown_table(header, lines),
+        "## By height of the camera above its scene's lowest location",
+        markdown_table(["height (m)", "views", *labels], _band_lines(summary.by_height, _height_label)),
+        "## By number of visible landmarks",
+        markdown_table(["visible landmarks", "views", *labels], _band_lines(summary.by_visible, _visible_label)),
+        "## Errors of the poses found",
+        f"In % of all viewpoints; {_percent(row['without_pose'])} % have no pose at all. Disbelieved poses have too "
+        "few inliers and count as not localized. Errors beyond the first and the last row count there.",
+    ]
+    for name, bins in errors:
+        sections.append(markdown_table([name, "localized", "disbelieved"], _error_lines(bins, row["n_views"])))
+    return "\n\n".join(sections) + "\n"
+
+
+def _height_label(low: float, high: float) -> str:
+    return f"{low:g}–{high:g}"
+
+
+def _visible_label(low: float, high: float) -> str:
+    """Name of a band of the number of landmarks in view: `low` to `high`, exclusive."""
+    if np.isinf(high):
+        return f"≥ {low:,.0f}"
+    return f"{low:,.0f}" if high == low + 1 else f"{low:,.0f}–{high - 1:,.0f}"
+
+
+def _labels() -> list[str]:
+    """The thresholds as text, from the finest to the coarsest."""
+    return [threshold_label(threshold_key(threshold)) for threshold in THRESHOLDS]
+
+
+def _band_lines(bands: pd.DataFrame, name: Any) -> list[list[str]]:
+    lines = []
+    for band in bands.to_dict("records"):
+        shares = [_percent(band[column]) for column in POSITIVE]
+        lines.append([name(band["low"], band["high"]), f"{band['n_views']:,}", *shares])
+    return lines
+
+
+def _error_lines(errors: pd.DataFrame, n_views: int) -> list[list[str]]:
+    """Histogram bins, summed by decades."""
+    starts = np.arange(0, len(errors), BINS_A_DECADE)
+    lows = errors["low"].to_numpy()[starts]
+    highs = [*errors["low"].to_numpy()[starts[1:]], None]
+    counts = np.add.reduceat(errors[["localized", "disbelieved"]].to_numpy(), starts, axis=0)
+    names = [f"≥ {low:g}" if high is None else f"{low:g}–{high:g}" for low, high in zip(lows, highs, strict=True)]
+    return [[name, *[_percent(count / n_views) for count in row]] for name, row in zip(names, counts, strict=True)]
+
+
+def _median_error(error_m: float, error_deg: float) -> str:
+    unit, scale = ("mm", 1000) if error_m < 0.01 else ("cm", 100) if error_m < 1 else ("m", 1)
+    distance = f"{scale * error_m:.1f} {unit}"
+    return f"{distance}, {error_deg:.2f}°" if error_deg < 1 else f"{distance}, {error_deg:.0f}°"
+
+
+def _percent(share: float) -> str:
+    return _or_dash(100 * share, ".1f")
+
+
+def _or_dash(value: float, form: str) -> str:
+    return "–" if pd.isna(value) else format(value, form)

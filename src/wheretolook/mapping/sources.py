@@ -1,0 +1,41 @@
+"""What a map was made from, as far as it lies beside it or its report tells."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from wheretolook.mapping.feature_files import HDF5_SUFFIXES
+from wheretolook.mapping.rendered_map import DATABASE_FILE
+from wheretolook.mapping.scale import REPORT_FILE
+from wheretolook.utils.reading import read_json_object
+
+
+def features_beside(model_dir: Path) -> Path | None:
+    """The features that lie beside a map of this project or one of COLMAP's usual folders; None if there are none."""
+    places = (model_dir, model_dir.parent / "photographs", model_dir.parent, model_dir.parent.parent)
+    for place in places:
+        if (place / DATABASE_FILE).is_file():
+            return place / DATABASE_FILE
+    found = [path for suffix in HDF5_SUFFIXES for path in sorted(model_dir.glob(f"*{suffix}"))]
+    if len(found) == 1:
+        return found[0]
+    named = _reported(model_dir, "existing", "database")
+    return Path(named) if named is not None and Path(named).is_file() else None
+
+
+def photographs_of(model_dir: Path) -> Path | None:
+    """The folder of photographs that a map of this project was made from, if its report names one that is there."""
+    named = _reported(model_dir, "photographs", "images")
+    for folder in (model_dir / "images", *([Path(named)] if named is not None else [])):
+        if folder.is_dir():
+            return folder
+    return None
+
+
+def _reported(model_dir: Path, group: str, name: str) -> str | None:
+    """A path among the settings in the report of a map of this project; None if there is none."""
+    try:
+        found = read_json_object(model_dir / REPORT_FILE)["config"][group][name]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return found if isinstance(found, str) and found else None

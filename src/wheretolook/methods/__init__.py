@@ -1,1 +1,0 @@
-"""Methods that score viewpoints: one module or folder each, with its record (`wheretolook.methods.method.Method`)."""

@@ -1,0 +1,234 @@
+"""Views along a route: the best sequence that a camera can turn through, and the cost of the path."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.geometry.lattices import axes_of_angles
+from wheretolook.geometry.poses import Float
+from wheretolook.planning.camera_turns import pan_tilt_angles
+from wheretolook.planning.config import PathConfig
+from wheretolook.planning.view_sequence import TurnLimit, best_sequence, between, lengths_along
+from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.utils.errors import PlanningError
+
+LIMIT_STEP_DEG = 0.5
+"""Limits on turns are rounded down to multiples of this, so that routes of similar spacing share a `TurnLimit`."""
+
+SHORT_ROUTE = "short route"
+SEARCH = "search"
+IMPROVEMENT = "improvement"
+"""How a path was found: as a short route with views chosen along it, by the search over places and views, or by
+improving either."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stop:
+    """A place of a path where the camera turns away from the path's view and back (`wheretolook.planning.stops`).
+
+    `place` is its row in the path; `axes` (K, 3) are the unit axes of the further looks in the world, in the order to
+    look along them, and `scores` (K,) of each one alone; `together` is the probability that they and the path's view
+    localize together; `turn_deg` is the sum of the angles between the axes from the path's view to them and back.
+    """
+
+    place: int
+    axes: Float
+    scores: Float
+    together: float
+    turn_deg: float
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedPath:
+    """A path of a camera, sampled at its corners and every `PathConfig.spacing_m` or a little less.
+
+    `positions` (W, 3) m and unit optical `axes` (W, 3) are in the world; `scores` (W,) are what the planner read in the
+    viewpoint map, 0 outside its free voxels, NaN without a map, or, from `plan_by_methods`, the scores of these very
+    poses; `cost` is as `PathConfig` defines it, by the trapezoidal rule over the map's scores; `found_by` is
+    `SHORT_ROUTE`, `SEARCH` or `IMPROVEMENT`, empty if the path was not planned; `stops` are in the order of the path,
+    and not part of the cost.
+    """
+
+    positions: Float
+    axes: Float
+    scores: Float
+    cost: float
+    found_by: str = ""
+    stops: tuple[Stop, ...] = ()
+
+    @property
+    def length_m(self) -> float:
+        """Length of the path."""
+        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
+    @property
+    def turn_deg(self) -> float:
+        """Sum of the angles between consecutive axes, those of further looks at stops among them."""
+        return turning_deg(self.axes) + sum(stop.turn_deg for stop in self.stops)
+
+    @property
+    def n_looks(self) -> int:
+        """Views of the path and further looks at its stops."""
+        return len(self.positions) + sum(len(stop.axes) for stop in self.stops)
+
+    @property
+    def looks(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Of all L looks in the order they are taken: the place (L,) in the path, and which look it is there (L,).
+
+        The path's own view is 1, further looks of a stop count from 2. `all_axes` and `all_scores` are in this order.
+        """
+        counts = np.ones(len(self.positions), dtype=np.int64)
+        for stop in self.stops:
+            counts[stop.place] += len(stop.axes)
+        places = np.repeat(np.arange(len(counts)), counts)
+        return places, np.arange(len(places)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
+
+    @property
+    def all_axes(self) -> Float:
+        """Unit axes (L, 3) of all looks."""
+        return self._with_further(self.axes, [stop.axes for stop in self.stops])
+
+    @property
+    def all_scores(self) -> Float:
+        """Scores (L,) of all looks, each alone."""
+        return self._with_further(self.scores, [stop.scores for stop in self.stops])
+
+    def _with_further(self, own: Float, further: list[Float]) -> Float:
+        """Values (L, ...) of all looks, from those of the path's views (W, ...) and of each stop's further looks."""
+        if not further:
+            return own
+        after = np.repeat([stop.place + 1 for stop in self.stops], [len(values) for values in further])
+        return np.insert(own, after, np.concatenate(further), axis=0)
+
+    @property
+    def scores_with_stops(self) -> Float:
+        """The scores (W,), at stops those of all looks together."""
+        scores = self.scores.copy()
+        scores[[stop.place for stop in self.stops]] = [stop.together for stop in self.stops]
+        return scores
+
+
+@dataclass(frozen=True, eq=False)
+class PathView:
+    """One view along a path.
+
+    `position` (3,) m and unit optical `axis` (3,) are in the world; `score` is one of `PlannedPath.scores`, NaN if
+    unknown; `pixels` (K, 2) are those of the landmarks in view, in an image of `size_px` (width, height); `rgb`
+    (H, W, 3) is None if the scene cannot be rendered. At a stop the path's own view is `look` 1 of `n_looks`, the
+    further ones follow it as views of their own, and `together` is the score of all of them; NaN elsewhere.
+    """
+
+    position: Float
+    axis: Float
+    score: float
+    pixels: Float
+    size_px: tuple[int, int]
+    rgb: NDArray[np.uint8] | None
+    look: int = 1
+    n_looks: int = 1
+    together: float = math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class RouteSamples:
+    """Points along a route, by arc length in metres: its S corners, E even steps no longer than the spacing, and both.
+
+    `along` (W,) holds both: a path sampled without its corners would cut through walls. `positions` (W, 3) m are there.
+    """
+
+    corners: Float
+    even: Float
+    along: Float
+    positions: Float
+
+    @classmethod
+    def of(cls, places: Float, spacing_m: float) -> RouteSamples:
+        """Samples of a polyline (S, 3) m."""
+        corners = lengths_along(places)
+        even = np.linspace(0, corners[-1], max(1, math.ceil(corners[-1] / spacing_m - 1e-9)) + 1)
+        along = np.union1d(even, corners)
+        along = along[np.append(True, np.diff(along) > 1e-9)]
+        return cls(corners, even, along, between(corners, places, along))
+
+
+class RouteViews:
+    """Chooses the views along routes by the scores of a viewpoint map, which are in [0, 1].
+
+    Every route starts with the unit axis `start_axis` (3,), if given.
+    """
+
+    def __init__(self, viewpoint_map: ViewpointMap, config: PathConfig, start_axis: Float | None = None) -> None:
+        self.map = viewpoint_map
+        self.config = config
+        self.start_axis = start_axis
+        low, high = np.sin(np.radians(config.pitch_deg))
+        height = viewpoint_map.directions[:, 2]
+        self._inside = (height >= low) & (height <= high)
+        best = viewpoint_map.scores[:, self._inside].max(axis=1, initial=0.0)
+        self._best = np.append(best, 0.0)  # best score of each row; the last entry stands for row -1
+        self._limits: dict[int, TurnLimit] = {}
+
+    def least_cost(self, places: Float) -> float:
+        """Lower bound of the cost of a route (S, 3) m: with the best view everywhere, and turns for free."""
+        samples = RouteSamples.of(places, self.config.spacing_m)
+        return self._cost(samples.positions, self._best[self.map.rows(samples.positions)])
+
+    def best(self, places: Float) -> PlannedPath | None:
+        """A route (S, 3) m with the views that have the greatest sum of scores, exactly; turns are spread evenly.
+
+        None if the map's directions are too coarse for the limit on turns.
+        """
+        samples = RouteSamples.of(places, self.config.spacing_m)
+        at = between(samples.corners, places, samples.even)
+        limit = self._limit(float(samples.even[-1]) / (len(samples.even) - 1))
+        rows = self.map.rows(at)
+        scores = np.where((rows >= 0)[:, None] & self._inside, self.map.scores[rows], 0.0)
+        scores = np.where(self._inside, scores, -np.inf)
+        try:
+            if self.start_axis is None:
+                axes = limit.directions[best_sequence(scores, limit).direction_ids]
+            else:
+                chosen = best_sequence(scores[1:], limit, self.start_axis).direction_ids
+                axes = np.concatenate([self.start_axis[None], limit.directions[chosen]])
+        except PlanningError:
+            return None
+        return self.costed(samples.positions, turned_evenly(samples.even, axes, samples.along))
+
+    def costed(self, positions: Float, axes: Float) -> PlannedPath:
+        """The path through positions (W, 3) m with axes (W, 3), with its scores and cost."""
+        rows = self.map.rows(positions)
+        nearest = (axes @ self.map.directions.T).argmax(1)
+        scores = np.where(rows >= 0, self.map.scores[rows, nearest], 0.0).astype(np.float64)
+        path = PlannedPath(positions, axes, scores, 0.0)
+        turning = self.config.turn_weight_m * math.radians(path.turn_deg)
+        return replace(path, cost=turning + self._cost(positions, scores))
+
+    def _cost(self, positions: Float, scores: NDArray[np.floating]) -> float:
+        """The part of the cost that depends on length and scores."""
+        steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        return float((steps * (1 + self.config.score_weight * (1 - (scores[1:] + scores[:-1]) / 2))).sum())
+
+    def _limit(self, step_m: float) -> TurnLimit:
+        number = int(self.config.max_turn_deg_per_m * step_m / LIMIT_STEP_DEG)
+        if number not in self._limits:
+            self._limits[number] = TurnLimit.of(self.map.directions, number * LIMIT_STEP_DEG, pan_tilt=True)
+        return self._limits[number]
+
+
+def turning_deg(axes: Float) -> float:
+    """Sum of the angles between consecutive unit axes (W, 3)."""
+    cosines = (axes[1:] * axes[:-1]).sum(1).clip(-1, 1)
+    return float(np.degrees(np.arccos(cosines)).sum())
+
+
+def turned_evenly(knots: Float, axes: Float, at: Float) -> Float:
+    """Unit axes (S, 3) at knots (S,), interpolated at (W,) linearly in yaw and pitch; (W, 3).
+
+    The pitch thus stays between those at the knots, which it would not on a great circle.
+    """
+    yaw, pitch = pan_tilt_angles(axes)
+    return axes_of_angles(np.degrees(between(knots, np.column_stack([np.unwrap(yaw), pitch]), at)))

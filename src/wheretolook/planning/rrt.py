@@ -1,0 +1,412 @@
+"""Paths on which a robot can localize: RRT* over position and orientation of the camera (paper, Sec. 4.3; OMPL)."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from tqdm.auto import tqdm
+
+from wheretolook.geometry.lattices import axes_of_angles
+from wheretolook.geometry.poses import Float
+from wheretolook.planning.camera_turns import check_axis
+from wheretolook.planning.config import PathConfig
+from wheretolook.planning.routes import IMPROVEMENT, SEARCH, SHORT_ROUTE, PlannedPath, RouteSamples, RouteViews
+from wheretolook.planning.view_sequence import between, lengths_along
+from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.utils.errors import PlanningError
+
+TABLE_STEP_DEG = 2.0  # step of yaw and pitch of the table of the map's direction nearest to an axis
+
+SHORT_SHARE = 0.25
+SEARCH_SHARE = 0.3
+SHORTEN_SHARE = 0.05
+"""Shares of the time for finding a short path, for searching places and views together, and for shortening the short
+path. The rest is for improving the cheapest path."""
+
+AHEAD_SHARE = 0.5  # share of the time for finding a short path without a viewpoint map; the rest is for shortening it
+SAME_M = 1e-6  # points closer than this count as equal
+STARTS = 12  # number of start orientations to choose from if none is given
+STEPS_M = (0.05, 1.0)  # range of the standard deviation by which a corner of a route is moved
+
+
+class Space(Protocol):
+    """Where a camera may be: `wheretolook.space.free_space.FreeSpace`, or anything that answers the same."""
+
+    def is_free(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Whether a camera may be at points (N, 3) m; (N,)."""
+
+    def segments_are_free(self, a: ArrayLike, b: ArrayLike) -> NDArray[np.bool_]:
+        """Whether it may go straight from points a to points b, (N, 3) m each; (N,)."""
+
+
+def plan_path(
+    start: ArrayLike,
+    goal: ArrayLike,
+    space: Space,
+    bounds: ArrayLike,
+    viewpoint_map: ViewpointMap | None = None,
+    config: PathConfig = PathConfig(),
+    start_axis: ArrayLike | None = None,
+    progress: bool = True,
+) -> PlannedPath:
+    """Plan a path along which a robot can localize; the best found in `config.time_s` is returned.
+
+    RRT* (Karaman and Frazzoli 2011) searches for a short path, then for places and views together. The views along
+    either are then chosen exactly (`best_sequence`), and the cheapest path is improved by moving its corners.
+
+    Without a viewpoint map the path is the shortest found. The camera, fixed to the front of the robot, looks forward
+    along it, as level as `PathConfig.pitch_deg` allows, without limit on turns.
+
+    `start` and `goal` are (3,) world, metres; `bounds` the lowest and highest corner (2, 3) m of the space to plan in;
+    the map's scores are in [0, 1]; `start_axis` (3,) is the optical axis to start with, None lets the planner choose.
+
+    Raises:
+        PlanningError: the start or the goal is not free or lies outside the bounds; they are the same; the axis is
+            beyond the camera's limits, or given without a viewpoint map; or no path was found in time.
+        ValueError: a point is not finite, or the axis has no direction.
+    """
+    ends = np.asarray([start, goal], dtype=np.float64)
+    box = np.array(bounds, dtype=np.float64)
+    if not np.isfinite(ends).all():
+        raise ValueError(f"start and goal must be finite, got {ends.tolist()}")
+    check_ends(ends, space, box)
+    if viewpoint_map is None and start_axis is not None:
+        fix = "Give no start axis."
+        raise PlanningError("without a viewpoint map the camera looks ahead", value=start_axis, fix=fix)
+    problem = _Problem(ends, box, space, viewpoint_map, config)
+    orientations = problem.start_orientations(start_axis)
+    rng = np.random.default_rng(0)
+    with tqdm(total=round(config.time_s, 1), desc="plan", unit="s", disable=not progress) as bar:
+        end = time.monotonic() + config.time_s
+        ahead = viewpoint_map is None
+        shortest = _Problem(ends, box, space, None, config)
+        route: Float | None = None
+        try:
+            least, most = (AHEAD_SHARE, 1.0) if ahead else (SHORT_SHARE, 1 - SEARCH_SHARE)
+            route = shortest.solve([(0.0, 0.0)], least * config.time_s, most * config.time_s, bar)[:, :3]
+        except PlanningError:
+            if ahead:
+                raise
+        if route is not None:
+            left = end - time.monotonic()
+            seconds = left if ahead else min(left, SHORTEN_SHARE * config.time_s)
+            route = improve(route, _shorter, _length(route), space, box, seconds, rng)
+        if viewpoint_map is None:
+            assert route is not None
+            bar.update(max(0.0, bar.total - bar.n))
+            samples = RouteSamples.of(route, config.spacing_m)
+            axes = _forward(samples.positions, np.radians(config.pitch_deg))
+            unknown = np.full(len(samples.positions), np.nan)
+            return PlannedPath(samples.positions, axes, unknown, float(samples.corners[-1]), SHORT_ROUTE)
+        axis = None if start_axis is None else axes_of_angles(np.degrees(orientations[0]))
+        views = RouteViews(viewpoint_map, config, axis)
+        found: dict[float, tuple[PlannedPath, Float]] = {}
+
+        def add(path: PlannedPath | None, places: Float, found_by: str) -> None:
+            if path is not None:
+                found[path.cost] = replace(path, found_by=found_by), places
+
+        if route is not None:
+            add(views.best(route), route, SHORT_ROUTE)
+        try:
+            left = max(1e-3, end - time.monotonic())
+            most = min(left, SEARCH_SHARE * config.time_s)
+            states = problem.solve(orientations, most, most if found else left, bar)
+            add(problem.path(states, views), states[:, :3], SEARCH)
+            add(views.best(states[:, :3]), states[:, :3], SEARCH)
+        except PlanningError:
+            if not found:
+                raise
+        cheapest, places = found[min(found)]
+
+        def cost_below(candidate: Float, limit: float) -> float | None:
+            if views.least_cost(candidate) >= limit:
+                return None
+            path = views.best(candidate)
+            return None if path is None or path.cost >= limit else path.cost
+
+        better = improve(places, cost_below, cheapest.cost, space, box, end - time.monotonic(), rng)
+        if better is not places:
+            add(views.best(better), better, IMPROVEMENT)
+        bar.update(max(0.0, bar.total - bar.n))
+    return found[min(found)][0]
+
+
+def check_ends(ends: Float, space: Space, bounds: Float) -> None:
+    """Raise a PlanningError unless a start and a goal (2, 3) m are different places where a camera can be."""
+    low, high = bounds
+    for name, point in zip(("start", "goal"), ends, strict=True):
+        if not ((point >= low) & (point <= high)).all() or not space.is_free(point[None])[0]:
+            fix = "Give a point where the camera can be, off walls and furniture"
+            there = low + (high - low) * np.random.default_rng(0).random((4096, 3))
+            if (free := space.is_free(there)).any():
+                near = there[free][np.linalg.norm(there[free] - point, axis=1).argmin()]
+                fix += f"; one near by is [{', '.join(f'{x:.2f}' for x in near)}]"
+            fix += "."
+            raise PlanningError(f"the {name} is not in free space", value=tuple(point.tolist()), fix=fix)
+    if np.linalg.norm(ends[1] - ends[0]) < SAME_M:
+        fix = "Ask the map for the best view there."
+        raise PlanningError("the start is the goal", value=tuple(ends[0].tolist()), fix=fix)
+
+
+def _length(places: Float) -> float:
+    return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+
+
+def _shorter(places: Float, limit: float) -> float | None:
+    length = _length(places)
+    return length if length < limit - 1e-9 else None
+
+
+def improve(
+    places: Float,
+    cost_below: Callable[[Float, float], float | None],
+    cost: float,
+    space: Space,
+    bounds: Float,
+    seconds: float,
+    rng: np.random.Generator,
+    most: int | None = None,
+) -> Float:
+    """Improve a route by shortcuts and by moving, adding and removing corners; returns the cheapest found, (S', 3) m.
+
+    Every route tried lies in free space and keeps its ends.
+
+    `places` (S, 3) m are the corners of a free route and `cost` is its cost; `cost_below` is that of a route if less
+    than a limit, else None. `bounds` (2, 3) m are corners of the space to plan in; `most` limits the routes tried.
+    """
+    end = time.monotonic() + seconds
+    tried = 0
+    while time.monotonic() < end and (most is None or tried < most):
+        tried += 1
+        candidate, first, last = _varied(places, bounds, rng)
+        # only the changed segments need to be tested
+        if not space.segments_are_free(candidate[first:last], candidate[first + 1 : last + 1]).all():
+            continue
+        found = cost_below(candidate, cost)
+        if found is not None:
+            places = candidate
+            cost = found
+    return places
+
+
+def _varied(places: Float, bounds: Float, rng: np.random.Generator) -> tuple[Float, int, int]:
+    """A random variation of a route, and the first and last corner between which it differs."""
+    n = len(places)
+    step = np.exp(rng.uniform(*np.log(STEPS_M)))
+    kind = rng.integers(4) if n > 2 else rng.integers(2)
+    if kind == 0:  # a new corner beside a random point of the route
+        after = int(rng.integers(1, n))
+        t = rng.random()
+        new = places[after - 1] * (1 - t) + places[after] * t + rng.normal(0, step, 3)
+        return np.insert(places, after, new.clip(*bounds), axis=0), after - 1, after + 1
+    if kind == 1:  # a shortcut between two random points of the route
+        at = lengths_along(places)
+        a, b = np.sort(rng.uniform(0, at[-1], 2))
+        ends = between(at, places, np.array([a, b]))
+        before = int((at < a).sum())
+        after = int((at <= b).sum())
+        return np.concatenate([places[:before], ends, places[after:]]), before - 1, before + 2
+    row = int(rng.integers(1, n - 1))
+    if kind == 2:  # remove a corner
+        return np.delete(places, row, axis=0), row - 1, row
+    moved = places.copy()
+    moved[row] = (moved[row] + rng.normal(0, step, 3)).clip(*bounds)
+    return moved, row - 1, row + 1
+
+
+class _Problem:
+    """A planning problem over states x, y, z (m), yaw, pitch (radians); without a map the last two do not matter."""
+
+    def __init__(
+        self, ends: Float, bounds: Float, space: Space, viewpoint_map: ViewpointMap | None, config: PathConfig
+    ) -> None:
+        self.ends = ends
+        self.bounds = bounds
+        self.space = space
+        self.config = config
+        self.map = viewpoint_map
+        self.pitch = tuple(map(math.radians, config.pitch_deg))
+        if viewpoint_map is not None:
+            self._score = viewpoint_map.scores.item
+            self._table = _nearest_directions(viewpoint_map.directions)
+
+    def start_orientations(self, axis: ArrayLike | None) -> list[tuple[float, float]]:
+        """Yaws and pitches that a path may start with, in radians."""
+        if self.map is None:
+            return [(0.0, 0.0)]
+        if axis is None:
+            middle = (self.pitch[0] + self.pitch[1]) / 2
+            return [(2 * math.pi * k / STARTS - math.pi, middle) for k in range(STARTS)]
+        x, y, z = check_axis(axis)
+        yaw = math.atan2(y, x)
+        pitch = math.asin(z)
+        if not self.pitch[0] - 1e-6 <= pitch <= self.pitch[1] + 1e-6:
+            problem = "the camera cannot be pitched as it should start"
+            value = f"{math.degrees(pitch):.1f} deg"
+            fix = f"Start within {self.config.pitch_deg} degrees, or widen pitch_deg."
+            raise PlanningError(problem, value=value, fix=fix)
+        return [(yaw, min(max(pitch, self.pitch[0]), self.pitch[1]))]
+
+    def motion_cost(self, a: tuple[float, ...], b: tuple[float, ...]) -> float:
+        """Cost of going straight from one state to another."""
+        length = math.dist(a[:3], b[:3])
+        if self.map is None:
+            return length
+        config = self.config
+        n = max(1, math.ceil(length / config.spacing_m))
+        turn = _wrapped(b[3] - a[3])
+        worth = 0.0
+        for k in range(n):
+            t = (k + 0.5) / n
+            at = (a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1]), a[2] + t * (b[2] - a[2]))
+            worth += self.score(at, a[3] + t * turn, a[4] + t * (b[4] - a[4]))
+        return length * (1 + config.score_weight * (1 - worth / n)) + config.turn_weight_m * _angle(a[3:], b[3:])
+
+    def score(self, point: tuple[float, float, float], yaw: float, pitch: float) -> float:
+        """Score of a view, 0 outside the map's free voxels."""
+        assert self.map is not None
+        row = self.map.row(point)
+        if row < 0:
+            return 0.0
+        rows, columns = self._table.shape
+        i = int((pitch + math.pi / 2) / math.pi * rows)
+        j = int((yaw + math.pi) / (2 * math.pi) * columns) % columns
+        return float(self._score(row, int(self._table[min(max(i, 0), rows - 1), j])))
+
+    def motion_is_possible(self, a: tuple[float, ...], b: tuple[float, ...]) -> bool:
+        """Whether the camera can go straight from one state to another."""
+        if self.map is not None:
+            most = math.radians(self.config.max_turn_deg_per_m) * math.dist(a[:3], b[:3])
+            # the sum of yaw and pitch is never less than the angle between the axes, so the limit holds
+            if abs(_wrapped(b[3] - a[3])) + abs(b[4] - a[4]) > most:
+                return False
+        return bool(self.space.segments_are_free([a[:3]], [b[:3]])[0])
+
+    def solve(self, orientations: list[tuple[float, float]], time_s: float, most_s: float, bar: Any) -> Float:
+        """States (S, 5) of the best path found in `time_s`, or else of the first one found until `most_s`.
+
+        Raises PlanningError if no path was found.
+        """
+        from ompl import base, geometric, util
+
+        util.setLogLevel(util.LOG_NONE)
+        # without a map nothing depends on where the camera looks: the pitch has next to no range, the yaw no weight
+        pitch = self.pitch if self.map is not None else (-1e-6, 1e-6)
+        low, high = self.bounds
+        space = _state_space(low, high, pitch, 0.2 if self.map is not None else 1e-6)
+        information = base.SpaceInformation(space)
+        information.setStateValidityChecker(lambda state: bool(self.space.is_free([_numbers(state)[:3]])[0]))
+        possible = self.motion_is_possible
+        cost_of = self.motion_cost
+
+        class Motions(base.MotionValidator):
+            def checkMotion(self, a: Any, b: Any, *rest: Any) -> bool:
+                return possible(_numbers(a), _numbers(b))
+
+        class Costs(base.OptimizationObjective):
+            def stateCost(self, state: Any) -> Any:
+                return base.Cost(0.0)
+
+            def motionCost(self, a: Any, b: Any) -> Any:
+                return base.Cost(cost_of(_numbers(a), _numbers(b)))
+
+        information.setMotionValidator(Motions(information))
+        information.setup()
+        definition = base.ProblemDefinition(information)
+        for yaw, start_pitch in orientations:
+            state = space.allocState()
+            for index, number in enumerate((*self.ends[0], start_pitch)):
+                state[0][index] = float(number)
+            state[1].value = float(yaw)
+            definition.addStartState(state)
+        around_goal = base.GoalSpace(information)
+        around_goal.setSpace(_state_space(self.ends[1] - 1e-9, self.ends[1] + 1e-9, pitch, 1.0))
+        definition.setGoal(around_goal)
+        objective = Costs(information)
+        definition.setOptimizationObjective(objective)
+        planner = geometric.RRTstar(information)
+        planner.setProblemDefinition(definition)
+        planner.setRange(self.config.step_m)
+        planner.setup()
+        step = max(1e-3, min(0.25, time_s))
+        spent = 0.0
+        while spent < time_s - 1e-9 or (spent < most_s - 1e-9 and not definition.hasExactSolution()):
+            planner.solve(step)
+            spent += step
+            bar.update(min(step, max(0.0, bar.total - bar.n)))
+        if not definition.hasExactSolution():
+            fix = "Give it more time, or loosen the camera's limits."
+            raise PlanningError("no path was found in time", value=f"{spent:.2g} s", fix=fix)
+        found = definition.getSolutionPath()
+        return np.array([_numbers(found.getState(index)) for index in range(found.getStateCount())])
+
+    def path(self, states: Float, views: RouteViews) -> PlannedPath:
+        """The path through states (S, 5) that keeps their views."""
+        samples = RouteSamples.of(states[:, :3], self.config.spacing_m)
+        angles = np.column_stack([np.unwrap(states[:, 3]), states[:, 4]])
+        axes = axes_of_angles(np.degrees(between(samples.corners, angles, samples.along)))
+        return views.costed(samples.positions, axes)
+
+
+def _state_space(low: Float, high: Float, pitch: tuple[float, ...], yaw_weight: float) -> Any:
+    """OMPL's space of states: x, y, z and pitch within bounds, and the yaw, with its weight in distances."""
+    from ompl import base
+
+    space = base.CompoundStateSpace()
+    place = base.RealVectorStateSpace(4)
+    bounds = base.RealVectorBounds(4)
+    for index, ends in enumerate(zip((*low, pitch[0]), (*high, pitch[1]), strict=True)):
+        bounds.setLow(index, float(ends[0]))
+        bounds.setHigh(index, float(ends[1]))
+    place.setBounds(bounds)
+    space.addSubspace(place, 1.0)
+    space.addSubspace(base.SO2StateSpace(), yaw_weight)
+    return space
+
+
+def _forward(positions: Float, pitch: Float) -> Float:
+    """Unit axes (W, 3) that look along a path (W, 3), as level as the limits of the pitch (2,) allow, in radians.
+
+    Where the path goes straight up or down, the yaw stays as before.
+    """
+    steps = np.gradient(positions, axis=0)[:, :2] if len(positions) > 1 else np.array([[1.0, 0.0]])
+    if not (np.linalg.norm(steps, axis=1) > 1e-9).any():
+        steps = np.tile([1.0, 0.0], (len(steps), 1))
+    length = np.linalg.norm(steps, axis=1)
+    known = length > 1e-9
+    last = np.maximum.accumulate(np.where(known, np.arange(len(steps)), int(np.argmax(known))))
+    level = (steps / np.maximum(length, 1e-9)[:, None])[last]
+    least = float(np.clip(0.0, *pitch))
+    return np.column_stack([level * math.cos(least), np.full(len(level), math.sin(least))])
+
+
+def _numbers(state: Any) -> tuple[float, float, float, float, float]:
+    """x, y, z, yaw, pitch of a state."""
+    place = state[0]
+    return place[0], place[1], place[2], state[1].value, place[3]
+
+
+def _wrapped(angle: float) -> float:
+    """The same angle in (-pi, pi]."""
+    return math.remainder(angle, 2 * math.pi)
+
+
+def _angle(a: tuple[float, ...], b: tuple[float, ...]) -> float:
+    """Angle between two axes, each by yaw and pitch, in radians."""
+    cosine = math.sin(a[1]) * math.sin(b[1]) + math.cos(a[1]) * math.cos(b[1]) * math.cos(a[0] - b[0])
+    return math.acos(min(1.0, max(-1.0, cosine)))
+
+
+def _nearest_directions(directions: Float) -> NDArray[np.int64]:
+    """Table of the direction nearest to the centre of each cell of pitch (rows) and yaw (columns)."""
+    pitch = np.arange(-90 + TABLE_STEP_DEG / 2, 90, TABLE_STEP_DEG)
+    yaw = np.arange(-180 + TABLE_STEP_DEG / 2, 180, TABLE_STEP_DEG)
+    axes = axes_of_angles(np.stack(np.meshgrid(yaw, pitch), axis=-1))
+    return np.asarray((axes @ directions.T).argmax(-1))

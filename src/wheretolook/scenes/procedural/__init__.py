@@ -1,1 +1,0 @@
-"""Procedural apartments: the scenes that are there without any download."""

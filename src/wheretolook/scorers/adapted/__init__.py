@@ -1,0 +1,20 @@
+"""The set network, adapted to one place by views that were localized there."""
+
+from __future__ import annotations
+
+from wheretolook.scorers.method import Method, MethodStyle, imported
+
+METHODS = (
+    Method(
+        position=120,
+        name="adapted",
+        about="The set network adapted to one place: calibrated there and told where it was wrong.",
+        style=MethodStyle("adapted to the place", "#882255", "P", "-"),
+        group="learned",
+        build=imported("wheretolook.scorers.adapted.score:adapted_scorer"),
+        weights="adapted",
+        probability=True,
+        only_if_named=True,
+        one_place=True,
+    ),
+)

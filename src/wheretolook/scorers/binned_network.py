@@ -1,0 +1,127 @@
+"""Networks over binned landmarks: what is stored of their input, and the score of a trained one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from wheretolook.geometry.poses import Float, check_poses
+from wheretolook.inputs.bins import BinnedViews, InputStatistics
+from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.scorers.base import BLOCK, BinnedScorer, check_field_of_view
+from wheretolook.scorers.range_watch import RangeWatch
+from wheretolook.training.attribute_statistics import mean_and_std
+from wheretolook.training.trained_network import StoredNetwork, TrainedNetwork
+from wheretolook.training.training_range import TrainingRange, bin_quantities
+from wheretolook.utils.errors import WeightsError
+
+
+class BinnedNetwork(StoredNetwork):
+    """A network that takes the means (B, C, bins, bins) of its channels and filled bins (B, bins, bins)."""
+
+    statistics: InputStatistics
+    bins: int
+    scored_at_once: int = 4096
+
+
+def stored_statistics(stored: Mapping[str, Any]) -> InputStatistics:
+    """Input statistics from the header of weights; a WeightsError where this version's bins lack a channel."""
+    values = stored["statistics"]
+    for name in values["channels"]:
+        if name not in ALL_CHANNELS:
+            fix = "Use the version that wrote them, or train again."
+            raise WeightsError("these weights ask for an unknown channel of the bins", value=name, fix=fix)
+    channels = tuple(values["channels"])
+    return InputStatistics(channels, *mean_and_std(values, channels))
+
+
+class StandardBins(nn.Module):
+    """Standardizes the channels of binned views by the mean and deviation of their kind (paper, Sec. 3.3 "Data").
+
+    Empty bins are exactly zero afterwards, that is, the mean of their kind; so are landmark channels where a value is
+    not known. Where landmarks lie, in the first channels, is always known: a NaN there is an error that must show.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, statistics: InputStatistics) -> None:
+        super().__init__()
+        channels = statistics.channels
+        self.n_certain = next((i for i, name in enumerate(channels) if name not in CHANNELS), len(channels))
+        # these follow from the description that is stored beside the weights: persistent=False
+        self.register_buffer("mean", torch.tensor(statistics.mean)[:, None, None], persistent=False)
+        self.register_buffer("std", torch.tensor(statistics.std)[:, None, None], persistent=False)
+
+    def forward(self, means: Tensor, filled: Tensor) -> Tensor:
+        """Means (B, C, bins, bins), standardized, of bins (B, bins, bins) that are filled or not."""
+        values = (means - self.mean) / self.std * filled[:, None]
+        if values.shape[1] > self.n_certain:
+            of_landmarks = values[:, self.n_certain :]
+            of_landmarks.masked_fill_(of_landmarks.isnan(), 0.0)
+        return values
+
+
+class BinnedNetworkScorer(BinnedScorer):
+    """The probability that a view localizes, by a network over its binned landmarks.
+
+    A network knows the field of view it was trained with. A camera of another resolution but the same field of view is
+    served by scaling its pixels; another is refused with a CameraError, since the network has never seen one. Views are
+    in range if the depths of their bins are like those learnt from, where the weights tell; `score` warns once.
+    """
+
+    local = True
+
+    def __init__(self, localization_map: LocalizationMap, trained: TrainedNetwork[Any]) -> None:
+        network: BinnedNetwork = trained.network
+        self.channels = network.statistics.channels
+        super().__init__(localization_map, network.bins, not {*self.channels} <= {*CHANNELS})
+        camera = localization_map.camera
+        self.device = localization_map.device
+        seen = check_field_of_view(trained.camera, camera)
+        self.name = trained.method
+        self.trained = trained
+        self.training_range = trained.training_range or TrainingRange({})
+        self._watch = RangeWatch(self.training_range)
+        self.network: Any = network.to(self.device).eval()
+        pixels = {"u": seen.width / camera.width, "v": seen.height / camera.height}
+        scales = [pixels.get(name, 1.0) for name in self.channels]
+        self._scale = torch.tensor(scales, device=self.device)[:, None, None]
+
+    def score_bins(self, binned: BinnedViews) -> Float:
+        """(B,) probabilities in [0, 1]."""
+        if self._watch.watching and "z" in binned.channels:
+            self._watch.check(self.name, [_depths(binned)])
+        binned = binned if binned.channels == self.channels else binned.select(self.channels)
+        scores = np.empty(len(binned))
+        block = self.network.scored_at_once
+        # TF32 would let a score depend on how many views are scored with it
+        with torch.inference_mode(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+            for begin in range(0, len(scores), block):
+                rows = slice(begin, begin + block)
+                means = torch.from_numpy(binned.means[rows]).to(self.device) * self._scale
+                filled = torch.from_numpy(binned.counts[rows] > 0).to(self.device)
+                # float64 keeps views apart whose probabilities round to 1 in float32
+                logits = self.network(means, filled).double()
+                scores[rows] = self.trained.calibrated(logits).sigmoid().cpu().numpy()
+        return scores
+
+    def in_range(self, cam_from_world: Float) -> NDArray[np.bool_]:
+        """Which poses (B, 3, 4) see depths like those of the views learnt from, (B,) bool."""
+        cam_from_world = check_poses(cam_from_world)
+        inside = np.ones(len(cam_from_world), dtype=bool)
+        for begin in range(0, len(inside) if self.training_range.bounds else 0, BLOCK):
+            binned = self.localization_map.bin_views(cam_from_world[begin : begin + BLOCK], self.bins)
+            inside[begin : begin + BLOCK] = self.training_range.contains(_depths(binned))
+        return inside
+
+
+def _depths(binned: BinnedViews) -> Float:
+    depths = binned.means[:, binned.channels.index("z")].sum((1, 2), dtype=np.float64)
+    return bin_quantities(depths, binned.n_filled)

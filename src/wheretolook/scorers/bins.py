@@ -1,0 +1,36 @@
+"""Reprojections with bins: landmarks spread over much of the image win."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.geometry.poses import Float
+from wheretolook.scorers.base import CountingScorer
+from wheretolook.scorers.method import MethodStyle, rule
+
+
+class BinsScorer(CountingScorer):
+    """Share of the image's bins with a landmark in view in them (paper, Sec. 4.1, "reprojection with bins").
+
+    Among views with as many filled bins, the one that sees more landmarks scores higher, by less than one bin is worth.
+    """
+
+    name = "bins"
+    local = True
+
+    def score_counts(self, n_visible: NDArray[np.int32], n_filled: NDArray[np.int32]) -> Float:
+        """(B,) in [0, 1)."""
+        seen = n_visible.astype(np.float64)
+        return (n_filled + seen / (1 + seen)) / (self.bins**2 + 1)
+
+
+METHODS = (
+    rule(
+        BinsScorer,
+        MethodStyle("reprojections with bins", "#009E73", "D", "-."),
+        position=30,
+        of_the_few=True,
+        fallback=True,
+    ),
+)

@@ -1,0 +1,69 @@
+"""The camera looks where the robot goes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from wheretolook.geometry.poses import Float, camera_centers, check_poses
+from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.method import MethodStyle, ScorerOptions, rule
+from wheretolook.scorers.random import uniform
+
+if TYPE_CHECKING:
+    from wheretolook.inputs.localization_map import LocalizationMap
+
+
+class ForwardScorer(Scorer):
+    """Views by how near they look to a heading: the classical camera that knows nothing of the map (paper, Sec. 4.3).
+
+    The heading is where the robot drives to, in the world: (3,) everywhere, of any length but zero; or (W, 3) waypoints
+    of a path in metres, W > 1, for the direction of the leg that is nearest to the camera. None is for a horizontal
+    heading drawn for each location, by the seed. Raises a ValueError if a heading is zero or not finite, or two
+    waypoints in a row are the same.
+    """
+
+    name = "forward"
+    local = True
+
+    def __init__(self, localization_map: LocalizationMap, heading: ArrayLike | None = None, seed: int = 0) -> None:
+        super().__init__(localization_map)
+        self.seed = seed
+        self._starts = np.empty((0, 3))
+        self._legs = np.empty((0, 3))
+        if heading is not None:
+            given = np.asarray(heading, dtype=np.float64)
+            legs = given[None] if given.ndim == 1 else np.diff(given, axis=0)
+            lengths = np.linalg.norm(legs, axis=-1)
+            usable = len(legs) and np.all((lengths > 0) & (lengths < np.inf))
+            if given.shape[-1:] != (3,) or given.ndim > 2 or not usable:
+                raise ValueError(f"a heading is a direction (3,) of finite length, or a path (W, 3) of such: {given}")
+            self._starts = np.zeros((1, 3)) if given.ndim == 1 else given[:-1]
+            self._legs = legs
+
+    def headings(self, centers: ArrayLike) -> Float:
+        """The headings (B, 3), of unit length, of camera centres (B, 3)."""
+        at = np.asarray(centers, dtype=np.float64)
+        if len(self._legs) == 0:
+            angle = 2 * np.pi * uniform(at, self.seed)
+            return np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
+        along = np.einsum("bwi,wi->bw", at[:, None] - self._starts, self._legs) / (self._legs**2).sum(-1)
+        nearest = self._starts + np.clip(along, 0, 1)[..., None] * self._legs
+        leg = np.argmin(np.linalg.norm(at[:, None] - nearest, axis=-1), axis=1)
+        return np.asarray((self._legs / np.linalg.norm(self._legs, axis=-1, keepdims=True))[leg])
+
+    def score(self, cam_from_world: Float) -> Float:
+        """(B,) in [0, 1]: half of one plus the cosine between optical axis and heading."""
+        poses = check_poses(cam_from_world)
+        cosines = np.einsum("bi,bi->b", poses[:, 2, :3], self.headings(camera_centers(poses)))
+        return np.asarray((1 + np.clip(cosines, -1, 1)) / 2)
+
+
+def _build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+    heading = None if not options.heading else options.heading[0] if len(options.heading) == 1 else options.heading
+    return ForwardScorer(localization_map, heading, options.seed)
+
+
+METHODS = (rule(ForwardScorer, MethodStyle("forward", "#6B6B6B", ">", (0, (6, 2))), build=_build, position=10),)

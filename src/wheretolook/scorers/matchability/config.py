@@ -1,0 +1,45 @@
+"""Options of the probability that a landmark in view is found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf
+
+from wheretolook.inputs.channels import ATTRIBUTES, OF_SIZE
+from wheretolook.training.config import FittingConfig, check_at_least
+from wheretolook.utils.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class LandmarksConfig(FittingConfig):
+    """Options of a network over single landmarks.
+
+    Args:
+        landmarks: landmarks of a view to learn from at a time, at most, chosen at random.
+        width: units of the layers that look at single landmarks.
+        hidden: attributes (`inputs.landmarks_in_view.ATTRIBUTES`) not to look at; by default those that tell how large
+            a scene is, on which matching does not depend.
+        enlarged: greatest factor by which scenes come larger or smaller in training; 1 leaves them as they are.
+    """
+
+    landmarks: int = 64
+    width: int = 48
+    hidden: tuple[str, ...] = OF_SIZE
+    enlarged: float = 3.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_at_least(self, 1, "landmarks", "width")
+        if not 1 <= self.enlarged < inf:
+            raise ConfigError("scenes can be enlarged by a factor of 1 or more", value=self.enlarged)
+        if unknown := [name for name in self.hidden if name not in ATTRIBUTES]:
+            known = f"There are {', '.join(ATTRIBUTES)}."
+            raise ConfigError("hidden names an attribute that there is not", value=unknown[0], fix=known)
+
+
+@dataclass(frozen=True)
+class MatchabilityConfig(LandmarksConfig):
+    """Options of the probability that a landmark in view is found."""
+
+    epochs: int = 6
+    batch_size: int = 256

@@ -1,0 +1,65 @@
+"""A score without knowledge: what any method must beat."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.geometry.poses import Float, check_poses
+from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.method import MethodStyle, ScorerOptions, rule
+
+if TYPE_CHECKING:
+    from wheretolook.inputs.localization_map import LocalizationMap
+
+POSE_DECIMALS = 6  # poses that agree to this many decimals (of a metre, and in the rotation matrix) get the same score
+
+
+class RandomScorer(Scorer):
+    """Uniform random scores, a function of pose and seed, so that they do not depend on the order of the batch."""
+
+    name = "random"
+    local = True
+
+    def __init__(self, localization_map: LocalizationMap, seed: int = 0) -> None:
+        super().__init__(localization_map)
+        self.seed = seed
+
+    def score(self, cam_from_world: Float) -> Float:
+        """(B,) in [0, 1)."""
+        return uniform(check_poses(cam_from_world).reshape(-1, 12), self.seed)
+
+
+def uniform(values: Float, seed: int) -> Float:
+    """Uniform numbers (B,) in [0, 1), a function of rows (B, K), up to `POSE_DECIMALS`, and the seed."""
+    numbers = np.round(values * 10**POSE_DECIMALS).astype(np.int64)
+    state = np.full(len(numbers), seed, dtype=np.uint64)
+    for column in numbers.T:
+        state = _splitmix64(state ^ column.astype(np.uint64))
+    return np.asarray((state >> np.uint64(11)).astype(np.float64) * 2.0**-53)
+
+
+def _splitmix64(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """One step of the SplitMix64 generator (Steele et al., OOPSLA 2014), which mixes all bits."""
+    state = state + np.uint64(0x9E3779B97F4A7C15)
+    state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return state ^ (state >> np.uint64(31))
+
+
+def _build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+    return RandomScorer(localization_map, options.seed)
+
+
+METHODS = (
+    rule(
+        RandomScorer,
+        MethodStyle("random", "#999999", "x", ":"),
+        build=_build,
+        position=0,
+        by_chance=True,
+        of_the_few=True,
+    ),
+)

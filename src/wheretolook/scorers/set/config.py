@@ -1,0 +1,45 @@
+"""Options of the network over the set of landmarks in view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from wheretolook.scorers.matchability.config import LandmarksConfig
+from wheretolook.training.config import check_at_least, check_share
+
+
+@dataclass(frozen=True)
+class SetConfig(LandmarksConfig):
+    """Options of the network over the set of landmarks in view.
+
+    With few training views, batches get smaller and epochs more (`wheretolook.scorers.set.learn.of_size`).
+
+    Args:
+        landmark_loss: how much the loss of the chances of being found counts beside that of the views, where it is
+            stored which landmarks were matched.
+        pooled: numbers that attention pools beside what the landmarks are expected to tell of the pose.
+        head: units of the layers that decide.
+        dropout: share of the deciding layers' units dropped.
+        from_matchability: start from `weights/matchability.safetensors` where the dataset has it.
+    """
+
+    epochs: int = 8
+    batch_size: int = 1024
+    learning_rate: float = 3e-3
+    landmarks: int = 192
+    landmark_loss: float = 0.5
+    pooled: int = 0
+    head: int = 48
+    dropout: float = 0.1
+    from_matchability: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_at_least(self, 1, "head")
+        check_at_least(self, 0, "landmark_loss", "pooled")
+        check_share(self, "dropout")
+
+    @property
+    def starts_from(self) -> str:
+        """The matchability model, unless told otherwise."""
+        return "matchability" if self.from_matchability else ""

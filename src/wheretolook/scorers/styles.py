@@ -1,0 +1,32 @@
+"""How methods are named and drawn, the same in every figure and table."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from wheretolook.scorers.method import Group, MethodStyle
+from wheretolook.scorers.registry import find
+
+ORACLE = "oracle"  # name of what knows the labels and chooses the best there is, in tables and figures
+
+_ORACLE_STYLE = MethodStyle("oracle", "#000000", "*", "-")
+
+_SPARE = (("#CC79A7", "8", (0, (1, 1))), ("#F0E442", "H", (0, (4, 2))), ("#7F3C8D", "3", (0, (2, 1))))
+"""Of methods that are not installed here."""
+
+
+def method_style(name: str) -> MethodStyle:
+    """Style of a method. What follows a space in its name, such as a file of weights, is added to the label."""
+    if name == ORACLE:
+        return _ORACLE_STYLE
+    method = find(name)
+    if method is None:
+        return MethodStyle(name, *_SPARE[sum(name.encode()) % len(_SPARE)])
+    further = name.partition(" ")[2]
+    return replace(method.style, label=f"{method.style.label}, {further}") if further else method.style
+
+
+def method_group(name: str) -> Group:
+    """Which group a method belongs to; one that is not known is a rule."""
+    method = find(name)
+    return "rules" if method is None else method.group

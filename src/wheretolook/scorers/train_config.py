@@ -1,0 +1,67 @@
+"""Options of the train stage: those that all learners share, and a group for each learner's own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, make_dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from wheretolook.scorers.method import Method
+from wheretolook.scorers.mlp.config import MlpConfig
+from wheretolook.scorers.registry import learned, methods_named
+from wheretolook.training.config import SharedConfig
+from wheretolook.utils.errors import ConfigError
+
+MOVED = {f"train.{option.name}": f"train.mlp.{option.name}" for option in fields(MlpConfig)}
+MOVED["train.variants"] = "It is train.methods now, with the names of methods: mlp-2d+z for 2d+z."
+"""Where options have gone that had another name before."""
+
+
+def _trained_unasked() -> tuple[str, ...]:
+    return tuple(name for name, method in learned().items() if method.trained_unasked)
+
+
+@dataclass(frozen=True)
+class _NamedMethods(SharedConfig):
+    methods: tuple[str, ...] = field(default_factory=_trained_unasked)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        methods_named(self.methods, learned())
+
+    def chosen(self) -> list[Method]:
+        """The methods to train, in the order asked for."""
+        return methods_named(self.methods, learned())
+
+    def options_of(self, method: Method) -> Any:
+        """The options that a method is trained with: those of its group, but for what it sets itself."""
+        return replace(getattr(self, method.folder), **method.settings)
+
+
+def _train_config() -> type:
+    """`SharedConfig` with a field for the options of each folder of learned methods."""
+    groups: dict[str, type] = {}
+    for method in learned().values():
+        assert method.config is not None
+        if groups.setdefault(method.folder, method.config) is not method.config:
+            fix = "Give all methods of a folder the same class of options."
+            raise ConfigError("two classes of options for one group of train", value=method.folder, fix=fix)
+    if taken := {*groups} & {own.name for own in fields(_NamedMethods)}:
+        raise ConfigError("a learned method's folder has the name of an option", value=min(taken), fix="Rename it.")
+    own = [(name, config, field(default_factory=config)) for name, config in groups.items()]
+    made = make_dataclass("TrainConfig", own, bases=(_NamedMethods,), frozen=True)
+    made.__module__ = __name__  # where processes that train find it
+    lines = [f"        {name}: {(config.__doc__ or name).partition(chr(10))[0]}" for name, config in groups.items()]
+    shared = (SharedConfig.__doc__ or "").rstrip()
+    made.__doc__ = "\n".join([shared, *lines, "    "])
+    return made
+
+
+if TYPE_CHECKING:
+
+    class TrainConfig(_NamedMethods):
+        """Options of the train stage; made of the methods there are."""
+
+        def __init__(self, **options: Any) -> None: ...
+
+else:
+    TrainConfig = _train_config()

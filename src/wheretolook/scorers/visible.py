@@ -1,0 +1,23 @@
+"""The most visible landmarks win."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.geometry.poses import Float
+from wheretolook.scorers.base import CountingScorer
+from wheretolook.scorers.method import MethodStyle, rule
+
+
+class VisibleScorer(CountingScorer):
+    """Share of the map's landmarks that a view sees (paper, Sec. 3.2)."""
+
+    name = "visible"
+
+    def score_counts(self, n_visible: NDArray[np.int32], n_filled: NDArray[np.int32]) -> Float:
+        """(B,) in [0, 1]."""
+        return n_visible / max(1, len(self.localization_map.landmarks.points))
+
+
+METHODS = (rule(VisibleScorer, MethodStyle("most visible landmarks", "#E69F00", "s", "--"), position=20),)

@@ -1,0 +1,147 @@
+"""Training of a viewpoint network: loss, regularization, optimizer and validation metrics."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from lightning.pytorch import LightningModule
+from torch import Tensor, nn
+from torch.nn.functional import binary_cross_entropy_with_logits
+from torchmetrics.functional.classification import binary_auroc, binary_average_precision, binary_calibration_error
+from torchmetrics.utilities.distributed import gather_all_tensors
+
+from wheretolook.training.config import FittingConfig
+from wheretolook.training.data import Batch
+
+CALIBRATION_BINS = 15  # equal-width bins of the expected calibration error (Guo et al., ICML 2017)
+
+
+def weighted_bce(
+    logits: Tensor, labels: Tensor, class_weights: tuple[float, float], count: float | None = None
+) -> Tensor:
+    """Mean weighted binary cross-entropy of logits and labels (B,), 0 or 1 (paper, Sec. 3.3), a scalar.
+
+    The weights are those of the negative and the positive class; a `count` divides the sum in place of B.
+    """
+    negative, positive = class_weights
+    weights = negative + (positive - negative) * labels
+    return binary_cross_entropy_with_logits(logits, labels, weight=weights, reduction="sum") / (count or len(labels))
+
+
+def weight_penalty(module: nn.Module) -> Tensor:
+    """Sum of the squares of all weights, a scalar. Biases are left out (the paper's sum is over W_l)."""
+    layers = [layer for layer in module.modules() if isinstance(layer, (nn.Linear, nn.Conv2d))]
+    weights = torch.cat([layer.weight.flatten() for layer in layers])
+    return weights.dot(weights)
+
+
+@runtime_checkable
+class Augmented(Protocol):
+    """A network that changes its inputs while it learns."""
+
+    def augment(self, options: FittingConfig, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """The inputs to learn from in place of a batch's."""
+
+
+@runtime_checkable
+class LearnsMore(Protocol):
+    """A network that learns something beside the labels of views."""
+
+    def learn_more(self, options: Any, count: float, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits (B,) of a batch's inputs, and a further loss, a sum that the `count` of views divides."""
+
+
+class ViewpointClassifier(LightningModule):
+    """Learns whether a viewpoint localizes, from batches of inputs of a network that gives logits (B,).
+
+    A network with a method `augment(options, *inputs)` gets its inputs through that while it learns; one with a method
+    `learn_more` adds a loss of its own, which the logged ones leave out. The seed is of dropout and noise, where
+    several processes train.
+
+    Logged every epoch: `{train,val}_loss`, `{train,val}_bce`, `l2` (the weighted penalty), `train_average_precision`
+    (with dropout on), `val_average_precision`, `val_roc_auc` and `val_calibration_error`. Balancing the classes shifts
+    the probabilities towards one half, so the calibration error also shows how unbalanced the labels are.
+    """
+
+    def __init__(
+        self, network: nn.Module, options: FittingConfig, class_weights: tuple[float, float], seed: int = 0
+    ) -> None:
+        super().__init__()
+        self.network = network
+        self.options = options
+        self.class_weights = class_weights
+        self.seed = seed
+        # logits and labels of an epoch's batches: metrics of every step would take longer than the steps
+        self._train_seen: list[Tensor] = []
+        self._val_seen: list[Tensor] = []
+        self._penalties: list[Tensor] = []
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Logits (B,) of views."""
+        logits: Tensor = self.network(*inputs)
+        return logits
+
+    def on_fit_start(self) -> None:
+        """Give every process its own dropout and noise."""
+        if self.trainer.world_size > 1:
+            torch.manual_seed(self.seed + self.trainer.global_rank)
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Loss of one process's share of a batch. The mean over processes is the loss of the batch."""
+        inputs, labels, total = batch
+        if isinstance(self.network, Augmented):
+            inputs = self.network.augment(self.options, *inputs)
+        count = total / self.trainer.world_size
+        more: Tensor | float = 0.0
+        if isinstance(self.network, LearnsMore):
+            logits, more = self.network.learn_more(self.options, count, *inputs)
+        else:
+            logits = self(*inputs)
+        penalty = self.options.l2 * weight_penalty(self.network)
+        self._train_seen.append(torch.stack([logits.detach(), labels]))
+        self._penalties.append(penalty.detach() * total)
+        return weighted_bce(logits, labels, self.class_weights, count) + more + penalty
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        """Logits of one process's share of a batch."""
+        self._val_seen.append(torch.stack([self(*batch.inputs), batch.labels]))
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the metrics of all validation views."""
+        logits, labels = self._gather(self._val_seen)
+        bce = weighted_bce(logits, labels, self.class_weights)
+        penalty = self.options.l2 * weight_penalty(self.network)
+        views: dict[str, Any] = {"preds": logits.sigmoid(), "target": labels.long(), "validate_args": False}
+        ranking = {"val_average_precision": binary_average_precision(**views), "val_roc_auc": binary_auroc(**views)}
+        calibration = {"val_calibration_error": binary_calibration_error(**views, n_bins=CALIBRATION_BINS, norm="l1")}
+        self._log({"val_loss": bce + penalty, "val_bce": bce, "l2": penalty, **ranking, **calibration})
+
+    def on_train_epoch_end(self) -> None:
+        """Log the metrics of all training views, each as it was when the network learnt from it."""
+        logits, labels = self._gather(self._train_seen)
+        bce = weighted_bce(logits, labels, self.class_weights)
+        penalty = torch.stack(self._penalties).sum() / len(labels)
+        self._penalties.clear()
+        precision = binary_average_precision(logits.sigmoid(), labels.long(), validate_args=False)
+        self._log({"train_loss": bce + penalty, "train_bce": bce, "train_average_precision": precision})
+
+    def configure_optimizers(self) -> Any:
+        """Adam (paper, Sec. 4), with a constant or a cosine learning rate."""
+        optimizer = torch.optim.Adam(self.parameters(), lr=self.options.learning_rate, fused=True)
+        if self.options.schedule == "constant":
+            return optimizer
+        return [optimizer], [torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, T_max=self.options.epochs)]
+
+    def _gather(self, seen: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Logits and labels of an epoch, (B,) each, over all processes."""
+        values = torch.cat(seen, 1)
+        seen.clear()
+        if self.trainer.world_size > 1:
+            values = torch.cat(gather_all_tensors(values), 1)
+        logits, labels = values
+        return logits, labels
+
+    def _log(self, values: dict[str, Tensor]) -> None:
+        # all processes have gathered the same values; without sync_dist Lightning warns that they might not have
+        self.log_dict(values, on_step=False, on_epoch=True, sync_dist=True)

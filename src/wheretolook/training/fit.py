@@ -1,0 +1,225 @@
+"""Fitting a network with Lightning: on one device or several, keeping the best weights and logging every epoch."""
+
+from __future__ import annotations
+
+import logging
+import math
+import signal
+import tempfile
+import threading
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+import torch
+from lightning.pytorch import Callback, LightningDataModule, LightningModule, Trainer
+from lightning.pytorch.callbacks import Checkpoint, EarlyStopping
+from lightning.pytorch.strategies import DDPStrategy
+from torch.multiprocessing.spawn import ProcessException
+from tqdm.auto import tqdm
+
+from wheretolook.training.classifier import ViewpointClassifier
+from wheretolook.training.config import FittingConfig, SharedConfig
+from wheretolook.utils.errors import ConfigError, TrackingError, WorkerError
+from wheretolook.utils.files import temporary_folder
+from wheretolook.utils.tracking import client
+from wheretolook.utils.tracking_config import TrackingConfig
+
+if TYPE_CHECKING:
+    from mlflow.entities import Metric
+
+MONITORED = "val_average_precision"  # the metric that tells which epoch was best
+
+LIGHTNING_LOGGERS = ("lightning.pytorch", "lightning.fabric")
+
+LOG_EVERY_S = 2.0  # epochs are logged together after so many seconds: a transaction takes longer than a short epoch
+LOG_AT_MOST = 1000  # metrics MLflow takes at a time
+
+
+def home_device(config: SharedConfig) -> str:
+    """Torch device of the process that calls, "cuda:0" or "cpu"; a ConfigError if there are too few GPUs."""
+    gpus = torch.cuda.device_count() if config.accelerator != "cpu" else 0
+    wanted = config.devices if gpus or config.accelerator == "gpu" else 0
+    if wanted > max(gpus, torch.backends.mps.is_available()):
+        fix = "Ask for fewer, or set train.accelerator to cpu to train in processes on the CPU."
+        raise ConfigError(f"train.devices asks for more GPUs than there are: {gpus}", value=config.devices, fix=fix)
+    return "cuda:0" if gpus else "cpu"
+
+
+def fit(classifier: ViewpointClassifier, data: LightningDataModule, record: EpochRecord, config: SharedConfig) -> None:
+    """Train a classifier; afterwards `record` has the history and the weights to keep.
+
+    With `config.devices > 1`, every device has its own process, started here and ended here: a script that calls this
+    needs the usual `if __name__ == "__main__":`, and an interactive session cannot call it.
+    """
+    options = classifier.options
+    callbacks: list[Callback] = [record]
+    if options.patience is not None:
+        callbacks.append(EarlyStopping(MONITORED, mode="max", patience=options.patience))
+    several = config.devices > 1
+    with _quiet(), temporary_folder() as folder:
+        if several:
+            record.file = folder / "record.pt"
+        where: dict[str, Any] = {"accelerator": config.accelerator, "devices": config.devices}
+        if several:  # spawned processes run nothing but the fit; those that run the program anew would repeat all else
+            where["strategy"] = _Spawned(start_method="spawn")
+            where["strategy"].temporary = str(folder)
+            where["accelerator"] = "cpu" if home_device(config) == "cpu" else config.accelerator
+        quiet: dict[str, Any] = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
+        how: dict[str, Any] = {"max_epochs": options.epochs, "callbacks": callbacks, "num_sanity_val_steps": 0}
+        trainer = Trainer(**where, **how, **quiet, default_root_dir=folder)
+        usual = tempfile.tempdir
+        if several:  # a process that outlives this one writes down its error as a temporary file
+            tempfile.tempdir = str(folder)
+        try:
+            trainer.fit(classifier, datamodule=data)
+        except ProcessException as error:
+            problem = f"a training process ended before its work was done: {error}"
+            fix = "There may be too little memory: lower train.devices."
+            raise WorkerError(problem, value=f"train.devices {config.devices}", fix=fix) from error
+        finally:
+            tempfile.tempdir = usual
+        record.collect()
+    data.trainer = None  # who asks for batches from now on gets whole ones, not one process's share
+
+
+class RunLog:
+    """Logs the metrics of epochs to an open MLflow run, several epochs at a time.
+
+    A store that fails does not end the training: nothing more is logged, and `failed` holds the error.
+    """
+
+    def __init__(self, tracking: TrackingConfig, run_id: str) -> None:
+        self.tracking = tracking
+        self.run_id = run_id
+        self.failed: TrackingError | None = None
+        self._waiting: list[Metric] = []
+        self._flushed = time.monotonic()
+
+    def add(self, epoch: int, metrics: dict[str, float]) -> None:
+        """Log the metrics of an epoch, now or soon. Those that are not finite are left out."""
+        from mlflow.entities import Metric
+
+        now = int(time.time() * 1000)
+        self._waiting += [Metric(name, value, now, epoch) for name, value in metrics.items() if math.isfinite(value)]
+        if time.monotonic() - self._flushed > LOG_EVERY_S or len(self._waiting) > LOG_AT_MOST // 2:
+            self.flush()
+
+    def flush(self) -> None:
+        """Log what waits."""
+        if self._waiting and self.failed is None:
+            try:
+                client(self.tracking).log_batch(self.run_id, metrics=self._waiting)
+            except TrackingError as error:
+                self.failed = error
+        self._waiting = []
+        self._flushed = time.monotonic()
+
+
+class EpochRecord(Checkpoint):
+    """Keeps, shows and logs each epoch's metrics (`rows`), and keeps the weights of the epoch asked for (`kept`).
+
+    In `file` a process that trains leaves the record for the one that started it; None if they are the same.
+    """
+
+    def __init__(self, title: str, options: FittingConfig, progress: bool, run_log: RunLog | None = None) -> None:
+        self.title = title
+        self.epochs = options.epochs
+        self.progress = progress
+        self.run_log = run_log
+        self.keep_best = options.keep == "best"
+        self.rows: list[dict[str, float]] = []
+        self.kept = -1
+        self.file: Path | None = None
+        self._weights: dict[str, torch.Tensor] = {}
+        self._bar: Any = None
+
+    @property
+    def history(self) -> pd.DataFrame:
+        """Metrics of each epoch, one row an epoch."""
+        return pd.DataFrame(self.rows)
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Show the bar."""
+        hidden = not (self.progress and trainer.is_global_zero)
+        self._bar = tqdm(total=self.epochs, desc=self.title, unit="epoch", disable=hidden)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Note the epoch's metrics; keep its weights if it is the best so far."""
+        metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
+        best = max((row[MONITORED] for row in self.rows), default=float("-inf"))
+        self.rows.append({"epoch": float(trainer.current_epoch), **metrics})
+        if not self.keep_best or metrics[MONITORED] > best:
+            self.kept = len(self.rows) - 1
+            self._weights = {name: tensor.detach().clone() for name, tensor in pl_module.state_dict().items()}
+        if self.run_log is not None and trainer.is_global_zero:
+            self.run_log.add(trainer.current_epoch, metrics)
+        now = metrics[MONITORED]
+        self._bar.set_postfix_str(f"AP {now:.3f}, best {max(best, now):.3f}", refresh=False)
+        self._bar.update()
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Hand the record over."""
+        if self.file is not None and trainer.is_global_zero:
+            torch.save((self.rows, self.kept, self._weights), self.file)
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Close the bar and log what is not logged yet."""
+        if self._bar is not None:
+            self._bar.close()
+        if self.run_log is not None and trainer.is_global_zero:
+            self.run_log.flush()
+
+    def collect(self) -> None:
+        """Take over what the process that trained has left."""
+        if self.file is not None:
+            self.rows, self.kept, self._weights = torch.load(self.file, map_location="cpu", weights_only=True)
+
+    def restore(self, classifier: ViewpointClassifier) -> dict[str, float]:
+        """Put the kept weights into the classifier and return the metrics of their epoch."""
+        classifier.load_state_dict(self._weights)
+        return dict(self.rows[self.kept])
+
+
+class _Spawned(DDPStrategy):
+    """Lightning's DDP in spawned processes, which are as quiet as the one that starts them."""
+
+    temporary: str | None = None  # folder for temporary files, of which Lightning leaves some
+
+    def setup_environment(self) -> None:
+        """Silence this process, which does nothing but train, and join the others."""
+        _silence()
+        tempfile.tempdir = self.temporary
+        super().setup_environment()
+
+
+def _silence() -> None:
+    for logger in map(logging.getLogger, LIGHTNING_LOGGERS):
+        logger.setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`")  # between Lightning and PyTorch
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence Lightning's notes on hardware, and turn its exit on Ctrl-C back into a KeyboardInterrupt."""
+    loggers = [logging.getLogger(name) for name in LIGHTNING_LOGGERS]
+    levels = [logger.level for logger in loggers]
+    in_main = threading.current_thread() is threading.main_thread()
+    handler = signal.getsignal(signal.SIGINT) if in_main else None
+    try:
+        with warnings.catch_warnings():
+            _silence()
+            yield
+    except SystemExit as stop:
+        if isinstance(stop.__context__, KeyboardInterrupt):
+            raise KeyboardInterrupt from stop
+        raise
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+        if in_main:
+            signal.signal(signal.SIGINT, handler)

@@ -1,0 +1,107 @@
+"""What all ways of learning have in common: data in, a model and its metrics out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pandas as pd
+import torch
+from lightning.pytorch import LightningDataModule
+from numpy.typing import ArrayLike, NDArray
+from torch import nn
+
+from wheretolook.dataset.layout import Dataset
+from wheretolook.geometry.camera import Camera
+from wheretolook.training.classifier import ViewpointClassifier
+from wheretolook.training.config import SharedConfig
+from wheretolook.training.fit import EpochRecord, RunLog, fit
+
+
+class Model(Protocol):
+    """Something learnt that lies in a weights file."""
+
+    def save(self, path: Path, training: dict[str, Any] | None = None) -> None:
+        """Write one safetensors file, atomically, with JSON values about the training in its header."""
+
+
+@dataclass(frozen=True, eq=False)
+class Learnt:
+    """What a learner has learnt."""
+
+    model: Model  # to be saved
+    metrics: dict[str, float]  # of what is kept, on the validation views; "val_average_precision" among them
+    # of what it has learnt from, such as n_train; logged as parameters
+    counts: dict[str, Any] = field(default_factory=dict)
+    history: pd.DataFrame | None = None  # metrics of each epoch, None where there are no epochs
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What a learner is asked to do."""
+
+    dataset: Dataset  # labelled train scenes, and val scenes if it has any
+    method: str  # name of the method to learn
+    config: SharedConfig  # options that all learners share
+    options: Any  # the method's own, such as a `FittingConfig`
+    title: str = ""  # of its progress bar
+    progress: bool = False  # whether to show it
+    run_log: RunLog | None = None  # takes the metrics of epochs; None logs none
+    # what learners that follow one another leave for the next, such as views that are binned already
+    kept: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def camera(self) -> Camera | None:
+        """The camera of all views to learn from; None if there are several."""
+        cameras = self.dataset.cameras
+        return cameras[0] if len(cameras) == 1 else None
+
+
+def fit_network(
+    network: nn.Module, data: LightningDataModule, task: Task, class_weights: tuple[float, float] = (1.0, 1.0)
+) -> tuple[dict[str, float], pd.DataFrame]:
+    """Train a network by the options of a task; it then holds the weights to keep. Their metrics, and all epochs'."""
+    classifier = ViewpointClassifier(network, task.options, class_weights, task.config.seed)
+    record = EpochRecord(task.title, task.options, task.progress, task.run_log)
+    fit(classifier, data, record, task.config)
+    metrics = record.restore(classifier)
+    network.eval()
+    return metrics, record.history
+
+
+def predict(network: nn.Module, data: LightningDataModule) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Logits and labels (B,) of the validation views, by a network that is brought to where they are."""
+    network.eval()
+    logits = []
+    labels = []
+    with torch.inference_mode():
+        for batch in data.val_dataloader():
+            logits.append(network.to(batch.inputs[0].device)(*batch.inputs).float().cpu())
+            labels.append(batch.labels.cpu())
+    return torch.cat(logits).numpy(), torch.cat(labels).numpy()
+
+
+def class_counts(**sides: NDArray[Any]) -> dict[str, Any]:
+    """Number of views of each side, and share of positives, by the names in which runs have them."""
+    counts: dict[str, Any] = {f"n_{name}": len(labels) for name, labels in sides.items()}
+    return counts | {f"positives_{name}": round(float(labels.mean()), 4) for name, labels in sides.items()}
+
+
+def fit_platt(logits: ArrayLike, labels: ArrayLike) -> tuple[float, float]:
+    """Scale and offset with which scale * logits + offset are the likeliest log-odds of labels (B,) (Platt 1999).
+
+    Temperature scaling has no offset, so it mends how sure a model is, but not a level that is off. They are 1 and 0
+    where a scale would turn the order round or the labels are of one class.
+    """
+    from sklearn.linear_model import LogisticRegression
+
+    values = np.asarray(logits, dtype=np.float64)
+    truth = np.asarray(labels).astype(bool)
+    if truth.all() or not truth.any():
+        return 1.0, 0.0
+    line = LogisticRegression(C=1e6).fit(values[:, None], truth)
+    scale = float(line.coef_[0, 0])
+    offset = float(line.intercept_[0])
+    return (scale, offset) if scale > 0 else (1.0, 0.0)

@@ -1,1 +1,0 @@
-"""The table of viewpoints: rows, sampling, and what a label is."""

@@ -1,0 +1,1 @@
+"""Studies and reproduction of the paper: figures, tables, release, baselines, learners that do not ship."""

@@ -1,0 +1,96 @@
+"""Landmarks that drawn images are localized against: SIFT, triangulated from the map's own images at its poses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.features.extraction import KeypointExtractor
+from wheretolook.geometry.camera import PinholeCamera, cameras_by_id
+from wheretolook.mapping.colmap_model import colmap_poses, read_model, write_model
+from wheretolook.mapping.config import MapConfig
+from wheretolook.mapping.rendered_map import (
+    LANDMARKS_FILE,
+    Clock,
+    extract_with_colors,
+    remove_inaccurate,
+    save_landmarks,
+)
+from wheretolook.mapping.triangulation import choose_pairs, shrink_depth, surface_overlap, triangulate_known_poses
+from wheretolook.utils.errors import MapError
+from wheretolook.utils.images import read_image as read_file
+from wheretolook.utils.processes import Processes
+from wheretolook_paper.benchmark.folder import DRAWN_CAMERA, BenchmarkScene
+
+if TYPE_CHECKING:
+    from wheretolook.rendering.types import Renderer
+
+_FIX = "Localize with the benchmark's own script instead: --localizer none."
+_RENDER_BATCH = 16
+
+
+def build_query_map(
+    scene: BenchmarkScene, renderer: Renderer, folder: Path, workers: int, device: str, progress: bool
+) -> Path:
+    """Triangulate landmarks anew and save them with descriptors in a folder that is there; returns their file.
+
+    The released maps are of SuperPoint keypoints, whose descriptors only SuperPoint's network makes; here SIFT is found
+    in the same images, and poses stay as they are. The mesh tells which images see the same surface.
+
+    Raises a MapError if the images are missing or of another size than the map's camera, the map has several cameras or
+    one with distortion, or nothing can be triangulated.
+    """
+    config = MapConfig()
+    model = read_model(scene.model)
+    cameras = {*cameras_by_id(model.cameras, scene.model).values()}
+    if len(cameras) > 1:
+        raise MapError("the benchmark's maps have one camera", path=scene.model, value=len(cameras), fix=_FIX)
+    camera = cameras.pop()
+    if not isinstance(camera, PinholeCamera):
+        raise MapError("the camera of the map is no pinhole", path=scene.model, value=camera.model, fix=_FIX)
+    poses = colmap_poses(scene.model, model)
+    names = [model.images[number].name for number in sorted(model.images) if model.images[number].has_pose]
+    files = [scene.image_file(name) for name in names]
+    depth: list[NDArray[np.float32]] = []
+    for start in range(0, len(poses), _RENDER_BATCH):
+        depth.extend(shrink_depth(renderer.render(DRAWN_CAMERA, poses[start : start + _RENDER_BATCH]).depth_m))
+    pairs = choose_pairs(surface_overlap(DRAWN_CAMERA, poses, np.stack(depth)), config.partners)
+    with Processes(workers) as processes:
+        images = _read(files, camera)
+        found = extract_with_colors(
+            KeypointExtractor(config.extractor, device), images, len(files), processes, "map: extract", progress
+        )
+        keypoints, colors = zip(*found, strict=True)
+        database = folder / "database.db"
+        views = camera, poses, keypoints, colors, pairs
+        built = triangulate_known_poses(database, *views, config, Clock(), 0, processes, progress)
+    remove_inaccurate(built, config.max_reprojection_error_px, scene.images, _FIX)
+    write_model(built, folder)
+    save_landmarks(folder, database, config.max_reprojection_error_px)
+    database.unlink()
+    return folder / LANDMARKS_FILE
+
+
+def _read(files: list[Path], camera: PinholeCamera) -> Iterator[NDArray[np.uint8]]:
+    """Images (H, W, 3), RGB."""
+    for path in files:
+        image = read_image(path)
+        if image is None or image.shape[:2] != (camera.height, camera.width):
+            size = None if image is None else f"{image.shape[1]}x{image.shape[0]}"
+            problem = f"this is no image of {camera.width}x{camera.height} px, as the map's camera has"
+            raise MapError(problem, path=path, value=size, fix="Copy it anew.")
+        yield image
+
+
+def read_image(path: Path) -> NDArray[np.uint8] | None:
+    """An image (H, W, 3) uint8, RGB; None if it is missing or cannot be read."""
+    import cv2
+
+    try:
+        return np.asarray(read_file(path, cv2.IMREAD_COLOR)[:, :, ::-1], dtype=np.uint8)
+    except (OSError, ValueError):
+        return None

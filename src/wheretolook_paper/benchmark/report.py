@@ -1,0 +1,145 @@
+"""Tables of a round: one line a view, and the summary, as shipped beside mended."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from wheretolook.dataset.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
+from wheretolook.geometry.poses import camera_centers
+from wheretolook.planning.camera_turns import pan_tilt_angles
+from wheretolook.utils.files import write_text
+from wheretolook.utils.markdown import markdown_table
+from wheretolook_paper.benchmark.scores import (
+    MEASURES,
+    PLAN,
+    PLAN_THRESHOLD,
+    PLAN_TURN_DEG,
+    Scores,
+    Share,
+    planned,
+    within,
+)
+
+VIEWS_CSV = "views.csv"
+SUMMARY_CSV = "summary.csv"
+SUMMARY_MD = "summary.md"
+
+NOTES = """\
+As shipped: the benchmark's scripts on these files. `evaluate_plan.py` takes the n-th line of the errors for the n-th
+pose, though errors stand in the order of file names (1, 10, 2) and poses in that of waypoints, and stops where their
+numbers differ. Mended: joined by id; a pose without an error has failed. Shares are of views, over scenes too: the
+views of all scenes in one, not a mean of scenes. No oracle: some waypoints may have no view that localizes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What a method reached in a scene."""
+
+    scene: str
+    method: str
+    scores: Scores
+
+
+def views_table(results: Sequence[Result]) -> pd.DataFrame:
+    """One row a view: where it looks, its error, its turn, and in which measures it counts.
+
+    `as_shipped_error_of` is the id whose error evaluate_plan.py takes for the view, `as_shipped_plan` what comes of it;
+    both are empty where the script stops.
+    """
+    return pd.concat([_views(result) for result in results], ignore_index=True)
+
+
+def _views(result: Result) -> pd.DataFrame:
+    scores = result.scores
+    poses = result.scores.poses.cam_from_world
+    centers = camera_centers(poses)
+    (yaw, pitch) = pan_tilt_angles(poses[:, 2, :3])
+    columns: dict[str, Any] = {"scene": result.scene, "method": result.method, "id": scores.poses.ids}
+    columns |= dict(zip("xyz", centers.T, strict=True))
+    columns |= {"yaw_deg": np.degrees(yaw), "pitch_deg": np.degrees(pitch)}
+    columns |= {"error_m": scores.metres, "error_deg": scores.degrees, "turn_deg": scores.turns_deg}
+    for limits in THRESHOLDS:
+        columns[threshold_key(limits)] = within(scores.metres, scores.degrees, limits).astype(int)
+    columns[PLAN] = planned(scores.metres, scores.degrees, scores.turns_deg).astype(int)
+    if scores.by_row is None:
+        return pd.DataFrame(columns | {"as_shipped_error_of": "", "as_shipped_plan": ""})
+    errors = scores.errors
+    rows = scores.by_row
+    columns["as_shipped_error_of"] = [errors.ids[row] for row in rows]
+    columns["as_shipped_plan"] = planned(errors.metres[rows], errors.degrees[rows], scores.turns_deg).astype(int)
+    return pd.DataFrame(columns)
+
+
+def summary_table(results: Sequence[Result]) -> pd.DataFrame:
+    """One row a scene, method and measure, with hits, total and percent, as shipped and mended; `ALL` scenes last.
+
+    Over all scenes, a script that stops in one of them has no result.
+    """
+    groups: dict[tuple[str, str], list[Scores]] = {}
+    for result in results:
+        groups.setdefault((result.scene, result.method), []).append(result.scores)
+    if len({result.scene for result in results}) > 1:
+        for result in results:
+            groups.setdefault((ALL, result.method), []).append(result.scores)
+    rows = []
+    for (scene, method), scores in groups.items():
+        for measure in MEASURES:
+            row: dict[str, Any] = {"scene": scene, "method": method, "measure": measure}
+            row |= _cells("as_shipped", _sum([one.as_shipped for one in scores], measure))
+            row |= _cells("mended", _sum([one.mended for one in scores], measure))
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _sum(shares: Sequence[Mapping[str, Share | None]], measure: str) -> Share | None:
+    total = Share(0, 0)
+    for of_scene in shares:
+        share = of_scene[measure]
+        if share is None:
+            return None
+        total += share
+    return total
+
+
+def _cells(prefix: str, share: Share | None) -> dict[str, Any]:
+    names = [f"{prefix}_{name}" for name in ("hits", "total", "percent")]
+    values = ("", "", "") if share is None else (share.hits, share.total, share.percent)
+    return dict(zip(names, values, strict=True))
+
+
+def summary_text(summary: pd.DataFrame) -> str:
+    """The summary for people, as Markdown that also reads as text."""
+    rows = []
+    for _, row in summary.iterrows():
+        shares = [_text(row, "as_shipped"), _text(row, "mended")]
+        rows.append([str(row["scene"]), str(row["method"]), measure_label(str(row["measure"])), *shares])
+    return markdown_table(["scene", "method", "error at most", "as shipped", "mended"], rows)
+
+
+def _text(row: pd.Series[Any], prefix: str) -> str:
+    hits = row[f"{prefix}_hits"]
+    total = row[f"{prefix}_total"]
+    return "stops" if hits == "" else str(Share(int(hits), int(total)))
+
+
+def measure_label(measure: str) -> str:
+    """A measure for people."""
+    if measure == PLAN:
+        return f"plan: {threshold_label(threshold_key(PLAN_THRESHOLD))}, turn {PLAN_TURN_DEG:g}°"
+    return threshold_label(measure)
+
+
+def write_report(results: Sequence[Result], folder: Path) -> str:
+    """Write the tables into a folder; returns the summary's text."""
+    summary = summary_table(results)
+    text = summary_text(summary)
+    write_text(folder / VIEWS_CSV, views_table(results).to_csv(index=False, float_format="%.6g", lineterminator="\n"))
+    write_text(folder / SUMMARY_CSV, summary.to_csv(index=False, float_format="%.4f", lineterminator="\n"))
+    write_text(folder / SUMMARY_MD, f"# Active Localization Benchmark\n\n{text}\n\n{NOTES}\n")
+    return text

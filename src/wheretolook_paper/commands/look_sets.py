@@ -1,0 +1,140 @@
+"""Sets of looks compared: chosen together, one by one, spread evenly, and so on; joined from stored matches."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.dataset.viewpoint_table import has_matches, is_good, poses, read_table
+from wheretolook.utils.tracking_store import kept_if_not_logged
+from wheretolook_paper.evaluation.looks import LOOKS_CSV, LOOKS_MD, NUMBERS, STRATEGIES, log_looks, write_looks
+
+if TYPE_CHECKING:
+    from wheretolook.evaluation.config import EvaluateConfig
+    from wheretolook.scorers.base import Scorer
+    from wheretolook.utils.tracking_config import TrackingConfig
+
+
+@dataclass(frozen=True)
+class LookConfig:
+    """What is compared: numbers of looks, strategies, how well turns are known, and the seed of what is drawn."""
+
+    numbers: tuple[int, ...] = NUMBERS
+    strategies: tuple[str, ...] = tuple(STRATEGIES)
+    turn_noise_deg: float = 0.0
+    seed: int = 0
+
+
+def scenes_with_pixels(dataset: Dataset, split: str) -> list[SceneFolder]:
+    """Scenes of a split, looked at by one camera, whose labels keep where landmarks were matched."""
+    scenes = [scene for scene in dataset.scenes if scene.split == split and not scene.cameras_file.is_file()]
+    return [scene for scene in scenes if has_matches(scene.table, pixels=True)]
+
+
+def evaluate_looks(
+    dataset: Dataset,
+    evaluate: EvaluateConfig,
+    tracking: TrackingConfig,
+    config: LookConfig = LookConfig(),
+    progress: bool = True,
+    device: str = "cpu",
+) -> pd.DataFrame | None:
+    """`look_table` of a split's scenes, `looks.csv` and `looks.md` beside its scores, and an MLflow run.
+
+    Views are scored by the first of `evaluate.weights`, or those that `planning.scene_map.default_weights` finds. None
+    if no scene's labels keep where landmarks were matched (`--label.store_pixels true`).
+    """
+    from wheretolook.evaluation.results import results_folder
+    from wheretolook.planning.scene_map import default_weights
+    from wheretolook.scorers.registry import load_scorer
+
+    scenes = scenes_with_pixels(dataset, evaluate.split)
+    weights = evaluate.weights[0] if evaluate.weights else default_weights(dataset)
+    if not scenes or weights is None:
+        return None
+    maps = [scene.localization_map(device=device) for scene in scenes]
+    found = [
+        compare_looks(scene, load_scorer(str(weights), around, evaluate.anywhere), config, progress)
+        for scene, around in zip(scenes, maps, strict=True)
+    ]
+    sets = pd.concat(found, ignore_index=True)
+    folder = results_folder(dataset, evaluate)
+    table = write_looks(folder, sets, f"Looks localized together on {dataset.name}, {evaluate.split} scenes")
+    params = {"dataset": dataset.name, "split": evaluate.split, "weights": weights.name, **asdict(config)}
+    with kept_if_not_logged(f"the comparison of looks in {folder}"):
+        log_looks(tracking, table, params, [folder / name for name in (LOOKS_CSV, LOOKS_MD)])
+    return table
+
+
+def compare_looks(
+    scene: SceneFolder, scorer: Scorer, config: LookConfig = LookConfig(), progress: bool = True
+) -> pd.DataFrame:
+    """Sets of looks by every strategy at every labelled location of a scene, and how they were localized.
+
+    Returns `labelling.look_sets.SET_COLUMNS` for each set, with `strategy`, `expected` (the worth it was given before),
+    `single_good` (whether the look that is best alone localizes alone) and `any_good` (whether one of the looks does).
+
+    Raises a TableError if the labels do not keep where landmarks were matched.
+    """
+    from wheretolook.localization.joint_labels import label_sets
+    from wheretolook.looks.joint_visibility import seen_around
+    from wheretolook.looks.selection import worth_of
+    from wheretolook.looks.set_score import SetWorth
+
+    table = read_table(scene.table, pixels=True)
+    cam_from_world = poses(table)
+    good = is_good(table)
+    scores = scorer.score(cam_from_world)
+    rng = np.random.default_rng(config.seed)
+    worth = SetWorth.shipped()
+    sets: list[list[int]] = []
+    about: list[dict[str, Any]] = []
+    for _, rows in table.groupby("location_id").indices.items():
+        axes = cam_from_world[rows, 2, :3]
+        values = scores[rows]
+        center = -cam_from_world[rows[0], :, :3].T @ cam_from_world[rows[0], :, 3]
+        seen, sure = (seen_around(scorer, center, axes, values, sure) for sure in (False, True))
+        for strategy in config.strategies:
+            for n in config.numbers:
+                if n > len(rows):
+                    continue
+                looks = _looks(strategy, n, axes, values, seen, sure, rng)
+                chosen = np.asarray(rows)[looks]
+                sets.append(chosen.tolist())
+                first = bool(good[rows[int(values.argmax())]])
+                expected = worth_of(seen, worth, looks)
+                about.append(
+                    {"scene": scene.name, "strategy": strategy, "expected": expected, "single_good": first}
+                    | {"any_good": bool(good[chosen].any())}
+                )
+    points = scene.localization_map().landmarks.points
+    cameras = scene.cameras()
+    camera = cameras if len(cameras) > 1 else next(iter(cameras.values()))
+    text = f"looks {scene.name}" if progress else None
+    labelled = label_sets(
+        table, sets, points, camera, turn_noise_deg=config.turn_noise_deg, seed=config.seed, progress=text
+    )
+    return pd.concat([pd.DataFrame(about), labelled], axis=1).assign(good=is_good(labelled))
+
+
+def _looks(strategy: str, n: int, axes: Any, scores: Any, seen: Any, sure: Any, rng: np.random.Generator) -> list[int]:
+    from wheretolook.looks.selection import Turns, best_one_by_one, choose_looks, evenly_spread
+    from wheretolook.looks.set_score import SetWorth, count_worth, fisher_worth
+
+    if strategy == "random":
+        return [int(row) for row in rng.choice(len(axes), n, replace=False)]
+    if strategy == "one-by-one":
+        return best_one_by_one(scores, axes, n)
+    if strategy == "even":
+        return evenly_spread(axes, n, int(np.argmax(scores)))
+    turns = Turns(axes)
+    if strategy == "visible":
+        return list(choose_looks(sure, count_worth, n, turns).looks)
+    if strategy == "fisher":
+        return list(choose_looks(sure, fisher_worth, n, turns).looks)
+    exchanges = 0 if strategy == "in-turn" else None
+    return list(choose_looks(seen, SetWorth.shipped(), n, turns, first=scores, exchanges=exchanges).looks)

@@ -1,0 +1,246 @@
+"""Times of the visibility check: compared with the paper's, and how time and memory grow with the size of the task."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from itertools import cycle
+from textwrap import shorten
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.style import context
+from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, NullLocator
+
+from wheretolook.figures.config import Look
+from wheretolook.figures.style import BLUE, GREEN, INK, PURPLE, RC, SKY, VERMILION, new_figure
+
+COUNTS = "counts alone"
+EVERYTHING = "occlusion, counts, best 100"
+TWIN = "NumPy twin, counts alone, scaled"
+"""Kinds of work that the runtime figure draws; it ignores all others. The twin is the plain NumPy implementation."""
+
+PAPER_LOCATIONS = 648
+PAPER_LANDMARKS = 24_919
+
+_PAPER = "from the paper"
+_RELEASED = "authors' kernel, measured"
+_OURS = "this project, measured"
+_LOOK: dict[str, dict[str, Any]] = {
+    _PAPER: {"facecolor": "white", "edgecolor": "#7a7a7a", "hatch": "///", "linewidth": 0.8},
+    _RELEASED: {"facecolor": "#dedede", "edgecolor": "#7a7a7a", "hatch": "...", "linewidth": 0.8},
+    _OURS: {"facecolor": SKY, "edgecolor": SKY, "linewidth": 0.8},
+}
+"""Looks of bars by the source of their number; hatches tell them apart in greyscale."""
+
+_PANELS = {COUNTS: "counts alone: the work that the paper times"}
+_PANELS[EVERYTHING] = "occlusion, counts and best 100 directions:\nmore than the paper times"
+
+
+@dataclass(frozen=True)
+class _Bar:
+    """One bar: its label, median seconds, source of the number, text at its end, least and most seconds."""
+
+    label: str
+    seconds: float
+    source: str
+    text: str
+    spread: tuple[float, float] | None = None
+
+
+_ELSEWHERE = (
+    _Bar("paper, CPU, 1 thread", 7387.0, _PAPER, "7,387 s"),
+    _Bar("paper, GPU", 23.0, _PAPER, "23 s"),
+    _Bar("released kernel, H200", 12.2, _RELEASED, "12.2 s"),
+)
+"""Bars that do not come from `runtime_figure`'s input: the paper's runtime figure ("initial sampling"), and the time of
+the authors' released CUDA kernel on an H200."""
+
+
+def runtime_figure(sizes: pd.DataFrame) -> Figure:
+    """The paper's runtime figure with this project's times beside it, at the paper's 648 locations x 24,919 landmarks.
+
+    Bars on a logarithmic axis in seconds, whiskers from the shortest to the longest run. Above the counts alone, which
+    the paper times; below, if there are such rows, with the work that its time leaves out. `sizes` has a row for each
+    machine, kind of work and number of threads, with `what`, `threads`, `median_s`, `min_s`, `max_s`, `repeats`,
+    `device` ("cpu" or Warp's CUDA device), `name` and `cores` of the machine. Rows of other work are ignored, and the
+    NumPy twin of a machine with a GPU if there is one of a CPU.
+    """
+    measured = _measured_bars(sizes)
+    bars = {COUNTS: [*_ELSEWHERE, *measured[COUNTS]], EVERYTHING: measured[EVERYTHING]}
+    shown = [what for what in _PANELS if bars[what]]
+    every = [bar for what in shown for bar in bars[what]]
+    # A logarithmic bar has no zero to start from: all start at the same power of ten, well below the shortest.
+    start = 10.0 ** min(-3, np.floor(np.log10(min(bar.seconds for bar in every) / 1.5)))
+    with context(RC):
+        figure = new_figure(6.0, 1.1 + 0.32 * len(every) + 0.4 * len(shown))
+        heights = [len(bars[what]) for what in shown]
+        panels = figure.subplots(len(shown), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+        for axes, what in zip(panels, shown, strict=True):
+            _draw_bars(axes, bars[what], start)
+            axes.set_title(_PANELS[what], fontsize=10, loc="left")
+        longest = max(bar.seconds for bar in every)
+        panels[0].set_xlim(start, 20 * longest)  # room for the text of the longest bar
+        powers = range(round(np.log10(start)), int(np.log10(2 * longest)) + 1)
+        # Every second power has a label, or they would touch; 1 ms has one.
+        labels = [_ticked(10.0**power) if power % 2 else "" for power in powers]
+        panels[0].set_xticks([10.0**power for power in powers], labels)
+        panels[0].xaxis.set_minor_locator(NullLocator())
+        panels[-1].set_xlabel(f"time for {PAPER_LOCATIONS} locations, {PAPER_LANDMARKS:,} landmarks (log)")
+        sources = dict.fromkeys(bar.source for bar in every)
+        handles = [Patch(label=source, **_LOOK[source]) for source in sources]
+        figure.legend(handles=handles, loc="outside upper center", ncols=3, columnspacing=1.4, handlelength=1.8)
+        return figure
+
+
+def runtime_table(sizes: pd.DataFrame) -> pd.DataFrame:
+    """The numbers of this project's times that `runtime_figure` draws: a row for each machine, work and threads."""
+    rows = sizes[sizes["what"].isin((TWIN, COUNTS, EVERYTHING))]
+    columns = {"machine": rows["name"].map(machine_label), "work": rows["what"], "threads": rows["threads"]}
+    columns |= {"median (s)": rows["median_s"], "least (s)": rows["min_s"], "most (s)": rows["max_s"]}
+    columns |= {"projections (10⁹/s)": rows["projections_per_s"] / 1e9}
+    return pd.DataFrame(columns).sort_values(["work", "median (s)"], ignore_index=True)
+
+
+def _draw_bars(axes: Axes, bars: list[_Bar], start: float) -> None:
+    plate: Look = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
+    for y, bar in enumerate(bars):
+        axes.barh(y, bar.seconds - start, 0.68, left=start, **_LOOK[bar.source])
+        end = bar.seconds
+        if bar.spread is not None:
+            low, high = bar.spread
+            ends = [[max(bar.seconds - low, 0)], [max(high - bar.seconds, 0)]]
+            axes.errorbar(bar.seconds, y, xerr=ends, fmt="none", ecolor=INK, elinewidth=1, capsize=2.5)
+            end = max(end, high)
+        axes.annotate(bar.text, (end, y), (5, 0), textcoords="offset points", va="center", fontsize=9.5, bbox=plate)
+    axes.set_xscale("log")
+    axes.set_yticks(range(len(bars)), [_wrapped(bar.label) for bar in bars], fontsize=9.5)
+    axes.set_ylim(len(bars) - 0.4, -0.6)
+    axes.grid(axis="y", visible=False)
+    axes.tick_params(axis="y", length=0)
+
+
+def _wrapped(label: str) -> str:
+    return label if len(label) <= 27 else ",\n".join(label.rsplit(", ", 1))
+
+
+def _measured_bars(sizes: pd.DataFrame) -> dict[str, list[_Bar]]:
+    """Bars of the rows that are drawn: the NumPy twin first, CPUs before GPUs, few threads before many."""
+    bars: dict[str, list[_Bar]] = {COUNTS: [], EVERYTHING: []}
+    rows = [row for row in sizes.to_dict("records") if row["what"] in (TWIN, *bars)]
+    cpus = {row["name"] for row in rows if not _is_gpu(row)}
+    twins = {row["name"] for row in rows if row["what"] == TWIN} & cpus
+    kept = [row for row in rows if row["what"] != TWIN or not twins or not _is_gpu(row)]
+    for row in sorted(kept, key=lambda row: (row["what"] != TWIN, _is_gpu(row), row["name"], row["threads"])):
+        median = float(row["median_s"])
+        repeats = int(row["repeats"])
+        spread = (float(row["min_s"]), float(row["max_s"])) if repeats > 1 else None
+        if row["what"] == TWIN:
+            several = len(twins) > 1
+            label = f"NumPy, scaled up, {machine_label(row['name'])}" if several else "NumPy, 1 thread, scaled up"
+        else:
+            label = machine_label(row["name"]) + ("" if _is_gpu(row) else f", {_threads(row)}")
+        what = COUNTS if row["what"] == TWIN else str(row["what"])
+        bars[what].append(_Bar(label, median, _OURS, duration(median), spread))
+    return bars
+
+
+def _is_gpu(row: dict[Any, Any]) -> bool:
+    return str(row["device"]) != "cpu"
+
+
+def _threads(row: dict[Any, Any]) -> str:
+    if row["threads"] == 1:
+        return "1 thread"
+    return f"all {row['cores']} cores" if row["threads"] == row["cores"] else f"{row['threads']} threads"
+
+
+def machine_label(name: str) -> str:
+    """A short name of a processor, without trade marks and clock; "CPU" if only the architecture is known."""
+    short = re.sub(r"\((R|TM|C)\)|\b\d+-Cores?\b|\b(Processor|CPU)\b|@.*$", " ", str(name), flags=re.IGNORECASE)
+    short = shorten(short, 28, placeholder="…")
+    return short if short not in ("", "x86_64", "AMD64", "aarch64", "arm64", "i386", "arm") else "CPU"
+
+
+def duration(seconds: float) -> str:
+    """A time with three digits: "3.58 ms", "149 s"."""
+    value, unit = (seconds, "s") if float(f"{seconds:.3g}") >= 1 else (1e3 * seconds, "ms")
+    digits = max(0, 2 - int(np.floor(np.log10(float(f"{value:.3g}")))))
+    return f"{float(f'{value:.3g}'):,.{digits}f} {unit}"
+
+
+def _ticked(seconds: float) -> str:
+    return f"{seconds:,.0f} s" if seconds >= 0.9 else f"{1e3 * seconds:g} ms"
+
+
+_GROWING = ("landmarks", "locations", "directions")
+_MACHINES = ((BLUE, "o"), (VERMILION, "s"), (GREEN, "D"), (PURPLE, "^"))
+_WORK: dict[str, tuple[Any, bool]] = {"with occlusion": ("-", True), COUNTS: ((0, (4, 1.5)), False)}
+"""Dashes of a kind of work, and whether its markers are filled."""
+
+
+def scaling_figure(growth: pd.DataFrame) -> Figure:
+    """How time (above) and memory (below) grow with the number of landmarks, locations or directions, each alone.
+
+    All axes are logarithmic; a dotted line shows proportional growth. `growth` has a row for each run, with `axis`
+    (which of the three grows), `landmarks`, `locations`, `directions`, `what` ("with occlusion", "counts alone"),
+    `median_s`, `min_s`, `max_s`, `peak_bytes` (0, not drawn, where it was too little to measure), `device` and `name`
+    of the machine.
+    """
+    machines = list(dict.fromkeys(zip(growth["device"], growth["name"], strict=True)))
+    shown = [axis for axis in _GROWING if (growth["axis"] == axis).any()]
+    with context(RC):
+        figure = new_figure(2.2 * len(shown) + 0.7, 5.2)
+        scales: Look = {"xscale": "log", "yscale": "log"}
+        panels = figure.subplots(2, len(shown), sharex="col", sharey="row", squeeze=False, subplot_kw=scales)
+        for column, axis in enumerate(shown):
+            part = growth[growth["axis"] == axis]
+            for (device, name), (color, marker) in zip(machines, cycle(_MACHINES), strict=False):
+                on_machine = part[(part["device"] == device) & (part["name"] == name)]
+                whiskers: Look = {"fmt": "none", "ecolor": color, "elinewidth": 1, "capsize": 2, "zorder": 1.9}
+                for what, (dashes, filled) in _WORK.items():
+                    rows = on_machine[on_machine["what"] == what].sort_values(axis)
+                    look: Look = {"color": color, "linestyle": dashes, "marker": marker, "markersize": 4.5}
+                    look["markerfacecolor"] = color if filled else "white"
+                    label = f"{machine_label(name)}, {what}"
+                    seconds = rows["median_s"].to_numpy(dtype=float)
+                    spread = [seconds - rows["min_s"], rows["max_s"] - seconds]
+                    panels[0, column].plot(rows[axis], seconds, label=label, **look)
+                    panels[0, column].errorbar(rows[axis], seconds, np.clip(spread, 0, None), **whiskers)
+                    measurable = rows[rows["peak_bytes"] > 0]
+                    panels[1, column].plot(measurable[axis], measurable["peak_bytes"] / 1e6, **look)
+            fixed = (f"{_numbers(part[other])} {other}" for other in _GROWING if other != axis)
+            panels[0, column].set_title("\n".join(fixed), fontsize=9)
+            panels[1, column].set_xlabel(axis)
+        panels[0, 0].set_ylabel("time (s)")
+        panels[1, 0].set_ylabel("peak memory (MB)")
+        for axes in panels.flat:
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.10g}")
+            axes.xaxis.set_minor_formatter(NullFormatter())
+            axes.yaxis.set_minor_formatter(NullFormatter())
+            if np.ptp(np.log10(axes.get_ylim())) < 2:  # else the axis would have a single number
+                axes.yaxis.set_major_locator(LogLocator(10, subs=(1, 2, 5)))
+        for axes in panels.flat:  # once all limits are known
+            _draw_proportional(axes)
+        handles, labels = panels[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=3, columnspacing=1.4, handlelength=2.6)
+        return figure
+
+
+def _numbers(values: pd.Series) -> str:
+    return " / ".join(f"{value:,.0f}" for value in sorted(values.unique()))
+
+
+def _draw_proportional(axes: Axes) -> None:
+    """A line of slope 1 through the middle of the panel, which does not change its limits."""
+    (left, right) = axes.get_xlim()
+    limits = axes.get_ylim()
+    slope = np.sqrt(limits[0] * limits[1] / (left * right))
+    look: Look = {"color": "#9a9a9a", "linewidth": 0.8, "linestyle": ":", "zorder": 0.9, "label": "proportional"}
+    axes.plot([left, right], [slope * left, slope * right], scalex=False, scaley=False, **look)
+    axes.set(xlim=(left, right), ylim=limits)

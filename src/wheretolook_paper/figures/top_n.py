@@ -1,0 +1,126 @@
+"""Scores of the best N viewpoints of a location: the paper's figure "Multiple viewpoints results"."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.style import context
+
+from wheretolook.dataset.thresholds import ALL, threshold_label
+from wheretolook.evaluation.score_table import main_rows, methods_of, threshold_keys
+from wheretolook.figures.config import Look
+from wheretolook.figures.style import GREY, PRINT, TWO_COLUMNS_IN, new_figure
+from wheretolook.scorers.registry import all_methods, find
+from wheretolook.scorers.styles import ORACLE, method_style
+from wheretolook_paper.evaluation.paper_tables import PAPER
+
+ROWS = {
+    "normalized": "good ones among the best N\n(% of the oracle's share)",
+    "any": "locations with a good one\namong N (%)",
+}
+"""The two scores of several viewpoints: columns of the score table, and their labels."""
+
+_PRINTED = {row.name: row.printed for row in PAPER["vs_others"]}
+_PAPER_MARKS = {"proposed": ("D", "paper, proposed"), "random": ("s", "paper, random")}
+
+
+def top_n_figure(scores: pd.DataFrame, methods: Sequence[str] = ()) -> Figure:
+    """Scores over the number N of best viewpoints, at each threshold.
+
+    Above, the share of good viewpoints among the best N of all locations, in % of the oracle's; below, the share of
+    locations with a good one among N, the oracle's as lines. Whiskers are 95 % bootstrap intervals. Open grey marks are
+    the paper's numbers, which it prints for N = 1 only, on other scenes and divided by its released code's constant.
+
+    `scores` is a table of `wheretolook.evaluation.scores.score_table`; its rows over all scenes are drawn, of the first
+    occlusion model and set of candidates; without methods named, those that are `of_the_few`.
+    """
+    scores = main_rows(scores)
+    pooled = scores[scores["scene"] == ALL]
+    keys = threshold_keys(scores)
+    shown = _present(pooled, methods) if methods else _the_few(pooled)
+    top_n = [int(n) for n in pooled["top_n"].unique()]
+    with context(PRINT):
+        figure = new_figure(TWO_COLUMNS_IN, 4.6)
+        panels = figure.subplots(len(ROWS), len(keys), sharex=True, sharey="row", squeeze=False)
+        for line, (column, name) in zip(panels, ROWS.items(), strict=True):
+            for index, (axes, key) in enumerate(zip(line, keys, strict=True)):
+                _draw(axes, pooled, shown, top_n, f"{column}_{{}}{key}")
+                if column == "normalized":
+                    axes.set_title(f"within {threshold_label(key)}")
+                    for printed_row, (marker, _) in _PAPER_MARKS.items():
+                        mark: Look = {"markersize": 5, "color": GREY, "markerfacecolor": "white"}
+                        axes.plot(-0.5, _PRINTED[printed_row][index], marker, **mark)
+                else:
+                    _draw_oracle(axes, pooled, top_n, f"{column}_{key}")
+            line[0].set_ylabel(name)
+        for axes in panels[-1]:
+            axes.set_xlabel("N")
+        look: Look = {"linestyle": "none", "color": GREY, "markerfacecolor": "white"}
+        printed = [Line2D([], [], marker=marker, label=label, **look) for marker, label in _PAPER_MARKS.values()]
+        handles = [*panels[1, 0].get_legend_handles_labels()[0], *printed]
+        figure.legend(handles=handles, loc="outside upper center", ncols=4, columnspacing=1.6, handlelength=1.4)
+        return figure
+
+
+def top_n_table(scores: pd.DataFrame, methods: Sequence[str] = ()) -> pd.DataFrame:
+    """What `top_n_figure` draws at the finest threshold, in %, and the oracle's: a row a method, columns by N."""
+    scores = main_rows(scores)
+    pooled = scores[scores["scene"] == ALL]
+    key = threshold_keys(scores)[0]
+    names = {"normalized": "good ones, % of the oracle's", "any": "locations with one, %"}
+    columns = {}
+    for column, name in names.items():
+        for n in pooled["top_n"].unique():
+            rows = pooled[pooled["top_n"] == n].set_index("method")
+            columns[name, f"N = {n}"] = 100 * rows[f"{column}_{key}"]
+    shown = [*(_present(pooled, methods) if methods else _the_few(pooled)), ORACLE]
+    table = pd.DataFrame(columns).loc[shown]
+    table.index = pd.Index([method_style(method).label for method in shown])
+    return table
+
+
+def _the_few(pooled: pd.DataFrame) -> list[str]:
+    """Those of a table's methods that a figure of a few shows (`Method.of_the_few`), the last registered first."""
+    first: dict[str, str] = {}
+    for name in methods_of(pooled):
+        known = find(name)
+        if known and known.of_the_few:
+            first.setdefault(known.family or known.name, name)
+    order = list(all_methods())
+    return sorted(first.values(), key=lambda name: order.index(name.partition(" ")[0]), reverse=True)
+
+
+def _present(pooled: pd.DataFrame, methods: Sequence[str]) -> list[str]:
+    """Those of the methods that a table has; a family stands for the first of its methods that is there."""
+    first: dict[str, str] = {}
+    for name in methods_of(pooled):
+        known = find(name)
+        first |= {name: name} | ({known.family: name} if known and known.family not in first else {})
+    return list(dict.fromkeys(first[name] for name in methods if name in first))
+
+
+def _draw(axes: Axes, pooled: pd.DataFrame, methods: Sequence[str], top_n: Sequence[int], column: str) -> None:
+    """Marks of all methods over N; `column` with "low_", "high_" or nothing inserted names the table's columns."""
+    places = np.arange(len(top_n), dtype=float)
+    for number, method in enumerate(methods):
+        rows = pooled[pooled["method"] == method].set_index("top_n").reindex(list(top_n))
+        style = method_style(method)
+        at = places + 0.14 * (number - (len(methods) - 1) / 2)  # side by side, or whiskers would hide one another
+        value, low, high = (100 * rows[column.format(end)].to_numpy(dtype=float) for end in ("", "low_", "high_"))
+        axes.vlines(at, low, high, color=style.color, linewidth=0.9)
+        axes.plot(at, value, style.marker, color=style.color, markersize=5, label=style.label)
+    axes.set_xticks(places, [f"{n}" for n in top_n])
+    axes.set(xlim=(-0.65, len(top_n) - 0.5), ylim=(None, 101))
+    axes.grid(axis="x", visible=False)
+
+
+def _draw_oracle(axes: Axes, pooled: pd.DataFrame, top_n: Sequence[int], column: str) -> None:
+    style = method_style(ORACLE)
+    best = pooled[pooled["method"] == ORACLE].set_index("top_n").reindex(list(top_n))
+    places = np.arange(len(top_n))
+    axes.hlines(100 * best[column], places - 0.42, places + 0.42, color=style.color, linewidth=1, label=style.label)

@@ -1,0 +1,65 @@
+"""The information in what a view really sees: its field of view and occlusion as they are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from wheretolook.geometry.camera import ColmapCamera
+from wheretolook.geometry.pose_information import N_NUMBERS, bearing_numbers
+from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.utils.parts import run_in_parts
+from wheretolook.utils.warp import start_warp
+from wheretolook.visibility.frustum import (
+    PosedViews,
+    frustum_sides,
+    landmarks_in_view_plain,
+    near_radius_m,
+    offsets_from,
+    points_on_device,
+    sets_on_device,
+    sides_rounding,
+    views_on_device,
+)
+from wheretolook_paper.fisher import exact_kernel
+from wheretolook_paper.fisher.exact_kernel import information_kernel
+
+CPU_VIEWS = 128  # views that a CPU thread takes at a time: some ten milliseconds of work
+
+
+def exact_information(views: PosedViews, device: str = "cpu") -> Float:
+    """Information on the pose of each of B views, summed over the landmarks it sees: (B, 15), see `information`.
+
+    The CPU works with all its cores, on cameras with distortion in NumPy and slowly.
+    """
+    if isinstance(views.camera, ColmapCamera):
+        return exact_information_plain(views)
+    device = start_warp(device)
+    wp.load_module(exact_kernel, device=device)  # only one thread may do that
+    sides = frustum_sides(views.camera, views.cam_from_world[..., :3])
+    bounds = [sides_rounding(sides), near_radius_m(views.camera)]
+    landmarks = points_on_device(views.points, device)
+    sets = sets_on_device(views.unoccluded, device)
+    numbers = np.empty((len(sides), N_NUMBERS))
+
+    def work(part: slice) -> None:
+        there = views_on_device(views, part, landmarks, sets, device)
+        result: Any = wp.empty((part.stop - part.start, N_NUMBERS), dtype=wp.float64, device=device)
+        wp.launch(information_kernel, result.shape[0], [there, *bounds], [result], device=device)
+        numbers[part] = result.numpy()
+
+    run_in_parts(len(sides), CPU_VIEWS if device == "cpu" else max(1, len(sides)), work, device)
+    return numbers
+
+
+def exact_information_plain(views: PosedViews) -> Float:
+    """What `exact_information` computes, in NumPy."""
+    seen = landmarks_in_view_plain(views)
+    centers = camera_centers(views.cam_from_world)
+    numbers = np.zeros((len(centers), N_NUMBERS))
+    for view, center in enumerate(centers):
+        offsets = offsets_from(center, views.points[seen[view]]).astype(np.float64)
+        numbers[view] = bearing_numbers(offsets).sum(0)
+    return numbers

@@ -1,0 +1,76 @@
+"""Metrics that turn the information on a pose into a single number."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, get_args
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike
+
+from wheretolook.geometry.pose_information import N_NUMBERS, TRACE, information_matrices
+from wheretolook.geometry.poses import Float
+from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.parts import run_in_parts
+from wheretolook.utils.warp import start_warp
+from wheretolook_paper.fisher import metrics_kernel
+from wheretolook_paper.fisher.metrics_kernel import eigenvalues_kernel
+
+Metric = Literal["mineig", "logdet", "trace"]
+METRICS: tuple[str, ...] = get_args(Metric)
+
+ROWS_AT_ONCE = 4096  # matrices that a thread of a CPU takes at a time: a few milliseconds
+
+
+def metric_of(numbers: ArrayLike, metric: str, pivots: ArrayLike | None = None, device: str = "cpu") -> Float:
+    """A metric (B,) of information matrices kept as numbers (B, 15), about pivots (B, 3) as in `information_matrices`.
+
+    More is better. The metric is "trace"; "logdet", the logarithm of one plus the determinant (log(1 + d), and
+    -log(1 - d) where an approximation makes d negative), so that it is finite without landmarks and keeps the
+    determinant's order; or "mineig", the smallest absolute eigenvalue, the singular value that the released code takes.
+
+    Raises:
+        ConfigError: no such metric, or no such device.
+    """
+    if metric not in METRICS:
+        raise ConfigError("unknown metric of information", value=metric, fix=f"There are {', '.join(METRICS)}.")
+    numbers = np.asarray(numbers, dtype=np.float64)
+    if metric == "trace" and pivots is None:
+        return np.asarray(numbers @ TRACE)
+    return metric_of_eigenvalues(eigenvalues(numbers, pivots, device), metric)
+
+
+def metric_of_eigenvalues(values: Float, metric: str) -> Float:
+    """As `metric_of`, (B,), from eigenvalues (B, 6)."""
+    if metric == "trace":
+        return np.asarray(values.sum(-1))
+    if metric == "mineig":
+        return np.asarray(np.abs(values).min(-1))
+    with np.errstate(divide="ignore"):
+        log_of_absolute = np.log(np.abs(values)).sum(-1)
+    return np.asarray(np.sign(values).prod(-1) * np.logaddexp(0, log_of_absolute))
+
+
+def eigenvalues(numbers: ArrayLike, pivots: ArrayLike | None = None, device: str = "cpu") -> Float:
+    """Eigenvalues (B, 6), in no order, of what `metric_of` takes; their errors are about 1e-16 of the matrix's norm."""
+    numbers = np.ascontiguousarray(numbers, dtype=np.float64).reshape(-1, N_NUMBERS)
+    arms = np.empty((0, 3)) if pivots is None else np.ascontiguousarray(pivots, dtype=np.float64).reshape(-1, 3)
+    device = start_warp(device)
+    values = np.empty((len(numbers), 6))
+
+    def work(part: slice) -> None:
+        there: Any = wp.array(numbers[part], dtype=wp.float64, device=device)
+        about: Any = wp.array(arms[part], dtype=wp.vec3d, device=device)
+        found: Any = wp.empty((part.stop - part.start, 6), dtype=wp.float64, device=device)
+        inputs = [there, pivots is not None, about]
+        wp.launch(eigenvalues_kernel, found.shape[0], inputs, [found], device=device)
+        values[part] = found.numpy()
+
+    wp.load_module(metrics_kernel, device=device)  # only one thread may do that
+    run_in_parts(len(numbers), ROWS_AT_ONCE if device == "cpu" else max(1, len(numbers)), work, device)
+    return values
+
+
+def eigenvalues_plain(numbers: ArrayLike, pivots: ArrayLike | None = None) -> Float:
+    """What `eigenvalues` computes, in NumPy, ascending."""
+    return np.asarray(np.linalg.eigvalsh(information_matrices(numbers, pivots)))

@@ -1,0 +1,1 @@
+"""Comparison of paths planned by several methods."""

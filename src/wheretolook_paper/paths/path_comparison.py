@@ -1,0 +1,208 @@
+"""Paths between the same starts and goals, planned by several methods, to be localized along (paper, Sec. 4.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from tqdm.auto import tqdm
+
+from wheretolook.dataset.viewpoint_table import pose_columns
+from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.planning.config import FORWARD, PathsConfig
+from wheretolook.planning.routes import PlannedPath
+from wheretolook.planning.rrt import plan_path
+from wheretolook.planning.view_sequence import TurnLimit, ViewSequence, best_sequence, greedy_sequence, resample_path
+from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.space.free_space import FreeSpace
+from wheretolook.space.mapped_space import MappedSpace
+from wheretolook.utils.errors import PlanningError, SceneError
+
+PLANNED = "planned"
+GIVEN = "given"
+"""What a method may choose: places and views, or the views along a path that is given."""
+
+Space = FreeSpace | MappedSpace
+Rule = Callable[[Float, TurnLimit], ViewSequence]
+
+RULES: dict[str, Rule] = {"": best_sequence, "greedy": greedy_sequence}
+"""How the views along a given path are chosen, exactly and by ActLoc's rule, by what is added to a method's name."""
+
+DRAWS = 50  # pairs drawn for each one wanted, before a scene is said to have too little room
+
+WAYS_M = 0.25
+MOST = 200_000
+"""Grid of places by which to find out whether there is a way from a start to a goal, and their largest number."""
+
+BLOCK = 10_000
+NEAREST = 8
+"""Places tested for free space at a time; those on the grid from which a way to a given point is tried."""
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedPaths:
+    """What was planned in a scene.
+
+    `paths` has a row for each pair, task (`PLANNED`, `GIVEN`) and method: `planned`, whether there is a path, its
+    `length_m`, `turn_deg`, `n_views`, `promised`, the mean score of its views by the method's own map (NaN for
+    "forward"), and `found_by` (`PlannedPath.found_by`). `views` has a row for each view along them: pair, task, method,
+    waypoint, score, and `wheretolook.dataset.viewpoint_table.POSE_COLUMNS`.
+    """
+
+    paths: pd.DataFrame
+    views: pd.DataFrame
+
+
+def draw_pairs(space: Space, config: PathsConfig) -> Float:
+    """Starts and goals (P, 2, 3) m in free space, far enough from each other, with a way between them.
+
+    Above floors, heights are those asked for; without a mesh, they are drawn. Raises SceneError if there is too little
+    room.
+    """
+    rng = np.random.default_rng(config.seed)
+    low, high = space.bounds
+    ways = Ways(space, WAYS_M)
+    found: list[Float] = []
+    for _ in range(DRAWS * config.pairs):
+        if len(found) == config.pairs:
+            break
+        ends = _free_points(space, rng.uniform(low, high, (400, 3)), config, rng)[:2]
+        if len(ends) < 2 or np.linalg.norm(ends[1] - ends[0]) < config.min_distance_m:
+            continue
+        if ways.joins(ends[0], ends[1]):  # not in parts of the scene between which there is no way
+            found.append(ends)
+    if len(found) < config.pairs:
+        apart = f"{config.min_distance_m:g} m apart with a way between them"
+        fix = "Lower paths.min_distance_m or paths.pairs."
+        raise SceneError(f"found only {len(found)} starts and goals {apart}", value=config.pairs, fix=fix)
+    return np.array(found)
+
+
+def _free_points(space: Space, points: Float, config: PathsConfig, rng: np.random.Generator) -> Float:
+    points = points[space.is_free(points)]
+    if isinstance(space, FreeSpace) and len(points):
+        points[:, 2] = space.floor_below(points) + rng.uniform(*config.height_m, len(points))
+        points = points[space.is_free(points)]
+    return points
+
+
+class Ways:
+    """Whether a camera can get from one place to another: a graph of free places on a grid over `space`.
+
+    Its edges join neighbours between which a camera can go straight. The grid's step `step_m` is widened where there
+    would be more than `MOST` places.
+    """
+
+    def __init__(self, space: Space, step_m: float) -> None:
+        self.space = space
+        low, high = np.asarray(space.bounds, dtype=np.float64)
+        step_m = max(step_m, float(np.prod(high - low) / MOST) ** (1 / 3))
+        axes = [np.arange(a + step_m / 2, max(b, a + step_m), step_m) for a, b in zip(low, high, strict=True)]
+        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        number = np.full(points.shape[:3], -1)
+        blocks = np.array_split(points.reshape(-1, 3), points.size // (3 * BLOCK) + 1)
+        free = np.concatenate([space.is_free(block) for block in blocks]).reshape(number.shape)
+        number[free] = np.arange(free.sum())
+        self._places: Float = points[free]
+        pairs = []
+        for axis in range(3):
+            here, there = (np.moveaxis(number, axis, 0)[part].ravel() for part in (slice(None, -1), slice(1, None)))
+            both = (here >= 0) & (there >= 0)
+            pairs.append(np.stack([here[both], there[both]], axis=1))
+        edges = np.concatenate(pairs)
+        edges = edges[space.segments_are_free(self._places[edges[:, 0]], self._places[edges[:, 1]])]
+        n = len(self._places)
+        graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
+        self._part = connected_components(graph, directed=False)[1] if n else np.empty(0, dtype=np.int32)
+        self._tree = cKDTree(self._places) if n else None
+
+    def joins(self, a: ArrayLike, b: ArrayLike) -> bool:
+        """Whether the grid has a way between points (3,) m."""
+        return bool(self._parts_near(a) & self._parts_near(b))
+
+    def _parts_near(self, point: ArrayLike) -> set[int]:
+        at = np.asarray(point, dtype=np.float64)
+        if self._tree is None:
+            return set()
+        near = np.atleast_1d(self._tree.query(at, k=min(NEAREST, len(self._places)))[1])
+        straight = self.space.segments_are_free(np.tile(at, (len(near), 1)), self._places[near])
+        return {int(part) for part in self._part[near[straight]]}
+
+
+def plan_pairs(
+    pairs: Float, space: Space, maps: Mapping[str, ViewpointMap], config: PathsConfig, progress: str | None = None
+) -> ComparedPaths:
+    """Plan between pairs by every method; then choose views along the shortest paths by every method.
+
+    `pairs` are starts and goals (P, 2, 3) m, `maps` those of each method but "forward", with scores in [0, 1]. Raises
+    PlanningError if no path was found at all.
+    """
+    paths: list[dict[str, Any]] = []
+    tables: list[pd.DataFrame] = []
+
+    def add(pair: int, task: str, method: str, path: PlannedPath | None) -> None:
+        key = {"pair": pair, "task": task, "method": method}
+        names = ("length_m", "turn_deg", "n_views", "promised")
+        numbers: tuple[float, ...] = (np.nan, np.nan, 0, np.nan)
+        if path is not None:
+            numbers = (path.length_m, path.turn_deg, len(path.positions), float(path.scores.mean()))
+            of_view = {"waypoint": np.arange(len(path.positions)), "score": path.scores}
+            poses = pose_columns(poses_looking_along(path.positions, path.axes))
+            tables.append(pd.DataFrame({**key, **of_view, **poses}))
+        found = {**dict(zip(names, numbers, strict=True)), "found_by": path.found_by if path else ""}
+        paths.append({**key, "planned": path is not None, **found})
+
+    def planned(ends: Float, viewpoint_map: ViewpointMap | None) -> PlannedPath | None:
+        try:
+            return plan_path(ends[0], ends[1], space, space.bounds, viewpoint_map, config.planner, progress=False)
+        except PlanningError:
+            return None
+
+    limits = {name: TurnLimit.of(views.directions, config.max_turn_deg) for name, views in maps.items()}
+    with tqdm(total=len(pairs) * (1 + len(maps)), desc=progress, unit="path", disable=progress is None) as bar:
+        for number, ends in enumerate(pairs):
+            shortest = planned(ends, None)
+            add(number, PLANNED, FORWARD, shortest)
+            bar.update()
+            for name, views in maps.items():
+                add(number, PLANNED, name, planned(ends, views))
+                bar.update()
+            along = None if shortest is None else resample_path(shortest.positions, config.planner.spacing_m)
+            add(number, GIVEN, FORWARD, _looking_ahead(shortest, along))
+            for name, views in maps.items():
+                for rule, choose in RULES.items():
+                    path = None if along is None else _looking_about(along, views, limits[name], config, choose)
+                    add(number, GIVEN, f"{name} {rule}".strip(), path)
+    if not tables:
+        raise PlanningError("no path was found at all", value=f"{len(pairs)} pairs", fix="Raise paths.planner.time_s.")
+    return ComparedPaths(pd.DataFrame(paths), pd.concat(tables, ignore_index=True))
+
+
+def _looking_ahead(shortest: PlannedPath | None, given: Float | None) -> PlannedPath | None:
+    """The path at its waypoints, with the axes of the nearest view of the shortest path."""
+    if shortest is None or given is None:
+        return None
+    nearest = np.linalg.norm(given[:, None] - shortest.positions[None], axis=2).argmin(1)
+    return PlannedPath(given, shortest.axes[nearest], np.full(len(given), np.nan), shortest.cost)
+
+
+def _looking_about(
+    given: Float, viewpoint_map: ViewpointMap, limit: TurnLimit, config: PathsConfig, choose: Rule
+) -> PlannedPath | None:
+    """The views along a given path that a rule chooses within the limits; None where it leads to where none is left."""
+    rows = viewpoint_map.rows(given)
+    low, high = np.sin(np.radians(config.planner.pitch_deg))
+    inside = (limit.directions[:, 2] >= low) & (limit.directions[:, 2] <= high)
+    scores = np.where((rows >= 0)[:, None], viewpoint_map.scores[rows], 0.0).astype(np.float64)
+    try:
+        chosen = choose(np.where(inside, scores, -np.inf), limit)
+    except PlanningError:
+        return None
+    return PlannedPath(given, limit.directions[chosen.direction_ids], chosen.scores, np.nan)

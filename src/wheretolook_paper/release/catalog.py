@@ -1,0 +1,346 @@
+"""Which figure or table of the paper is drawn from which logged run, and what to run where there is none.
+
+Another item is another entry of `ITEMS`: its name, what it is in the paper, the run and file that it needs, the command
+that makes that run, and a function from `Source` to a figure, or to texts by their files' endings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from wheretolook.dataset.layout import Dataset
+from wheretolook.evaluation.calibration import read_calibration
+from wheretolook.evaluation.report import score_markdown
+from wheretolook.evaluation.results import CALIBRATION_CSV, SCORES_CSV
+from wheretolook.evaluation.scores import read_scores
+from wheretolook.figures.calibration import calibration_figure
+from wheretolook.figures.config import FiguresConfig
+from wheretolook.figures.path_film import methods_figure
+from wheretolook.figures.scores import regret_figure, score_figure
+from wheretolook.figures.style import save_figure
+from wheretolook.scorers.registry import learned, load_scorer
+from wheretolook.utils.errors import ConfigError, MissingRunError, WhereToLookError
+from wheretolook.utils.files import write_text
+from wheretolook.utils.markdown import markdown_table
+from wheretolook.utils.tracking import artifact, client, finished_runs
+from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.utils.tracking_store import kept_if_not_logged
+from wheretolook_paper.evaluation.looks import LOOKS_CSV
+from wheretolook_paper.figures.inputs import inputs_figure
+from wheretolook_paper.figures.lattices import fibonacci_figure
+from wheretolook_paper.figures.looks import looks_figure
+from wheretolook_paper.figures.network_walkthrough import learning_figure
+from wheretolook_paper.figures.occlusion import occlusion_figure
+from wheretolook_paper.figures.paths import paths_figure
+from wheretolook_paper.figures.peaks import peaks_figure
+from wheretolook_paper.figures.pipeline import pipeline_figure
+from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
+from wheretolook_paper.figures.sampling import sampling_figure
+from wheretolook_paper.figures.top_n import top_n_figure
+from wheretolook_paper.figures.training import training_figure
+from wheretolook_paper.paths.path_report import PATHS_CSV
+from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV
+from wheretolook_paper.release.copy import is_release, read_about
+from wheretolook_paper.release.paper_architecture import paper_architecture_table
+from wheretolook_paper.release.showcase import Showcase, open_showcase
+from wheretolook_paper.release.showcase_figures import (
+    Learning,
+    learning_of,
+    peaks_of,
+    pipeline_of,
+    planned_views,
+    sampling_of,
+)
+from wheretolook_paper.release.training_histories import HISTORY_CSV, histories, method_of_run, train_runs
+
+if TYPE_CHECKING:
+    from mlflow.entities import Run
+
+    from wheretolook.scorers.base import Scorer
+    from wheretolook.scorers.binned_network import BinnedNetworkScorer
+
+Texts = Mapping[str, str]
+"""A table: its text by the ending of its file, such as "md"."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """What an item is drawn from: the dataset that it is about, and the newest of each kind of run that it needs."""
+
+    dataset: Dataset
+    tracking: TrackingConfig
+    runs: tuple[Run, ...]
+
+    def file(self, name: str) -> Path:
+        """An artifact of the first run."""
+        return artifact(self.tracking, self.runs[0].info.run_id, name)
+
+
+Drawer = Callable[[Source], Figure | Texts]
+
+
+@dataclass(frozen=True)
+class Item:
+    """A figure or a table.
+
+    Attributes:
+        name: of its files.
+        paper: what it is in the paper, such as "Table 2"; "" if the paper has none.
+        what: it shows, in a few words.
+        notebook: that shows it.
+        draw: makes it.
+        stage: tag of the run that it needs; "" for none.
+        file: artifact that the run must have.
+        command: makes such a run; {config} stands for the dataset's configuration, {source} for that of the dataset
+            with meshes: of a release, the one that it was copied from.
+        params: parameters that the run must have; "{dataset}" stands for the dataset's name.
+        of_release: whether only a release has it: it shows a scene made anew from its seed, or other datasets' results.
+        of_source: whether a run of the dataset that a release was copied from serves, too.
+    """
+
+    name: str
+    paper: str
+    what: str
+    notebook: str
+    draw: Drawer
+    stage: str = "evaluate"
+    file: str = SCORES_CSV
+    command: str = "wheretolook evaluate --config {config}"
+    params: tuple[tuple[str, str], ...] = (("dataset", "{dataset}"),)
+    of_release: bool = False
+    of_source: bool = False
+
+    def runs(self, dataset: Dataset, tracking: TrackingConfig) -> tuple[Run, ...]:
+        """The newest run of those that it can be drawn from; of train runs the newest of each method."""
+        found: dict[str, Run] = {}
+        for name in (dataset.name, *([_source_of(dataset)] if self.of_source else [])):
+            params = {key: value.format(dataset=name) for key, value in self.params}
+            if self.stage == "train":
+                trained = train_runs(tracking, params["dataset"], params.get("method", ""), self.file)
+            else:
+                runs = finished_runs(tracking, self.stage, params=params, file=self.file) if self.stage else ()
+                trained = (("", run) for run in runs)
+            for method, run in trained:
+                found.setdefault(method, run)
+        return tuple(found.values())
+
+    def command_for(self, dataset: Dataset) -> str:
+        """What to run to make what is missing."""
+        return self.command.format(config=f"configs/{dataset.name}.yaml", source=f"configs/{_source_of(dataset)}.yaml")
+
+
+def _source_of(dataset: Dataset) -> str:
+    """Name of the dataset that a release was copied from; of another, its own."""
+    return str(read_about(dataset)["source"]) if is_release(dataset) else dataset.name
+
+
+def _of(
+    draw: Callable[[pd.DataFrame], Figure], file: str, read: Callable[[Path], pd.DataFrame] = pd.read_csv
+) -> Drawer:
+    """Draws a figure of the table that lies in an artifact."""
+
+    def drawer(source: Source) -> Figure:
+        return draw(read(source.file(file)))
+
+    return drawer
+
+
+def _of_scores(draw: Callable[[pd.DataFrame], Figure]) -> Drawer:
+    return _of(draw, SCORES_CSV, read_scores)
+
+
+def _score_table(source: Source) -> Texts:
+    scores = read_scores(source.file(SCORES_CSV))
+    return {"md": score_markdown(scores), "csv": scores.to_csv(index=False)}
+
+
+def _training(source: Source) -> Figure:
+    return training_figure(histories(source.tracking, source.dataset.name))
+
+
+def _architecture(source: Source) -> Texts:
+    params = {method_of_run(run): run.data.params for run in source.runs}
+    networks = [params[name] for name, method in learned().items() if method.ships == "network" and name in params]
+    if not networks:
+        raise MissingRunError("none of the paper's networks was trained")
+    table = paper_architecture_table(networks[-1])  # that of most inputs, the paper's proposal
+    return {
+        "md": markdown_table(list(table.columns), table.to_numpy().tolist()) + "\n",
+        "csv": table.to_csv(index=False),
+        "tex": table.to_latex(index=False),
+    }
+
+
+def _paper_table(name: str) -> Drawer:
+    return lambda source: {ending: source.file(f"table_{name}.{ending}").read_text() for ending in ("md", "csv", "tex")}
+
+
+def _lattices(source: Source) -> Figure:
+    return fibonacci_figure()
+
+
+_open = lru_cache(maxsize=1)(open_showcase)
+
+
+def _shown(source: Source, weights: str = "") -> tuple[Showcase, Scorer, int]:
+    """The first test scene of a release, a scorer of it, and a place where looking matters."""
+    showcase = _open(source.dataset)
+    scorer = load_scorer(source.dataset.root / "weights" / weights, showcase.localization_map)
+    return showcase, scorer, showcase.instructive_location()
+
+
+def _learnt(source: Source) -> Learning:
+    showcase, scorer, location = _shown(source, f"{method_of_run(source.runs[0])}.safetensors")
+    return learning_of(showcase, cast("BinnedNetworkScorer", scorer), location)
+
+
+def _pipeline(source: Source) -> Figure:
+    return pipeline_figure(pipeline_of(*_shown(source)))
+
+
+def _learning(source: Source) -> Figure:
+    return learning_figure(*_learnt(source))
+
+
+def _sampling(source: Source) -> Figure:
+    showcase = _open(source.dataset)
+    return sampling_figure(sampling_of(showcase, showcase.instructive_location()))
+
+
+def _inputs(source: Source) -> Figure:
+    return inputs_figure(_learnt(source).image)
+
+
+def _peaks(source: Source) -> Figure:
+    return peaks_figure(*peaks_of(*_shown(source)))
+
+
+def _planning(source: Source) -> Figure:
+    showcase = _open(source.dataset)
+    return methods_figure(planned_views(showcase, source.dataset), showcase.localization_map.landmarks.points)
+
+
+_TRAIN = "wheretolook train --config {config}"
+_BENCH = "python tests/benchmarks/bench_visibility.py{} --out cpu.json && python tests/benchmarks/bench_visibility.py" \
+    " --draw cpu.json --log"  # fmt: skip
+_LOG_RELEASE = "wheretolook log-release --config {config}"
+
+_SET, _PAPERS, _WIDEST = ((("dataset", "{dataset}"), ("method", method)) for method in ("set", "mlp-2d+z", "mlp-2d+3d"))
+_TRAIN_SET = "wheretolook demo --config configs/cameras.yaml"
+_TRAIN_WIDEST = f"{_TRAIN} --train.methods '[mlp-2d+3d]'"
+
+ITEMS: tuple[Item, ...] = (
+    Item("pipeline", "Fig. 1", "from a map to the camera that is turned", "01_pipeline", _pipeline, "train", "",
+         _TRAIN_SET, _SET, of_release=True),
+    Item("learning", "Fig. 2", "a view on its way through the network", "03_inputs", _learning, "train", "", _TRAIN,
+         _PAPERS, of_release=True),
+    Item("viewpoint_generation", "Fig. 3", "voxels, directions, occlusion", "02_sampling", _sampling, "", "",
+         _LOG_RELEASE, of_release=True),
+    Item("spherical_sampling", "Fig. 4", "lattices of directions", "02_sampling", _lattices, "", ""),
+    Item("architecture", "Table 1", "layers of the network", "04_training", _architecture, "train", "", _TRAIN_WIDEST,
+         _WIDEST),
+    Item("table_vs_others", "Table 2", "all methods", "05_tables", _paper_table("vs_others"),
+         file="table_vs_others.md"),
+    Item("planning", "Fig. 5", "the same way by three methods", "07_planning", _planning, "train", "", _TRAIN_SET,
+         _SET, of_release=True),
+    Item("paths", "Fig. 5", "planned paths that localize", "07_planning", _of(paths_figure, PATHS_CSV),
+         "paths", PATHS_CSV, "wheretolook compare-paths --config {source}", of_source=True),
+    Item("runtimes", "Fig. 6", "times of the visibility check", "08_runtimes", _of(runtime_figure, RUNTIMES_CSV),
+         "benchmark", RUNTIMES_CSV, _BENCH.format(""), ()),
+    Item("table_input_variants", "Table 3", "inputs of the network", "05_tables", _paper_table("input_variants"),
+         file="table_input_variants.md"),
+    Item("top_n", "Fig. 7", "several viewpoints of a location", "06_top_n", _of_scores(top_n_figure)),
+    Item("inputs", "", "from an image to an input", "03_inputs", _inputs, "train", "", _TRAIN, _PAPERS,
+         of_release=True),
+    Item("peaks", "", "what the network looks at", "04_training", _peaks, "train", "", _TRAIN_SET, _SET,
+         of_release=True),
+    Item("training", "", "learning curves", "04_training", _training, "train", HISTORY_CSV, _TRAIN),
+    Item("calibration", "", "whether probabilities mean what they say", "04_training",
+         _of(calibration_figure, CALIBRATION_CSV, read_calibration), file=CALIBRATION_CSV),
+    Item("scores", "", "all methods at all thresholds", "05_tables", _of_scores(score_figure)),
+    Item("score_table", "", "all that an evaluation tells", "05_tables", _score_table),
+    Item("regret", "", "what each method loses", "05_tables", _of_scores(regret_figure)),
+    Item("occlusion", "", "what seeing through walls changes", "05_tables", _of_scores(occlusion_figure)),
+    Item("regret_interiors", "", "what each loses on scenes by others", "05_tables", _of_scores(regret_figure),
+         command=_LOG_RELEASE, params=(("dataset", "interiors"),), of_release=True),
+    Item("looks", "", "several looks localized together", "10_looks", _of(looks_figure, LOOKS_CSV), "looks", LOOKS_CSV,
+         "wheretolook evaluate --config {config} # of labels made with --label.store_pixels true"),
+    Item("visibility_scaling", "", "how time and memory grow", "08_runtimes", _of(scaling_figure, SCALING_CSV),
+         "benchmark", SCALING_CSV, _BENCH.format(" --scaling"), ()),
+)  # fmt: skip
+"""The paper's in its order, then those that it has none of."""
+
+
+def catalog_text() -> str:
+    """The catalog for people: name, paper's item, what it shows, notebook, stage of its run."""
+    rows = [[item.name, item.paper or "–", item.what, item.notebook, item.stage or "–"] for item in ITEMS]
+    return markdown_table(["name", "paper", "shows", "notebook", "run"], rows)
+
+
+def check_names(config: FiguresConfig) -> None:
+    """Raise ConfigError unless there are all the items that are asked for."""
+    unknown = set(config.only) - {item.name for item in ITEMS}
+    if unknown:
+        raise ConfigError("unknown figure", value=sorted(unknown), fix="`wheretolook figures --list` names them.")
+
+
+def write_items(
+    dataset: Dataset, tracking: TrackingConfig, config: FiguresConfig = FiguresConfig(),
+    say: Callable[[str], None] = print,
+) -> dict[str, str]:  # fmt: skip
+    """Write all items about a dataset, figures as several kinds of files, and attach them to their runs.
+
+    The files tell the runs that they were drawn from: figures in their metadata (`wheretolook.figures.style.note_of`),
+    Markdown and TeX in a comment. Returns, for each item that could not be made, the command to run first, or what is
+    wrong. Raises as `check_names`.
+    """
+    check_names(config)
+    out = config.out or dataset.root / "results" / "figures"
+    missing = {}
+    for item in ITEMS:
+        if config.only and item.name not in config.only:
+            continue
+        if item.of_release and not is_release(dataset):
+            if item.name in config.only:
+                missing[item.name] = "wheretolook figures --config configs/release.yaml"
+            say(f"{item.name}: only releases have it")
+            continue
+        try:
+            source = Source(dataset, tracking, item.runs(dataset, tracking))
+            if item.stage and not source.runs:
+                missing[item.name] = item.command_for(dataset)
+                say(f"{item.name}: no such run; first: {missing[item.name]}")
+                continue
+            content = item.draw(source)
+        except WhereToLookError as error:
+            missing[item.name] = str(error)
+            say(f"{item.name}: {error}")
+            continue
+        ids = [run.info.run_id for run in source.runs]
+        files = _write(item.name, content, f"runs: {', '.join(ids)} ({item.stage})" if ids else "", out, config.kinds)
+        with kept_if_not_logged(f"{item.name} in {out}"):
+            for run_id in ids:
+                for file in files:
+                    client(tracking).log_artifact(run_id, str(file), "figures")
+        say(f"{item.name}: -> {', '.join(str(file) for file in files)}")
+    return missing
+
+
+def _write(name: str, content: Figure | Texts, note: str, out: Path, kinds: tuple[str, ...]) -> list[Path]:
+    if isinstance(content, Figure):
+        files = [out / f"{name}.{kind}" for kind in kinds]
+        for file in files:
+            save_figure(content, file, note)
+        return files
+    out.mkdir(parents=True, exist_ok=True)
+    comments = {"md": f"\n<!-- {note} -->\n", "tex": f"% {note}\n"} if note else {}
+    for ending, text in content.items():
+        write_text(out / f"{name}.{ending}", text + comments.get(ending, ""))
+    return [out / f"{name}.{ending}" for ending in content]

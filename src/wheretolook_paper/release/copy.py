@@ -1,0 +1,220 @@
+"""A release: a labelled dataset small enough to travel with the code, weights trained on it, and a card about both.
+
+A release is a dataset folder of its own. It has neither meshes nor COLMAP models nor descriptors, so it cannot be
+labelled anew, but it is read, trained on and evaluated as any other.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from wheretolook.dataset.artifact_cache import forget_stamp
+from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.dataset.names import RELEASE_FILE
+from wheretolook.dataset.viewpoint_table import write_table
+from wheretolook.mapping.colmap_model import CAMERAS_FILE, save_mapping_poses
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.scorers.method import Method
+from wheretolook.scorers.registry import learned, scorers
+from wheretolook.utils.confine import entry_of
+from wheretolook.utils.errors import ConfigError, StorageError, TableError, WeightsError
+from wheretolook.utils.files import sha256, write_json
+from wheretolook.utils.reading import read_json_object
+from wheretolook.utils.version import VERSION
+from wheretolook.visibility.occlusion import StoredOcclusion
+
+CARD = "README.md"
+
+SHELF = "others"
+"""Folder beside the shipped weights for those of other methods. Only their records ship."""
+
+MAX_BYTES = 16_000_000  # a release is smaller than this
+
+
+def is_release(dataset: Dataset) -> bool:
+    """Whether a dataset is a release."""
+    return (dataset.root / RELEASE_FILE).is_file()
+
+
+def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> Dataset:
+    """Write a compact copy of a labelled dataset. The same dataset gives the same bytes.
+
+    It holds compact tables (`viewpoints.table.COMPACT_SCHEMA`) without matches, landmarks in half precision without
+    descriptors, the mapping images' poses if they are known, what labels were made with but for the list of shards, and
+    the dataset's settings as JSON values. Weights and results that lie at `root`, `<data>/<release_name>`, stay; if the
+    data changed, the card and the scores of networks that do not ship are removed.
+
+    Raises:
+        ConfigError: the release's folder holds another dataset, or a release of another one.
+        TableError, MapError: a scene's table, landmarks or occlusion are missing or damaged.
+    """
+    before = _release_of(root, dataset.name)
+    fingerprint = None if before is None else before.fingerprint()
+    for scene in before.scenes if before is not None else ():
+        forget_stamp(scene, "label")  # until all is copied, nothing may learn from what is there
+    copied = [
+        (scene, SceneFolder(entry_of(root, scene.name, "a scene's name"), scene.split, scene.camera))
+        for scene in dataset.scenes
+    ]
+    for scene, copy in copied:
+        copy.map.mkdir(parents=True, exist_ok=True)
+        write_table(scene.read_table(), copy.table, compact=True)
+        Landmarks.load(scene.landmarks).save(copy.landmarks, compact=True)
+        StoredOcclusion.load(scene.occlusion).save(copy.occlusion)
+        if (mapping_poses := scene.mapping_poses()) is None:
+            copy.mapping_cameras.unlink(missing_ok=True)
+        else:
+            save_mapping_poses(mapping_poses, copy.mapping_cameras)
+        copy.label_manifest.unlink(missing_ok=True)
+        if scene.label_manifest.is_file():
+            write_json(copy.label_manifest, _manifest(scene.label_manifest))
+    source = {"source": dataset.name, "source_fingerprint": dataset.fingerprint()}
+    write_json(root / RELEASE_FILE, {**source, "code_version": VERSION, "settings": dict(settings)})
+    release = Dataset(root, tuple(copy for _, copy in copied))
+    release.save()
+    for scene in before.scenes if before is not None else ():
+        if scene.name not in {copy.name for copy in release.scenes}:
+            shutil.rmtree(scene.folder, ignore_errors=True)
+    if release.fingerprint() != fingerprint:
+        for outdated in (CARD, "results/variants.csv"):
+            (root / outdated).unlink(missing_ok=True)
+    return release
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What of the weights in a release's folder ships, by the validation average precision of each."""
+
+    network: Path  # the best of the paper's networks
+    best: Path  # the best of all, used where none are named; may be the network
+    shelved: tuple[Path, ...]  # the rest
+    precision: dict[str, float]  # of all, by their file's name without its ending
+
+
+def trained_weights(release: Dataset) -> dict[Path, Method]:
+    """The weights in a release's folder of methods that score views by themselves, and these methods."""
+    from wheretolook.training.provenance import weights_path
+
+    paths = {weights_path(release, name): method for name, method in learned().items() if name in scorers()}
+    return {path: method for path, method in paths.items() if path.is_file()}
+
+
+def choose_weights_to_ship(release: Dataset) -> Choice:
+    """Choose the paper's network by validation average precision, and the best of all by `preference`.
+
+    Raises WeightsError if the paper's network has no weights, or if weights or their record do not fit the release.
+    """
+    from wheretolook.training.provenance import was_trained_on
+    from wheretolook.training.weights import preference, read_record, read_training
+
+    folder = release.root / "weights"
+    fix = f"Run `wheretolook train --config configs/{release.name}.yaml`."
+    precision: dict[Path, float] = {}
+    methods = trained_weights(release)
+    for path in methods:
+        record = read_record(path)
+        training = read_training(path)
+        if record["about"] != training or not was_trained_on(release, training):
+            raise WeightsError("these weights were not trained on this release", path=path, fix=fix)
+        precision[path] = float(record["metrics"]["val_average_precision"])
+    if not precision:
+        raise WeightsError("there are no weights to ship", path=folder, fix=fix)
+    networks = [path for path, method in methods.items() if method.ships == "network"]
+    if not networks:
+        raise WeightsError("there are no weights to ship of the paper's network", path=folder, fix=fix)
+    network = max(networks, key=lambda path: precision[path])
+    able = [path for path, method in methods.items() if path == network or method.ships == "best"]
+    best = max(able, key=preference)
+    shelved = tuple(path for path in precision if path not in (network, best))
+    return Choice(network, best, shelved, {path.stem: value for path, value in precision.items()})
+
+
+def ship_weights(release: Dataset) -> Choice:
+    """Choose what ships; store the weights of the paper's network in half precision, put the rest on the shelf.
+
+    The shelf is `weights/others/`, where no evaluation finds them. A matchability model stays where it is: methods that
+    weight landmarks need it. Done again, nothing changes. Raises as `choose_weights_to_ship`.
+    """
+    from wheretolook.training.weights import read_record, save_in_half
+
+    choice = choose_weights_to_ship(release)
+    folder = release.root / "weights"
+    for path in choice.shelved:
+        (folder / SHELF).mkdir(exist_ok=True)
+        for file in (path, path.with_suffix(".json")):
+            os.replace(file, folder / SHELF / file.name)
+    record = read_record(choice.network)
+    save_in_half(choice.network)
+    write_json(choice.network.with_suffix(".json"), {**record, "weights_sha256": sha256(choice.network)})
+    return choice
+
+
+def sizes(root: Path, weights: bool = True) -> dict[str, int]:
+    """Bytes of what ships of the release at `root`, by kind of file. Figures and shelved weights do not ship.
+
+    Without `weights` none are counted, for as long as it is not chosen which of them ship. Raises StorageError if the
+    release is not smaller than `MAX_BYTES`.
+    """
+    kinds = {"viewpoints.parquet": "tables", "landmarks.npz": "landmarks", CAMERAS_FILE: "cameras"}
+    kinds["occlusion.npz"] = "occlusion"
+    parts = dict.fromkeys((*kinds.values(), "weights", "text"), 0)
+    for path in root.rglob("*"):
+        shelved = path.suffix == ".safetensors" and (path.parent.name == SHELF or not weights)
+        drawn = path.suffix in (".png", ".partial", ".lock") or path.parent == root / "results" / "figures"
+        if path.is_file() and not shelved and not drawn:
+            parts["weights" if path.suffix == ".safetensors" else kinds.get(path.name, "text")] += path.stat().st_size
+    if sum(parts.values()) >= MAX_BYTES:
+        problem = f"the release is not smaller than {MAX_BYTES / 1e6:.0f} MB"
+        fix = "Label fewer viewpoints or scenes, or map with fewer landmarks."
+        raise StorageError(problem, path=root, value=size_text(parts), fix=fix)
+    return parts
+
+
+def size_text(parts: Mapping[str, int]) -> str:
+    """Sizes for people: "tables 4.81 MB, ..., in all 13.20 MB"."""
+    return ", ".join(f"{name} {size / 1e6:.2f} MB" for name, size in {**parts, "in all": sum(parts.values())}.items())
+
+
+def read_about(release: Dataset) -> dict[str, Any]:
+    """What a release was made from: source, source_fingerprint, code_version and settings.
+
+    Raises ConfigError if the file is missing or damaged.
+    """
+    path = release.root / RELEASE_FILE
+    try:
+        about = read_json_object(path)
+        return {name: about[name] for name in ("source", "source_fingerprint", "code_version", "settings")}
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        fix = "Run `wheretolook release` on its source."
+        raise ConfigError(f"not the description of a release: {error}", path=path, fix=fix) from error
+
+
+def _release_of(root: Path, source: str) -> Dataset | None:
+    """The release that lies at `root`, which must be of the same source; None if there is nothing yet."""
+    if not (root / "dataset.json").is_file():
+        return None
+    release = Dataset.load(root)
+    fix = "Move it elsewhere first."
+    if not is_release(release):
+        raise ConfigError("this dataset is no release and would be overwritten", path=root, fix=fix)
+    found = read_about(release)["source"]
+    if found != source:
+        raise ConfigError(f"here lies the release of another dataset than {source}", path=root, value=found, fix=fix)
+    return release
+
+
+def _manifest(path: Path) -> dict[str, Any]:
+    """What labels were made with, but for the shards, of which there are thousands, and the matches, which stay."""
+    try:
+        content = read_json_object(path)
+        return {
+            name: value for name, value in content.items() if name not in ("shards", "store_matches", "store_pixels")
+        }
+    except (ValueError, AttributeError) as error:
+        fix = "Remove it, or label the scene again."
+        raise TableError(f"not what the label stage wrote: {error}", path=path, fix=fix) from error

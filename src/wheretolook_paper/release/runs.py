@@ -1,0 +1,266 @@
+"""What a release holds as MLflow runs: notebooks, figures and MLflow's UI then work on a fresh clone at once.
+
+A release ships the tables of its evaluation, the records of its training and what studies found, but no MLflow store.
+Here they are logged as the stages log them, once: a run with the same file as its artifact is found again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.thresholds import ALL
+from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good
+from wheretolook.evaluation.results import SCORES_CSV, best_of, evaluation_params, runs_of_rows
+from wheretolook.evaluation.scores import read_scores
+from wheretolook.scorers.registry import learned
+from wheretolook.utils.files import temporary_folder, write_text
+from wheretolook.utils.locks import hold
+from wheretolook.utils.tracking import NestedRun, artifact, experiment_ids, finished_runs, log, log_nested, start_run
+from wheretolook.utils.tracking import client as client_of
+from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.utils.tracking_layout import ALL_METHODS, AUC, BEST_TAG, REGRET, joined
+from wheretolook_paper.evaluation.looks import LOOKS_CSV, log_looks
+from wheretolook_paper.paths.path_report import PATHS_CSV, log_paths
+from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
+from wheretolook_paper.release.card import GENERALIZATION_CSV
+from wheretolook_paper.release.training_histories import (
+    HISTORY_CSV,
+    TRAINING_CSV,
+    kept_metrics,
+    log_history,
+    params_of,
+    read_histories,
+    records,
+)
+from wheretolook_paper.release.training_histories import train_runs as runs_of_training
+
+LEARNERS_CSV = "learners.csv"
+"""In a release's `results/`: how all learners do on scenes of validation, test and others, a row for each seed."""
+
+_WAIT_S = 600.0  # for another process that logs a release, in seconds
+TAGS = {"logged_from": "release"}  # of runs that were not computed where they are logged
+
+Say = Callable[[str], None]
+Values = dict[str, Any]
+
+
+@dataclass
+class ReleaseRuns:
+    """Ids of the runs of a release in a store; None for what the release does not have."""
+
+    evaluate: dict[str, str] = field(default_factory=dict)  # by the dataset evaluated on, the release first
+    train: dict[str, str] = field(default_factory=dict)  # by the method
+    learners: str | None = None
+    paths: str | None = None
+    looks: str | None = None
+    benchmark: str | None = None
+    new: int = 0  # how many of all these were logged now
+
+
+def log_release(dataset: Dataset, tracking: TrackingConfig, say: Say = lambda text: None) -> ReleaseRuns:
+    """Log those runs of a release that the store lacks. Returns all of them, also those that were there.
+
+    The store is made if there is none. Runs that a killed call left unfinished are deleted first; calls made at the
+    same time wait for each other.
+    """
+    with hold(tracking.root / ".release.lock", "log-release", wait_s=_WAIT_S):
+        _forget_halves(tracking)
+        return _log_missing(dataset, tracking, say)
+
+
+def _forget_halves(tracking: TrackingConfig) -> None:
+    """Delete the unfinished runs of a release, and those nested in them."""
+    mlflow = client_of(tracking)
+    experiments = experiment_ids(mlflow, tracking)
+
+    def matching(condition: str) -> list[str]:
+        found = mlflow.search_runs(experiments, condition, max_results=10_000) if experiments else ()
+        return [str(run.info.run_id) for run in found]
+
+    tagged = " and ".join(f"tags.{name} = '{value}'" for name, value in TAGS.items())
+    for half in matching(f"{tagged} and attributes.status != 'FINISHED'"):
+        for run_id in (*matching(f"tags.`mlflow.parentRunId` = '{half}'"), half):
+            mlflow.delete_run(run_id)
+
+
+def _log_missing(dataset: Dataset, tracking: TrackingConfig, say: Say) -> ReleaseRuns:
+    runs = ReleaseRuns()
+    results = dataset.root / "results"
+
+    def keep(name: str, found: str | None, make: Callable[..., str], *arguments: Any) -> str:
+        if found is not None:
+            return found
+        say(f"logging {name}")
+        runs.new += 1
+        return make(*arguments, tracking)
+
+    if (scores := results / SCORES_CSV).is_file():
+        found = _found(tracking, "evaluate", SCORES_CSV, scores.read_bytes())
+        runs.evaluate[dataset.name] = keep("the evaluation", found, _log_scores, dataset)
+    if (others := results / GENERALIZATION_CSV).is_file():
+        for key, rows in read_scores(others).groupby("dataset", sort=False):
+            name = str(key)
+            table = rows.drop(columns=["dataset", "weights_sha256"]).reset_index(drop=True)
+            found = _found(tracking, "evaluate", SCORES_CSV, table.to_csv(index=False).encode())
+            runs.evaluate[name] = keep(f"the evaluation on {name}", found, _log_others, name, table, dataset)
+    histories = dict(iter(read_histories(results / TRAINING_CSV).groupby("method")))
+    for path, record in records(dataset.root / "weights").items():
+        method = record["about"]["method"]
+        history = histories.get(method)
+        found = _train_run(tracking, path, record, history is not None)
+        runs.train[method] = keep(f"the training of {method}", found, _log_training, dataset, path, record, history)
+    learners = (LEARNERS_CSV, "learners", _log_learners)
+    paths = (PATHS_CSV, "paths", _log_paths)
+    looks = (LOOKS_CSV, "looks", _log_looks)
+    times = (RUNTIMES_CSV, "benchmark", _log_benchmark)
+    for file, stage, log_file in (learners, paths, looks, times):
+        if (results / file).is_file():
+            found = _found(tracking, stage, file, (results / file).read_bytes())
+            setattr(runs, stage, keep(file, found, log_file, dataset))
+    return runs
+
+
+def _found(tracking: TrackingConfig, stage: str, name: str, content: bytes) -> str | None:
+    """Id of the newest run of a stage that has this file as an artifact."""
+    for run in finished_runs(tracking, stage, file=name):
+        if artifact(tracking, run.info.run_id, name).read_bytes() == content:
+            return str(run.info.run_id)
+    return None
+
+
+def _train_run(tracking: TrackingConfig, path: Path, record: dict[str, Any], with_history: bool) -> str | None:
+    """The run that trained these weights, or the one that was logged from their record."""
+    method = record["about"]["method"]
+    for _, run in runs_of_training(tracking, method=method, file=HISTORY_CSV if with_history else ""):
+        logged = artifact(tracking, run.info.run_id, path.name)
+        if run.info.run_id == record["run_id"] or (logged.is_file() and logged.read_bytes() == path.read_bytes()):
+            return str(run.info.run_id)
+    return None
+
+
+def _log_scores(dataset: Dataset, tracking: TrackingConfig) -> str:
+    """The evaluation on the release's own test scenes, as the evaluate stage logs it, without tables of locations."""
+    results = dataset.root / "results"
+    scenes = dataset.split("test")
+    table = read_scores(results / SCORES_CSV)
+    named = (dataset.root / "weights" / f"{name}.safetensors" for name in learned())
+    params = {**evaluation_params(dataset, scenes, [path for path in named if path.is_file()]), **_choices(table)}
+    views = pd.concat([scene.read_table() for scene in scenes])
+    views = views[views["status"] != UNLABELLED]
+    metrics = {"n_views": float(len(views)), "positives": float(is_good(views).mean())}
+    files = [path for path in results.iterdir() if path.is_file() and path.suffix != ".png"]
+    return _log_evaluation(dataset.name, table, params, metrics, files, tracking)
+
+
+def _log_others(name: str, table: pd.DataFrame, dataset: Dataset, tracking: TrackingConfig) -> str:
+    """An evaluation on another dataset, which does not ship."""
+    scenes = " ".join(scene for scene in table["scene"].unique() if scene != ALL)
+    params = {"dataset": name, "scenes": scenes, "weights": f"of {dataset.name}", **_choices(table)}
+    with temporary_folder() as folder:
+        path = folder / SCORES_CSV
+        path.write_bytes(table.to_csv(index=False).encode())
+        return _log_evaluation(name, table, params, {}, [path], tracking)
+
+
+def _choices(table: pd.DataFrame) -> Values:
+    """Those options of an evaluation that its table shows."""
+    choices = {name: tuple(table[name].unique().tolist()) for name in ("top_n", "occlusion", "candidates")}
+    return {**choices, "reference": table["reference"].iloc[0]}
+
+
+def _log_evaluation(
+    name: str, table: pd.DataFrame, params: Values, metrics: Values, files: list[Path], tracking: TrackingConfig
+) -> str:
+    best, first = best_of(table)
+    metrics |= {**first, "n_locations": float(table.loc[table["scene"] == ALL, "n_locations"].iloc[0])}
+    tags = {**TAGS, "dataset": name, **best}
+    with start_run(tracking, ALL_METHODS, "evaluate", params, tags=tags) as (mlflow, run):
+        log(mlflow, run, metrics=metrics)
+        for path in files:
+            mlflow.log_artifact(run, str(path))
+        log_nested(tracking, run, "evaluate", runs_of_rows(table, params), TAGS)
+    return run
+
+
+def _log_training(
+    dataset: Dataset, path: Path, record: dict[str, Any], history: pd.DataFrame | None, tracking: TrackingConfig
+) -> str:
+    """A train run as of the release, in which its weights lie, wherever they have learnt."""
+    about = {**record["about"], "dataset": dataset.name}
+    learnt_from = {}
+    if record["about"]["dataset"] != dataset.name:
+        learnt_from = {"learnt_from": record["about"]["dataset"]}
+    tags = {**TAGS, "trained_as": str(record["run_id"])}
+    with start_run(tracking, about["method"], "train", params_of(about) | learnt_from, tags=tags) as (mlflow, run):
+        log(mlflow, run, metrics=kept_metrics(record["metrics"]))
+        mlflow.log_artifact(run, str(path))
+        if history is not None:
+            history = history.drop(columns="method").dropna(axis=1, how="all")
+            log_history(tracking, run, history)
+            write_text(artifact(tracking, run, HISTORY_CSV), history.to_csv(index=False))
+    return run
+
+
+def _log_learners(dataset: Dataset, tracking: TrackingConfig) -> str:
+    """The comparison of learners: nested, one run for each, what it learnt from, and seed.
+
+    The run itself has the metrics to sort by of the learner with the least regret, the mean over its seeds.
+    """
+    path = dataset.root / "results" / LEARNERS_CSV
+    table = pd.read_csv(path, dtype=str, keep_default_na=False)
+    nested = []
+    for key, rows in table.groupby(["learner", "learnt_from", "seed"], sort=False):
+        numbers: dict[str, float] = {}
+        for measure in ("average_precision", "roc_auc", "ece", "regret"):
+            values = pd.to_numeric(rows[measure])
+            means = values.groupby(rows["split"]).mean()
+            numbers |= {f"{measure}_{split}": float(mean) for split, mean in means.items()}
+            if measure in ("average_precision", "regret"):
+                numbers |= {f"{measure}/{scene}": float(x) for scene, x in zip(rows["scene"], values, strict=True)}
+        sorted_by = {REGRET: "regret_test", AUC: "roc_auc_test"}
+        numbers |= {name: numbers[measure] for name, measure in sorted_by.items() if measure in numbers}
+        named = dict(zip(("learner", "learnt_from", "seed"), map(str, key), strict=True))
+        seed = f"seed {named['seed']}" if named["seed"] else ""
+        what = joined(named["learner"], named["learnt_from"], seed)
+        nested.append(NestedRun(what, {"dataset": dataset.name, **named}, numbers))
+    by_learner = [{"what": joined(one.params["learner"], one.params["learnt_from"]), **one.metrics} for one in nested]
+    of_learner = pd.DataFrame(by_learner).groupby("what").mean().filter((REGRET, AUC))
+    tags = dict(TAGS)
+    first = {}
+    if REGRET in of_learner:
+        best = str(of_learner[REGRET].idxmin())
+        tags[BEST_TAG] = best
+        first = {str(name): float(of_learner[name][best]) for name in of_learner}
+    about = {"dataset": dataset.name}
+    with start_run(tracking, "all learners", "learners", about, tags=tags) as (mlflow, run):
+        log(mlflow, run, metrics=first)
+        mlflow.log_artifact(run, str(path))
+        log_nested(tracking, run, "learners", nested, TAGS)
+    return run
+
+
+def _log_paths(dataset: Dataset, tracking: TrackingConfig) -> str:
+    results = dataset.root / "results"
+    return log_paths({"dataset": dataset.name}, pd.read_csv(results / PATHS_CSV), results, tracking, TAGS)
+
+
+def _log_looks(dataset: Dataset, tracking: TrackingConfig) -> str:
+    """The comparison of looks on the test scenes, with a nested run for each way to choose and number of looks."""
+    file = dataset.root / "results" / LOOKS_CSV
+    table = pd.read_csv(file)
+    params = {"dataset": dataset.name, "split": "test"}
+    return log_looks(tracking, table[table["split"] == "test"], params, [file], TAGS)
+
+
+def _log_benchmark(dataset: Dataset, tracking: TrackingConfig) -> str:
+    results = dataset.root / "results"
+    times = results / RUNTIMES_CSV
+    scaling = results / SCALING_CSV
+    growth = pd.read_csv(scaling) if scaling.is_file() else pd.DataFrame()
+    return log_runtimes(tracking, pd.read_csv(times), growth, TAGS, times)

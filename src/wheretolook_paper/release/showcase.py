@@ -1,0 +1,172 @@
+"""A scene of the release as figures show it: its mesh made anew from the seed, its map, its viewpoints, what they see.
+
+A release has no meshes. An apartment follows from the release's settings and the seed in the scene's name; that it is
+the one that was labelled shows in its occlusion, which must be what the release has stored.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import cached_property
+from typing import cast, get_args
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+
+from wheretolook.dataset.environment import Scene, SceneConfig
+from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.names import RELEASE_FILE
+from wheretolook.dataset.sampling import free_locations
+from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.viewpoint_table import instructive_location, is_good
+from wheretolook.figures.dollhouse import Dollhouse, dollhouse
+from wheretolook.geometry.lattices import VoxelGrid
+from wheretolook.geometry.poses import Float
+from wheretolook.scenes.config import ApartmentConfig, SceneKind
+from wheretolook.space.config import FreeSpaceConfig
+from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.options import recorded
+from wheretolook.visibility.config import OcclusionConfig
+from wheretolook.visibility.occlusion import StoredOcclusion
+from wheretolook_paper.release.copy import read_about
+from wheretolook_rooms.generator import generate_scene
+
+EYE_M = 1.45  # height of the locations that figures show, unless told otherwise: about that of the mapping cameras
+SAME_OCCLUSION = 0.999  # share of the lines of sight that must be as stored; what differs is rounding
+
+_CHECKED = 16  # locations whose lines of sight are compared
+
+_SEEDED = re.compile(rf"({'|'.join(get_args(SceneKind))})-(\d+)")
+
+
+class Showcase(Scene):
+    """A scene of a release with everything that figures need; its mesh tells what is occluded."""
+
+    sampling: SampleConfig  # how its viewpoints were sampled
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """The scene's viewpoints."""
+        return self.files.read_table()
+
+    @cached_property
+    def grid(self) -> VoxelGrid:
+        """Voxels whose centres are the locations."""
+        return self.sampling.voxels(self.space.bounds)
+
+    @cached_property
+    def free(self) -> NDArray[np.int64]:
+        """Ids of the locations in free space, (L,) ascending."""
+        return free_locations(self.grid, self.space)
+
+    @cached_property
+    def directions(self) -> Float:
+        """Optical axes sampled at each location, (D, 3) unit vectors."""
+        return self.sampling.axes()
+
+    @property
+    def keep(self) -> int:
+        """K, the directions that the paper keeps of each location."""
+        return self.sampling.keep or SampleConfig().keep
+
+    @cached_property
+    def house(self) -> Dollhouse:
+        """The scene obliquely from above, cut at the height of eyes."""
+        return dollhouse(self.mesh, cut_m=self._floor + EYE_M, device=self.device)
+
+    @cached_property
+    def plan(self) -> Dollhouse:
+        """The scene from straight above."""
+        return dollhouse(self.mesh, elevation_deg=90, device=self.device)
+
+    @property
+    def _floor(self) -> float:
+        return float(self.mesh.bounds[0, 2])
+
+    def render(self, cam_from_world: ArrayLike) -> NDArray[np.uint8]:
+        """What cameras (B, 3, 4) see, (B, H, W, 3)."""
+        return self.renderer.render(self.camera, cam_from_world).rgb
+
+    def layer(self, height_m: float = EYE_M) -> NDArray[np.int64]:
+        """Ids of all voxels, free or not, of the layer that holds a height above the floor, (nx ny,)."""
+        nz = self.grid.shape[2]
+        z = (self._floor + height_m - self.grid.lower[2]) / self.grid.voxel_m[2]
+        ids = np.arange(len(self.grid))
+        return ids[ids % nz == np.clip(int(z), 0, nz - 1)]
+
+    def center(self, location_id: int) -> Float:
+        """(3,) metres, of a location."""
+        return self.grid.centers()[location_id]
+
+    def nearest_location(self, point: ArrayLike) -> int:
+        """The location with viewpoints that is nearest to a world point (3,) m."""
+        ids = np.unique(self.table["location_id"].to_numpy(np.int64))
+        apart = np.linalg.norm(self.grid.centers()[ids] - np.asarray(point, dtype=np.float64), axis=1)
+        return int(ids[np.argmin(apart)])
+
+    def summary(self) -> str:
+        """How much of everything there is, as a sentence."""
+        n_locations = self.table["location_id"].nunique()
+        good = is_good(self.table).mean()
+        cameras = "" if self.mapping_poses is None else f" of {len(self.mapping_poses)} images"
+        return (
+            f"**{self.name}**: {len(self.mesh.triangles):,} triangles; a map{cameras} with "
+            f"{len(self.landmarks):,} landmarks; {len(self.table):,} labelled viewpoints at {n_locations} locations, "
+            f"of which {good:.0%} localize."
+        )
+
+    def viewpoints(self, location_id: int) -> pd.DataFrame:
+        """Rows of the table at a location. Raises ConfigError if it has none."""
+        rows = self.table[self.table["location_id"] == location_id]
+        if len(rows) == 0:
+            fix = "Take one of the table's location_id."
+            raise ConfigError("no viewpoint was sampled at this location", value=location_id, fix=fix)
+        return rows
+
+    def instructive_location(self, height_m: float = EYE_M) -> int:
+        """The location of a layer where to look matters most; if the layer has no viewpoint, one of any height."""
+        rows = self.table[self.table["location_id"].isin(self.layer(height_m))]
+        return instructive_location(rows if len(rows) else self.table)
+
+
+def open_showcase(dataset: Dataset, name: str | None = None, device: str = "cpu") -> Showcase:
+    """A scene of a release of generated apartments, by default the first test scene.
+
+    Raises:
+        ConfigError: it is no release, its description is damaged, or it has no such scene.
+        SceneError: the scene was not generated from a seed, or what this code makes of the seed is not the scene that
+            was labelled.
+    """
+    about = dataset.root / RELEASE_FILE
+    if not about.is_file():
+        fix = "Open one that `wheretolook release` made."
+        raise ConfigError("this dataset is no release", path=dataset.root, fix=fix)
+    settings = read_about(dataset)["settings"]
+    scene = dataset.scene(name) if name else (*dataset.split("test"), *dataset.scenes)[0]
+    seeded = _SEEDED.fullmatch(scene.name)
+    if seeded is None:
+        raise SceneError("this scene was not generated from a seed", path=scene.folder, value=scene.name)
+    occlusion = recorded(OcclusionConfig, {**settings["occlusion"], "model": "mesh"})
+    config = SceneConfig(occlusion, recorded(FreeSpaceConfig, settings["scenes"]["free_space"]))
+    kind = cast(SceneKind, seeded[1])
+    apartment = recorded(ApartmentConfig, settings["scenes"]["apartment"])
+    mesh, _ = generate_scene(kind, apartment, int(seeded[2]), device=device)
+    showcase = Showcase(scene, None, config, device, mesh)
+    showcase.sampling = recorded(SampleConfig, settings["sample"])
+    if settings["occlusion"]["model"] == "mesh":
+        _check_same(showcase)
+    return showcase
+
+
+def _check_same(scene: Scene) -> None:
+    """Raise a SceneError if lines of sight are not those stored."""
+    stored = StoredOcclusion.load(scene.files.occlusion)
+    points = scene.landmarks.points
+    some = stored.locations[:: max(1, len(stored.locations) // _CHECKED)]
+    same = (scene.occlusion.unoccluded(some, points) == stored.unoccluded(some, points)).mean()
+    if not same >= SAME_OCCLUSION:
+        problem = "made anew from its seed, the scene is not the one that was labelled"
+        value = f"{same:.1%} of the lines of sight are as stored"
+        fix = "Check out the version of the code that release.json names."
+        raise SceneError(problem, path=scene.files.folder, value=value, fix=fix)

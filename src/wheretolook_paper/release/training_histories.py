@@ -1,0 +1,154 @@
+"""What a train run in the tracking store holds: its parameters, and the metrics of every epoch, its history."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from io import StringIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from wheretolook.dataset.layout import Dataset
+from wheretolook.training.old_names import name_of_variant, with_name, with_names
+from wheretolook.utils.errors import WeightsError
+from wheretolook.utils.files import write_text
+from wheretolook.utils.reading import read_json_object
+from wheretolook.utils.tracking import artifact, client, finished_runs
+from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.utils.tracking_layout import AUC
+
+if TYPE_CHECKING:
+    from mlflow.entities import Run
+
+HISTORY_CSV = "history.csv"  # artifact of a train run: a row an epoch
+
+TRAINING_CSV = "training.csv"
+"""In a release's `results/`: the histories of all that was trained, one below the other, with a column `method`."""
+
+NOT_LOGGED = "not_logged"
+"""In the record of weights whose training is not logged yet: "params" and "history", the text of `HISTORY_CSV`."""
+
+LOG_AT_MOST = 1000  # metrics MLflow takes at a time
+
+
+def params_of(about: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters of a train run, from what its weights' record tells about it."""
+    return {name: about[name] for name in ("method", "dataset", "dataset_fingerprint")} | about["config"]
+
+
+def kept_metrics(metrics: Mapping[str, float]) -> dict[str, float]:
+    """Metrics of a train run that tell about the weights kept, given those of their epoch; that to sort by first."""
+    first = {AUC: metrics["val_roc_auc"]} if "val_roc_auc" in metrics else {}
+    return first | {f"kept_{name}": value for name, value in metrics.items()}
+
+
+def method_of_run(run: Run) -> str:
+    """The name of the method that a train run has trained."""
+    params = run.data.params
+    return str(params["method"]) if "method" in params else name_of_variant(params.get("variant", ""))
+
+
+def train_runs(
+    tracking: TrackingConfig, dataset: str = "", method: str = "", file: str = ""
+) -> Iterator[tuple[str, Run]]:
+    """Finished train runs, the newest first, with the names of their methods; "" is for any."""
+    for run in finished_runs(tracking, "train", params={"dataset": dataset} if dataset else None, file=file):
+        name = method_of_run(run)
+        if not method or name == method:
+            yield name, run
+
+
+def histories(tracking: TrackingConfig, dataset: str) -> dict[str, pd.DataFrame]:
+    """The history of the newest run of each method trained on a dataset, by the method; empty without any."""
+    found: dict[str, pd.DataFrame] = {}
+    for method, run in train_runs(tracking, dataset, file=HISTORY_CSV):
+        if method not in found:
+            found[method] = pd.read_csv(artifact(tracking, run.info.run_id, HISTORY_CSV))
+    return dict(sorted(found.items()))
+
+
+def trained(tracking: TrackingConfig, dataset: str) -> pd.DataFrame:
+    """What the newest run of each method trained on a dataset kept, a row a method, the best first.
+
+    Columns: `method`, `epoch` whose weights were kept, and on the validation views `average_precision`, `roc_auc` and
+    `calibration_error`, NaN where the learner does not measure it.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for method, run in train_runs(tracking, dataset):
+        kept = run.data.metrics
+        measures = {name: kept.get(f"kept_val_{name}", float("nan")) for name in _MEASURES}
+        found.setdefault(method, {"method": method, "epoch": kept.get("kept_epoch", float("nan")), **measures})
+    table = pd.DataFrame(list(found.values()), columns=["method", "epoch", *_MEASURES])
+    table["epoch"] = table["epoch"].astype("Int64")
+    return table.sort_values("average_precision", ascending=False, ignore_index=True)
+
+
+_MEASURES = ("average_precision", "roc_auc", "calibration_error")
+
+
+def history_not_logged(record: Mapping[str, Any]) -> pd.DataFrame | None:
+    """The history in the record of a training that is not logged yet; None if there is none."""
+    kept = record.get(NOT_LOGGED)
+    text = kept.get("history") if isinstance(kept, dict) else None
+    return pd.read_csv(StringIO(text), float_precision="round_trip") if isinstance(text, str) and text else None
+
+
+def log_history(tracking: TrackingConfig, run_id: str, history: pd.DataFrame) -> None:
+    """Log a history, one row for each `epoch`, as training itself does. What is not finite is left out."""
+    from mlflow.entities import Metric
+
+    start = int(client(tracking).get_run(run_id).info.start_time)
+    metrics = [
+        Metric(str(name), float(value), start + int(row["epoch"]), int(row["epoch"]))
+        for row in history.to_dict("records")
+        for name, value in row.items()
+        if name != "epoch" and pd.notna(value)
+    ]
+    for begin in range(0, len(metrics), LOG_AT_MOST):
+        client(tracking).log_batch(run_id, metrics=metrics[begin : begin + LOG_AT_MOST])
+
+
+def records(folder: Path) -> dict[Path, dict[str, Any]]:
+    """Records of training in a folder of weights and the folders in it, by their files. WeightsError if damaged."""
+    found = {}
+    for path in sorted(folder.rglob("*.json")):
+        try:
+            record = read_json_object(path)
+            found[path] = record | {"about": with_name(record["about"])}
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise WeightsError(f"not a record of training: {error}", path=path, fix="Train again.") from error
+    return found
+
+
+def read_histories(path: Path) -> pd.DataFrame:
+    """`TRAINING_CSV`; empty if there is none."""
+    return with_names(pd.read_csv(path)) if path.is_file() else pd.DataFrame({"method": []})
+
+
+def keep_histories(release: Dataset, tracking: TrackingConfig) -> pd.DataFrame:
+    """Write `results/training.csv` of a release: histories of what was trained on it, as far as the store has them.
+
+    A history is that of the run that trained the weights, or else of the newest with the same parameters. Methods
+    without any keep the rows that the file has already.
+    """
+    path = release.root / "results" / TRAINING_CSV
+    known = read_histories(path)
+    kept = []
+    for record in records(release.root / "weights").values():
+        method = record["about"]["method"]
+        history = None
+        same = {name: str(value) for name, value in params_of(record["about"]).items() if name != "method"}
+        runs = (run for _, run in train_runs(tracking, same["dataset"], method, HISTORY_CSV))
+        alike = [run for run in runs if same.items() <= run.data.params.items()]
+        own = [run for run in alike if run.info.run_id == record["run_id"]]
+        for run in (own or alike)[:1]:
+            history = pd.read_csv(artifact(tracking, run.info.run_id, HISTORY_CSV))
+        if history is None:
+            history = history_not_logged(record)
+        rows = known[known["method"] == method] if history is None else history.assign(method=method)
+        kept.append(rows[["method", *rows.columns.drop("method")]])
+    table = pd.concat([rows for rows in kept if len(rows)], ignore_index=True) if any(map(len, kept)) else known
+    if len(table):
+        write_text(path, table.to_csv(index=False, float_format="%.5g", lineterminator="\n"))
+    return table

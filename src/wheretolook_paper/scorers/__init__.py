@@ -1,0 +1,1 @@
+"""Baselines and learners that do not ship, registered by entry points."""

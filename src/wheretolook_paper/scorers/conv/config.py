@@ -1,0 +1,30 @@
+"""Options of the convolutional network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from wheretolook.training.config import FittingConfig, check_at_least, check_share
+from wheretolook.utils.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class ConvConfig(FittingConfig):
+    """Options of the convolutional network over the bins.
+
+    Args:
+        widths: channels after each convolution; every one but the first halves the sides of the grid.
+        dropout: share of pooled values dropped in training.
+        bins: bins along each side of the image.
+    """
+
+    widths: tuple[int, ...] = (32, 64, 128, 128)
+    dropout: float = 0.2
+    bins: int = 30
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.widths or min(self.widths) < 1:
+            raise ConfigError("there must be a convolution, and each at least one channel wide", value=self.widths)
+        check_at_least(self, 1, "bins")
+        check_share(self, "dropout")

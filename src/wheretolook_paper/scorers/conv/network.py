@@ -1,0 +1,66 @@
+"""A small convolutional network over the grid of bins: the paper's input kept as the image that it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import relu
+
+from wheretolook.inputs.bins import InputStatistics
+from wheretolook.scorers.binned_network import BinnedNetwork, StandardBins, stored_statistics
+
+
+@dataclass(frozen=True)
+class ConvSpec:
+    """Everything that defines a convolutional network but its weights."""
+
+    statistics: InputStatistics  # of its channels over the training views; their names are those of its input
+    bins: int  # bins along each side of the image
+    widths: tuple[int, ...]  # channels after each convolution
+    dropout: float  # share of pooled values dropped in training
+
+
+class ConvNetwork(BinnedNetwork):
+    """Convolutions of 3 x 3 bins with ReLU between, the mean and the maximum over the image, one logit out.
+
+    It looks at its channels, standardized, and at which bins are filled. Nothing is normalized on the way: how much
+    there is to see is what matters most, and a normalization would hide it.
+    """
+
+    scored_at_once = 512  # the first convolution of one view takes 115 kB
+
+    def __init__(self, spec: ConvSpec) -> None:
+        super().__init__()
+        self.spec = spec
+        self.statistics = spec.statistics
+        self.bins = spec.bins
+        self.standard = StandardBins(spec.statistics)
+        before = (len(spec.statistics.channels) + 1, *spec.widths)
+        strides = (1, *[2] * (len(spec.widths) - 1))
+        sizes = zip(before, spec.widths, strides, strict=False)
+        self.convolutions = nn.ModuleList(nn.Conv2d(n_in, n_out, 3, stride, padding=1) for n_in, n_out, stride in sizes)
+        self.dropout = nn.Dropout(spec.dropout)
+        self.last = nn.Linear(2 * spec.widths[-1], 1)
+
+    def forward(self, means: Tensor, filled: Tensor) -> Tensor:
+        """Logits (B,), not calibrated, of its channels' means (B, C, bins, bins) and filled bins (B, bins, bins)."""
+        values = torch.cat([self.standard(means, filled), filled[:, None].to(means.dtype)], dim=1)
+        for convolution in self.convolutions:
+            values = relu(convolution(values))
+        pooled = torch.cat([values.mean((2, 3)), values.amax((2, 3))], dim=1)
+        logits: Tensor = self.last(self.dropout(pooled))
+        return logits.squeeze(-1)
+
+    def description(self) -> dict[str, Any]:
+        """The fields of `ConvSpec`."""
+        return asdict(self.spec)
+
+    @classmethod
+    def of_description(cls, stored: Mapping[str, Any]) -> ConvNetwork:
+        """The untrained network of a description; a WeightsError if it looks at an unknown channel of the bins."""
+        widths = tuple(stored["widths"])
+        return cls(ConvSpec(stored_statistics(stored), int(stored["bins"]), widths, float(stored["dropout"])))

@@ -1,0 +1,39 @@
+"""Options of the network that scores all directions at a location."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from wheretolook.training.config import FittingConfig, check_at_least, check_share
+from wheretolook.utils.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class SphereConfig(FittingConfig):
+    """Options of "sphere"; a batch holds whole locations with about `batch_size` viewpoints in all.
+
+    Args:
+        points: landmarks of a location at most, spread evenly over those in free sight.
+        cameras: mapping cameras at most, spread evenly over all.
+        width: of tokens and queries; a multiple of `heads`.
+        heads: of attention.
+        layers: blocks of attention among the tokens.
+        dropout: share of values dropped in the blocks of attention.
+    """
+
+    epochs: int = 30
+    batch_size: int = 1024
+    learning_rate: float = 5e-4
+    points: int = 512
+    cameras: int = 128
+    width: int = 96
+    heads: int = 4
+    layers: int = 2
+    dropout: float = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_at_least(self, 1, "points", "cameras", "width", "heads", "layers")
+        check_share(self, "dropout")
+        if self.width % self.heads:
+            raise ConfigError("sphere needs a width that is a multiple of heads", value=(self.width, self.heads))

@@ -1,0 +1,32 @@
+"""Learning the network that scores all directions at a location."""
+
+from __future__ import annotations
+
+from wheretolook.training.data import check_classes, validation_views
+from wheretolook.training.fit import home_device
+from wheretolook.training.learner import Learnt, Task, class_counts, fit_network, fit_platt, predict
+from wheretolook.training.scenes import training_scenes
+from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook_paper.scorers.sphere.network import SphereNetwork
+from wheretolook_paper.scorers.sphere.views import SphereDataModule, load_sphere_views
+
+
+def learn_sphere(task: Task) -> Learnt:
+    """A `SphereNetwork` from a dataset's train scenes, calibrated on the validation views.
+
+    Raises a TableError if there is no train scene, no labels, or labels of one class only; a MapError if a scene's
+    mapping cameras are not known.
+    """
+    dataset = task.dataset
+    config = task.config
+    scenes = training_scenes(dataset)
+    device = home_device(config)
+    views = load_sphere_views(dataset, scenes, config, task.options, device, task.progress)
+    held_out = validation_views(dataset, views.scene, views.location, config)
+    labels = views.labels.numpy() > 0
+    check_classes(dataset, config, labels[~held_out], labels[held_out])
+    data = SphereDataModule(views, held_out, task.options.batch_size, config)
+    network = SphereNetwork(task.options)
+    metrics, history = fit_network(network, data, task)
+    model = TrainedNetwork(task.method, network, dataset.camera, *fit_platt(*predict(network, data)))
+    return Learnt(model, metrics, class_counts(train=labels[~held_out], val=labels[held_out]), history)

@@ -1,0 +1,39 @@
+"""The score of boosted trees, which know what landmarks are like."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from wheretolook.geometry.poses import Float, check_poses
+from wheretolook.inputs.landmark_features import ATTRIBUTES, pool
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.scorers.base import BLOCK
+from wheretolook.scorers.landmark_scorer import LandmarkScorer
+from wheretolook_paper.scorers.trees.learn import BoostedTrees
+
+
+class TreesScorer(LandmarkScorer):
+    """Boosted trees on where the landmarks in view lie and how they were mapped: the probability that a view
+    localizes.
+    """
+
+    name = "trees"
+    local = True
+
+    def __init__(self, localization_map: LocalizationMap, trees: BoostedTrees) -> None:
+        super().__init__(localization_map, ATTRIBUTES, trees.training_range, trees.camera)
+        self.trees = trees.to(localization_map.device)
+
+    def score(self, cam_from_world: Float) -> Float:
+        """(B,) probabilities in [0, 1]."""
+        cam_from_world = check_poses(cam_from_world)
+        scores = np.empty(len(cam_from_world))
+        looked_at: list[Float] = []
+        for begin in range(0, len(scores), BLOCK):
+            block = cam_from_world[begin : begin + BLOCK]
+            described = self.describer.describe(block)
+            looked_at += self._look(described, described.counts)
+            pooled = pool(described, block, self.localization_map.camera)
+            scores[begin : begin + BLOCK] = self.trees.logits(pooled).sigmoid().cpu().numpy()
+        self._watch.check(self.name, looked_at)
+        return scores

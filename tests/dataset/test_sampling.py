@@ -1,0 +1,119 @@
+"""Choosing viewpoints by what they see."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from wheretolook.dataset.sampling import free_locations, sample_viewpoints
+from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.viewpoint_table import SCHEMA, poses
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
+from wheretolook.geometry.poses import camera_centers, transform
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.visibility.occlusion import NoOcclusion, StoredOcclusion
+
+CAMERA = PinholeCamera(320, 240, 160.0)
+GRID = VoxelGrid((-2.0, -2.0, 0.0), (2.0, 2.0, 2.0), (4, 4, 2))
+
+
+def landmarks_at(points: np.ndarray) -> Landmarks:
+    n = len(points)
+    zeros = np.zeros(n, np.float32)
+    return Landmarks(
+        ids=np.arange(n), points=points, track_length=np.full(n, 3, np.int32), reprojection_error_px=zeros,
+        triangulation_angle_deg=zeros, mapping_direction=np.tile(np.float32([1, 0, 0]), (n, 1)),
+        mapping_direction_spread=zeros, mapping_distance_m=zeros, mapping_distance_spread=zeros,
+        descriptors=None, ambiguity=zeros,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def landmarks() -> Landmarks:
+    """A wall at x = 5."""
+    rng = np.random.default_rng(0)
+    return landmarks_at(np.column_stack([np.full(300, 5.0), rng.uniform(-3, 3, 300), rng.uniform(0, 2, 300)]))
+
+
+def sampled(landmarks: Landmarks, **options: object) -> tuple[pd.DataFrame, StoredOcclusion]:
+    config = SampleConfig(directions=100, **options)  # type: ignore[arg-type]
+    return sample_viewpoints(GRID, np.arange(len(GRID)), landmarks, CAMERA, NoOcclusion(), config)
+
+
+def test_rows_say_what_their_viewpoint_sees(landmarks: Landmarks) -> None:
+    table, _ = sampled(landmarks, keep=20)
+    assert set(table.columns) == set(SCHEMA.names)
+    seen = transform(poses(table), landmarks.points)
+    inside = (seen[..., 2] > 1e-3) & CAMERA.in_image(CAMERA.project(seen))
+    assert np.abs(inside.sum(1) - table["n_visible"]).max() <= 1  # single precision at the border
+    np.testing.assert_allclose(camera_centers(poses(table)), GRID.centers()[table["location_id"]], atol=1e-12)
+    np.testing.assert_allclose(poses(table)[:, 2, :3], fibonacci_sphere(100)[table["direction_id"]], atol=1e-12)
+    assert (table["viewpoint_id"] == table["location_id"] * 100 + table["direction_id"]).all()
+
+
+def test_each_location_looks_with_one_of_several_cameras(landmarks: Landmarks) -> None:
+    cameras = {1: PinholeCamera(160, 120, 60.0), 2: PinholeCamera(80, 160, 150.0, center_px=(44.0, 77.0))}
+    config = SampleConfig(directions=100, keep=0, min_visible=0)
+    ids = np.arange(len(GRID))
+    table, occlusion = sample_viewpoints(GRID, ids, landmarks, cameras, NoOcclusion(), config)
+    assert set(table.columns) == {*SCHEMA.names, "camera_id"}
+    assert table.groupby("location_id")["camera_id"].nunique().max() == 1
+    assert table.groupby("camera_id")["location_id"].nunique().tolist() == [len(GRID) // 2] * 2
+    for number, camera in cameras.items():
+        alone, same = sample_viewpoints(GRID, ids, landmarks, camera, NoOcclusion(), config)
+        rows = (table["camera_id"] == number).to_numpy()
+        pd.testing.assert_frame_equal(table[rows].drop(columns="camera_id"), alone[rows])
+        np.testing.assert_array_equal(occlusion.packed, same.packed)
+
+
+def test_the_best_directions_are_kept_and_ranked(landmarks: Landmarks) -> None:
+    everything, _ = sampled(landmarks, keep=0, min_visible=0)
+    best, _ = sampled(landmarks, keep=7)
+    assert len(everything) == len(GRID) * 100
+    for location, rows in best.groupby("location_id"):
+        counts = everything[everything["location_id"] == location].sort_values(
+            ["n_visible", "direction_id"], ascending=[False, True]
+        )
+        assert (
+            rows.sort_values("visibility_rank")["direction_id"].tolist() == counts["direction_id"].tolist()[: len(rows)]
+        )
+        assert sorted(rows["visibility_rank"]) == list(range(len(rows))) and len(rows) <= 7
+        assert (rows["n_visible"] >= 1).all()
+
+
+def test_subsets_are_drawn_by_seed(landmarks: Landmarks) -> None:
+    options = {"keep": 20, "max_locations": 9, "max_directions": 5}
+    first, stored = sampled(landmarks, **options, seed=1)
+    again, _ = sampled(landmarks, **options, seed=1)
+    other, _ = sampled(landmarks, **options, seed=2)
+    pd.testing.assert_frame_equal(first, again)
+    assert not first["viewpoint_id"].equals(other["viewpoint_id"])
+    assert first["location_id"].nunique() == 9 == len(stored.locations)
+    assert first.groupby("location_id").size().max() == 5
+    assert first["viewpoint_id"].is_monotonic_increasing and first["viewpoint_id"].is_unique
+
+
+def test_directions_may_differ_by_split() -> None:
+    config = SampleConfig(max_directions={"train": 3, "val": 0, "test": 7})
+    assert [config.directions_of(split) for split in ("train", "val", "test")] == [3, 0, 7]
+    assert SampleConfig(max_directions=5).directions_of("test") == 5
+    for bad in ({"train": 3}, {"train": 3, "val": 1, "test": -1}, -1):
+        with pytest.raises(ConfigError, match="max_directions"):
+            SampleConfig(max_directions=bad)  # type: ignore[arg-type]
+
+
+def test_a_scene_without_free_space_says_so() -> None:
+    class Solid:
+        def is_free(self, points: np.ndarray) -> np.ndarray:
+            return np.zeros(len(points), dtype=bool)
+
+    with pytest.raises(SceneError, match="none of the 32 locations is in free space"):
+        free_locations(GRID, Solid())  # type: ignore[arg-type]
+
+
+def test_negative_numbers_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"sample\.keep"):
+        SampleConfig(keep=-1)

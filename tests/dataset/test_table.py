@@ -1,0 +1,199 @@
+"""The table on disk: schema, poses, labels, damage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from wheretolook.dataset.viewpoint_table import (
+    MATCH_FIELDS,
+    SCHEMA,
+    is_good,
+    pose_columns,
+    poses,
+    read_table,
+    write_table,
+)
+from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.utils.errors import TableError
+from wheretolook.utils.files import fingerprint
+
+
+@pytest.fixture
+def table() -> pd.DataFrame:
+    rng = np.random.default_rng(0)
+    truth = poses_looking_along(rng.normal(size=(5, 3)), rng.normal(size=(5, 3)))
+    return pd.DataFrame(
+        {
+            "viewpoint_id": np.arange(5),
+            "location_id": 0,
+            "direction_id": np.arange(5),
+            **pose_columns(truth),
+            "n_visible": 7,
+            "visibility_rank": np.arange(5),
+            "status": ["localized", "localized", "localized", "no_pose", "too_few_matches"],
+            "error_m": [0.049, 0.05, 0.01, np.nan, np.nan],
+            "error_deg": [0.39, 0.1, 0.41, np.nan, np.nan],
+            "n_inliers": [20, 30, 12, 0, 0],
+        }
+    )
+
+
+def test_round_trip_and_equal_bytes(table: pd.DataFrame, tmp_path: Path) -> None:
+    write_table(table, tmp_path / "a.parquet")
+    write_table(table, tmp_path / "b.parquet")
+    back = read_table(tmp_path / "a.parquet")
+    assert list(back.columns) == SCHEMA.names
+    np.testing.assert_allclose(poses(back), poses(table), atol=1e-15)
+    assert fingerprint(tmp_path / "a.parquet") == fingerprint(tmp_path / "b.parquet")
+    assert not list(tmp_path.glob("*.partial"))
+
+
+@pytest.fixture
+def matched(table: pd.DataFrame) -> pd.DataFrame:
+    """Views with many matches, one, and none; of two, all are inliers."""
+    matches = [np.arange(0, 90, 3), np.arange(30), np.arange(7, 20), np.array([1_000_000]), np.zeros(0)]
+    inliers = [np.arange(0, 60, 3), np.arange(30), np.arange(8, 20), np.zeros(0), np.zeros(0)]
+    columns = {"matched_rows": matches, "inlier_rows": inliers}
+    return table.assign(**{name: [one.astype(np.int32) for one in rows] for name, rows in columns.items()})
+
+
+def test_matches_are_read_when_asked_for(matched: pd.DataFrame, tmp_path: Path) -> None:
+    paths = [tmp_path / f"{name}.parquet" for name in ("a", "again", "shuffled")]
+    write_table(matched, paths[0])
+    back = read_table(paths[0], matches=True)
+    assert list(back.columns) == [*SCHEMA.names, *MATCH_FIELDS.names]
+    for name in MATCH_FIELDS.names:
+        assert all(isinstance(rows, np.ndarray) and rows.dtype == np.int32 for rows in back[name])
+        assert [rows.tolist() for rows in back[name]] == [rows.tolist() for rows in matched[name]]
+    write_table(back, paths[1])
+    write_table(matched.iloc[::-1].iloc[::-1], paths[2])
+    assert len({path.read_bytes() for path in paths}) == 1
+    assert list(read_table(paths[0]).columns) == SCHEMA.names
+
+
+def test_who_does_not_ask_for_matches_reads_the_same(
+    table: pd.DataFrame, matched: pd.DataFrame, tmp_path: Path
+) -> None:
+    write_table(table, tmp_path / "without.parquet")
+    write_table(matched, tmp_path / "with.parquet")
+    pd.testing.assert_frame_equal(read_table(tmp_path / "with.parquet"), read_table(tmp_path / "without.parquet"))
+
+
+@pytest.mark.parametrize("n", [0, 5])
+def test_rows_of_equal_lengths_stay_apart(n: int, table: pd.DataFrame, tmp_path: Path) -> None:
+    """Arrays that would fit one matrix."""
+    rows = [np.arange(n, dtype=np.int32) + view for view in range(5)]
+    write_table(table.assign(matched_rows=rows, inlier_rows=rows), tmp_path / "a.parquet")
+    back = read_table(tmp_path / "a.parquet", matches=True)
+    assert [one.tolist() for one in back["inlier_rows"]] == [one.tolist() for one in rows]
+    assert {one.dtype for one in back["matched_rows"]} == {np.dtype(np.int32)}
+
+
+def test_matches_that_are_not_stored_are_named_with_what_stores_them(
+    table: pd.DataFrame, matched: pd.DataFrame, tmp_path: Path
+) -> None:
+    path = tmp_path / "viewpoints.parquet"
+    for one, compact in ((table, False), (matched.drop(columns="inlier_rows"), False), (matched, True)):
+        write_table(one, path, compact)
+        with pytest.raises(TableError, match=r"viewpoints\.parquet.*matched_rows.*--label\.store_matches true"):
+            read_table(path, matches=True)
+    matched.drop(columns="inlier_rows").to_parquet(path)  # by others
+    with pytest.raises(TableError, match=r"\['inlier_rows'\].*--label\.store_matches true"):
+        read_table(path, matches=True)
+    matched.assign(matched_rows="many").to_parquet(path)
+    with pytest.raises(TableError, match="another type"):
+        read_table(path, matches=True)
+
+
+def test_a_compact_table_leaves_matches_out(table: pd.DataFrame, matched: pd.DataFrame, tmp_path: Path) -> None:
+    write_table(table, tmp_path / "without.parquet", compact=True)
+    write_table(matched, tmp_path / "with.parquet", compact=True)
+    assert fingerprint(tmp_path / "with.parquet") == fingerprint(tmp_path / "without.parquet")
+
+
+def test_labels_are_strict_at_both_limits(table: pd.DataFrame) -> None:
+    assert is_good(table).tolist() == [True, False, False, False, False]
+    assert is_good(table, 0.25, 2).tolist() == [True, True, True, False, False]
+
+
+def test_unlabelled_rows_are_named(table: pd.DataFrame) -> None:
+    with pytest.raises(TableError, match=r"without labels \(got 1\)"):
+        is_good(table.assign(status=["unlabelled", *table["status"][1:]]))
+
+
+def test_missing_truncated_and_foreign_files(table: pd.DataFrame, tmp_path: Path) -> None:
+    path = tmp_path / "viewpoints.parquet"
+    with pytest.raises(TableError, match="sample stage"):
+        read_table(path)
+    write_table(table, path)
+    path.write_bytes(path.read_bytes()[:-50])
+    with pytest.raises(TableError, match=r"viewpoints\.parquet.*truncated"):
+        read_table(path)
+    write_table(table.assign(qw=0.0, qx=0.0, qy=0.0, qz=0.0), path)
+    with pytest.raises(TableError, match="no rigid transform"):
+        read_table(path)
+    table.assign(error_m="near").to_parquet(path)
+    with pytest.raises(TableError, match="another type"):
+        read_table(path)
+    table.drop(columns="error_m").to_parquet(path)
+    with pytest.raises(TableError, match="error_m"):
+        read_table(path)
+
+
+@pytest.fixture
+def many(table: pd.DataFrame) -> pd.DataFrame:
+    """Forty locations with fifty directions each, in no order."""
+    rng = np.random.default_rng(1)
+    locations = rng.uniform(-20, 20, (40, 3))
+    directions = rng.normal(size=(50, 3))
+    truth = poses_looking_along(np.repeat(locations, 50, axis=0), np.tile(directions, (40, 1)))
+    rows = table.iloc[rng.integers(0, 5, len(truth))].reset_index(drop=True)
+    rows = rows.assign(
+        viewpoint_id=np.arange(len(truth)), location_id=np.arange(len(truth)) // 50,
+        direction_id=np.arange(len(truth)) % 50, **pose_columns(truth),
+        error_m=np.where(rows["error_m"].isna(), np.nan, rng.random(len(truth))),
+    )  # fmt: skip
+    return rows.sample(frac=1, random_state=0).reset_index(drop=True)
+
+
+def test_a_compact_table_reads_the_same(many: pd.DataFrame, tmp_path: Path) -> None:
+    plain, compact, again = (tmp_path / f"{name}.parquet" for name in ("plain", "compact", "again"))
+    write_table(many, plain)
+    write_table(many, compact, compact=True)
+    write_table(read_table(compact), again, compact=True)
+    assert compact.read_bytes() == again.read_bytes()
+    assert compact.stat().st_size < plain.stat().st_size / 2
+    back = read_table(compact)
+    before = read_table(plain)
+    translation = ["tx", "ty", "tz"]
+    pd.testing.assert_frame_equal(back.drop(columns=translation), before.drop(columns=translation))
+    np.testing.assert_allclose(back[translation], before[translation], rtol=0, atol=1e-12)
+    # the centre of a location is stored once, where anyone reads it without arithmetic
+    columns = pd.read_parquet(compact)
+    assert columns.groupby("location_id")[["x_m", "y_m", "z_m"]].nunique().to_numpy().max() == 1
+    centers = camera_centers(poses(before))
+    np.testing.assert_allclose(columns[["x_m", "y_m", "z_m"]], centers, rtol=0, atol=1e-12)
+
+
+def test_damaged_compact_tables(many: pd.DataFrame, tmp_path: Path) -> None:
+    path = tmp_path / "viewpoints.parquet"
+    write_table(many, path, compact=True)
+    content = path.read_bytes()
+    columns = pd.read_parquet(path)
+    for place in (len(content) // 4, len(content) // 2):
+        path.write_bytes(content[:place] + bytes([content[place] ^ 255]) + content[place + 1 :])
+        with pytest.raises(TableError, match=r"viewpoints\.parquet"):
+            read_table(path)
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(TableError, match="truncated"):
+        read_table(path)
+    columns.drop(columns="y_m").to_parquet(path)
+    with pytest.raises(TableError, match=r"missing \(got \['y_m'\]"):
+        read_table(path)
+    columns.assign(x_m=np.nan).to_parquet(path)
+    with pytest.raises(TableError, match="no rigid transform"):
+        read_table(path)

@@ -1,0 +1,165 @@
+"""What stages make of photographs that were left out: weights adapted by them, and rows of an evaluation."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from holdout.corridor import write_corridor
+from synthetic_dataset import make_dataset
+from wheretolook.cli import main
+from wheretolook.dataset.layout import Dataset
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.evaluation.report import score_markdown
+from wheretolook.evaluation.results import latest_scores, runs_of_rows
+from wheretolook.holdout.command import run
+from wheretolook.holdout.holdout import left_out_blocks
+from wheretolook.holdout.holdout_views import evaluated_photographs
+from wheretolook.holdout.photo_map import WORK, open_map
+from wheretolook.scorers.adapted.network import AdaptedNetwork
+from wheretolook.scorers.set.network import SetNetwork
+from wheretolook.stages.evaluate import evaluate_methods
+from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook.training.weights import read_training
+from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.utils.tracking import finished_runs
+from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.visibility.occlusion import NoOcclusion
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
+SET = shipped(WEIGHTS) / "set.safetensors"
+
+
+@pytest.fixture(scope="module")
+def checked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
+    """The corridor's model and database, and a folder of datasets in which its check lies."""
+    folder = tmp_path_factory.mktemp("place")
+    sparse, database = write_corridor(folder / "corridor")
+    where = ["--data", str(folder / "data"), "--occlusion", "none", "--workers", "1", "--device", "cpu"]
+    run(["--map", str(sparse), "--database", str(database), "--metres", *where])
+    return sparse, database, folder / "data"
+
+
+def adapt(checked: tuple[Path, Path, Path], tmp_path: Path, *options: str) -> int:
+    sparse, database, data = checked
+    where = ["--map", str(sparse), "--database", str(database), "--data", str(data), "--device", "cpu"]
+    how = ["--occlusion.model", "none", "--label.workers", "1", "--tracking.folder", str(tmp_path / "mlruns")]
+    return main(["adapt", *where, *how, *options])
+
+
+def test_weights_that_hope_too_little_are_adapted_by_photographs_alone(
+    checked: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sparse, database, data = checked
+    timid = TrainedNetwork.load(SET, SetNetwork, "set")
+    timid.offset -= 4
+    timid.save(tmp_path / "timid.safetensors", read_training(SET))
+    before = {path: path.stat().st_mtime_ns for path in data.glob(f"checks/corridor/{WORK}/*/*/views.csv")}
+    assert adapt(checked, tmp_path, "--weights", str(tmp_path / "timid.safetensors")) == 0
+    said = capsys.readouterr().out
+    adapted = data / "checks" / "corridor" / "adapted.safetensors"
+    assert "left-out photographs" in said and "the adapted weights are better" in said
+    assert before and before == {path: path.stat().st_mtime_ns for path in before}  # the check's blocks are found
+    told = read_training(adapted)
+    assert told["scene"] == "corridor" and told["photographs"] == told["views"] > 60
+    assert told["after"]["calibration_error"] < told["before"]["calibration_error"] / 2
+    (logged,) = finished_runs(TrackingConfig(tmp_path / "mlruns"), "adapt")
+    assert logged.data.params["photographs"] == str(told["photographs"])
+
+    # a check scores with them, on maps of few of the landmarks too, and says what they have learnt from
+    where = ["--map", str(sparse), "--database", str(database), "--metres", "--occlusion", "none", "--workers", "1"]
+    capsys.readouterr()
+    run([*where, "--data", str(data), "--device", "cpu", "--weights", str(adapted)])
+    assert "may have learnt from these photographs" in capsys.readouterr().out
+    content = json.loads((data / "checks" / "corridor" / "check.json").read_text())
+    assert content["method"] == "adapted" and content["ece"]["value"] < told["before"]["calibration_error"] / 2
+
+
+@pytest.mark.slow
+def test_where_photographs_teach_nothing_the_weights_stay(
+    checked: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Weights that are calibrated here already are not bettered."""
+    out = tmp_path / "mine.safetensors"
+    assert adapt(checked, tmp_path, "--out", str(out)) == 0
+    learnt = TrainedNetwork.load(out, AdaptedNetwork, "adapted")
+    calibrated = TrainedNetwork.load(SET, SetNetwork, "set")
+    calibrated.scale *= learnt.scale
+    calibrated.offset = learnt.scale * calibrated.offset + learnt.offset
+    calibrated.save(tmp_path / "calibrated.safetensors", read_training(SET))
+    capsys.readouterr()
+    again = tmp_path / "again.safetensors"
+    assert adapt(checked, tmp_path, "--weights", str(tmp_path / "calibrated.safetensors"), "--out", str(again)) == 0
+    assert "does not make the weights better" in capsys.readouterr().out
+    assert not again.exists() and again.with_suffix(".md").is_file()
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (("--scene", "corridor"), "a scene or to a map"),
+        (("--images", "photos"), "from a database or from images"),
+        (("--weights", str(SET.with_name("mlp-2d+z.safetensors"))), "only a set network"),
+        (("--out", "weights"), "ends in .safetensors"),
+    ],
+)
+def test_bad_input_is_named(
+    checked: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...],
+    says: str,
+) -> None:  # fmt: skip
+    assert adapt(checked, tmp_path, *options) == 2
+    assert says in capsys.readouterr().err
+
+
+def test_photographs_have_rows_beside_rendered_views(checked: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    sparse, database, data = checked
+    rendered = make_dataset(tmp_path / "data" / "both", ("test",), n_locations=14, n_directions=16)
+    source = open_map(sparse, database, metric=True)
+    left_out = left_out_blocks(source, data / "checks" / "corridor" / "work")
+    photographs = evaluated_photographs(rendered.scenes[0], source, left_out, NoOcclusion())
+    config = EvaluateConfig(("random", "visible", "set"), weights=(SET,), resamples=50, top_n=(1,), photographs=True)
+    tracking = TrackingConfig(str(tmp_path / "mlruns"))
+    table = evaluate_methods(rendered, config, tracking, progress=False, photographs=[photographs])
+    assert set(latest_scores(tracking)["candidates"]) == {"all", "photographs"}
+    assert list(table["candidates"].unique()) == ["all", "photographs"]
+    rows = table[(table["candidates"] == "photographs") & (table["scene"] == "all")].set_index("method")
+    # what the check of the same blocks says
+    numbers = json.loads((data / "checks" / "corridor" / "check.json").read_text())
+    assert rows.loc["visible", "roc_auc"] == pytest.approx(numbers["methods"]["visible"]["auc"]["value"])
+    assert rows.loc["oracle", "n_locations"] == len(np.unique(photographs.views["place"]))
+    views = pd.read_csv(data / "checks" / "corridor" / "views.csv")
+    assert photographs.views["photograph"].tolist() == views["row"].tolist()
+    assert rows["good_0.05m_0.4deg"].max() <= views["good"].sum()
+    alone = evaluate_methods(rendered, replace(config, photographs=False), tracking, progress=False)
+    both = table[table["candidates"] == "all"].reset_index(drop=True)
+    pd.testing.assert_frame_equal(alone, both)  # rendered views' rows are as without
+    report = score_markdown(table)
+    assert "## Photographs" in report and report.count("set of landmarks") > score_markdown(alone).count("set of")
+    names = [nested.what for nested in runs_of_rows(table, {})]
+    assert sum(name.endswith("photographs") for name in names) == len(config.methods) + 1  # and the oracle
+
+
+@pytest.mark.slow
+def test_a_scene_of_photographs_alone_is_evaluated_and_adapted_to(
+    checked: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sparse, database, _ = checked
+    where = ["--name", "mine", "--data", str(tmp_path / "data"), "--tracking.folder", str(tmp_path / "mlruns")]
+    where += ["--device", "cpu", "--label.workers", "1"]
+    model = ["--model", str(sparse), "--database", str(database), "--map.existing.camera_id", "1"]
+    assert main(["map", *where, *model]) == 0
+    assert main(["evaluate", *where]) == 2  # nothing is labelled
+    methods = ["--evaluate.methods", "[visible, set]", "--evaluate.weights", f"[{SET}]"]
+    assert main(["evaluate", *where, *methods, "--evaluate.photographs", "true"]) == 0
+    capsys.readouterr()
+    table = pd.read_csv(tmp_path / "data" / "mine" / "results" / "scores.csv")
+    assert set(table["candidates"]) == {"photographs"} and (table.loc[table["method"] == "set", "roc_auc"] > 0.9).all()
+    dataset = Dataset.load(tmp_path / "data" / "mine")
+    assert main(["adapt", *where]) == 0  # the blocks are found again
+    said = capsys.readouterr()
+    assert "left-out photographs" in said.out and (dataset.root / "adapted" / "corridor.md").is_file()

@@ -1,0 +1,49 @@
+"""One room for all tests of labelling, and its labels from a plain loop in this process."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from localization.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, file_bytes, map_room
+from wheretolook.localization.localizer import Localizer
+from wheretolook.localization.shard import label_rows
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.scenes.loading import load_mesh
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory: pytest.TempPathFactory) -> MappedRoom:
+    """No texture repeats: the room is 5 m long, and so is a texture."""
+    return map_room(tmp_path_factory.mktemp("room"), texture_scale=0.5)
+
+
+@pytest.fixture(scope="session")
+def views() -> pd.DataFrame:
+    """24 unlabelled viewpoints, of which some localize."""
+    parts = facing(POSTER, 12, 1.5), facing(PLAIN, 6, 2.5, seed=1), facing(PLAIN, 6, 1.1)
+    return pd.concat(parts, ignore_index=True).assign(viewpoint_id=np.arange(24))
+
+
+@pytest.fixture(scope="session")
+def expected(room: MappedRoom, views: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The file of their labels that every engine must produce."""
+    localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
+    labelled = label_rows(views, WarpRenderer(load_mesh(room.mesh)), localizer, CAMERA)
+    assert labelled["status"].nunique() > 1
+    return file_bytes(labelled, tmp_path_factory.mktemp("expected"))
+
+
+@pytest.fixture(scope="session")
+def matched(room: MappedRoom, views: pd.DataFrame) -> pd.DataFrame:
+    """Their labels with the landmarks that were matched."""
+    localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
+    return label_rows(views, WarpRenderer(load_mesh(room.mesh)), localizer, CAMERA, store_matches=True)
+
+
+@pytest.fixture(scope="session")
+def expected_matches(matched: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The file that every engine must produce when it stores matches."""
+    return file_bytes(matched, tmp_path_factory.mktemp("matched"))

@@ -1,0 +1,146 @@
+"""A room with known labels (its plain wall never localizes, its poster wall always does), and faulty workers.
+
+Worker processes import this module to unpickle what the tests hand them.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from mapping.conftest import ROOM_SIZE, BoxFreeSpace, box_room
+from one_scene import label_viewpoints
+from wheretolook.dataset.viewpoint_table import SCHEMA, UNLABELLED, pose_columns, write_table
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.localization.config import LabelConfig
+from wheretolook.localization.shard import SceneJob
+from wheretolook.mapping.config import MapConfig
+from wheretolook.mapping.rendered_map import build_map
+from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.scenes.loading import load_mesh, save_glb
+
+CAMERA = PinholeCamera(320, 240, 160.0)
+PLAIN = 1  # the face x = high of `box_room`
+POSTER = 0  # the face x = 0
+
+
+@dataclass(frozen=True)
+class MappedRoom:
+    """A room with one plain wall, and its map."""
+
+    mesh: Path
+    landmarks: Path
+
+    @property
+    def job(self) -> SceneJob:
+        return SceneJob(self.mesh, self.landmarks, CAMERA)
+
+
+def map_room(folder: Path, texture_scale: float) -> MappedRoom:
+    mesh = box_room()
+    textures = list(mesh.textures)
+    textures[PLAIN] = np.full_like(textures[PLAIN], 200)
+    mesh = replace(mesh, textures=tuple(textures), corner_uvs=mesh.corner_uvs * np.float32(texture_scale))
+    save_glb(mesh, folder / "mesh.glb")
+    mesh = load_mesh(folder / "mesh.glb")
+    inputs = (mesh, WarpRenderer(mesh), BoxFreeSpace(), CAMERA, MapConfig(n_images=24))
+    build_map(*inputs, seed=0, out_dir=folder / "map", raycaster=MeshRaycaster(mesh), workers=1, progress=False)
+    return MappedRoom(folder / "mesh.glb", folder / "map" / "landmarks.npz")
+
+
+def viewpoints(locations: np.ndarray, directions: np.ndarray) -> pd.DataFrame:
+    n = len(locations)
+    columns = {name: np.zeros(n) for name in SCHEMA.names} | pose_columns(poses_looking_along(locations, directions))
+    table = pd.DataFrame(columns).assign(viewpoint_id=np.arange(n), status=UNLABELLED, error_m=np.nan, error_deg=np.nan)
+    return table.astype({"viewpoint_id": np.int64, "n_inliers": np.int32})
+
+
+def facing(wall: int, n: int, distance_m: float, seed: int = 0) -> pd.DataFrame:
+    """Views perpendicular to a wall x = const, so near that they see only this wall."""
+    rng = np.random.default_rng(seed)
+    locations = np.column_stack([np.zeros(n), rng.uniform(1.6, 2.4, n), rng.uniform(1.2, 1.4, n)])
+    locations[:, 0] = ROOM_SIZE[0] - distance_m if wall == PLAIN else distance_m
+    return viewpoints(locations, np.tile([1.0 if wall == PLAIN else -1.0, 0, 0], (n, 1)))
+
+
+def label(table: pd.DataFrame, room: MappedRoom, shards: Path, **config: Any) -> bytes:
+    """Bytes of the labelled table's file."""
+    options = LabelConfig(**config)
+    labelled = label_viewpoints(table, room.mesh, room.landmarks, CAMERA, shards, options, progress=False)
+    return file_bytes(labelled, shards)
+
+
+def file_bytes(table: pd.DataFrame, folder: Path) -> bytes:
+    path = folder.with_name(f"{folder.name}-labelled.parquet")
+    write_table(table, path)
+    return path.read_bytes()
+
+
+def times(shards: Path) -> dict[Path, int]:
+    """When each finished shard was written."""
+    return {path: path.stat().st_mtime_ns for path in sorted(shards.glob("*.parquet"))}
+
+
+def workers_of(pid: int) -> list[int]:
+    """Spawned worker processes of a process."""
+    children = [child for path in Path(f"/proc/{pid}/task").glob("*/children") for child in path.read_text().split()]
+    return [int(child) for child in children if "spawn_main" in _command(child)]
+
+
+def is_running(pid: int) -> bool:
+    return bool(_command(pid))
+
+
+def _command(pid: int | str) -> str:
+    """Command line of a process; empty when it has ended."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_text()
+    except OSError:
+        return ""
+
+
+def wait_until(condition: Callable[[], bool], seconds: float = 120) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.01)
+
+
+class Deadly:
+    """Kills the worker that receives it."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return signal.raise_signal, (signal.SIGKILL,)
+
+
+def half_a_message(pipe: Connection, number: int) -> None:
+    """Stands in for a worker: dies while it sends its labels."""
+    pipe.recv()
+    pipe._send((1000).to_bytes(4, "big") + b"the beginning")  # type: ignore[attr-defined]
+    sys.exit(1)
+
+
+class BreaksRenderer(SceneJob):
+    """Makes the renderer fail in the process that receives it."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _arrive, (self.mesh, self.landmarks, self.camera)
+
+
+def _arrive(mesh: Path, landmarks: Path, camera: PinholeCamera) -> SceneJob:
+    def render(*_: Any) -> None:
+        raise RuntimeError("the device is gone")
+
+    WarpRenderer.render = render  # type: ignore[method-assign, assignment]
+    return SceneJob(mesh, landmarks, camera)

@@ -1,0 +1,277 @@
+"""Faults at each step of labelling lead to the same table, possibly after resuming, or to a typed error."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+
+from localization.rooms import (
+    CAMERA,
+    BreaksRenderer,
+    Deadly,
+    MappedRoom,
+    half_a_message,
+    is_running,
+    label,
+    times,
+    wait_until,
+    workers_of,
+)
+from wheretolook.dataset.viewpoint_table import read_table, write_table
+from wheretolook.localization import labeller, local_engine
+from wheretolook.localization.config import LabelConfig
+from wheretolook.localization.labeller import LabelTask, label_scenes
+from wheretolook.localization.local_engine import run_local
+from wheretolook.localization.shard import Shard
+from wheretolook.scenes.loading import load_mesh, save_glb
+from wheretolook.utils.errors import StorageError, TableError, WorkerError
+
+
+@pytest.mark.slow
+def test_killed_workers_are_replaced_and_repeat_their_shard_only(
+    room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One is killed while it starts, one in the middle of its shard."""
+    killed: set[int] = set()
+    ticks: list[int] = []
+
+    def kill_one() -> None:
+        victim = workers_of(os.getpid())[0]
+        os.kill(victim, signal.SIGKILL)
+        killed.add(victim)
+
+    def watched(shards: list[Shard], workers: int, tick: Callable[[int], None]):  # type: ignore[no-untyped-def]
+        def watch(n: int) -> None:
+            tick(n)
+            if not ticks:
+                kill_one()
+            ticks.append(n)
+
+        return run_local(shards, workers, watch)
+
+    def kill_at_start() -> None:
+        wait_until(lambda: len(workers_of(os.getpid())) == 2)
+        kill_one()
+
+    monkeypatch.setattr(local_engine, "run_local", watched)
+    killer = threading.Thread(target=kill_at_start)
+    killer.start()
+    assert label(views, room, tmp_path / "shards", workers=2, shard_size=12) == expected
+    killer.join()
+    assert len(killed) == 2
+    assert sum(ticks) == len(views)  # what is done twice counts once
+    assert -sum(n for n in ticks if n < 0) <= 12
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.slow
+def test_a_shard_that_kills_its_worker_every_time_is_given_up(
+    room: MappedRoom, views: pd.DataFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(local_engine, "MAX_DEATHS", 2)
+    rows = views[:2]
+    good = Shard(room.job, tmp_path / "a", rows)  # type: ignore
+    deadly = Shard(room.job, tmp_path / "b", Deadly())
+    run = run_local([good, deadly], workers=1)
+    shard, labelled = next(run)
+    assert shard is good and len(labelled.rows) == 2
+    with pytest.raises(WorkerError, match=r"mesh\.glb: 2 labelling processes were killed .*label\.workers"):
+        next(run)
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_in_the_middle_of_a_message_counts_as_killed(
+    room: MappedRoom, views: pd.DataFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(local_engine, "_work", half_a_message)
+    monkeypatch.setattr(local_engine, "MAX_DEATHS", 1)
+    with pytest.raises(WorkerError, match="killed"):
+        next(run_local([Shard(room.job, tmp_path / "a", views)], workers=1))
+
+
+@pytest.mark.slow
+def test_a_failing_renderer_is_named_with_the_mesh(room: MappedRoom, views: pd.DataFrame, tmp_path: Path) -> None:
+    job = BreaksRenderer(room.mesh, room.landmarks, CAMERA)
+    run = label_scenes([LabelTask("room", job, views, tmp_path)], LabelConfig(workers=1, shard_size=5), progress=False)
+    with pytest.raises(WorkerError, match=r"mesh\.glb: .*the device is gone.*viewpoints 0 to 4") as caught:
+        next(run)
+    assert caught.value.path == room.mesh
+    assert not multiprocessing.active_children() and not times(tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_this_process")
+def test_a_full_disk_keeps_what_is_finished(
+    room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path
+) -> None:
+    """/dev/full replaces the file that is being written: first the manifest, then the third shard."""
+    shards = tmp_path / "shards"
+    shards.mkdir()
+    (shards / f"{labeller.MANIFEST}.partial").symlink_to("/dev/full")
+    with pytest.raises(StorageError, match="No space left on device") as caught:
+        label(views, room, shards, shard_size=6)
+    assert caught.value.path == shards / labeller.MANIFEST and not times(shards)
+    assert not (shards / f"{labeller.MANIFEST}.partial").is_symlink()  # no part stays
+
+    run = local_engine.run_local
+
+    def fill_at_the_third(missing: list[Shard], workers: int, tick: Callable[[int], None]):  # type: ignore[no-untyped-def]
+        missing[2].path.with_name(f"{missing[2].path.name}.partial").symlink_to("/dev/full")
+        return run(missing, workers, tick)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(local_engine, "run_local", fill_at_the_third)
+        with pytest.raises(StorageError, match=r"00000012-.*No space left on device"):
+            label(views, room, shards, shard_size=6)
+    finished = times(shards)
+    assert len(finished) == 2
+    assert label(views, room, shards, shard_size=6) == expected  # there is room again
+    assert finished.items() <= times(shards).items()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_this_process")
+def test_damaged_shards_are_made_anew_and_no_others(
+    room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path
+) -> None:
+    label(views, room, tmp_path, shard_size=4)
+    truncated, flipped, empty, swapped, *_ = paths = list(times(tmp_path))
+    truncated.write_bytes(truncated.read_bytes()[:-100])
+    flipped.write_bytes(with_flipped_bit(flipped.read_bytes(), inside_a_page(flipped)))
+    empty.write_bytes(b"")
+    swapped.write_bytes(paths[-1].read_bytes())
+    before = times(tmp_path)
+    assert label(views, room, tmp_path, shard_size=4) == expected
+    after = times(tmp_path)
+    assert [path for path in after if after[path] != before[path]] == [truncated, flipped, empty, swapped]
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_shard_that_is_damaged_while_others_are_made_is_an_error(
+    room: MappedRoom, views: pd.DataFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = local_engine.run_local
+
+    def damage_what_is_finished(n: int) -> None:
+        for path in times(tmp_path):
+            path.write_bytes(b"")
+
+    monkeypatch.setattr(local_engine, "run_local", lambda missing, n, _: run(missing, n, damage_what_is_finished))
+    tasks = [LabelTask("room", room.job, views[:4], tmp_path)]
+    with pytest.raises(StorageError, match=r"00000000-.*damaged or removed"):
+        next(label_scenes(tasks, LabelConfig(shard_size=2), progress=False))
+    assert [path.name[:8] for path in times(tmp_path)] == ["00000002"]  # the next run makes the other anew
+
+
+@pytest.mark.parametrize("matches", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_no_flipped_bit_of_a_table_goes_unnoticed(
+    matches: bool, expected: bytes, expected_matches: bytes, tmp_path: Path
+) -> None:
+    """At 40 places of each column's pages and 300 of the footer: an error, or a bit that nothing depends on."""
+    path = tmp_path / "table.parquet"
+    expected = expected_matches if matches else expected
+    path.write_bytes(expected)
+    whole = read_table(path, matches)
+    pages = pq.ParquetFile(path).metadata.row_group(0)
+    rng = np.random.default_rng(0)
+    footer = len(expected) - 8 - int.from_bytes(expected[-8:-4], "little")
+    places = list(rng.integers(footer, len(expected), 300))
+    for column in range(pages.num_columns):
+        start = pages.column(column).dictionary_page_offset or pages.column(column).data_page_offset
+        places += list(rng.integers(start, start + pages.column(column).total_compressed_size, 40))
+    noticed = 0
+    for place in places:
+        path.write_bytes(with_flipped_bit(expected, place, bit=rng.integers(8)))
+        try:
+            pd.testing.assert_frame_equal(read_table(path, matches), whole)
+        except TableError:
+            noticed += 1
+    assert noticed > len(places) / 2
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_shards_of_another_mesh_or_of_other_viewpoints_are_not_used(
+    room: MappedRoom, views: pd.DataFrame, tmp_path: Path
+) -> None:
+    mesh = tmp_path / "mesh.glb"
+    mesh.write_bytes(room.mesh.read_bytes())
+    copy = MappedRoom(mesh, room.landmarks)
+    table = views[:6]
+    label(table, copy, tmp_path / "shards", shard_size=3)
+
+    counted = table.assign(n_visible=7)
+    label(counted, copy, tmp_path / "shards", shard_size=3)
+    assert (read_table(tmp_path / "shards-labelled.parquet")["n_visible"] == 7).all()
+
+    bare = load_mesh(room.mesh)
+    for texture in bare.textures:
+        texture[:] = 200
+    save_glb(bare, mesh)
+    label(table, copy, tmp_path / "shards", shard_size=3)
+    assert (read_table(tmp_path / "shards-labelled.parquet")["status"] == "too_few_matches").all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("n_finished", "matches"), [(0, False), (3, False), (3, True)])
+def test_killed_at_any_moment_it_resumes_to_the_same_table(
+    room: MappedRoom,
+    views: pd.DataFrame,
+    expected: bytes,
+    expected_matches: bytes,
+    tmp_path: Path,
+    n_finished: int,
+    matches: bool,
+    request: pytest.FixtureRequest,
+) -> None:
+    write_table(views, tmp_path / "table.parquet")
+    script = tmp_path / "run.py"
+    script.write_text(
+        "import sys\nfrom pathlib import Path\n"
+        "from labelling.rooms import MappedRoom, label\n"
+        "from wheretolook.dataset.viewpoint_table import read_table\n"
+        "if __name__ == '__main__':\n"
+        "    folder, mesh, landmarks = map(Path, sys.argv[1:])\n"
+        "    table = read_table(folder / 'table.parquet')\n"
+        f"    options = dict(workers=2, shard_size=2, store_matches={matches})\n"
+        "    label(table, MappedRoom(mesh, landmarks), folder / 'shards', **options)\n"
+    )
+    run = subprocess.Popen(
+        [sys.executable, str(script), str(tmp_path), str(room.mesh), str(room.landmarks)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    wait_until(lambda: len(workers_of(run.pid)) == 2 and len(times(tmp_path / "shards")) >= n_finished)
+    workers = workers_of(run.pid)
+    run.send_signal(signal.SIGKILL)
+    run.wait()
+    finished = times(tmp_path / "shards")
+    assert n_finished <= len(finished) < 12
+    wait_until(lambda: not any(map(is_running, workers)), seconds=30)  # they do not outlive it
+    assert times(tmp_path / "shards") == finished
+
+    request.getfixturevalue("in_this_process")
+    labelled = label(views, room, tmp_path / "shards", shard_size=2, store_matches=matches)
+    assert labelled == (expected_matches if matches else expected)
+    assert finished.items() <= times(tmp_path / "shards").items()
+
+
+def with_flipped_bit(content: bytes, place: int, bit: int = 0) -> bytes:
+    flipped = bytearray(content)
+    flipped[place] ^= 1 << bit
+    return bytes(flipped)
+
+
+def inside_a_page(path: Path) -> int:
+    """The bit is in the translations, which are not compressed: only the checksum reveals the change."""
+    return int(pq.ParquetFile(path).metadata.row_group(0).column(7).data_page_offset) - 4  # its dictionary's last value

@@ -1,0 +1,217 @@
+"""Several looks localized together: known poses are found, in spite of outliers, noise, and rooms that look alike."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
+from wheretolook.geometry.poses import camera_centers, pose_error, poses_looking_along
+from wheretolook.localization.config import LocalizerConfig
+from wheretolook.localization.estimation import PoseEstimator
+from wheretolook.localization.rig import Look, rig_of, turned_looks
+from wheretolook.localization.rig_localization import JointLocalizer
+from wheretolook.utils.errors import ConfigError, PoseError
+
+CAMERA = PinholeCamera()
+AXES = ((1, 0, 0), (0, 1, 0.2), (-1, 0.3, -0.1))
+
+
+def a_room(n=3000, seed=0, shift=(0.0, 0.0, 0.0)):
+    """Points on the walls of a room of 8 x 6 x 3 m around the origin, (n, 3)."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, (n, 3))
+    axis = rng.integers(0, 3, n)
+    points[np.arange(n), axis] = np.sign(points[np.arange(n), axis])
+    return points * (4, 3, 1.5) + shift
+
+
+def look_at(points, cam_from_world, mount, rng, n=80, noise_px=0.0, outliers=0.0, camera=CAMERA):
+    """A look's matches with so many points in its image, some with wrong landmarks; (Look, right matches)."""
+    there = points @ cam_from_world[:, :3].T + cam_from_world[:, 3]
+    pixels = camera.project(there)
+    rows = np.flatnonzero((there[:, 2] > 0.1) & camera.in_image(pixels))
+    rows = rng.choice(rows, min(n, len(rows)), replace=False)
+    seen = pixels[rows] + rng.normal(0, noise_px, (len(rows), 2))
+    wrong = rng.random(len(rows)) < outliers
+    matched = np.where(wrong, rng.integers(0, len(points), len(rows)), rows)
+    return Look(mount, seen, matched, camera), ~wrong
+
+
+def looks_from(points, center=(0.4, -0.7, 0.1), axes=AXES, seed=1, **options):
+    rng = np.random.default_rng(seed)
+    poses = poses_looking_along(np.tile(center, (len(axes), 1)), np.array(axes, dtype=float))
+    made = [look_at(points, pose, mount, rng, **options) for pose, mount in zip(poses, rig_of(poses), strict=True)]
+    return poses, [look for look, _ in made], [right for _, right in made]
+
+
+def test_exact_matches_give_the_exact_pose_of_every_look():
+    points = a_room()
+    poses, looks, _ = looks_from(points)
+    found = JointLocalizer(PoseEstimator(points)).localize_together(looks)
+    assert found.status == "localized" and found.n_inliers == found.n_matches == 240
+    np.testing.assert_allclose(found.cams_from_world, poses, atol=1e-6)
+    np.testing.assert_allclose(found.rig_from_world, poses[0], atol=1e-6)
+
+
+def test_a_rig_whose_parts_are_apart_is_localized_as_one():
+    """Stereo with 30 cm between centres and a camera that looks back, of another model."""
+    points = a_room()
+    rng = np.random.default_rng(3)
+    other = ColmapCamera("OPENCV", 800, 600, (400.0, 410.0, 390.0, 310.0, -0.1, 0.02, 0.001, -0.001))
+    mounts = [np.eye(3, 4), np.eye(3, 4), np.eye(3, 4)]
+    mounts[1][0, 3] = -0.3
+    mounts[2][:, :3] = Rotation.from_euler("y", 170, degrees=True).as_matrix()
+    mounts[2][:, 3] = (0.0, 0.1, 0.2)
+    rig = poses_looking_along([[0.5, 0.2, -0.2]], [[1.0, 0.4, 0.1]])[0]
+    poses = np.stack([
+        np.concatenate([m[:, :3] @ rig[:, :3], (m[:, :3] @ rig[:, 3] + m[:, 3])[:, None]], axis=1) for m in mounts
+    ])  # fmt: skip
+    cameras = (CAMERA, CAMERA, other)
+    looks = [look_at(points, pose, m, rng, camera=c)[0] for pose, m, c in zip(poses, mounts, cameras, strict=True)]
+    found = JointLocalizer(PoseEstimator(points)).localize_together(looks)
+    np.testing.assert_allclose(found.cams_from_world, poses, atol=1e-5)
+
+
+def test_outliers_are_told_from_inliers():
+    points = a_room()
+    poses, looks, right = looks_from(points, outliers=0.7, noise_px=0.5)
+    found = JointLocalizer(PoseEstimator(points)).localize_together(looks)
+    error_m, error_deg = pose_error(found.cams_from_world, poses)
+    assert error_m.max() < 0.02 and error_deg.max() < 0.2
+    told = np.concatenate(found.inliers)
+    assert (told[np.concatenate(right)]).mean() > 0.98 and told[~np.concatenate(right)].mean() < 0.02
+    assert found.elsewhere < 0.2 * found.support
+
+
+def test_looks_are_more_accurate_together_and_the_deviation_tells_how_accurate():
+    """Over 40 draws of noise the errors are as large as the deviation says, and smaller than those of one look."""
+    points = a_room()
+    localizer = JointLocalizer(PoseEstimator(points))
+    errors = []
+    single = []
+    deviations = []
+    for seed in range(40):
+        poses, looks, _ = looks_from(points, seed=seed, noise_px=1.0, n=30)
+        found = localizer.localize(looks)
+        alone = localizer.localize(looks[:1])
+        errors.append(np.linalg.norm(camera_centers(found.cams_from_world[0]) - camera_centers(poses[0])))
+        single.append(np.linalg.norm(camera_centers(alone.cams_from_world[0]) - camera_centers(poses[0])))
+        deviations.append(found.deviation[0])
+    rms = np.sqrt(np.mean(np.square(errors)))
+    assert rms < 0.5 * np.sqrt(np.mean(np.square(single)))
+    assert 0.7 < rms / np.mean(deviations) < 1.4
+
+
+def test_one_look_is_localized_exactly_as_a_single_image():
+    points = a_room()
+    estimator = PoseEstimator(points)
+    for seed in range(5):
+        _, (look, *_), _ = looks_from(points, seed=seed, outliers=0.6, noise_px=1.0)
+        pose, inliers = estimator.estimate(look.pixels, look.rows, CAMERA)
+        joint = JointLocalizer(estimator, turn_noise_deg=1.0).localize([look])
+        np.testing.assert_allclose(joint.cams_from_world[0], pose, atol=1e-12)
+        np.testing.assert_array_equal(joint.inliers[0], inliers)
+
+
+def test_of_two_rooms_alike_the_looks_together_tell_which():
+    """Two copies of a room, and one landmark in ten of its own in each. A look that is matched with the wrong copy has
+    more inliers there than any other has; together the others outvote it, and the wrong copy is found as the rival."""
+    room = a_room(2000)
+    points = np.concatenate([room, room + np.array([20.0, 0, 0])])
+    poses, looks, _ = looks_from(room, axes=(*AXES, (0, -1, 0)), n=60, noise_px=0.3)
+    wrong = looks[1]
+    rng = np.random.default_rng(5)
+    strong = look_at(room, poses[1], wrong.cam_from_rig, rng, n=110)[0]
+    looks[1] = Look(strong.cam_from_rig, strong.pixels, strong.rows + len(room), CAMERA)
+    localizer = JointLocalizer(PoseEstimator(points))
+    alone = localizer.localize([looks[1]])
+    assert alone.n_inliers > 100 and pose_error(alone.cams_from_world[0], poses[1])[0] > 19
+    found = localizer.localize_together(looks)
+    assert pose_error(found.cams_from_world, poses)[0].max() < 0.01
+    assert found.n_inliers == 180 and 100 < found.elsewhere < 111
+
+
+def test_turns_that_are_known_to_a_degree_are_refined():
+    points = a_room()
+    rng = np.random.default_rng(2)
+    errors = []
+    ignored = []
+    for seed in range(4):
+        poses, looks, _ = looks_from(points, seed=seed, noise_px=0.5, outliers=0.3)
+        turned = [
+            Look(
+                np.concatenate([Rotation.from_rotvec(np.radians(rng.normal(0, 1, 3))).as_matrix()
+                                @ look.cam_from_rig[:, :3], np.zeros((3, 1))], axis=1),
+                look.pixels, look.rows, CAMERA,
+            )
+            for look in looks
+        ]  # fmt: skip
+        estimator = PoseEstimator(points)
+        known = JointLocalizer(estimator, turn_noise_deg=1.0).localize(turned)
+        errors.append(pose_error(known.cams_from_world, poses))
+        ignored.append(pose_error(JointLocalizer(estimator).localize(turned).cams_from_world, poses))
+    error_m, error_deg = np.max(errors, axis=0)
+    assert error_m.max() < 0.02 and error_deg.max() < 0.2
+    assert np.median(np.array(ignored)[:, 0]) > 3 * np.median(np.array(errors)[:, 0])
+
+
+def test_a_map_in_national_coordinates_gives_the_same():
+    points = a_room()
+    far = np.array([4_512_300.0, 5_402_100.0, 300.0])
+    _, looks, _ = looks_from(points, outliers=0.3, noise_px=0.5)
+    near = JointLocalizer(PoseEstimator(points)).localize(looks)
+    away = JointLocalizer(PoseEstimator(points + far)).localize(looks)
+    centers = camera_centers(away.cams_from_world) - far
+    np.testing.assert_allclose(centers, camera_centers(near.cams_from_world), atol=1e-5)
+    assert away.n_inliers == near.n_inliers
+
+
+def test_too_few_matches_and_no_pose_have_their_status():
+    points = a_room()
+    _, looks, _ = looks_from(points, n=1)
+    few = JointLocalizer(PoseEstimator(points)).localize(looks)
+    assert few.status == "too_few_matches" and few.cams_from_world is None and few.n_matches == 3
+    _, looks, _ = looks_from(points, n=12, outliers=1.0)
+    lost = JointLocalizer(PoseEstimator(points, LocalizerConfig(min_inliers=15))).localize(looks)
+    assert lost.status == "no_pose" and lost.n_inliers < 15
+    empty = [Look(look.cam_from_rig, np.zeros((0, 2)), np.zeros(0, dtype=np.int64), CAMERA) for look in looks]
+    assert JointLocalizer(PoseEstimator(points)).localize(empty).status == "too_few_matches"
+
+
+def test_a_look_that_matched_nothing_harms_nothing():
+    points = a_room()
+    poses, looks, _ = looks_from(points)
+    looks[1] = Look(looks[1].cam_from_rig, np.zeros((0, 2)), np.zeros(0, dtype=np.int64), CAMERA)
+    for noise in (0.0, 0.5):
+        found = JointLocalizer(PoseEstimator(points), noise).localize_together(looks)
+        np.testing.assert_allclose(found.cams_from_world, poses, atol=1e-4)
+
+
+def test_bad_input_is_refused_by_name():
+    points = a_room()
+    poses, looks, _ = looks_from(points)
+    localizer = JointLocalizer(PoseEstimator(points))
+    with pytest.raises(PoseError, match="a single look"):
+        localizer.localize_together(looks[:1])
+    with pytest.raises(PoseError, match="no look"):
+        localizer.localize([])
+    with pytest.raises(ConfigError, match="noise of turns"):
+        JointLocalizer(PoseEstimator(points), -0.1)
+    with pytest.raises(ConfigError, match="noise of turns"):
+        JointLocalizer(PoseEstimator(points), float("nan"))
+    moved = poses.copy()
+    moved[1, 0, 3] += 0.01
+    with pytest.raises(PoseError, match=r"not of one place.*0\.01 m apart"):
+        rig_of(moved)
+    matches = [(look.pixels, look.rows) for look in looks]
+    assert len(turned_looks(rig_of(poses)[:, :, :3], matches, CAMERA)) == 3
+    mirror = np.array(rig_of(poses)[:, :, :3])
+    mirror[2] *= -1
+    with pytest.raises(PoseError, match="look 2 is no rotation"):
+        localizer.localize(turned_looks(mirror, matches, CAMERA))
+    with pytest.raises(PoseError, match="one rotation"):
+        turned_looks(mirror[:2], matches, CAMERA)
+    with pytest.raises(PoseError, match="a pixel"):
+        localizer.localize([Look(np.eye(3, 4), looks[0].pixels[:5], looks[0].rows, CAMERA), looks[1]])

@@ -1,0 +1,184 @@
+"""Labels of a room whose answers are known: a plain wall never localizes, a poster wall in the map always does."""
+
+from __future__ import annotations
+
+import multiprocessing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from localization.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, map_room
+from one_scene import label_viewpoints
+from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, is_good, poses
+from wheretolook.features.keypoints import Keypoints
+from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
+from wheretolook.geometry.poses import pose_error, transform
+from wheretolook.localization.config import LabelConfig, LocalizerConfig
+from wheretolook.localization.labeller import LabelTask, _SceneInProgress
+from wheretolook.localization.localizer import Localizer
+from wheretolook.localization.shard import label_rows
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.scenes.loading import load_mesh
+from wheretolook.utils.errors import MapError, SceneError
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_plain_wall_never_localizes_and_a_poster_wall_always_does(room: MappedRoom, tmp_path: Path) -> None:
+    for wall, expected in ((PLAIN, 0.0), (POSTER, 1.0)):
+        table = facing(wall, 12, distance_m=1.1)
+        labelled = label_viewpoints(
+            table, room.mesh, room.landmarks, CAMERA, tmp_path, LabelConfig(workers=1), progress=False
+        )
+        assert is_good(labelled).mean() == expected
+        if wall == PLAIN:
+            assert labelled["error_m"].isna().all() and (labelled["n_inliers"] == 0).all()
+        else:
+            assert (labelled["n_inliers"] >= 10).all() and labelled["error_m"].max() < 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_this_process")
+def test_a_repeated_texture_localizes_at_the_wrong_copy_and_is_labelled_so(tmp_path: Path) -> None:
+    """On the 4 m long wall the texture repeats after 2.5 m: some poses are wrong by 2.5 m, with many inliers."""
+    room = map_room(tmp_path, texture_scale=1.0)
+    arguments = room.mesh, room.landmarks, CAMERA, tmp_path / "shards", LabelConfig(workers=1)
+    labelled = label_viewpoints(facing(POSTER, 12, distance_m=1.1), *arguments, progress=False)
+    wrong = labelled["error_m"] > 0.1
+    assert 0 < wrong.sum() < 12
+    np.testing.assert_allclose(labelled["error_m"][wrong], 2.5, atol=0.02)
+    assert labelled["n_inliers"][wrong].min() > 50 and not is_good(labelled)[wrong].any()
+
+
+def test_errors_are_measured_against_the_true_pose(room: MappedRoom) -> None:
+    """A table that lies about a pose by 10 cm and 3 degrees gets exactly these errors."""
+    table = facing(POSTER, 3, distance_m=1.5)
+    localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
+
+    class Elsewhere(WarpRenderer):
+        def render(self, camera, cam_from_world):  # type: ignore[no-untyped-def]
+            moved = np.array(cam_from_world)
+            turn = np.radians(3.0)
+            yaw = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
+            moved[:, :, 3] += [0.0, 0.1, 0.0]  # 10 cm along the camera's y
+            return super().render(camera, yaw @ moved)
+
+    labelled = label_rows(table, Elsewhere(load_mesh(room.mesh)), localizer, CAMERA)
+    np.testing.assert_allclose(labelled["error_m"], 0.1, atol=0.02)
+    np.testing.assert_allclose(labelled["error_deg"], 3.0, atol=0.2)
+
+
+def test_a_pose_is_found_where_seven_matches_in_eight_are_wrong(room: MappedRoom) -> None:
+    """And the same pose every time, which is not used where it has too few inliers."""
+    landmarks = Landmarks.load(room.landmarks)
+    true_pose = poses(facing(POSTER, 1, distance_m=1.5))[0]
+    in_camera = transform(true_pose, landmarks.points)
+    rows = np.flatnonzero(in_camera[:, 2] > 0.1)[:320]
+    pixels = CAMERA.project(in_camera[rows])
+    wrong = np.arange(len(rows)) % 8 > 0
+    rng = np.random.default_rng(0)
+    pixels[wrong] = rng.uniform(0, (CAMERA.width, CAMERA.height), (wrong.sum(), 2))
+    keypoints = replace(Keypoints.none(), pixels=pixels.astype(np.float32))
+    matches = np.arange(len(rows)), rows
+    found, again = (Localizer(landmarks, CAMERA).estimate(keypoints, *matches) for _ in range(2))
+    assert found.status == LOCALIZED and len(found.inlier_rows) >= (~wrong).sum() == 40
+    error_m, error_deg = pose_error(found.cam_from_world[None], true_pose[None])
+    assert error_m[0] < 0.01 and error_deg[0] < 0.2
+    np.testing.assert_array_equal(found.cam_from_world, again.cam_from_world)
+    strict = Localizer(landmarks, CAMERA, LocalizerConfig(min_inliers=len(found.inlier_rows) + 1))
+    assert strict.estimate(keypoints, *matches).status == NO_POSE
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        PinholeCamera(640, 480, 300.0, 320.0, (310.0, 250.0)),
+        ColmapCamera("OPENCV", 640, 480, (300.0, 305.0, 320.0, 240.0, -0.1, 0.02, 0.001, -0.002)),
+        ColmapCamera("OPENCV_FISHEYE", 640, 480, (220.0, 221.0, 318.0, 242.0, 0.01, -0.002, 0.0, 0.0)),
+        ColmapCamera("SIMPLE_RADIAL_FISHEYE", 640, 480, (220.0, 318.0, 242.0, 0.01)),
+        ColmapCamera("FOV", 640, 480, (300.0, 300.0, 320.0, 240.0, 0.9)),
+    ],
+    ids=lambda camera: getattr(camera, "model", "pinhole"),
+)
+def test_a_pose_is_found_with_every_camera(room: MappedRoom, camera: Camera) -> None:
+    """Half of the matches are wrong."""
+    landmarks = Landmarks.load(room.landmarks)
+    (pose,) = poses(facing(POSTER, 1, distance_m=1.5))
+    pixels = camera.project(transform(pose[None], landmarks.points)[0])
+    rows = np.flatnonzero(camera.in_image(pixels) & (transform(pose[None], landmarks.points)[0][:, 2] > 0))[:300]
+    found = pixels[rows] + np.random.default_rng(0).normal(0, 0.3, (len(rows), 2))
+    matched = rows.copy()
+    matched[::2] = np.roll(matched[::2], 7)
+    keypoints = replace(Keypoints.none(), pixels=found.astype(np.float32))
+    estimate = Localizer(landmarks, CAMERA).estimate(keypoints, np.arange(len(rows)), matched, camera)
+    assert estimate.cam_from_world is not None and estimate.status == LOCALIZED
+    (error_m,), (error_deg,) = pose_error(estimate.cam_from_world[None], pose[None])
+    assert error_m < 0.02 and error_deg < 0.3 and len(estimate.inlier_rows) >= 0.4 * len(rows)
+
+
+def test_views_of_several_cameras_are_labelled_as_each_alone(room: MappedRoom) -> None:
+    cameras = {4: CAMERA, 9: PinholeCamera(240, 320, 200.0, center_px=(118.0, 166.0))}
+    table = facing(POSTER, 8, distance_m=1.5).assign(camera_id=np.array([4, 9, 9, 4, 4, 4, 9, 4], np.int32))
+    renderer = WarpRenderer(load_mesh(room.mesh))
+    localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
+    labelled = label_rows(table, renderer, localizer, cameras)
+    assert is_good(labelled).all() and labelled["viewpoint_id"].equals(table["viewpoint_id"])
+    for number, camera in cameras.items():
+        rows = table["camera_id"] == number
+        alone = label_rows(table[rows], renderer, Localizer(localizer.landmarks, camera), camera)
+        pd.testing.assert_frame_equal(labelled[rows], alone)
+
+
+def test_views_of_a_large_camera_go_in_smaller_batches(room: MappedRoom) -> None:
+    """Twenty workers that shared a GPU ran out of its 80 GB by eight images of 1,280 x 1,280 pixels each."""
+    sizes: list[int] = []
+
+    class Noting(WarpRenderer):
+        def render(self, camera, cam_from_world):  # type: ignore[no-untyped-def]
+            sizes.append(len(cam_from_world))
+            return super().render(camera, cam_from_world)
+
+    camera = PinholeCamera(1280, 960, 640)
+    localizer = Localizer(Landmarks.load(room.landmarks), camera)
+    label_rows(facing(POSTER, 3, distance_m=1.5), Noting(load_mesh(room.mesh)), localizer, camera)
+    assert sizes == [2, 1]
+
+
+@pytest.mark.parametrize(("where", "cameras", "expected"), [("cpu", 5, 30), ("cuda", 5, 80), ("cuda", 0, 30)])
+def test_a_gpu_gets_many_views_of_each_camera_at_once(
+    room: MappedRoom, tmp_path: Path, where: str, cameras: int, expected: int
+) -> None:
+    """Only views of one camera go together: of forty, shards of 64 views made batches of one or two."""
+    numbered = tuple((number, CAMERA) for number in range(cameras))
+    task = LabelTask("room", replace(room.job, device=where, cameras=numbered), facing(POSTER, 200, 1.5), tmp_path)
+    shards = _SceneInProgress.of(task, 30).shards
+    assert [len(shard.rows) for shard in shards[:-1]] == [expected] * (len(shards) - 1)
+    assert sum(len(shard.rows) for shard in shards) == 200
+
+
+def test_matches_with_one_landmark_determine_no_pose(room: MappedRoom) -> None:
+    keypoints = replace(Keypoints.none(), pixels=np.full((20, 2), 100.5, np.float32))
+    matches = np.arange(20), np.zeros(20, dtype=np.int64)
+    found = Localizer(Landmarks.load(room.landmarks), CAMERA).estimate(keypoints, *matches)
+    assert found.status == NO_POSE and found.cam_from_world is None and len(found.inlier_rows) == 0
+
+
+@pytest.mark.slow
+def test_an_error_in_a_worker_keeps_its_type(room: MappedRoom, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.glb"
+    broken.write_bytes(b"no mesh")
+    config = LabelConfig(workers=1)
+    for path in (broken, tmp_path / "missing.glb"):
+        with pytest.raises(SceneError, match=path.name):
+            label_viewpoints(facing(POSTER, 2, 1.5), path, room.landmarks, CAMERA, tmp_path, config, progress=False)
+    assert not multiprocessing.active_children()
+
+
+def test_landmarks_without_descriptors_are_refused(room: MappedRoom, tmp_path: Path) -> None:
+    bare = tmp_path / "landmarks.npz"
+    replace(Landmarks.load(room.landmarks), descriptors=None).save(bare)
+    with pytest.raises(MapError, match="without descriptors"):
+        label_viewpoints(facing(POSTER, 2, 1.5), room.mesh, bare, CAMERA, tmp_path, progress=False)

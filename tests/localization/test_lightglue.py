@@ -1,0 +1,104 @@
+"""Queries are matched by LightGlue with the mapping images that see most of what they show."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from holdout.corridor import HEIGHT, WIDTH, write_corridor
+from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.registry import all_kinds
+from wheretolook.geometry.camera import PinholeCamera, cameras_by_id
+from wheretolook.geometry.poses import pose_error
+from wheretolook.holdout.holdout import leave_out
+from wheretolook.holdout.holdout_blocks import choose_blocks
+from wheretolook.holdout.photo_map import open_map
+from wheretolook.localization.config import LocalizerConfig
+from wheretolook.localization.localizer import Localizer
+from wheretolook.mapping.colmap_model import colmap_poses, read_model
+from wheretolook.mapping.feature_files import read_features
+from wheretolook.mapping.landmarks import load_colmap_landmarks
+from wheretolook.utils.errors import ConfigError, MapError, WeightsError
+
+KIND = all_kinds()["aliked"]
+
+
+def nearest_neighbour_weights(path: Path) -> Path:
+    """Weights with which LightGlue's layers change nothing, and its assignment finds mutual nearest neighbours."""
+    torch = pytest.importorskip("torch")
+    kornia = pytest.importorskip("kornia.feature", reason="LightGlue needs kornia: pip install kornia")
+    settings = {name: value for name, value in kornia.LightGlue.features["aliked"].items() if name != "weights"}
+    state = kornia.LightGlue(features=None, **settings).state_dict()
+    for name, value in state.items():
+        if name.endswith(("ffn.3.weight", ".bias")):
+            value.zero_()
+        if name == "input_proj.weight":
+            value.copy_(torch.eye(*value.shape))
+        if name.endswith("final_proj.weight"):
+            value.copy_(40 * torch.eye(len(value)))
+        if name.endswith("matchability.weight"):
+            value.zero_()
+        if name.endswith("matchability.bias"):
+            value.fill_(10.0)
+    torch.save(state, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def corridor(tmp_path_factory) -> Path:
+    """A map's folder with its database, of ALIKED's kind of descriptors."""
+    sparse, database = write_corridor(tmp_path_factory.mktemp("aliked"), kind=KIND)
+    shutil.copy(database, sparse / "database.db")
+    return sparse
+
+
+def test_a_query_is_localized_by_the_images_that_see_the_same(corridor, tmp_path):
+    weights = nearest_neighbour_weights(tmp_path / "aliked_lightglue.pth")
+    landmarks = load_colmap_landmarks(corridor, corridor / "database.db")
+    model = read_model(corridor)
+    camera = cameras_by_id(model.cameras, corridor)[1]
+    _, ((pixels, descriptors),) = read_features(corridor / "database.db", ["010.jpg"])
+    query = Keypoints(pixels, KIND.restore(descriptors), np.ones(len(pixels), np.float32))
+    config = LocalizerConfig(lightglue=str(weights), lightglue_images=2)
+    localizer = Localizer(landmarks, camera, config, map_dir=corridor)
+    ((keypoints, rows),) = localizer.match([query])
+    assert (np.diff(keypoints) > 0).all() and len(set(rows.tolist())) == len(rows)
+    of_image = model.images[11].points2D
+    true = {k: point.point3D_id for k, point in enumerate(of_image) if point.has_point3D()}
+    right = [true.get(k) == number for k, number in zip(keypoints.tolist(), landmarks.ids[rows].tolist(), strict=True)]
+    assert len(rows) > 50 and np.mean(right) > 0.95
+    found = localizer.estimate(query, keypoints, rows)
+    error_m, error_deg = pose_error(found.cam_from_world, colmap_poses(corridor)[10])
+    assert found.status == "localized" and error_m < 0.02 and error_deg < 0.3
+    nothing = Keypoints.none(KIND.dimension)
+    assert [len(part) for part in localizer.match([nothing])[0]] == [0, 0]
+
+
+def test_what_lightglue_needs(corridor, tmp_path, monkeypatch):
+    landmarks = load_colmap_landmarks(corridor, corridor / "database.db")
+    camera = PinholeCamera(WIDTH, HEIGHT, 160.0)
+    config = LocalizerConfig(lightglue=str(nearest_neighbour_weights(tmp_path / "lightglue.pth")))
+    with pytest.raises(MapError, match=r"--map.keep_database true"):
+        Localizer(landmarks, camera, config, map_dir=tmp_path)
+    with pytest.raises(WeightsError, match=r"missing\.pth.*--label.localizer.lightglue"):
+        Localizer(landmarks, camera, LocalizerConfig(lightglue="missing.pth"), map_dir=corridor)
+    sparse, database = write_corridor(tmp_path / "sift")
+    with pytest.raises(ConfigError, match=r"not known for these features.*'sift'"):
+        Localizer(load_colmap_landmarks(sparse, database), camera, config, map_dir=sparse)
+    monkeypatch.setitem(sys.modules, "kornia", None)
+    monkeypatch.setitem(sys.modules, "kornia.feature", None)
+    with pytest.raises(ConfigError, match=r"pip install 'wheretolook\[learned\]'"):
+        Localizer(landmarks, camera, config, map_dir=corridor)
+
+
+def test_photographs_left_out_of_a_map_of_learned_features_are_localized(corridor, tmp_path):
+    """As `check` does, by what the database holds: nothing is extracted."""
+    source = open_map(corridor, corridor / "database.db", metric=True)
+    block = min(choose_blocks(source), key=lambda block: len(block.left_out))
+    (found,) = leave_out(source, [block], tmp_path)
+    assert found.landmarks.features == "aliked"
+    assert found.views["good"].mean() > 0.5 and (found.views["n_matches"] > 20).any()

@@ -1,0 +1,94 @@
+"""Two rooms alike: the pose with evidence of its own is taken, though a wrong one has more inliers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import pose_error, poses_looking_along
+from wheretolook.localization.estimation import PoseEstimator
+from wheretolook.localization.pose_ambiguity import Likeness, most_likely, preference, strongest_rival
+from wheretolook.localization.rig import Look, rig_of
+from wheretolook.localization.rig_localization import JointLocalizer
+
+CAMERA = PinholeCamera()
+BEYOND = np.array([20.0, 0, 0])
+
+
+def two_rooms():
+    """Points (N, 3) of a room of 8 x 6 x 3 m and its copy 20 m off, and of a column that only the first has.
+
+    Also rows of each: room, copy, column.
+    """
+    rng = np.random.default_rng(0)
+    room = rng.uniform(-1, 1, (2000, 3))
+    axis = rng.integers(0, 3, len(room))
+    room[np.arange(len(room)), axis] = np.sign(room[np.arange(len(room)), axis])
+    room *= (4, 3, 1.5)
+    column = np.column_stack([np.full((40, 2), (2.0, 0.5)), np.linspace(-1, 1, 40)])
+    points = np.concatenate([room, room + BEYOND, column])
+    return points, np.split(np.arange(len(points)), [2000, 4000])
+
+
+def in_image(points, rows, pose):
+    there = points[rows] @ pose[:, :3].T + pose[:, 3]
+    pixels = CAMERA.project(np.where(there[:, 2:] > 0.1, there, (0, 0, 1)))
+    seen = (there[:, 2] > 0.1) & CAMERA.in_image(pixels)
+    return rows[seen], pixels[seen]
+
+
+def test_only_what_the_other_place_lacks_is_its_own():
+    points, (room, copy, column) = two_rooms()
+    here = poses_looking_along([[0.4, -0.7, 0.1]], [[1.0, 0.4, 0.0]])[0]
+    there = poses_looking_along([[20.4, -0.7, 0.1]], [[1.0, 0.4, 0.0]])[0]
+    likeness = Likeness(points)
+    assert likeness.own_places(room, here, there) == likeness.own_places(copy, there, here) == 0
+    # 2 m of the column, in cubes of 0.25 m whose corners lie at multiples of that: the last point is in a ninth
+    assert likeness.own_places(column, here, there) == likeness.places(column) == 9
+    # a turn of half a circle: the room is alike, the column is where there is nothing
+    turned = poses_looking_along([[-0.4, 0.7, 0.1]], [[-1.0, -0.4, 0.0]])[0]
+    assert likeness.own_places(column, here, turned) == 9
+    # 20 cm off a thing is the same thing
+    near = poses_looking_along([[0.6, -0.7, 0.1]], [[1.0, 0.4, 0.0]])[0]
+    assert likeness.own_places(column, here, near) == 0
+
+
+@pytest.mark.parametrize("n_column", [0, 12])
+def test_evidence_of_its_own_outweighs_inliers_that_likeness_explains(n_column):
+    """Each of three looks matches 60 landmarks of the copy and 30 of the room that it sees. With none of the column
+    nobody can tell, and the copy has more inliers; a dozen of the column, in one look, decide."""
+    points, (room, _, column) = two_rooms()
+    axes = [(1.0, 0.4, 0.0), (0.0, 1.0, 0.2), (-1.0, 0.3, -0.1)]
+    poses = poses_looking_along(np.tile((0.4, -0.7, 0.1), (3, 1)), np.array(axes))
+    rng = np.random.default_rng(1)
+    looks = []
+    for number, (pose, mount) in enumerate(zip(poses, rig_of(poses), strict=True)):
+        rows, pixels = in_image(points, room, pose)
+        taken = rng.choice(len(rows), 90, replace=False)
+        landmarks = np.where(np.arange(90) < 60, rows[taken] + len(room), rows[taken])
+        own, at = in_image(points, column, pose) if number == 0 else (column[:0], np.zeros((0, 2)))
+        seen = np.concatenate([pixels[taken], at[:n_column]])
+        looks.append(Look(mount, seen, np.concatenate([landmarks, own[:n_column]]), CAMERA))
+    found = JointLocalizer(PoseEstimator(points)).localize(looks)
+    right = poses if n_column else poses_looking_along(np.tile((20.4, -0.7, 0.1), (3, 1)), np.array(axes))
+    assert pose_error(found.cams_from_world, right)[0].max() < 1e-3
+    assert found.n_inliers == (90 + 12 if n_column else 180)
+    assert found.own[1] == 0 and (found.own[0] > 0) == (n_column > 0)
+    assert found.elsewhere == pytest.approx(180 if n_column else 90, abs=1)
+
+
+def test_preference_is_for_own_places_then_for_support():
+    assert preference((0, 0), (100, 50)) > 0 > preference((0, 0), (50, 100))
+    assert preference((8, 0), (50, 100)) > 0 and preference((0, 8), (100, 50)) < 0
+    assert preference((3, 4), (90, 90)) == pytest.approx(-preference((4, 3), (90, 90)))
+
+
+def test_the_pose_is_taken_whose_strongest_rival_is_weakest():
+    """The second beats the first, the third beats the second, and the first beats the third by far."""
+    own = np.array([[0, 10, 50], [14, 0, 12], [12, 14, 0]])
+    support = [300.0, 230.0, 33.0]
+    assert [strongest_rival(own, support, k) for k in range(3)] == [1, 0, 0]
+    assert most_likely(own, support) == 1
+    assert most_likely(own[:1, :1], support[:1]) == 0 == most_likely(np.array([[0, 0], [50, 0]]), [300.0, 29.0])
+    assert most_likely(np.array([[0, 0], [50, 0]]), [300.0, 31.0]) == 1

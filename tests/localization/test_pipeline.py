@@ -1,0 +1,107 @@
+"""The pipeline: order, overlap, bounds, errors and threads."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from wheretolook.localization.pipeline import Step, run_pipeline
+
+
+@pytest.fixture(autouse=True)
+def no_thread_is_left() -> Iterator[None]:
+    before = threading.active_count()
+    yield
+    assert threading.active_count() == before
+
+
+def slowly(seconds: float) -> Step:
+    def run(item: int) -> int:
+        time.sleep(seconds)
+        return item
+
+    return Step(f"slow {seconds}", run)
+
+
+def test_order_is_kept_whichever_item_takes_longest() -> None:
+    def uneven(item: int) -> int:
+        time.sleep(0.01 * (item % 3))
+        return item
+
+    steps = [Step("double", lambda item: 2 * item), Step("wait", uneven), Step("text", str)]
+    assert list(run_pipeline(range(20), steps)) == [str(2 * i) for i in range(20)]
+    assert list(run_pipeline([], steps)) == []
+
+
+def test_steps_overlap_and_their_time_is_counted() -> None:
+    seconds: dict[str, float] = {}
+    start = time.perf_counter()
+    steps = [Step("a", slowly(0.05).run), Step("b", slowly(0.05).run), Step("c", slowly(0.05).run)]
+    assert list(run_pipeline(range(10), steps, seconds)) == list(range(10))
+    wall = time.perf_counter() - start
+    assert list(seconds) == ["a", "b", "c"]
+    assert min(seconds.values()) >= 0.5
+    assert wall < 0.8 * sum(seconds.values())  # 0.6 s of 1.5 s on an idle machine
+
+
+def test_the_source_is_read_no_further_than_the_queues_are_long() -> None:
+    read = 0
+
+    def source() -> Iterator[int]:
+        nonlocal read
+        for item in range(1000):
+            read += 1
+            yield item
+
+    run = run_pipeline(source(), [Step("a", abs), Step("b", abs)], depth=2)
+    for taken in range(1, 6):
+        next(run)
+        time.sleep(0.1)
+        assert read <= taken + 3 * 2 + 3  # three queues of two, and what each of three threads holds
+    run.close()
+
+
+class OwnError(BaseException):
+    """A BaseException that is not an Exception."""
+
+
+@pytest.mark.parametrize("place", ["source", "first", "last"])
+@pytest.mark.parametrize("error", [ValueError, OwnError])
+def test_an_error_anywhere_is_raised_after_the_items_before_it(place: str, error: type[BaseException]) -> None:
+    def source() -> Iterator[int]:
+        for item in range(1000):
+            if place == "source" and item == 5:
+                raise error("five")
+            yield item
+
+    def failing(name: str) -> Step:
+        def run(item: int) -> int:
+            if place == name and item == 5:
+                raise error("five")
+            return item
+
+        return Step(name, run)
+
+    got = []
+    with pytest.raises(error, match="five"):
+        for item in run_pipeline(source(), [failing("first"), slowly(0.001), failing("last")]):
+            got.append(item)
+    assert got == [0, 1, 2, 3, 4]
+
+
+def test_a_consumer_that_leaves_ends_the_threads() -> None:
+    before = threading.active_count()
+    run = run_pipeline(iter(int, 1), [Step("a", abs), Step("b", abs)])
+    next(run)
+    assert threading.active_count() == before + 3
+    start = time.perf_counter()
+    run.close()
+    assert threading.active_count() == before
+    assert time.perf_counter() - start < 2
+
+    with pytest.raises(KeyError, match="the consumer's own"):
+        for _ in run_pipeline(range(1000), [slowly(0.01)]):
+            raise KeyError("the consumer's own")

@@ -1,0 +1,219 @@
+"""Statistics of labels, compared with numbers computed by hand on small tables, and their logging."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from synthetic_dataset import make_dataset
+from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.thresholds import ALL
+from wheretolook.dataset.viewpoint_table import (
+    LOCALIZED,
+    NO_POSE,
+    TOO_FEW_MATCHES,
+    UNLABELLED,
+    pose_columns,
+    read_table,
+    write_table,
+)
+from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.localization.report import POSITIVE, label_markdown, label_summary, threshold_sentence
+from wheretolook.stages.label import log_labels
+from wheretolook.utils.errors import TableError
+from wheretolook.utils.tracking import artifact, newest_run
+from wheretolook.utils.tracking_config import TrackingConfig
+
+NAN = float("nan")
+
+
+def table(rows: list[tuple[int, float, int, str, float, float]]) -> pd.DataFrame:
+    """Viewpoints of rows (location, its height, landmarks in view, status, errors in metres and degrees)."""
+    names = ["location_id", "z", "n_visible", "status", "error_m", "error_deg"]
+    frame = pd.DataFrame(rows, columns=names)
+    centers = np.column_stack([np.full((len(rows), 2), 7.0), frame.pop("z")])
+    directions = np.random.default_rng(0).normal(size=(len(rows), 3))  # heights must not depend on where one looks
+    cam_from_world = poses_looking_along(centers, directions / np.linalg.norm(directions, axis=1, keepdims=True))
+    return frame.assign(
+        viewpoint_id=np.arange(len(rows)),
+        direction_id=0,
+        visibility_rank=0,
+        n_inliers=0,
+        **pose_columns(cam_from_world),
+    )
+
+
+HALL = table(
+    [
+        (0, -2.0, 5000, LOCALIZED, 0.004, 0.1),  # positive everywhere
+        (0, -2.0, 400, LOCALIZED, 0.004, 0.4),  # the finest limit is exclusive
+        (1, -2.0, 99, LOCALIZED, 0.4, 4.0),
+        (2, -1.3, 100, LOCALIZED, 4.0, 9.0),
+        (2, -1.3, 9, LOCALIZED, 4.0, 90.0),
+        (2, -1.3, 5, NO_POSE, 0.004, 0.1),  # too few inliers: never positive
+        (3, 1.1, 0, TOO_FEW_MATCHES, NAN, NAN),
+        (3, 1.1, 2, NO_POSE, NAN, NAN),
+    ]
+)
+SHED = table([(0, 10.0, 1000, LOCALIZED, 0.002, 0.2), (0, 10.0, 50, NO_POSE, 500.0, 179.0)])
+
+
+@pytest.fixture
+def summary():  # type: ignore[no-untyped-def]
+    return label_summary({"hall": HALL, "shed": SHED}, {"hall": "train", "shed": "test"})
+
+
+def test_shares_by_hand(summary) -> None:  # type: ignore[no-untyped-def]
+    shares = summary.shares.set_index(["scene", "split"])
+    assert list(shares.index) == [("hall", "train"), ("shed", "test"), (ALL, "train"), (ALL, "test"), (ALL, ALL)]
+    hall = shares.loc["hall", "train"]
+    assert (hall["n_views"], hall["n_locations"]) == (8, 4)
+    np.testing.assert_allclose(hall[list(POSITIVE)].astype(float), np.array([1, 2, 3, 4]) / 8)
+    statuses = hall[[LOCALIZED, TOO_FEW_MATCHES, NO_POSE, "without_pose"]].astype(float)
+    np.testing.assert_allclose(statuses, np.array([5, 1, 2, 2]) / 8)
+    assert hall["locations_positive"] == 1 / 4
+    assert hall["finest_of_coarsest"] == 1 / 4
+    assert hall["same_label_share"] == 5 / 8
+    assert hall["spearman"] == pytest.approx(pd.Series([1, 0, 0, 0, 0, 0, 0, 0]).corr(pd.Series([1] * 4 + [0] * 4)))
+    assert hall["median_within_m"] == pytest.approx(0.202)
+    assert hall["median_beyond_deg"] == pytest.approx(45.05)
+
+    everything = shares.loc[ALL, ALL]
+    assert (everything["n_views"], everything["n_locations"]) == (10, 5)  # location 0 of two scenes
+    assert everything[POSITIVE[0]] == 2 / 10
+    assert everything["locations_positive"] == 2 / 5
+    pd.testing.assert_series_equal(shares.loc[ALL, "test"], shares.loc["shed", "test"], check_names=False)
+
+
+def test_bands_by_hand(summary) -> None:  # type: ignore[no-untyped-def]
+    height = summary.by_height
+    np.testing.assert_allclose(height["low"], [0, 0.5, 1, 1.5, 2, 2.5, 3])  # above the lowest of each scene
+    np.testing.assert_allclose(height["high"], height["low"] + 0.5)
+    assert list(height["n_views"]) == [5, 3, 0, 0, 0, 0, 2]
+    np.testing.assert_allclose(height[POSITIVE[0]], [2 / 5, 0, NAN, NAN, NAN, NAN, 0])
+    np.testing.assert_allclose(height[POSITIVE[-1]], [4 / 5, 1 / 3, NAN, NAN, NAN, NAN, 0])
+    visible = summary.by_visible
+    assert list(visible["low"]) == [0, 1, 10, 30, 100, 300, 1000, 3000]
+    assert list(visible["n_views"]) == [1, 3, 0, 2, 1, 1, 1, 1]
+    np.testing.assert_allclose(visible[POSITIVE[-1]], [0, 0, NAN, 1 / 2, 1, 1, 1, 1])
+
+
+def test_bands_of_height_widen_in_a_tower() -> None:
+    tower = pd.concat([HALL, table([(9, 30.0, 7, LOCALIZED, 0.001, 0.01)])], ignore_index=True)
+    height = label_summary({"tower": tower}, {"tower": "val"}).by_height
+    assert list(height["low"]) == [0, 5, 10, 15, 20, 25, 30]
+    assert list(height["n_views"]) == [8, 0, 0, 0, 0, 0, 1]
+
+
+def test_views_of_a_location_share_a_band() -> None:
+    rng = np.random.default_rng(0)
+    rows = [(0, 0.1 + rng.normal(0, 1e-12), 1, LOCALIZED, 0.1, 0.1) for _ in range(50)]
+    rows += [(1, 0.6 + rng.normal(0, 1e-12), 1, LOCALIZED, 0.1, 0.1) for _ in range(50)]
+    assert list(label_summary({"a": table(rows)}, {"a": "val"}).by_height["n_views"]) == [50, 50]
+
+
+def test_error_histograms_by_hand(summary) -> None:  # type: ignore[no-untyped-def]
+    metres = summary.errors_m
+    degrees = summary.errors_deg
+    for errors in (metres, degrees):
+        assert errors["localized"].sum() == 6
+        assert errors["disbelieved"].sum() == 2
+    (bin_of_4mm,) = np.flatnonzero((metres["low"] <= 0.004) & (metres["high"] > 0.004))
+    assert metres["localized"][bin_of_4mm] == 2
+    assert metres["disbelieved"][bin_of_4mm] == 1
+    assert metres["disbelieved"].iloc[-1] == 1  # 500 m counts in the last bin
+    assert degrees["high"].iloc[-1] > 180
+
+
+def one_kind(good: int, finer: int, bad: int) -> pd.DataFrame:
+    rows = [(0, 0.0, 1, LOCALIZED, 0.003, 0.05)] * good + [(0, 0.0, 1, LOCALIZED, 1.0, 3.0)] * finer
+    return table(rows + [(0, 0.0, 1, LOCALIZED, 12.0, 80.0)] * bad)
+
+
+@pytest.mark.parametrize(
+    ("good", "coarse", "verdict"),
+    [
+        (19, 1, "The thresholds all but coincide:"),
+        (16, 4, "The thresholds differ little:"),
+        (15, 5, "The thresholds differ:"),
+    ],
+)
+def test_words_follow_from_the_numbers(good: int, coarse: int, verdict: str) -> None:
+    summary = label_summary({"a": one_kind(good, coarse, bad=20)}, {"a": "train"})
+    sentence = threshold_sentence(summary)
+    assert sentence.startswith(verdict)
+    assert f"{100 - 2.5 * coarse:.1f} % of the viewpoints have the same label at all 4" in sentence
+    assert f"Of those within 5 m, 10°, {5 * good:.1f} % are within 5 cm, 0.4°" in sentence
+    assert "median errors are 3.0 mm, 0.05°; those of the other poses found are 12.0 m, 80°." in sentence
+    assert sentence in label_markdown(summary)
+
+
+def test_labels_of_one_class_are_told_without_numbers_that_are_none() -> None:
+    bad = label_summary({"a": table([(0, 0.0, 1, TOO_FEW_MATCHES, NAN, NAN)] * 3)}, {"a": "train"})
+    assert threshold_sentence(bad) == "No viewpoint is within 5 m, 10°: all are negative at every threshold."
+    assert np.isnan(bad.overall["finest_of_coarsest"])
+    assert bad.errors_m[["localized", "disbelieved"]].to_numpy().sum() == 0
+    good = label_summary({"a": one_kind(3, 0, 0)}, {"a": "train"})
+    assert threshold_sentence(good).endswith("Their median errors are 3.0 mm, 0.05°.")
+    for summary in (bad, good):
+        assert "nan" not in label_markdown(summary)
+
+
+def test_markdown_has_a_row_for_every_scene_split_and_band(summary) -> None:  # type: ignore[no-untyped-def]
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in label_markdown(summary, "Hut").split("\n")]
+    shares = ["12.5", "25.0", "37.5", "50.0", "25.0", "62.5", "12.5", "25.0", "25.0", "62.5", "0.38"]
+    assert ["hall", "train", "8", "4", *shares] in lines
+    assert [line[:2] for line in lines if line[:1] == [ALL]] == [[ALL, "train"], [ALL, "test"], [ALL, ALL]]
+    assert ["0–0.5", "5", "40.0", "60.0", "80.0", "80.0"] in lines
+    assert ["1–1.5", "0", "–", "–", "–", "–"] in lines
+    bands = ["0", "1–9", "1,000–2,999", "≥ 3,000"]
+    assert [line[0] for line in lines if line and line[0] in bands] == bands
+    assert ["0.001–0.01", "30.0", "10.0"] in lines
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Dataset:
+    return make_dataset(tmp_path / "hut", ("train", "train", "test"), n_locations=5, n_directions=8, n_landmarks=100)
+
+
+def test_logged_numbers_are_those_of_the_tables(dataset: Dataset, tmp_path: Path) -> None:
+    tracking = TrackingConfig(str(tmp_path / "mlruns"))
+    summary = log_labels(dataset, tracking, {"render": 1.5, "label": 20.0})
+    run = newest_run(tracking, "label", {"dataset": "hut"})
+    assert run is not None
+    params = {"dataset": "hut", "dataset_fingerprint": dataset.fingerprint()}
+    assert run.data.params == params | {"scenes": "scene-0 scene-1 scene-2"}
+    metrics = run.data.metrics
+    shares = summary.shares
+    assert (metrics["n_views"], metrics["train_n_views"], metrics["test_n_views"]) == (120, 80, 40)
+    assert (metrics["seconds_render"], metrics["seconds_label"]) == (1.5, 20.0)
+    for name in (*POSITIVE, "same_label_share", "locations_positive"):
+        assert metrics[name] == shares[name].iloc[-1]
+        assert metrics[f"train_{name}"] == pytest.approx(shares[name].iloc[:2].mean())
+        assert metrics[f"test_{name}"] == shares[name].iloc[2]
+    assert 0 < metrics[POSITIVE[0]] < metrics[POSITIVE[-1]] < 1
+    for name in ("labels.csv", "labels.md", "labels.png"):
+        written = (dataset.root / "results" / name).read_bytes()
+        assert artifact(tracking, run.info.run_id, name).read_bytes() == written
+    assert len(list((dataset.root / "results").iterdir())) == 3
+    pd.testing.assert_frame_equal(pd.read_csv(dataset.root / "results" / "labels.csv"), shares, check_dtype=False)
+
+
+def test_unlabelled_or_empty_scenes_are_named(dataset: Dataset, tmp_path: Path) -> None:
+    tracking = TrackingConfig(str(tmp_path / "mlruns"))
+    path = dataset.scenes[1].table
+    labelled = read_table(path)
+    write_table(labelled.assign(status=labelled["status"].where(labelled.index != 3, UNLABELLED)), path)
+    with pytest.raises(TableError, match=r"scene-1/viewpoints\.parquet.*without labels.*got 1"):
+        log_labels(dataset, tracking)
+    write_table(labelled.iloc[:0], path)
+    with pytest.raises(TableError, match=r"scene-1/viewpoints\.parquet.*no viewpoints"):
+        log_labels(dataset, tracking)
+    with pytest.raises(TableError, match="no scene"):
+        log_labels(replace(dataset, scenes=()), tracking)
+    assert not (dataset.root / "results").exists()
+    assert newest_run(tracking, "label") is None

@@ -1,0 +1,182 @@
+"""Which landmarks each view matched, stored beside its label: what the rows are, and that nothing else changes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from localization.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, file_bytes, label, times
+from wheretolook.dataset.viewpoint_table import (
+    LOCALIZED,
+    MATCH_FIELDS,
+    NO_POSE,
+    SCHEMA,
+    TOO_FEW_MATCHES,
+    is_good,
+    poses,
+    read_table,
+    write_table,
+)
+from wheretolook.features.config import ExtractorConfig
+from wheretolook.geometry.poses import transform
+from wheretolook.localization.config import LocalizerConfig
+from wheretolook.localization.labeller import LABELS, MANIFEST, versions
+from wheretolook.localization.localizer import Localizer
+from wheretolook.localization.shard import label_rows
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.scenes.loading import load_mesh
+from wheretolook.utils.errors import TableError
+from wheretolook.utils.files import fingerprint
+
+
+def test_rows_belong_to_the_labels_beside_them(room: MappedRoom, matched: pd.DataFrame) -> None:
+    n = len(Landmarks.load(room.landmarks))
+    assert list(matched.columns) == [*SCHEMA.names, *MATCH_FIELDS.names]
+    for view in matched.itertuples():
+        assert view.matched_rows.dtype == view.inlier_rows.dtype == np.int32
+        assert len(view.inlier_rows) == view.n_inliers <= len(view.matched_rows)
+        assert (len(view.matched_rows) < 4) == (view.status == TOO_FEW_MATCHES)
+        assert np.isin(view.inlier_rows, view.matched_rows).all()
+        for rows in (view.matched_rows, view.inlier_rows):
+            assert (np.diff(rows) > 0).all() and ((rows >= 0) & (rows < n)).all()
+    lengths = matched["matched_rows"].map(len)
+    assert lengths.min() == 0 and (lengths > matched["n_inliers"]).any() and matched["n_inliers"].max() > 50
+
+
+def test_inliers_lie_where_the_true_pose_puts_them(
+    room: MappedRoom, views: pd.DataFrame, matched: pd.DataFrame
+) -> None:
+    """Inliers project within RANSAC's limit of their keypoint; the other matches project beyond it."""
+    landmarks = Landmarks.load(room.landmarks)
+    localizer = Localizer(landmarks, CAMERA)
+    good = np.flatnonzero(is_good(matched))
+    assert len(good) >= 10
+    images = WarpRenderer(load_mesh(room.mesh)).render(CAMERA, poses(views)[good]).rgb
+    keypoints = localizer.extract(images)
+    distances: list[np.ndarray] = []
+    others: list[np.ndarray] = []
+    for row, found, (of_image, of_map) in zip(good, keypoints, localizer.match(keypoints), strict=True):
+        np.testing.assert_array_equal(np.sort(of_map), matched["matched_rows"][row])
+        in_camera = transform(poses(views)[row], landmarks.points[of_map])
+        projected = CAMERA.project(in_camera)
+        distance = np.linalg.norm(projected - found.pixels[of_image], axis=1)
+        inlier = np.isin(of_map, matched["inlier_rows"][row])
+        assert (in_camera[inlier, 2] > 0).all() and CAMERA.in_image(projected[inlier]).mean() > 0.99
+        distances.append(distance[inlier])
+        others.append(distance[~inlier & (in_camera[:, 2] > 0)])
+    inliers = np.concatenate(distances)
+    outliers = np.concatenate(others)
+    limit = localizer.config.max_error_px
+    slack = 3.0  # RANSAC judged by its own pose, before it was refined
+    assert inliers.max() < limit + slack and np.quantile(inliers, 0.99) < limit and np.median(inliers) < 0.5
+    assert len(outliers) > 50 and outliers.min() > limit - slack
+
+
+def test_labels_are_the_same_with_and_without(
+    views: pd.DataFrame, matched: pd.DataFrame, expected: bytes, tmp_path: Path
+) -> None:
+    assert file_bytes(matched.drop(columns=MATCH_FIELDS.names), tmp_path / "bare") == expected
+
+
+def test_matches_of_every_status_are_told(room: MappedRoom, monkeypatch: pytest.MonkeyPatch) -> None:
+    table = facing(POSTER, 1, 1.5)
+    image = WarpRenderer(load_mesh(room.mesh)).render(CAMERA, poses(table)).rgb[0]
+    landmarks = Landmarks.load(room.landmarks)
+    many = 10_000
+    for name, status in (("", LOCALIZED), ("min_inliers", NO_POSE), ("min_matches", TOO_FEW_MATCHES)):
+        with monkeypatch.context() as changed:
+            config = LocalizerConfig(min_inliers=many if name == "min_inliers" else 10)
+            if name == "min_matches":
+                changed.setattr(LocalizerConfig, name, many)
+            found = Localizer(landmarks, CAMERA, config).localize(image)
+        assert found.status == status and found.matched_rows.dtype == np.int64
+        assert found.matched_rows.shape == (found.n_matches,) and found.n_matches > 50
+        assert (len(found.inlier_rows) > 0) == (status != TOO_FEW_MATCHES)
+
+
+def test_rows_of_earlier_labels_do_not_survive(room: MappedRoom, matched: pd.DataFrame, tmp_path: Path) -> None:
+    localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
+    stale = matched[:2].assign(matched_rows=[np.array([7])] * 2, inlier_rows=[np.array([7])] * 2)
+    renderer = WarpRenderer(load_mesh(room.mesh))
+    assert list(label_rows(stale, renderer, localizer, CAMERA).columns) == SCHEMA.names
+    again = label_rows(stale, renderer, localizer, CAMERA, store_matches=True)
+    assert file_bytes(again, tmp_path / "again") == file_bytes(matched[:2], tmp_path / "first")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("workers", "shard_size"), [(1, 24), (2, 5)])
+def test_workers_and_shards_do_not_change_the_rows(
+    room: MappedRoom, views: pd.DataFrame, expected_matches: bytes, tmp_path: Path, workers: int, shard_size: int
+) -> None:
+    shards = tmp_path / "shards"
+    assert label(views, room, shards, workers=workers, shard_size=shard_size, store_matches=True) == expected_matches
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_shards_with_and_without_matches_are_told_apart(room: MappedRoom, tmp_path: Path) -> None:
+    """Shards without matches have the names and the manifest of versions that could not store matches."""
+    table = pd.concat([facing(POSTER, 3, 1.5), facing(PLAIN, 1, 1.1)], ignore_index=True)
+    shards = tmp_path / "shards"
+    settings = {
+        "versions": versions(),
+        "localizer": LocalizerConfig().record(),
+        "extractor": ExtractorConfig().record(),
+        "camera": CAMERA.record(),
+        "renderer": "cpu raster",
+        "mesh": fingerprint(room.mesh),
+        "landmarks": fingerprint(room.landmarks),
+    }
+    label(table, room, shards, shard_size=4)
+    (without,) = times(shards)
+    manifest = json.loads((shards / MANIFEST).read_text())
+    assert {**settings, "n_viewpoints": 4, "shards": {without.name: 4}} == manifest
+    inputs = [name for name in SCHEMA.names if name not in LABELS]
+    content = json.dumps(settings, sort_keys=True).encode()
+    content += pd.util.hash_pandas_object(table[inputs], index=False).to_numpy().tobytes()
+    assert without.name == f"00000000-{hashlib.sha256(content).hexdigest()[:16]}.parquet"
+    before = times(shards)
+
+    label(table, room, shards, shard_size=4, store_matches=True)
+    (stored,) = set(times(shards)) - {without}
+    expected = {**settings, "store_matches": True, "n_viewpoints": 4, "shards": {stored.name: 4}}
+    assert json.loads((shards / MANIFEST).read_text()) == expected
+    both = times(shards)
+    assert before.items() <= both.items()
+    label(table, room, shards, shard_size=4)
+    label(table, room, shards, shard_size=4, store_matches=True)
+    assert times(shards) == both
+
+    write_table(read_table(stored), stored)  # it lost its rows
+    label(table, room, shards, shard_size=4, store_matches=True)
+    assert list(read_table(stored, matches=True).columns) == [*SCHEMA.names, *MATCH_FIELDS.names]
+
+
+def test_pixels_are_kept_in_the_order_of_the_landmarks(
+    room: MappedRoom, views: pd.DataFrame, matched: pd.DataFrame, tmp_path: Path
+) -> None:
+    """Where a good view's inliers were found lies within RANSAC's limit of where the true pose puts them."""
+    landmarks = Landmarks.load(room.landmarks)
+    rows = np.flatnonzero(is_good(matched))[:4]
+    localizer = Localizer(landmarks, CAMERA)
+    renderer = WarpRenderer(load_mesh(room.mesh))
+    some = views.iloc[rows].reset_index(drop=True)
+    kept = label_rows(some, renderer, localizer, CAMERA, store_pixels=True)
+    write_table(kept, tmp_path / "viewpoints.parquet")
+    back = read_table(tmp_path / "viewpoints.parquet", pixels=True)
+    assert "matched_pixels" not in read_table(tmp_path / "viewpoints.parquet", matches=True)
+    for row, pose in enumerate(poses(some)):
+        np.testing.assert_array_equal(back["matched_rows"][row], matched["matched_rows"][rows[row]])
+        pixels = back["matched_pixels"][row].reshape(-1, 2)
+        assert pixels.dtype == np.float32 and len(pixels) == len(back["matched_rows"][row])
+        inlier = np.isin(back["matched_rows"][row], back["inlier_rows"][row])
+        at = CAMERA.project(transform(pose, landmarks.points[back["matched_rows"][row][inlier]]))
+        assert np.linalg.norm(at - pixels[inlier], axis=1).max() < 10
+    with pytest.raises(TableError, match=r"matched_pixels.*--label\.store_pixels true"):
+        write_table(matched, tmp_path / "matches.parquet")
+        read_table(tmp_path / "matches.parquet", pixels=True)

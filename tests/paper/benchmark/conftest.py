@@ -1,0 +1,61 @@
+"""A scene folder in the benchmark's layout, of a generated room: drawn and mapped as the benchmark's scripts do it."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mapping.conftest import ROOM_SIZE, BoxFreeSpace, box_room
+from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.mapping.config import WalkConfig
+from wheretolook.mapping.triangulation import _posed_model
+from wheretolook.mapping.walk import plan_walk
+from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.scenes.loading import load_mesh, save_glb
+from wheretolook_paper.benchmark.folder import CAMERA, DRAWN_CAMERA, BenchmarkScene
+from wheretolook_paper.benchmark.query_map import build_query_map
+
+IDS = (*map(str, range(1, 13)),)  # file names sort differently: 1, 10, 11, 12, 2
+
+
+def make_scene(folder: Path) -> Path:
+    """00010-room: a room with one plain wall, 30 images of 320 x 320 px, 12 waypoints 0.2 m apart."""
+    scene = folder / "00010-room"
+    images = scene / "scene_reconstruction" / "images"
+    images.mkdir(parents=True)
+    mesh = box_room()
+    textures = [np.full_like(texture, 200) if face == 1 else texture for face, texture in enumerate(mesh.textures)]
+    mesh = replace(mesh, textures=tuple(textures), corner_uvs=mesh.corner_uvs * np.float32(0.5))
+    save_glb(mesh, scene / "room.glb")
+    mesh = load_mesh(scene / "room.glb")
+    walk = plan_walk(BoxFreeSpace(), mesh.bounds, 30, WalkConfig(), 0)
+    poses = poses_looking_along(walk.positions, walk.directions)
+    renderer = WarpRenderer(mesh)
+    posed = _posed_model(CAMERA, poses)
+    for number, rgb in enumerate(renderer.render(DRAWN_CAMERA, poses).rgb, 1):
+        image = posed.images[number]
+        cv2.imwrite(str(images / image.name), rgb[:, :, ::-1])
+        image.name = f"scene_reconstruction/images/{image.name}"  # as in the released models
+    posed.write_text(str(scene / "scene_reconstruction"))
+    middle = np.array(ROOM_SIZE) / 2
+    at = middle + np.outer(0.2 * (np.arange(len(IDS)) - 6), (1, 0, 0))
+    lines = [" ".join([name, *map(str, point)]) for name, point in zip(IDS, at.tolist(), strict=True)]
+    (scene / "waypoints.txt").write_text("\n".join(lines) + "\n")
+    made = folder / "made"
+    made.mkdir()
+    build_query_map(BenchmarkScene.of(scene), renderer, made, 1, "cpu", False)
+    for path in (scene / "scene_reconstruction").glob("*.txt"):
+        path.unlink()
+    for path in made.glob("*.bin"):
+        shutil.copy(path, scene / "scene_reconstruction")
+    return scene
+
+
+@pytest.fixture(scope="session")
+def scene_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_scene(tmp_path_factory.mktemp("benchmark"))

@@ -1,0 +1,187 @@
+"""Both measures against numbers worked out by hand, and against the released scripts said again in plain loops."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from wheretolook.geometry.poses import invert_poses, poses_looking_along
+from wheretolook.utils.errors import ConfigError, TableError
+from wheretolook_paper.benchmark.command import run
+from wheretolook_paper.benchmark.files import read_errors, read_poses, write_errors, write_poses
+from wheretolook_paper.benchmark.report import Result, summary_table, views_table
+from wheretolook_paper.benchmark.scores import PLAN, Scores, Share
+
+YAWS = (0, 25, 50, 90, 100, 100, 100, 100, 100, 100, 100)  # the fourth view is 40 degrees from the third
+ERRORS = {  # metres and degrees of each id
+    "1": (0.05, 0.4),  # on the limit: within
+    "2": (0.2, 1.9),
+    "3": (0.25, 2.0),  # on the limit of the plan
+    "4": (0.01, 0.1),  # good, but reached by 40 degrees
+    "5": (0.0500001, 0.1),
+    "6": (0.4, 4.9),
+    "7": (4.9, 9.9),
+    "8": (math.nan, math.nan),
+    "9": (0.01, 11.0),
+    "10": (0.02, 0.2),
+    "11": (6.0, 0.1),
+}
+
+
+def write_case(folder: Path, ids: list[str], errors: dict[str, tuple[float, float]], yaws: tuple[float, ...]) -> Path:
+    axes = [(math.cos(math.radians(yaw)), math.sin(math.radians(yaw)), 0) for yaw in yaws]
+    write_poses(folder / "selected_gt_poses.txt", ids, poses_looking_along(np.zeros((len(ids), 3)), axes))
+    write_errors(folder / "pose_errors.txt", list(errors), *np.array(list(errors.values())).T)
+    return folder
+
+
+def scores_of(folder: Path) -> Scores:
+    return Scores.of(read_poses(folder / "selected_gt_poses.txt"), read_errors(folder / "pose_errors.txt"))
+
+
+def loc_as_released(errors: Path) -> list[tuple[int, int]]:
+    """evaluate_loc.py, said again: lines of three words count; limits inclusive; over the number of lines."""
+    lines = [line.split() for line in errors.read_text().splitlines()]
+    pairs = [(float(line[1]), float(line[2])) for line in lines if len(line) == 3]
+    limits = [(0.05, 0.4), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0)]
+    return [(sum(m <= most_m and d <= most_d for m, d in pairs), len(pairs)) for most_m, most_d in limits]
+
+
+def plan_as_released(errors: Path, poses: Path) -> tuple[int, int] | None:
+    """evaluate_plan.py, said again: the n-th error with the n-th pose; it stops if their numbers differ."""
+    lines = [line.split() for line in errors.read_text().splitlines()]
+    pairs = [(float(line[1]), float(line[2])) for line in lines if len(line) == 3]
+    rows = [line.split() for line in poses.read_text().splitlines() if not line.startswith("#")]
+    quaternions = [[float(cell) for cell in row[1:5]] for row in rows if len(row) == 8]
+    if len(pairs) != len(quaternions):
+        return None
+    turns = [0.0]
+    for before, after in pairwise(quaternions):
+        cosine = abs(sum(a * b for a, b in zip(before, after, strict=True)))
+        turns.append(math.degrees(2 * math.acos(min(1.0, cosine))))
+    good = [m <= 0.25 and d <= 2 and turn <= 30 for (m, d), turn in zip(pairs, turns, strict=True)]
+    return sum(good), len(pairs)
+
+
+def test_numbers_worked_out_by_hand(tmp_path: Path) -> None:
+    folder = write_case(tmp_path, list(ERRORS), ERRORS, YAWS)
+    scores = scores_of(folder)
+    # ids within each limit: 1 4 10; and 2 3 5; and 6; and 7
+    expected = {"0.05m_0.4deg": 3, "0.25m_2deg": 6, "0.5m_5deg": 7, "5m_10deg": 8}
+    assert scores.mended == {name: Share(hits, 11) for name, hits in expected.items()} | {PLAN: Share(5, 11)}
+    np.testing.assert_allclose(scores.turns_deg, np.abs(np.diff(YAWS, prepend=0)), atol=1e-9)
+    # by row the lines 1 10 11 2 3 4 5 6 7 8 9 meet the poses 1 2 3 4 ...: 2 gets the 40 degrees, 4 does not
+    assert [scores.errors.ids[row] for row in scores.by_row] == ["1", "10", "11", "2", "3", "4", "5", *"6789"]
+    assert scores.as_shipped[PLAN] == Share(5, 11)  # 1 10 3 4 5, and mended 1 2 3 5 10
+    planned = views_table([Result("scene", "method", scores)]).set_index("id")
+    assert [name for name in ERRORS if planned.loc[name, PLAN]] == ["1", "2", "3", "5", "10"]
+    shipped = planned[planned["as_shipped_plan"] == 1]["as_shipped_error_of"]
+    assert [*shipped] == ["1", "10", "3", "4", "5"]
+
+
+def test_a_good_error_with_another_pose_s_turn(tmp_path: Path) -> None:
+    ids = [str(number) for number in range(1, 11)]
+    errors = {name: ((0.01, 0.1) if name in ("1", "2", "10") else (9.0, 90.0)) for name in ids}
+    yaws = (0, 90, 100, 110, 120, 130, 140, 150, 160, 250)
+    scores = scores_of(write_case(tmp_path, ids, errors, yaws))
+    # 1 begins; 2 and 10 are reached by 90 degrees. By row: 1 begins, 10 has the 90 degrees of 2, 2 the 10 of 3
+    assert (scores.mended[PLAN], scores.as_shipped[PLAN]) == (Share(1, 10), Share(2, 10))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_as_shipped_is_what_the_scripts_compute(seed: int, tmp_path: Path) -> None:
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(2, 40))
+    ids = [str(number) for number in rng.permutation(n)]
+    limits = rng.choice([0.05, 0.25, 0.5, 5.0, 7.0, 0.01], n), rng.choice([0.4, 2.0, 5.0, 10.0, 20.0, 0.1], n)
+    failed = rng.random(n) < 0.2
+    kept = [row for row in range(n) if seed % 3 or row]  # of every third, the first has no line
+    errors = {ids[row]: (np.nan, np.nan) if failed[row] else (limits[0][row], limits[1][row]) for row in kept}
+    folder = write_case(tmp_path, ids, errors, tuple(np.cumsum(rng.uniform(0, 60, n))))
+    poses = folder / "selected_gt_poses.txt"
+    lines = folder / "pose_errors.txt"
+    scores = scores_of(folder)
+    *loc, plan = scores.as_shipped.values()
+    assert [(share.hits, share.total) for share in loc] == loc_as_released(lines)
+    assert (plan and (plan.hits, plan.total)) == plan_as_released(lines, poses)
+    assert (plan is None) == (len(kept) < n)
+    # joined by id is what the script computes where both files stand in one order, and no line is missing
+    in_order = [f"{name} {m} {d}" for name, m, d in zip(ids, scores.metres, scores.degrees, strict=True)]
+    lines.write_text("\n".join(in_order))
+    mended = scores.mended[PLAN]
+    assert (mended.hits, mended.total) == plan_as_released(lines, poses)
+    assert [(share.hits, share.total) for share in scores.mended.values()][:4] == loc_as_released(lines)
+
+
+def test_files_of_the_benchmarks_own_script(tmp_path: Path) -> None:
+    """It writes the image's name where it found no pose, strips p, n, g and dots off others, and ends lines so."""
+    poses = poses_looking_along(np.zeros((3, 3)), np.tile([1.0, 0, 0], (3, 1)))
+    write_poses(tmp_path / "selected_gt_poses.txt", ["7", "gap", "12"], poses)
+    (tmp_path / "pose_errors.txt").write_text("12 0.01 0.1\n7.png nan nan \na 0.3 1.0\n")
+    scores = scores_of(tmp_path)
+    np.testing.assert_array_equal(scores.metres, [np.nan, 0.3, 0.01])
+    assert scores.mended["0.5m_5deg"] == Share(2, 3)
+
+
+def test_a_pose_without_an_error_has_failed_and_the_script_stops(tmp_path: Path) -> None:
+    few = {name: ERRORS[name] for name in ("1", "2", "4")}
+    scores = scores_of(write_case(tmp_path, list(ERRORS), few, YAWS))
+    assert scores.as_shipped["0.05m_0.4deg"] == Share(2, 3) and scores.mended["0.05m_0.4deg"] == Share(2, 11)
+    assert scores.as_shipped[PLAN] is None and scores.mended[PLAN] == Share(2, 11)
+    table = views_table([Result("scene", "method", scores)])
+    assert (table["as_shipped_plan"] == "").all()
+
+
+def test_scenes_are_pooled_not_averaged(tmp_path: Path) -> None:
+    large = scores_of(write_case(tmp_path / "a", list(ERRORS), ERRORS, YAWS))
+    small = scores_of(write_case(tmp_path / "b", ["1"], {"1": (0.01, 0.1)}, (0,)))
+    summary = summary_table([Result("a", "m", large), Result("b", "m", small)]).set_index(["scene", "measure"])
+    pooled = summary.loc[("all", "0.05m_0.4deg")]
+    assert (pooled["mended_hits"], pooled["mended_total"]) == (4, 12)
+    assert pooled["as_shipped_percent"] == pytest.approx(100 / 3)
+
+
+def test_poses_are_written_world_to_camera(tmp_path: Path) -> None:
+    poses = poses_looking_along([[1.0, 2.0, 3.0]], [[0.0, 1.0, 0.0]])
+    write_poses(tmp_path / "poses.txt", ["1"], poses)
+    back = read_poses(tmp_path / "poses.txt")
+    np.testing.assert_allclose(back.cam_from_world, poses, atol=1e-12)
+    np.testing.assert_allclose(invert_poses(back.cam_from_world)[0, :, 3], (1, 2, 3), atol=1e-12)
+
+
+def test_the_command_scores_files_that_are_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_case(tmp_path / "estimate", list(ERRORS), ERRORS, YAWS)
+    given = ["--errors", str(folder / "pose_errors.txt"), "--poses", str(folder / "selected_gt_poses.txt")]
+    assert run([*given, "--out", str(tmp_path / "out")]) == 0
+    assert "3/11 (27.27 %)" in capsys.readouterr().out
+    assert pd.read_csv(tmp_path / "out" / "summary.csv")["mended_hits"].tolist() == [3, 6, 7, 8, 5]
+    with pytest.raises(ConfigError, match="belong together"):
+        run(given[:2])
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("1 0.1 0.1\n1 0.2 0.2\n", "twice"),
+        ("1 0.1\n", "line 1"),
+        ("1 0.1 x\n", "line 1"),
+        ("# a comment\n", "empty"),
+        ("1 0.1 0.1\n99 0.1 0.1\n", "99"),
+    ],
+)
+def test_errors_that_cannot_be_scored(text: str, problem: str, tmp_path: Path) -> None:
+    write_case(tmp_path, ["1"], {"1": (0.1, 0.1)}, (0,))
+    (tmp_path / "pose_errors.txt").write_text(text)
+    with pytest.raises(TableError, match=problem):
+        scores_of(tmp_path)
+
+
+def test_a_quaternion_has_unit_length(tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_text("1 1 1 0 0 0 0 0\n")
+    with pytest.raises(TableError, match="unit length"):
+        read_poses(tmp_path / "poses.txt")

@@ -1,0 +1,101 @@
+"""Exact information: the kernel against its plain twin and against what is known by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from conftest import RandomViews
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
+from wheretolook.geometry.lattices import fibonacci_sphere
+from wheretolook.geometry.pose_information import TRACE, bearing_numbers, information_matrices
+from wheretolook.geometry.poses import poses_looking_along, rotation_looking_along, transform
+from wheretolook.visibility.frustum import LandmarkSets, PosedViews
+from wheretolook_paper.fisher.exact import exact_information, exact_information_plain
+
+
+def test_information_is_that_of_the_plain_twin(random_views: RandomViews, device: str) -> None:
+    v = random_views
+    arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
+    plain = exact_information_plain(arguments)
+    np.testing.assert_allclose(exact_information(arguments, device), plain, rtol=1e-9, atol=1e-12 * np.abs(plain).max())
+    assert np.sum(plain @ TRACE > 0) > 30
+
+
+def test_more_views_than_a_core_takes_at_a_time(device: str) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-4, 4, (200, 3))
+    rows = rng.integers(0, 7, 1000)
+    locations = rng.uniform(-2, 2, (7, 3))
+    mask = rng.random((7, 200)) < 0.7
+    poses = poses_looking_along(locations[rows], rng.normal(size=(1000, 3)))
+    arguments = PosedViews(PinholeCamera(), poses, points, LandmarkSets.from_mask(mask), rows)
+    np.testing.assert_allclose(exact_information(arguments, device), exact_information_plain(arguments), atol=1e-9)
+
+
+def test_landmarks_on_the_very_border_are_decided_alike(device: str) -> None:
+    """Within single precision's error of a side, or about a millimetre from the camera."""
+    camera = PinholeCamera()
+    rotations = rotation_looking_along(fibonacci_sphere(40))
+    rng = np.random.default_rng(0)
+    pixels = np.stack([rng.choice([0.0, 640.0], 20_000), rng.uniform(0, 480, 20_000)], 1)
+    pixels[::2] = np.stack([rng.uniform(0, 640, 10_000), rng.choice([0.0, 480.0], 10_000)], 1)
+    depth = rng.uniform(0.5, 8, (20_000, 1))
+    depth[:2000] = rng.uniform(0.9, 1.1, (2000, 1)) / 1024
+    pixels[:2000] = rng.uniform(0, 480, (2000, 2))
+    rays = np.concatenate([(pixels - (320, 240)) / 320, np.ones((20_000, 1))], 1) * depth
+    points = np.einsum("nji,nj->ni", rotations[rng.integers(0, 40, 20_000)], rays)
+    poses = poses_looking_along(np.zeros((40, 3)), fibonacci_sphere(40))
+    sets = LandmarkSets.from_mask(np.ones((1, len(points)), bool))
+    arguments = PosedViews(camera, poses, points, sets, np.zeros(40, dtype=int))
+    # the turn's share of the trace is twice the number of landmarks in view
+    found = exact_information(arguments, device)
+    plain = exact_information_plain(arguments)
+    turns = [9, 12, 14]
+    np.testing.assert_array_equal(np.round(found[:, turns].sum(1) / 2, 6), np.round(plain[:, turns].sum(1) / 2, 6))
+    np.testing.assert_allclose(found, plain, rtol=1e-9, atol=1e-12 * np.abs(plain).max())
+
+
+def test_information_by_hand(device: str) -> None:
+    camera = PinholeCamera(100, 100, 50.0)  # sees 45 degrees to every side
+    points = np.array([[2, 0, 0], [2, 1.9, 0], [2, 2.1, 0], [-2, 0, 0], [np.nan, 0, 0], [0, 0, 0]])
+    poses = poses_looking_along(np.zeros((3, 3)), [[1.0, 0, 0], [-1, 0, 0], [0, 0, 1]])
+    sets = LandmarkSets.from_mask(np.array([[True] * 6, [True, False, True, True, True, True]]))
+    found = exact_information(PosedViews(camera, poses[[0, 0, 1, 2]], points, sets, np.array([0, 1, 0, 0])), device)
+    near, wide = bearing_numbers(points[:2])
+    np.testing.assert_allclose(found, [near + wide, near, bearing_numbers(points[3]), np.zeros(15)], atol=1e-12)
+    # a shift along the axis changes nothing, one across it half a radian for each metre
+    np.testing.assert_allclose(np.diag(information_matrices(found[1])), [0, 0.25, 0.25, 0, 1, 1], atol=1e-12)
+
+
+def test_a_distorted_camera_sums_up_what_it_sees(random_views: RandomViews) -> None:
+    v = random_views
+    camera = ColmapCamera("OPENCV", 640, 480, (300.0, 300.0, 330.0, 235.0, -0.2, 0.05, 1e-3, -1e-3))
+    found = exact_information(PosedViews(camera, v.cam_from_world, v.points, v.visible, v.location_rows))
+    for view, pose in enumerate(v.cam_from_world):
+        candidates = v.visible[v.location_rows[view]]
+        seen = v.points[candidates[camera.sees(transform(pose, v.points[candidates]))]]
+        expected = bearing_numbers(seen - v.locations[v.location_rows[view]]).sum(0)
+        np.testing.assert_allclose(found[view], expected, rtol=1e-5, atol=1e-5)  # offsets are rounded to float32
+    assert (found @ TRACE > 0).sum() > 30
+
+
+def test_a_pinhole_of_colmap_is_as_ours(random_views: RandomViews, device: str) -> None:
+    v = random_views
+    pinhole = (v.camera.focal_px, v.camera.focal_px, v.camera.cx, v.camera.cy)
+    colmap = ColmapCamera("PINHOLE", v.camera.width, v.camera.height, pinhole)
+    arguments = v.cam_from_world, v.points, v.visible, v.location_rows
+    ours = exact_information(PosedViews(v.camera, *arguments), device)
+    theirs = exact_information(PosedViews(colmap, *arguments), device)
+    same = np.isclose(ours @ TRACE, theirs @ TRACE, rtol=1e-6)
+    assert same.mean() > 0.95  # but for landmarks on the border
+    np.testing.assert_allclose(ours[same], theirs[same], rtol=1e-5, atol=1e-5)
+
+
+def test_no_views_and_no_landmarks(device: str) -> None:
+    camera = PinholeCamera()
+    none = LandmarkSets.from_mask(np.ones((1, 0), bool))
+    assert exact_information(
+        PosedViews(camera, np.empty((0, 3, 4)), np.ones((1, 3)), none, np.empty(0, int)), device
+    ).shape == (0, 15)
+    poses = poses_looking_along(np.zeros((2, 3)), np.eye(3)[:2])
+    assert not exact_information(PosedViews(camera, poses, np.empty((0, 3)), none, np.zeros(2, int)), device).any()

@@ -1,0 +1,213 @@
+"""The field against direct sums over landmarks, and against the exact information that it approximates."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from wheretolook.geometry.lattices import fibonacci_sphere
+from wheretolook.geometry.pose_information import TRACE, information_matrices
+from wheretolook.geometry.poses import Float
+from wheretolook_paper.fisher.field import FisherField, stationary_axis_of_trace, worst_axis_of_trace
+from wheretolook_paper.fisher.field_sums import field_sums, field_sums_plain
+from wheretolook_paper.fisher.metrics import METRICS
+from wheretolook_paper.fisher.soft_visibility import (
+    JITTER,
+    GaussianProcessVisibility,
+    QuadraticVisibility,
+    SoftVisibility,
+)
+
+HALF_ANGLE = 0.766  # of the paper's camera
+VISIBILITIES = [QuadraticVisibility(HALF_ANGLE), GaussianProcessVisibility(HALF_ANGLE, 0.45)]
+
+
+def jacobians(offsets: Float) -> Float:
+    """Jacobians (N, 3, 6) of bearings, in the world, by a shift and a turn of the camera along the world's axes."""
+    distance = np.linalg.norm(offsets, axis=1)[:, None, None]
+    bearing = offsets[:, :, None] / distance
+    x, y, z = offsets.T
+    zero = np.zeros_like(x)
+    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+    by_point = (np.eye(3) - bearing * bearing.transpose(0, 2, 1)) / distance
+    return by_point @ np.concatenate([np.broadcast_to(-np.eye(3), cross.shape), cross], axis=2)
+
+
+def soft_sums(visibility: SoftVisibility, location: Float, points: Float, axes: Float) -> Float:
+    """Sum over landmarks of v(z, f) J^T J, (D, 6, 6), with v by its own formula."""
+    offsets = points - location
+    bearings = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
+    if isinstance(visibility, GaussianProcessVisibility):
+        covariance = np.exp(-((axes[:, None] - visibility.axes) ** 2).sum(-1) / (2 * visibility.length**2))
+        among = np.exp(-((visibility.axes[:, None] - visibility.axes) ** 2).sum(-1) / (2 * visibility.length**2))
+        cosine = visibility.axes @ bearings.T
+        seen = 1 / (1 + np.exp(-visibility.steepness * (cosine - np.cos(visibility.half_angle_rad))))
+        v = covariance @ np.linalg.solve(among + JITTER * np.eye(len(among)), seen)
+    else:
+        v = np.polyval(visibility.coefficients, axes @ bearings.T)  # type: ignore[attr-defined]
+    each = jacobians(offsets)
+    return np.einsum("dn,nij,nik->djk", v, each, each, optimize=True)
+
+
+def hard_sums(location: Float, points: Float, axes: Float) -> Float:
+    """Sum over the landmarks within the cone of J^T J, (D, 6, 6)."""
+    offsets = points - location
+    seen = axes @ offsets.T >= np.cos(HALF_ANGLE) * np.linalg.norm(offsets, axis=1)
+    each = jacobians(offsets)
+    return np.einsum("dn,nij,nik->djk", seen.astype(float), each, each, optimize=True)
+
+
+@pytest.mark.parametrize("visibility", VISIBILITIES)
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_field_gives_the_direct_sum(visibility: SoftVisibility, masked: bool, device: str) -> None:
+    rng = np.random.default_rng(0)
+    locations = rng.uniform(-2, 2, (20, 3))
+    points = rng.uniform(-5, 5, (9000, 3))
+    axes = fibonacci_sphere(60)
+    mask = rng.random((20, 9000)) < 0.3 if masked else None
+    field = FisherField.build(locations, points, visibility, mask, device)
+    assert field.factors.shape == (20, visibility.n_factors, 15)
+    for row in (0, 7, 19):
+        seen = points if mask is None else points[mask[row]]
+        expected = soft_sums(visibility, locations[row], seen, axes)
+        error = np.abs(information_matrices(field.information(row, axes)) - expected)
+        assert np.all(error.max((1, 2)) < 1e-5 * np.abs(expected).max((1, 2)))
+
+
+@pytest.mark.parametrize("visibility", VISIBILITIES)
+@pytest.mark.parametrize("masked", [False, True])
+def test_sums_are_those_of_the_plain_twin(visibility: SoftVisibility, masked: bool, device: str) -> None:
+    rng = np.random.default_rng(0)
+    locations = rng.uniform(-2, 2, (40, 3))
+    points = rng.uniform(-5, 5, (3000, 3))
+    points[:5] = locations[:5] + 1e-4  # too near
+    mask = rng.random((40, 3000)) < 0.4 if masked else None
+    found = field_sums(locations, points, visibility, mask, device)
+    plain = field_sums_plain(locations, points, visibility, mask)
+    assert found.shape == plain.shape == (40, visibility.n_factors, 15)
+    largest = np.abs(plain).max((1, 2), keepdims=True)
+    assert np.all(np.abs(found - plain) < 1e-6 * largest)
+
+
+def test_the_kernels_soft_step_is_that_of_the_plain_twin(device: str) -> None:
+    """One landmark at every angle to the only axis there is."""
+    angles = np.linspace(0, np.pi, 1001)
+    visibility = GaussianProcessVisibility(HALF_ANGLE, 0.5, n_factors=2)
+    side = np.cross(visibility.axes[0], [0.0, 0, 1])
+    side /= np.linalg.norm(side)
+    locations = -2 * (np.cos(angles)[:, None] * visibility.axes[0] + np.sin(angles)[:, None] * side)
+    found = field_sums(locations, np.zeros((1, 3)), visibility, device=device)
+    share = found[:, 0] @ TRACE / (2 / 4 + 2)
+    expected = 1 / (1 + np.exp(-15 * (np.cos(angles) - np.cos(HALF_ANGLE))))
+    assert np.abs(share - expected).max() < 6e-7
+    assert share.min() < 1e-7 and share.max() > 0.98
+
+
+@pytest.mark.parametrize("visibility", VISIBILITIES)
+def test_many_views_at_once_are_the_same(visibility: SoftVisibility) -> None:
+    rng = np.random.default_rng(0)
+    field = FisherField.build(rng.uniform(-1, 1, (5, 3)), rng.uniform(-5, 5, (500, 3)), visibility)
+    rows = rng.integers(0, 4, 40)  # none at the last
+    axes = fibonacci_sphere(40)
+    found = field.information_of_views(rows, axes)
+    for view in range(40):
+        expected = field.information(rows[view], axes[view : view + 1])[0]
+        np.testing.assert_allclose(found[view], expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("visibility", VISIBILITIES)
+def test_a_map_far_from_the_origin_and_landmarks_at_the_camera(visibility: SoftVisibility) -> None:
+    rng = np.random.default_rng(0)
+    far = np.array([4e6, -2e6, 512.0])
+    locations = rng.integers(-512, 512, (3, 3)) / 256
+    points = rng.integers(-2048, 2048, (200, 3)) / 256
+    near = FisherField.build(locations, points, visibility)
+    np.testing.assert_array_equal(FisherField.build(locations + far, points + far, visibility).factors, near.factors)
+    # one that is at a location, or as good as, has no bearing there
+    with_one = FisherField.build(locations, np.concatenate([points, locations[:1] + 1e-4]), visibility)
+    np.testing.assert_allclose(with_one.factors[0], near.factors[0], atol=1e-5 * np.abs(near.factors[0]).max())
+    assert np.abs(with_one.factors[1] - near.factors[1]).max() > 1e-3
+    assert not FisherField.build(locations, np.empty((0, 3)), visibility).factors.any()
+
+
+def test_more_factors_approximate_the_cone_better() -> None:
+    """As in the paper's Sec. VII: the information of the hard cone against that of the field, over the samples."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-5, -5, -2), (5, 5, 2), (2000, 3))
+    axes = fibonacci_sphere(200)
+    location = np.array([0.5, -1.0, 0.2])
+    truth = hard_sums(location, points, axes)
+
+    def error(visibility: SoftVisibility) -> float:
+        found = information_matrices(FisherField.build(location, points, visibility).information(0, axes))
+        each = np.linalg.norm(found - truth, axis=(1, 2)) / np.linalg.norm(truth, axis=(1, 2))
+        return float(each.mean())
+
+    errors = [error(GaussianProcessVisibility.fitted(HALF_ANGLE, n, steepness=30)) for n in (10, 15, 30, 70, 150)]
+    assert np.all(np.diff(errors) < 0)
+    assert errors[0] > 0.3 and errors[-1] < 0.05
+    assert error(GaussianProcessVisibility.fitted(HALF_ANGLE)) < 0.1 < error(QuadraticVisibility(HALF_ANGLE))
+
+
+@pytest.mark.parametrize("visibility", VISIBILITIES)
+@pytest.mark.parametrize("metric", METRICS)
+def test_metrics_of_a_location(visibility: SoftVisibility, metric: str) -> None:
+    rng = np.random.default_rng(0)
+    locations = rng.uniform((2, -1, -1), (4, 1, 1), (2, 3))
+    axes = fibonacci_sphere(30)
+    field = FisherField.build(locations, rng.uniform(-5, 5, (300, 3)), visibility)
+    for about_origin in (False, True):
+        pivots = np.broadcast_to(-locations[1], (30, 3)) if about_origin else None
+        matrices = information_matrices(field.information(1, axes), pivots)
+        determinant = np.linalg.det(matrices)
+        expected = {
+            "trace": np.trace(matrices, axis1=1, axis2=2),
+            "logdet": np.sign(determinant) * np.log1p(np.abs(determinant)),
+            "mineig": np.linalg.svd(matrices, compute_uv=False)[:, -1],
+        }[metric]
+        found = field.metric(1, axes, metric, about_origin)
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_probes_point_away_from_the_landmarks() -> None:
+    rng = np.random.default_rng(0)
+    for direction in fibonacci_sphere(7):
+        points = 4 * direction + rng.normal(size=(300, 3))
+        field = FisherField.build(np.zeros((1, 3)), points, QuadraticVisibility(HALF_ANGLE))
+        axes = fibonacci_sphere(500)
+        assert worst_axis_of_trace(field, 0, axes) @ direction < -0.2
+        assert axes[np.argmax(field.metric(0, axes, "trace"))] @ direction > 0.95
+        stationary = stationary_axis_of_trace(field, 0)
+        assert stationary @ direction < -0.9
+        assert np.linalg.norm(stationary) == pytest.approx(1)
+
+
+def test_the_stationary_axis_has_no_gradient() -> None:
+    rng = np.random.default_rng(0)
+    visibility = QuadraticVisibility(HALF_ANGLE)
+    points = rng.normal((1, 2, 0), size=(100, 3))
+    axis = stationary_axis_of_trace(FisherField.build(np.zeros((1, 3)), points, visibility), 0)
+    distance = torch.from_numpy(np.linalg.norm(points, axis=1))
+    bearings = torch.from_numpy(points) / distance[:, None]
+    k1, k2, k3 = visibility.coefficients
+
+    def trace(z: torch.Tensor) -> torch.Tensor:
+        cosine = bearings @ z
+        return ((k1 * cosine**2 + k2 * cosine + k3) * (2 / distance**2 + 2)).sum()
+
+    hessian = torch.func.hessian(trace)(torch.zeros(3, dtype=torch.float64))
+    gradient = torch.func.grad(trace)(torch.zeros(3, dtype=torch.float64))
+    stationary = -torch.linalg.solve(hessian, gradient)
+    np.testing.assert_allclose(axis, stationary / stationary.norm(), atol=1e-5)
+
+
+def test_without_landmarks_the_stationary_axis_is_some_unit_vector() -> None:
+    field = FisherField.build(np.zeros((1, 3)), np.empty((0, 3)), QuadraticVisibility(HALF_ANGLE))
+    assert np.linalg.norm(stationary_axis_of_trace(field, 0)) == 1
+
+
+@pytest.mark.parametrize("shape", [(2, 20), (1, 30), (3, 30), (30, 2)])
+def test_masks_of_another_shape_are_refused(shape: tuple[int, int]) -> None:
+    with pytest.raises(ValueError, match=r"shape \(2, 30\)"):
+        FisherField.build(np.zeros((2, 3)), np.ones((30, 3)), VISIBILITIES[0], np.ones(shape, bool))

@@ -1,0 +1,169 @@
+"""Information against automatic differentiation, its metrics against NumPy, and the kernel against its plain twin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from wheretolook.geometry.pose_information import TRACE, bearing_numbers, information_matrices
+from wheretolook.geometry.poses import Float
+from wheretolook.utils.errors import ConfigError
+from wheretolook_paper.fisher.metrics import METRICS, eigenvalues, eigenvalues_plain, metric_of
+
+
+def turn_of(vector: torch.Tensor) -> torch.Tensor:
+    """The matrix (3, 3) that multiplies as the cross product."""
+    x, y, z = vector
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+
+
+def bearing_about_camera(change: torch.Tensor, rotation: torch.Tensor, center: torch.Tensor, points: torch.Tensor):  # type: ignore[no-untyped-def]
+    """Bearings (N, 3) in the camera, whose centre is shifted and whose axes are turned, both along the world's axes."""
+    turned = torch.linalg.matrix_exp(turn_of(change[3:])) @ rotation
+    offsets = (points - (center + change[:3])) @ turned
+    return offsets / offsets.norm(dim=1, keepdim=True)
+
+
+def bearing_about_origin(change: torch.Tensor, rotation: torch.Tensor, center: torch.Tensor, points: torch.Tensor):  # type: ignore[no-untyped-def]
+    """The same with the pose T (world from camera) changed to Exp(change) T, as in the released code."""
+    twist = torch.zeros(4, 4, dtype=torch.float64)
+    twist[:3, :3] = turn_of(change[3:])
+    twist[:3, 3] = change[:3]
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = center
+    inverse = torch.linalg.inv(torch.linalg.matrix_exp(twist) @ pose)
+    offsets = points @ inverse[:3, :3].T + inverse[:3, 3]
+    return offsets / offsets.norm(dim=1, keepdim=True)
+
+
+def differentiated(bearing, rotation: Float, center: Float, points: Float) -> Float:  # type: ignore[no-untyped-def]
+    """J^T J (6, 6), summed over landmarks."""
+    fixed = [torch.as_tensor(value, dtype=torch.float64) for value in (rotation, center, points)]
+    jacobian = torch.func.jacfwd(lambda change: bearing(change, *fixed))(torch.zeros(6, dtype=torch.float64))
+    return torch.einsum("nki,nkj->ij", jacobian, jacobian).numpy()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_information_is_that_of_automatic_differentiation(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rotation = Rotation.random(random_state=seed).as_matrix()
+    center = rng.normal(scale=4, size=3)
+    points = center + rng.normal(size=(30, 3)) * rng.uniform(0.1, 10, (30, 1))
+    numbers = bearing_numbers(points - center).sum(0)
+    for bearing, pivot in ((bearing_about_camera, None), (bearing_about_origin, -center)):
+        expected = differentiated(bearing, rotation, center, points)
+        error = np.abs(information_matrices(numbers, pivot) - expected).max() / np.abs(expected).max()
+        assert error < 1e-12
+    assert np.abs(information_matrices(numbers) - expected).max() > 0.1 * np.abs(expected).max()  # they are two things
+
+
+def test_the_cameras_rotation_changes_nothing() -> None:
+    rng = np.random.default_rng(0)
+    center = rng.normal(size=3)
+    points = rng.normal(scale=5, size=(20, 3))
+    for rotation in Rotation.random(4, random_state=1).as_matrix():
+        expected = differentiated(bearing_about_camera, rotation, center, points)
+        found = information_matrices(bearing_numbers(points - center).sum(0))
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_the_determinant_does_not_depend_on_the_pivot() -> None:
+    rng = np.random.default_rng(0)
+    numbers = bearing_numbers(rng.normal(size=(25, 3)) * 3).sum(0)
+    pivots = np.concatenate([np.zeros((1, 3)), rng.normal(scale=3, size=(20, 3))])
+    determinants = np.linalg.det(information_matrices(np.broadcast_to(numbers, (21, 15)), pivots))
+    np.testing.assert_allclose(determinants, np.linalg.det(information_matrices(numbers)), rtol=1e-9)
+
+
+def test_the_trace_of_one_landmark_in_closed_form() -> None:
+    offsets = np.random.default_rng(0).normal(size=(50, 3)) * 3
+    distance = np.linalg.norm(offsets, axis=1)
+    expected = 2 / distance**2 + 2
+    np.testing.assert_allclose(np.trace(information_matrices(bearing_numbers(offsets)), axis1=1, axis2=2), expected)
+    np.testing.assert_allclose(metric_of(bearing_numbers(offsets), "trace"), expected)
+    np.testing.assert_allclose(bearing_numbers(offsets) @ TRACE, expected)
+
+
+def test_one_landmark_straight_ahead_by_hand() -> None:
+    expected = np.zeros((6, 6))
+    expected[[0, 1], [0, 1]] = 1 / 4  # a shift of 1 m across turns the bearing of what is 2 m away by half a radian
+    expected[[3, 4], [3, 4]] = 1
+    expected[3, 1] = expected[1, 3] = -1 / 2  # a turn about x moves the bearing as a shift along -y does
+    expected[4, 0] = expected[0, 4] = 1 / 2
+    np.testing.assert_allclose(information_matrices(bearing_numbers([0.0, 0.0, 2.0])), expected, atol=1e-15)
+
+
+def kinds_of_numbers() -> dict[str, Float]:
+    rng = np.random.default_rng(0)
+    landmarks = bearing_numbers(rng.normal(size=(300, 40, 3)) * rng.uniform(0.05, 20, (300, 40, 1)))
+    sphere = np.zeros((3, 15))
+    sphere[:, [0, 3, 5]] = 2.0  # eigenvalues that are the same
+    sphere[:, [9, 12, 14]] = [[2.0], [5.0], [-2.0]]
+    return {
+        "many landmarks": landmarks.sum(1),
+        "indefinite": (landmarks[:, :20].sum(1) - 0.7 * landmarks[:, 20:].sum(1)),
+        "any": rng.normal(size=(300, 15)) * 10.0 ** rng.integers(-6, 7, (300, 1)),
+        "none": np.zeros((3, 15)),
+        "one landmark": landmarks[:, 0],
+        "two landmarks": landmarks[:, :2].sum(1),
+        "near and far": bearing_numbers(rng.normal(size=(50, 30, 3)) * 10.0 ** rng.uniform(-3, 3, (50, 30, 1))).sum(1),
+        "equal eigenvalues": sphere,
+    }
+
+
+@pytest.mark.parametrize("kind", kinds_of_numbers())
+@pytest.mark.parametrize("pivoted", [False, True])
+def test_eigenvalues_are_those_of_the_plain_twin(kind: str, pivoted: bool, device: str) -> None:
+    numbers = kinds_of_numbers()[kind]
+    pivots = np.random.default_rng(1).normal(scale=3, size=(len(numbers), 3)) if pivoted else None
+    found = np.sort(eigenvalues(numbers, pivots, device), axis=1)
+    plain = eigenvalues_plain(numbers, pivots)
+    assert np.all(np.abs(found - plain) <= 2e-14 * np.abs(plain).max(1, keepdims=True))
+    assert np.abs(plain).max() > 0.1 or kind == "none"
+
+
+@pytest.mark.parametrize("kind", kinds_of_numbers())
+@pytest.mark.parametrize("pivoted", [False, True])
+def test_metrics_are_those_of_numpy(kind: str, pivoted: bool, device: str) -> None:
+    numbers = kinds_of_numbers()[kind]
+    pivots = np.random.default_rng(1).normal(scale=3, size=(len(numbers), 3)) if pivoted else None
+    matrices = information_matrices(numbers, pivots)
+    norm = np.linalg.norm(matrices, axis=(1, 2))
+    singular = np.linalg.svd(matrices, compute_uv=False)[:, -1]
+    assert np.all(np.abs(metric_of(numbers, "mineig", pivots, device) - singular) <= 1e-12 * norm)
+    trace = np.einsum("bii->b", matrices)
+    assert np.all(np.abs(metric_of(numbers, "trace", pivots, device) - trace) <= 1e-12 * norm)
+    determinant = np.linalg.det(matrices)
+    expected = np.sign(determinant) * np.log1p(np.abs(determinant))
+    sure = singular > 1e-5 * norm  # where the determinant itself is known to some ten digits
+    found = metric_of(numbers, "logdet", pivots, device)
+    np.testing.assert_allclose(found[sure], expected[sure], rtol=1e-9)
+    if kind in ("none", "one landmark", "two landmarks"):
+        assert np.all(np.abs(found) < 1e-9) and not sure.any()
+    else:
+        assert sure.any()
+    assert np.any(found < -0.1) == (kind in ("indefinite", "any", "equal eigenvalues"))
+
+
+def test_what_is_not_a_number_comes_to_an_end() -> None:
+    numbers = np.ones((3, 15))
+    numbers[0, 4] = np.nan
+    numbers[1, 12] = np.inf
+    found = metric_of(numbers, "mineig")
+    assert not np.isfinite(found[:2]).any() and np.isfinite(found[2])
+
+
+def test_many_matrices_on_all_cores_are_the_same_as_few() -> None:
+    numbers = np.random.default_rng(0).normal(size=(9000, 15))
+    alone = np.concatenate([eigenvalues(part) for part in np.array_split(numbers, 9)])
+    np.testing.assert_array_equal(eigenvalues(numbers), alone)
+
+
+def test_no_such_metric() -> None:
+    with pytest.raises(ConfigError, match=r"unknown metric.*det.*mineig, logdet, trace"):
+        metric_of(np.zeros((1, 15)), "det")
+    assert METRICS == ("mineig", "logdet", "trace")

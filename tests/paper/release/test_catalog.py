@@ -1,0 +1,196 @@
+"""Every figure and table of the catalog, from a store to files, and what is said of those that cannot be made."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from planning.rooms import patiently
+from synthetic_release import history, make_release
+from synthetic_scores import make_scores
+from wheretolook.cli import main
+from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.thresholds import ALL
+from wheretolook.figures.config import FiguresConfig
+from wheretolook.figures.style import note_of
+from wheretolook.planning.config import PathConfig, PlanConfig
+from wheretolook.planning.routes import PathView
+from wheretolook.scorers.styles import method_style
+from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.tracking import newest_artifact, newest_run
+from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook_paper.figures.top_n import ROWS, top_n_figure, top_n_table
+from wheretolook_paper.release.catalog import ITEMS, write_items
+from wheretolook_paper.release.paper_architecture import paper_architecture_table
+from wheretolook_paper.release.runs import log_release
+from wheretolook_paper.release.showcase import open_showcase
+from wheretolook_paper.release.showcase_figures import planned_views
+from wheretolook_paper.release.table_view import latest_paper_table, paper_cells, paper_styler
+
+RELEASE = Path(__file__).parents[3] / "data" / "release"
+PAPER = {f"Fig. {n}" for n in range(1, 8)} | {f"Table {n}" for n in (1, 2, 3)}
+OF_SCENES = {"pipeline", "learning", "viewpoint_generation", "planning", "inputs", "peaks"}
+"""What needs a scene that can be made anew from its seed, which the tiny release has not."""
+
+NOT_THERE = {"training", "visibility_scaling"} | OF_SCENES
+
+
+def quiet(text: str) -> None:
+    pass
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, TrackingConfig]:
+    folder = tmp_path_factory.mktemp("catalog")
+    release = make_release(folder / "data" / "release")
+    tracking = TrackingConfig(str(folder / "mlruns"))
+    log_release(release, tracking)
+    return release, tracking
+
+
+def test_the_catalog_names_the_papers_items() -> None:
+    assert {item.paper for item in ITEMS} >= PAPER
+    assert len({item.name for item in ITEMS}) == len(ITEMS)
+    assert all(item.command and item.notebook[:2].isdigit() for item in ITEMS)
+
+
+@pytest.mark.slow
+def test_all_that_has_a_run_is_written_and_attached(store: tuple[Dataset, TrackingConfig], tmp_path: Path) -> None:
+    release, tracking = store
+    said: list[str] = []
+    missing = write_items(release, tracking, FiguresConfig(tmp_path, kinds=("pdf",)), said.append)
+    assert missing.keys() == NOT_THERE
+    assert missing["training"] == "wheretolook train --config configs/release.yaml"
+    assert any(missing["training"] in line for line in said)
+    written = {path.stem for path in tmp_path.iterdir()}
+    assert written == {item.name for item in ITEMS} - NOT_THERE
+    run = newest_run(tracking, "evaluate", params={"dataset": "release"})
+    others = newest_run(tracking, "evaluate", params={"dataset": "interiors"})
+    assert run is not None and others is not None
+    assert note_of(tmp_path / "top_n.pdf") == f"runs: {run.info.run_id} (evaluate)"
+    assert others.info.run_id in note_of(tmp_path / "regret_interiors.pdf")
+    assert run.info.run_id in (tmp_path / "table_vs_others.md").read_text()
+    assert (tmp_path / "table_vs_others.tex").read_text().endswith(f"% runs: {run.info.run_id} (evaluate)\n")
+    attached = newest_artifact(tracking, "evaluate", "figures/top_n.pdf", "release")
+    assert attached.read_bytes() == (tmp_path / "top_n.pdf").read_bytes()
+    assert "fully connected 4500 × 300" in (tmp_path / "architecture.md").read_text()
+
+
+@pytest.mark.slow
+def test_scenes_of_the_release_are_drawn_with_the_runs_of_their_weights(tmp_path: Path) -> None:
+    release = Dataset.load(RELEASE)
+    tracking = TrackingConfig(str(tmp_path / "mlruns"))
+    runs = log_release(release, tracking).train
+    drawn = tuple(OF_SCENES - {"planning"})
+    assert write_items(release, tracking, FiguresConfig(tmp_path / "out", drawn, ("png",)), quiet) == {}
+    notes = {name: note_of(tmp_path / "out" / f"{name}.png") for name in drawn}
+    assert notes == {
+        "pipeline": f"runs: {runs['set']} (train)", "peaks": f"runs: {runs['set']} (train)",
+        "learning": f"runs: {runs['mlp-2d+z']} (train)", "inputs": f"runs: {runs['mlp-2d+z']} (train)",
+        "viewpoint_generation": "",
+    }  # fmt: skip
+    showcase = open_showcase(release)
+    quick = PlanConfig(grid=(4, 4, 2), directions=40)
+
+    def views_within(seconds: float) -> dict[str, list[PathView]]:
+        config = replace(quick, planner=PathConfig(time_s=seconds))
+        return planned_views(showcase, release, ("forward", "bins"), config)
+
+    views = patiently(views_within, seconds=2.0)
+    assert [*views] == ["forward", "bins"]
+    ends = [[path[0].position, path[-1].position] for path in views.values()]
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
+    assert np.linalg.norm(np.diff(ends[0], axis=0)) > 4  # the farthest of ten pairs
+
+
+def test_chosen_items_are_made_alone(store: tuple[Dataset, TrackingConfig], tmp_path: Path) -> None:
+    assert write_items(*store, FiguresConfig(tmp_path, ("calibration",), ("svg",)), quiet) == {}
+    assert [path.name for path in tmp_path.iterdir()] == ["calibration.svg"]
+    with pytest.raises(ConfigError, match="figures --list"):
+        write_items(*store, FiguresConfig(tmp_path, ("calibrations",)), quiet)
+
+
+@pytest.mark.slow
+def test_the_command_says_what_is_missing(
+    store: tuple[Dataset, TrackingConfig], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A release whose runs nobody has logged; exit code 2 until the last one is there."""
+    shutil.copytree(store[0].root.parent, tmp_path / "data")
+    config = tmp_path / "release.yaml"
+    config.write_text(f"name: release\ndata: {tmp_path / 'data'}\ntracking: {{folder: {tmp_path / 'mlruns'}}}\n")
+    command = ["figures", "--config", str(config), "--out", str(tmp_path / "out"), "--kinds", "[png]", "--only"]
+    assert main([*command, "[top_n, training]"]) == 2
+    printed = capsys.readouterr()
+    assert "training" in printed.err and "wheretolook train --config configs/release.yaml" in printed.err
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["top_n.png"]
+    history().assign(method="mlp-2d+3d").to_csv(tmp_path / "data" / "release" / "results" / "training.csv", index=False)
+    assert main([*command, "[top_n, training]"]) == 0
+    assert (tmp_path / "out" / "training.png").is_file()
+    assert main(["log-release", "--config", str(config)]) == 0
+    assert "0 runs are new" in capsys.readouterr().out
+    fresh = TrackingConfig(str(tmp_path / "fresh"))
+    assert main(["log-release", "--config", str(config), "--tracking.folder", fresh.folder]) == 0
+    for stage, file in (("evaluate", "figures/top_n.png"), ("train", "figures/training.png")):
+        assert newest_artifact(fresh, stage, file, "release").stat().st_size > 1000
+    (tmp_path / "data" / "release" / "release.json").unlink()
+    assert main(["log-release", "--config", str(config)]) == 2
+    assert "no release" in capsys.readouterr().err
+
+
+def test_the_catalog_is_listed_and_explained(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["figures", "--list"]) == 0
+    listed = capsys.readouterr().out
+    assert all(item.name in listed and item.notebook in listed for item in ITEMS)
+    for command, text in (("figures", "exit code is 2"), ("log-release", "make ui")):
+        assert main([command, "--help"]) == 0
+        assert text in capsys.readouterr().out
+
+
+def test_marks_of_several_viewpoints_are_the_tables() -> None:
+    scores = make_scores()
+    figure = top_n_figure(scores)
+    panels = [axes for axes in figure.axes if axes.lines]
+    assert len(panels) == 8 and [panels[0].get_ylabel(), panels[4].get_ylabel()] == list(ROWS.values())
+    pooled = scores[scores["scene"] == ALL]
+    for panel, column in ((panels[0], "normalized_0.05m_0.4deg"), (panels[7], "any_5m_10deg")):
+        lines = {line.get_label(): line.get_ydata() for line in panel.lines}
+        for method in ("random", "bins", "fisher-trace-exact", "mlp-2d"):
+            rows = pooled[pooled["method"] == method]
+            assert lines[method_style(method).label] == pytest.approx(100 * rows[column])
+    printed = {line.get_marker(): line.get_ydata()[0] for line in panels[0].lines if len(line.get_ydata()) == 1}
+    assert printed == {"D": 72.9, "s": 54.7}
+    low, high = panels[0].get_ylim()
+    assert low < min(min(line.get_ydata()) for line in panels[0].lines) and high >= 100
+    table = top_n_table(scores)
+    # the set network was not evaluated
+    shown = ["mlp-2d", "fisher-trace-exact", "bins", "random", "oracle"]
+    assert table.index.tolist() == [method_style(name).label for name in shown]
+    assert (table.loc["oracle", "good ones, % of the oracle's"] == 100).all()
+
+
+def test_paper_tables_for_reading(store: tuple[Dataset, TrackingConfig]) -> None:
+    table = latest_paper_table(store[1], "vs_others", "release")
+    cells = paper_cells(table)
+    bins = cells.loc[("reprojections with bins", "reprojections with bins"), "5 cm, 0.4°"]
+    row = table[table["paper_row"] == "reprojections with bins"].iloc[0]
+    assert bins["ours"] == f"{row['score_0.05m_0.4deg']:.1f}" and bins["paper"] == "68.7"
+    assert bins["95 %"].split(" – ")[0] == f"{row['score_low_0.05m_0.4deg']:.1f}"
+    assert (cells.xs("FIF trace GP app").loc[:, (slice(None), "paper")] == "–").all(axis=None)
+    html = paper_styler(table).to_html()
+    assert html.count("font-weight: bold;\n}") >= 1 and "72.9" in html
+
+
+def test_layers_are_those_that_were_trained() -> None:
+    small = paper_architecture_table({"method": "mlp-2d", "bins": "10", "hidden": "[50]", "dropout": "0.2"})
+    assert small["here"].tolist()[:5] == ["fully connected 200 × 50", "ReLU", "dropout 0.2", "fully connected 50 × 1",
+                                          "Sigmoid"]  # fmt: skip
+    assert small["layer"].tolist() == ["1", "1.1", "1.2", "2", "2.1", "2.2", "3", "3.1"]
+    assert small["here"].tolist()[5:] == ["", "", ""]
+    same = paper_architecture_table({"variant": "2d+3d", "bins": "30", "hidden": "(300, 300)", "dropout": "0.5"})
+    different = pd.Series(same["paper"] != same["here"])
+    assert same.loc[different, "here"].tolist() == ["fully connected 4500 × 300"]

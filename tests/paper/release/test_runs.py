@@ -1,0 +1,286 @@
+"""A release logged as MLflow runs: once, as the stages log, and open to every search that the page on runs names."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from synthetic_dataset import make_dataset
+from synthetic_release import METHODS, history, make_release
+from wheretolook.dataset.layout import Dataset
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.evaluation.results import latest_scores
+from wheretolook.evaluation.scores import read_scores
+from wheretolook.figures.config import FiguresConfig
+from wheretolook.stages.evaluate import evaluate_methods as evaluate
+from wheretolook.utils.errors import MissingRunError
+from wheretolook.utils.tracking import (
+    artifact,
+    client,
+    experiment_ids,
+    experiments,
+    finished_runs,
+    newest_artifact,
+    newest_run,
+    start_run,
+)
+from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook_paper.release.catalog import write_items
+from wheretolook_paper.release.notebook import open_store
+from wheretolook_paper.release.runs import ReleaseRuns, log_release
+from wheretolook_paper.release.training_histories import HISTORY_CSV, histories, keep_histories, trained
+
+PAGE = Path(__file__).parents[3] / "mlruns" / "README.md"
+
+
+@pytest.fixture(scope="module")
+def logged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, TrackingConfig, ReleaseRuns]:
+    folder = tmp_path_factory.mktemp("logged")
+    release = make_release(folder / "data" / "release")
+    tracking = TrackingConfig(str(folder / "mlruns"))
+    return release, tracking, log_release(release, tracking)
+
+
+@pytest.fixture
+def store(logged: tuple[Dataset, TrackingConfig, ReleaseRuns], tmp_path: Path) -> tuple[Dataset, TrackingConfig]:
+    """A release and its store that may be changed."""
+    shutil.copytree(logged[0].root.parent.parent, tmp_path / "copy")
+    release = Dataset.load(tmp_path / "copy" / "data" / "release")
+    return release, TrackingConfig(str(tmp_path / "copy" / "mlruns"))
+
+
+def children(tracking: TrackingConfig, parent: str) -> dict[str, tuple[dict[str, str], dict[str, float]]]:
+    """Parameters and metrics of the runs nested in a run, by their names."""
+    experiment = client(tracking).get_run(parent).info.experiment_id
+    query = f"tags.mlflow.parentRunId = '{parent}'"
+    runs = client(tracking).search_runs([experiment], query, max_results=1000)
+    assert {run.info.status for run in runs} <= {"FINISHED"}
+    return {run.info.run_name: (run.data.params, run.data.metrics) for run in runs}
+
+
+def test_every_kind_of_result_becomes_a_run_once(logged: tuple[Dataset, TrackingConfig, ReleaseRuns]) -> None:
+    release, tracking, runs = logged
+    assert [*runs.evaluate] == ["release", "interiors"] and [*runs.train] == ["mlp-2d+3d"]
+    ids = [*runs.evaluate.values(), *runs.train.values(), runs.learners, runs.paths, runs.looks, runs.benchmark]
+    assert None not in ids and len({*ids}) == runs.new == 7
+    again = log_release(release, tracking)
+    assert again == dataclasses.replace(runs, new=0)
+    pd.testing.assert_frame_equal(
+        latest_scores(tracking, "release"), read_scores(release.root / "results" / "scores.csv")
+    )
+    assert (
+        newest_artifact(tracking, "paths", "paths.csv").read_bytes()
+        == (release.root / "results" / "paths.csv").read_bytes()
+    )
+
+
+def test_rows_over_all_scenes_are_nested(logged: tuple[Dataset, TrackingConfig, ReleaseRuns]) -> None:
+    release, tracking, runs = logged
+    scores = read_scores(release.root / "results" / "scores.csv")
+    nested = children(tracking, runs.evaluate["release"])
+    assert len(nested) == 2 * (len(METHODS) + 1)
+    params, metrics = nested["mlp-2d+z, none (evaluate release)"]
+    assert params["occlusion"] == "none" and params["dataset"] == "release" and params["scenes"] == "scene-0 scene-1"
+    rows = scores.query("method == 'mlp-2d+z' and occlusion == 'none'").set_index(["top_n", "scene"])
+    for n in (1, 5, 10):
+        assert metrics[f"top-{n}/raw_0.05m_0.4deg"] == rows.loc[(n, "all"), "raw_0.05m_0.4deg"]
+        assert metrics[f"top-{n}/regret_5m_10deg"] == rows.loc[(n, "all"), "regret_5m_10deg"]
+        assert metrics[f"top-{n}/scene-1/regret_0.05m_0.4deg"] == rows.loc[(n, "scene-1"), "regret_0.05m_0.4deg"]
+    assert sorted(metrics)[:3] == ["1_auc", "1_regret", "1_share"]
+    assert metrics["1_regret"] == metrics["top-1/regret_0.05m_0.4deg"]
+    assert metrics["1_share"] == metrics["top-1/raw_0.05m_0.4deg"] and metrics["1_auc"] == metrics["roc_auc"]
+    learners = children(tracking, str(runs.learners))
+    names = ("bins, seed 0", "set, apartments, seed 0", "set, apartments, seed 1")
+    assert {*learners} == {f"{name} (learners release)" for name in names}
+    last = learners["set, apartments, seed 1 (learners release)"][1]
+    assert last["regret_test"] == last["1_regret"] == pytest.approx(0.2)
+    assert last["average_precision/c"] == last["average_precision_others"] == pytest.approx(0.9)
+    assert children(tracking, str(runs.paths)).keys() == {
+        f"{method}, {task} (paths release)" for task in ("planned", "given") for method in ("forward", "bins")
+    }
+    looks = children(tracking, str(runs.looks))
+    assert {*looks} == {f"{name} looks (looks release)" for name in ("together, 1", "together, 2", "random, 2")}
+    assert looks["together, 2 looks (looks release)"][1] == {"good": 0.8, "any_good": 0.75}
+
+
+def test_each_dataset_and_purpose_has_an_experiment_that_says_what_to_look_at(
+    logged: tuple[Dataset, TrackingConfig, ReleaseRuns],
+) -> None:
+    tracking = logged[1]
+    found = {experiment.name: experiment for experiment in experiments(client(tracking), tracking)}
+    released = ("evaluation", "learners", "looks", "paths", "training")
+    assert found.keys() == {"interiors: evaluation", "benchmarks", *(f"release: {purpose}" for purpose in released)}
+    for experiment in found.values():
+        note = experiment.tags["mlflow.note.content"]
+        ids = [experiment.experiment_id]
+        logged_here = client(tracking).search_runs(ids, max_results=1000)
+        metrics = {name for run in logged_here for name in run.data.metrics}
+        named = {*re.findall(r"`((?:1|regret|kept|average_precision|times)_[a-z_]+|localized|good|any_good)`", note)}
+        assert (named and named <= metrics) or experiment.name == "benchmarks", (experiment.name, named - metrics)
+        for query in re.findall(r"`(params\.[^`]*)`", note):
+            assert client(tracking).search_runs(ids, query), query
+        for address in re.findall(r"\]\((#[^)]*)\)", note):
+            assert address.startswith(f"#/experiments/{experiment.experiment_id}/runs?viewStateShareKey=")
+            view = json.loads(experiment.tags[f"mlflow.sharedViewState.{address.rpartition('=')[2]}"])
+            order = f"{view['orderByKey']} {'ASC' if view['orderByAsc'] else 'DESC'}"
+            shown = client(tracking).search_runs(ids, view["searchFilter"], order_by=[order], max_results=1000)
+            for column in view["selectedColumns"]:
+                kind, _, name = column.replace("`", "").partition(".")
+                values = [(run.data.params if kind == "params" else run.data.metrics).get(name) for run in shown]
+                assert any(value is not None for value in values), (experiment.name, column)
+
+
+def test_parents_carry_the_numbers_of_the_best(logged: tuple[Dataset, TrackingConfig, ReleaseRuns]) -> None:
+    release, tracking, runs = logged
+    parent = client(tracking).get_run(runs.evaluate["release"]).data
+    scores = read_scores(release.root / "results" / "scores.csv")
+    rows = scores.query("scene == 'all' and top_n == 1 and occlusion == 'mesh' and method not in ('oracle', 'random')")
+    best = rows.loc[rows["regret_0.05m_0.4deg"].idxmin()]
+    assert parent.tags["best"] == best["method"] and sorted(parent.metrics)[:3] == ["1_auc", "1_regret", "1_share"]
+    assert parent.metrics["1_regret"] == best["regret_0.05m_0.4deg"] == rows["regret_0.05m_0.4deg"].min()
+    assert parent.metrics["1_share"] == best["raw_0.05m_0.4deg"] and parent.metrics["1_auc"] == best["roc_auc"]
+    assert len(parent.metrics) == 6
+    learners = client(tracking).get_run(str(runs.learners)).data
+    assert learners.metrics.keys() == {"1_auc", "1_regret"} and learners.tags["best"] in ("bins", "set, apartments")
+    paths = client(tracking).get_run(str(runs.paths)).data
+    assert paths.tags["best"] in ("forward", "bins") and paths.metrics["localized"] == 0.5
+    (trained_run,) = (client(tracking).get_run(run) for run in runs.train.values())
+    assert trained_run.info.run_name == "mlp-2d+3d (train release)" and trained_run.data.metrics["1_auc"] == 0.8
+
+
+def test_a_store_of_an_older_version_serves_on(tmp_path: Path) -> None:
+    """All its runs lie in one experiment, with other names of runs and fewer metrics: read, and left as they are."""
+    release = make_release(tmp_path / "data" / "release")
+    folder = str(tmp_path / "mlruns")
+    old = TrackingConfig(folder, "wheretolook")
+    tracking = TrackingConfig(folder)
+    runs = log_release(release, old)
+    mlflow = client(old)
+    mlflow.update_run(runs.evaluate["release"], name="evaluate release")
+    mlflow.delete_tag(runs.evaluate["release"], "best")
+    assert log_release(release, tracking) == ReleaseRuns(**{**vars(runs), "new": 0})
+    assert [one.name for one in experiments(mlflow, tracking)] == ["wheretolook"]
+    pd.testing.assert_frame_equal(latest_scores(tracking, "release"), latest_scores(old, "release"))
+    config = FiguresConfig(tmp_path / "figures", ("scores", "table_vs_others", "paths", "runtimes"), ("png",))
+    assert write_items(release, tracking, config, lambda text: None) == {}
+    drawn = {path.name for path in (tmp_path / "figures").iterdir()}
+    assert drawn >= {"scores.png", "table_vs_others.md", "paths.png", "runtimes.png"}
+    assert artifact(old, str(runs.paths), "figures/paths.png").is_file()
+    assert mlflow.get_run(runs.evaluate["release"]).info.run_name == "evaluate release"
+    with start_run(tracking, "later", "paths", {"dataset": "release"}) as (_, later):
+        pass
+    assert [run.info.run_id for run in finished_runs(tracking, "paths")] == [later, runs.paths]
+    assert [run.info.run_id for run in finished_runs(old, "paths")] == [runs.paths]  # the option still limits it
+
+
+def test_a_deleted_experiment_does_not_come_back(store: tuple[Dataset, TrackingConfig]) -> None:
+    release, tracking = store
+    (paths,) = (one for one in experiments(client(tracking), tracking) if one.name == "release: paths")
+    client(tracking).delete_experiment(paths.experiment_id)
+    assert log_release(release, tracking).new == 1 and log_release(release, tracking).new == 0
+    names = [one.name for one in experiments(client(tracking), tracking)]
+    assert "release: paths" not in names and f"release: paths at {tracking.root}" in names
+
+
+def test_a_release_is_logged_as_its_evaluation_was(tmp_path: Path) -> None:
+    """The same names, parameters and metrics; and in the store of the evaluation itself its run is found."""
+    dataset = make_dataset(tmp_path / "tiny", ("test", "test"), n_locations=4, n_directions=6)
+    (dataset.root / "weights").mkdir()
+    own = TrackingConfig(str(tmp_path / "own"))
+    other = TrackingConfig(str(tmp_path / "other"))
+    config = EvaluateConfig(methods=("random", "bins"), resamples=20, top_n=(1, 2), occlusions=("none",))
+    evaluate(dataset, config, own, progress=False)
+    runs = log_release(dataset, other)
+    found = log_release(dataset, own)
+    (evaluated,) = finished_runs(own, "evaluate")
+    assert found.new == 0 and found.evaluate == {"tiny": evaluated.info.run_id}
+    theirs = children(own, evaluated.info.run_id)
+    ours = children(other, runs.evaluate["tiny"])
+    assert ours.keys() == theirs.keys() and len(ours) == 3
+    for name, (params, metrics) in ours.items():
+        assert metrics == theirs[name][1]
+        assert params.items() - theirs[name][0].items() <= {("reference", "")}
+    logged = client(other).get_run(runs.evaluate["tiny"]).data.metrics
+    assert logged == client(own).get_run(evaluated.info.run_id).data.metrics
+
+
+def test_only_what_is_new_is_logged(store: tuple[Dataset, TrackingConfig]) -> None:
+    release, tracking = store
+    table = pd.read_csv(release.root / "results" / "runtimes.csv")
+    table.assign(median_s=9.0).to_csv(release.root / "results" / "runtimes.csv", index=False)
+    before = client(tracking).get_run(newest_run(tracking, "benchmark").info.run_id)  # type: ignore[union-attr]
+    runs = log_release(release, tracking)
+    assert runs.new == 1 and runs.benchmark != before.info.run_id
+    times = client(tracking).get_run(str(runs.benchmark)).data.metrics
+    assert set(times.values()) == {9.0}
+
+
+def test_histories_travel_with_a_release(store: tuple[Dataset, TrackingConfig]) -> None:
+    release, tracking = store
+    assert histories(tracking, "release") == {}
+    history().assign(method="mlp-2d+3d").to_csv(release.root / "results" / "training.csv", index=False)
+    run = log_release(release, tracking).train["mlp-2d+3d"]
+    assert log_release(release, tracking).new == 0
+    (found,) = histories(tracking, "release").values()
+    pd.testing.assert_frame_equal(found, history())
+    steps = client(tracking).get_metric_history(run, "val_average_precision")
+    assert [(step.step, step.value) for step in steps] == [(0, 0.5), (1, 0.75), (2, 0.7)]
+    assert trained(tracking, "release").iloc[0].to_dict() | {"calibration_error": None} == {
+        "method": "mlp-2d+3d", "epoch": 1, "average_precision": 0.75, "roc_auc": 0.8, "calibration_error": None,
+    }  # fmt: skip
+    (release.root / "results" / "training.csv").unlink()  # and from the store back into the release
+    pd.testing.assert_frame_equal(keep_histories(release, tracking).drop(columns="method"), history())
+    assert (release.root / "results" / "training.csv").is_file()
+
+
+def test_an_interrupted_run_is_not_taken_for_a_finished_one(store: tuple[Dataset, TrackingConfig]) -> None:
+    release, tracking = store
+    run = newest_run(tracking, "paths")
+    assert run is not None
+    mlflow = client(tracking)
+
+    def names(condition: str) -> list[str]:
+        found = mlflow.search_runs(experiment_ids(mlflow, tracking), condition, max_results=10_000)
+        return sorted(one.info.run_name for one in found)
+
+    before = names("tags.stage = 'paths'")
+    mlflow.update_run(run.info.run_id, status="RUNNING")  # as `kill -9` leaves it, with all that is nested in it
+    runs = log_release(release, tracking)
+    assert runs.new == 1 and runs.paths != run.info.run_id
+    assert names("tags.stage = 'paths'") == before and len(before) > 1  # none twice
+    assert log_release(release, tracking).new == 0
+
+
+def test_notebooks_open_a_filled_store(
+    logged: tuple[Dataset, TrackingConfig, ReleaseRuns], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WHERETOLOOK_MLRUNS", str(tmp_path / "mlruns"))
+    monkeypatch.setenv("WHERETOLOOK_RELEASE", str(logged[0].root))
+    tracking = open_store()
+    assert tracking.root == tmp_path / "mlruns"
+    assert newest_run(tracking, "train", params={"method": "mlp-2d+3d"}, file="mlp-2d+3d.json") is not None
+    assert newest_run(tracking, "train", file=HISTORY_CSV) is None
+    with pytest.raises(MissingRunError, match="no run of train with nothing"):
+        newest_artifact(tracking, "train", "nothing")
+
+
+def test_searches_of_the_page_on_runs_find_something(logged: tuple[Dataset, TrackingConfig, ReleaseRuns]) -> None:
+    text = PAGE.read_text()
+    tracking = logged[1]
+    queries = re.findall(r"^```\n(tags.*?)\n```", text, re.MULTILINE)
+    queries += re.findall(r"^\| [a-z][^|]* \| `+ ?((?:tags|params|metrics).*?) ?`+(?: \||,)", text, re.MULTILINE)
+    assert len(queries) == 7
+    ids = experiment_ids(client(tracking), tracking)
+    for query in queries:
+        assert client(tracking).search_runs(ids, query), query
+    best = client(tracking).search_runs(ids, queries[0], order_by=["metrics.`1_regret` ASC"])
+    values = [run.data.metrics["1_regret"] for run in best]
+    assert values == sorted(values) and len(values) == len(METHODS)
+    for picture in re.findall(r"\]\((images/.*?)\)", text):
+        assert (PAGE.parent / picture).stat().st_size < 150_000

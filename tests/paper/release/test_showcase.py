@@ -1,0 +1,255 @@
+"""A scene of a release is made anew from its seed, and what figures are given is what the parts of the project say."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from synthetic_dataset import make_landmarks, make_mapping_poses
+from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.dataset.sampling import free_locations, sample_viewpoints
+from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.viewpoint_table import (
+    LOCALIZED,
+    NO_POSE,
+    UNLABELLED,
+    outcome_in_brief,
+    outcome_in_words,
+    poses,
+    shares_good,
+    write_table,
+)
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.lattices import VoxelGrid
+from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
+from wheretolook.inputs.bins import InputStatistics
+from wheretolook.mapping.colmap_model import save_mapping_poses
+from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.scenes.config import ApartmentConfig
+from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.binned_network import BinnedNetworkScorer
+from wheretolook.scorers.mlp.network import NetworkSpec, ViewpointNetwork
+from wheretolook.scorers.visible import VisibleScorer
+from wheretolook.space.config import FreeSpaceConfig
+from wheretolook.space.free_space import FreeSpace
+from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.visibility.config import OcclusionConfig
+from wheretolook.visibility.occlusion import MeshOcclusion
+from wheretolook_paper.release.showcase import Showcase, open_showcase
+from wheretolook_paper.release.showcase_figures import (
+    binned_image_of,
+    learning_of,
+    mistaken_location,
+    peaks_of,
+    pipeline_of,
+    sampling_of,
+)
+from wheretolook_rooms.generator import generate_apartment
+
+CAMERA = PinholeCamera(96, 72, 48.0)
+SEED = 3
+APARTMENT = ApartmentConfig(n_rooms=3, area_m2=28, texels_per_m=20, texture_size=1024, light_spacing_m=0.5,
+                            light_rays=4)  # fmt: skip
+SAMPLING = SampleConfig(grid=(5, 4, 3), directions=40, keep=0, max_directions=12)
+
+
+@pytest.fixture(scope="module")
+def release(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """A release of one apartment whose landmarks are random points of its mesh; views up localize worse."""
+    root = tmp_path_factory.mktemp("data") / "tiny"
+    scene = SceneFolder(root / f"apartment-{SEED:03d}", "test", CAMERA)
+    scene.map.mkdir(parents=True)
+    mesh = generate_apartment(APARTMENT, SEED)
+    rng = np.random.default_rng(0)
+    landmarks = make_landmarks(rng, 400)
+    triangles = mesh.vertices[mesh.triangles[rng.integers(0, len(mesh.triangles), 400)]].astype(np.float64)
+    landmarks.points[:] = np.einsum("nc,ncd->nd", rng.dirichlet(np.ones(3), 400), triangles)
+    landmarks.save(scene.landmarks)
+    save_mapping_poses(make_mapping_poses(0), scene.mapping_cameras)
+    space = FreeSpace(mesh)
+    grid = VoxelGrid.over(space.bounds, SAMPLING.grid)
+    occlusion = MeshOcclusion(MeshRaycaster(mesh), two_sided=space.two_sided)
+    table, stored = sample_viewpoints(grid, free_locations(grid, space), landmarks, CAMERA, occlusion, SAMPLING)
+    up = poses(table)[:, 2, 2]
+    found = up < 0.5
+    errors = {"error_m": np.where(found, 0.05 + 0.1 * up, np.nan), "error_deg": np.where(found, 0.1, np.nan)}
+    status = np.where(found, LOCALIZED, NO_POSE)
+    write_table(
+        table.assign(status=status, n_inliers=10, **errors).astype(dict.fromkeys(errors, np.float32)), scene.table
+    )
+    stored.save(scene.occlusion)
+    dataset = Dataset(root, (scene,))
+    dataset.save()
+    settings = {
+        "scenes": {"apartment": asdict(APARTMENT), "free_space": asdict(FreeSpaceConfig())},
+        "occlusion": asdict(OcclusionConfig()),
+        "sample": asdict(SAMPLING),
+    }
+    about = {"source": "source", "source_fingerprint": "0", "code_version": "0", "settings": settings}
+    (root / "release.json").write_text(json.dumps(about))
+    return dataset
+
+
+@pytest.fixture(scope="module")
+def showcase(release: Dataset) -> Showcase:
+    return open_showcase(release)
+
+
+class UpScorer(Scorer):
+    """Likes level views, and those a little to the east."""
+
+    name = "up"
+
+    def score(self, cam_from_world: Float) -> Float:
+        return 0.5 - 0.4 * cam_from_world[:, 2, 2] + 0.05 * cam_from_world[:, 2, 0]
+
+
+def test_the_scene_is_the_one_that_was_sampled(showcase: Showcase) -> None:
+    assert showcase.name == "apartment-003" and showcase.keep == 100
+    assert len(showcase.directions) == SAMPLING.directions
+    assert set(showcase.table["location_id"]) <= set(showcase.free)
+    centers = camera_centers(poses(showcase.table))
+    np.testing.assert_allclose(showcase.grid.centers()[showcase.table["location_id"]], centers, atol=1e-9)
+    assert "400 landmarks" in showcase.summary() and "12 images" in showcase.summary()
+
+
+def test_another_scene_than_the_one_that_was_labelled_is_refused(release: Dataset, tmp_path: Path) -> None:
+    about = json.loads((release.root / "release.json").read_text())
+    original = (release.root / "release.json").read_text()
+    about["settings"]["scenes"]["apartment"]["area_m2"] = 40
+    try:
+        (release.root / "release.json").write_text(json.dumps(about))
+        with pytest.raises(SceneError, match="not the one that was labelled"):
+            open_showcase(release)
+    finally:
+        (release.root / "release.json").write_text(original)
+    elsewhere = Dataset(release.root, (SceneFolder(release.root / "house", "test", CAMERA),))
+    with pytest.raises(SceneError, match="not generated from a seed"):
+        open_showcase(elsewhere)
+    with pytest.raises(ConfigError, match="no such scene"):
+        open_showcase(release, "apartment-004")
+    with pytest.raises(ConfigError, match="no release"):
+        open_showcase(Dataset(tmp_path, ()))
+
+
+def test_locations_are_found(showcase: Showcase) -> None:
+    layer = showcase.layer(1.45)
+    heights = showcase.grid.centers()[layer][:, 2]
+    assert len(layer) == 5 * 4 and np.ptp(heights) == 0
+    assert abs(heights[0] - 1.45) <= showcase.grid.voxel_m[2] / 2
+    chosen = showcase.instructive_location()
+    ids, shares = shares_good(showcase.table[showcase.table["location_id"].isin(layer)])
+    assert abs(shares[ids == chosen][0] - 0.5) == np.abs(shares - 0.5).min()
+    assert showcase.nearest_location(showcase.center(chosen) + 0.01) == chosen
+    with pytest.raises(ConfigError, match="no viewpoint"):
+        showcase.viewpoints(-1)
+
+
+def test_pipeline_takes_the_best_views(showcase: Showcase) -> None:
+    scorer = UpScorer(showcase.localization_map)
+    location = showcase.instructive_location()
+    pipeline = pipeline_of(showcase, scorer, location)
+    np.testing.assert_allclose(camera_centers(pipeline.chosen), showcase.center(location))
+    rows = showcase.viewpoints(location)
+    scores = scorer.score(poses(rows))
+    best = rows.iloc[int(np.argmax(scores))]
+    assert pipeline.chosen_score == scores.max() and pipeline.outcome == outcome_in_words(best)
+    assert pipeline.seen.sum() == best["n_visible"]
+    assert len(pipeline.locations) == len(np.intersect1d(showcase.layer(), showcase.free))
+    # all directions are kept of so few, so that each location has the best of the lattice
+    everywhere = 0.5 - 0.4 * showcase.directions[:, 2] + 0.05 * showcase.directions[:, 0]
+    np.testing.assert_allclose(pipeline.best_scores, everywhere.max())
+    np.testing.assert_allclose(
+        pipeline.best_axes, showcase.directions[[np.argmax(everywhere)] * len(pipeline.locations)]
+    )
+    assert pipeline.rgb.shape == (72, 96, 3) and pipeline.rgb.std() > 1
+
+
+def test_sampling_counts_what_the_table_counts(showcase: Showcase) -> None:
+    location = showcase.instructive_location()
+    sampling = sampling_of(showcase, location)
+    rows = showcase.viewpoints(location)
+    np.testing.assert_array_equal(sampling.n_visible[rows["direction_id"]], rows["n_visible"])
+    assert (sampling.kept == (sampling.n_visible > 0)).all()  # K is greater than the lattice
+    assert location in sampling.layer and set(sampling.layer[sampling.free]) <= set(showcase.free)
+    # what is in view in all directions together is what is not hidden
+    localization_map = showcase.localization_map
+    seen = np.unique(np.concatenate([localization_map.landmarks_in_view(pose[None])[0] for pose in poses(rows)]))
+    assert sampling.unoccluded[seen].all() and not sampling.unoccluded.all()
+
+
+def test_a_binned_image_shows_its_landmarks(showcase: Showcase) -> None:
+    row = showcase.table.iloc[int(showcase.table["n_visible"].argmax())]
+    pose = poses(pd.DataFrame([row]))[0]
+    image = binned_image_of(showcase, pose, bins=6)
+    assert len(image.pixels) == row["n_visible"] == image.counts.sum()
+    assert CAMERA.in_image(image.pixels).all()
+    cells = np.zeros((6, 6), int)
+    np.add.at(cells, tuple((image.pixels[:, ::-1] / (72 / 6, 96 / 6)).astype(int).T), 1)
+    np.testing.assert_array_equal(cells, image.counts)
+    np.testing.assert_array_equal(np.isnan(image.means["z"]), image.counts == 0)
+    filled = image.counts > 0
+    total = float((image.means["u"][filled] * image.counts[filled]).sum())
+    assert total == pytest.approx(image.pixels[:, 0].sum(), rel=1e-5)
+
+
+def test_peaks_are_labelled_views_with_what_came_of_them(showcase: Showcase) -> None:
+    scorer = UpScorer(showcase.localization_map)
+    location = showcase.instructive_location()
+    found = peaks_of(showcase, scorer, location, n=2)
+    rows = showcase.viewpoints(location)
+    axes = poses(rows)[:, 2, :3]
+    scores = scorer.score(poses(rows))
+    assert found.peaks[0].score == scores.max() and found.pits[0].score == scores.min()
+    for view in (*found.peaks, *found.pits):
+        row = int(np.argmin(np.linalg.norm(axes - view.direction, axis=1)))
+        assert view.score == scores[row] and view.outcome == outcome_in_brief(rows.iloc[row])
+    np.testing.assert_allclose(found.scores, scorer.score(_poses_at(showcase, location)))
+    np.testing.assert_array_equal(found.tried[1], (rows["error_m"] < 0.05).to_numpy())
+
+
+def test_the_mistaken_location_is_where_scores_are_farthest_from_labels(showcase: Showcase) -> None:
+    scorer = VisibleScorer(showcase.localization_map)
+    mistaken = mistaken_location(showcase, scorer)
+    rows = showcase.table[showcase.table["location_id"].isin(showcase.layer())]
+    good = (rows["status"] == LOCALIZED) & (rows["error_m"] < 0.05) & (rows["error_deg"] < 0.4)
+    off = np.abs(scorer.score(poses(rows)) - good).groupby(rows["location_id"]).mean()
+    assert mistaken == off.idxmax()
+
+
+def test_learning_follows_the_best_and_the_worst_view(showcase: Showcase) -> None:
+    statistics = InputStatistics(("u", "v"), (48.0, 36.0), (20.0, 20.0))
+    network = TrainedNetwork("mlp-2d", ViewpointNetwork(NetworkSpec(statistics, bins=6)), CAMERA)
+    scorer = BinnedNetworkScorer(showcase.localization_map, network)
+    location = showcase.instructive_location()
+    rows = showcase.viewpoints(location)
+    scores = scorer.score(poses(rows))
+    for best, score in ((True, scores.max()), (False, scores.min())):
+        learning = learning_of(showcase, scorer, location, best)
+        assert learning.activations[-1] == pytest.approx(score)
+        assert learning.channels == ("u", "v") and learning.image.counts.shape == (6, 6)
+        assert learning.outcome == outcome_in_brief(rows.iloc[int(np.argmin(np.abs(scores - score)))])
+
+
+@pytest.mark.parametrize(
+    ("status", "error_m", "error_deg", "words", "brief"),
+    [
+        (LOCALIZED, 0.0123, 0.456, "pose found, 1.2 cm and 0.46° off", "1.2 cm, 0.46° off"),
+        (LOCALIZED, 2.34, 56.7, "wrong pose found, 2.3 m and 57° off", "2.3 m, 57° off"),
+        (NO_POSE, np.nan, np.nan, "no pose", "no pose"),
+        (UNLABELLED, np.nan, np.nan, "", ""),
+    ],
+)
+def test_outcomes_are_told_in_words(status: str, error_m: float, error_deg: float, words: str, brief: str) -> None:
+    label = pd.Series({"status": status, "error_m": error_m, "error_deg": error_deg})
+    assert (outcome_in_words(label), outcome_in_brief(label)) == (words, brief)
+
+
+def _poses_at(showcase: Showcase, location: int) -> Float:
+    return poses_looking_along(np.tile(showcase.center(location), (len(showcase.directions), 1)), showcase.directions)

@@ -1,0 +1,341 @@
+"""The procedural apartment: closed, reachable, deterministic, and both plain and rich in texture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.scenes.config import ApartmentConfig
+from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook_rooms import atlas, decor, fixtures, furniture
+from wheretolook_rooms import patches as patches_module
+from wheretolook_rooms.atlas import repeat_patterns
+from wheretolook_rooms.generator import furnish_apartment, generate_apartment
+from wheretolook_rooms.materials import NoiseBank, plain
+from wheretolook_rooms.plan import Plan, draw_plan
+from wheretolook_rooms.style import Style
+
+SEEDS = (0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2)))
+CONFIG = ApartmentConfig()
+FAST = ApartmentConfig(
+    n_rooms=3, area_m2=26, texels_per_m=20, texture_size=1024, light_rays=4, light_spacing_m=0.5
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def apartment() -> TexturedMesh:
+    return generate_apartment(CONFIG, 1)
+
+
+@cache
+def furnished(seed: int) -> tuple[Plan, patches_module.Surface]:
+    plan, patches, _, _ = furnish_apartment(CONFIG, seed)
+    return plan, patches_module.join(patches)
+
+
+def _raycasting_scene(surface: patches_module.Surface) -> Any:
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        o3d.core.Tensor(surface.vertices.astype(np.float32)), o3d.core.Tensor(surface.triangles.astype(np.uint32))
+    )
+    return scene
+
+
+def _rays(origins: NDArray[Any], directions: NDArray[Any]) -> Any:
+    import open3d as o3d
+
+    return o3d.core.Tensor(np.concatenate(np.broadcast_arrays(origins, directions), -1).astype(np.float32))
+
+
+def _cast(scene: Any, origins: NDArray[Any], directions: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    return {k: v.numpy() for k, v in scene.cast_rays(_rays(origins, directions)).items()}
+
+
+@pytest.mark.slow
+def test_same_seed_gives_same_bytes_and_another_seed_another_home() -> None:
+    first, again, other = (generate_apartment(FAST, seed) for seed in (7, 7, 8))
+    for name in ("vertices", "triangles", "corner_uvs", "triangle_texture"):
+        assert getattr(first, name).tobytes() == getattr(again, name).tobytes()
+    assert first.textures[0].tobytes() == again.textures[0].tobytes()
+    assert first.vertices.tobytes() != other.vertices.tobytes()
+
+
+def test_mesh_is_well_formed(apartment: TexturedMesh) -> None:
+    assert apartment.vertices.dtype == np.float32
+    assert apartment.triangles.dtype == np.int32
+    assert np.isfinite(apartment.vertices).all()
+    assert apartment.triangles.min() >= 0
+    assert apartment.triangles.max() < len(apartment.vertices)
+    assert apartment.corner_uvs.shape == (len(apartment.triangles), 3, 2)
+    assert apartment.corner_uvs.min() >= 0
+    assert apartment.corner_uvs.max() <= 1
+    assert (apartment.triangle_texture == 0).all()
+    (texture,) = apartment.textures
+    assert texture.dtype == np.uint8
+    assert max(texture.shape[:2]) <= 4096
+    assert 2.5 <= apartment.bounds[1, 2] <= 2.8
+    assert apartment.bounds[0, 2] == pytest.approx(0, abs=0.005)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_triangle_count(seed: int) -> None:
+    assert 50_000 <= len(furnished(seed)[1].triangles) <= 300_000
+
+
+def test_texture_is_not_stretched(apartment: TexturedMesh) -> None:
+    """Texels per metre from first principles: texture area over surface area of each larger triangle."""
+    corners = apartment.vertices[apartment.triangles].astype(float)
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    height, width = apartment.textures[0].shape[:2]
+    uv = apartment.corner_uvs.astype(float) * [width, height]
+    a = uv[:, 1] - uv[:, 0]
+    b = uv[:, 2] - uv[:, 0]
+    texels = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    large = area > 1.0
+    density = np.sqrt(texels[large] / area[large])
+    assert large.sum() > 30
+    assert density.min() > 20
+    assert 80 <= np.median(density) <= 160
+
+
+def test_texture_has_plain_and_rich_regions(apartment: TexturedMesh) -> None:
+    """At random points of the surface, drawn by area: contrast in a window of 17 texels around each."""
+    rng = np.random.default_rng(0)
+    grey = apartment.textures[0].astype(np.float32).mean(-1)
+    corners = apartment.vertices[apartment.triangles].astype(float)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    chosen = rng.choice(len(area), 4000, p=area / area.sum())
+    weights = rng.dirichlet((1, 1, 1), len(chosen))
+    uv = (weights[..., None] * apartment.corner_uvs[chosen]).sum(1)
+    height, width = grey.shape
+    column = (uv[:, 0] * width).astype(int)
+    row = (uv[:, 1] * height).astype(int)
+    mean = ndimage.uniform_filter(grey, 17)
+    deviation = np.sqrt(np.maximum(ndimage.uniform_filter(grey**2, 17) - mean**2, 0))[row, column]
+    assert 0.25 < (deviation < 2.5).mean() < 0.85  # plain: below what SIFT fires on
+    assert (deviation > 8.0).mean() > 0.10
+    brightness = mean[row, column]
+    assert 90 < np.median(brightness) < 225
+    assert (brightness > 252).mean() < 0.05  # not burnt
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_shell_is_closed(seed: int) -> None:
+    plan, surface = furnished(seed)
+    scene = _raycasting_scene(surface)
+    directions = np.random.default_rng(seed).normal(size=(20_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    low = surface.vertices.min(0) - 1e-4
+    high = surface.vertices.max(0) + 1e-4
+    for room in plan.rooms:
+        centre = np.array([(room.x0 + room.x1) / 2, (room.y0 + room.y1) / 2, plan.height - 0.75])
+        hit = _cast(scene, centre, directions)
+        assert np.isfinite(hit["t_hit"]).all()
+        ends = centre + hit["t_hit"][:, None] * directions
+        assert ((ends > low) & (ends < high)).all()
+        front = (hit["primitive_normals"] * directions).sum(1) < 0
+        assert front.mean() > 0.98  # walls face the room
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_every_room_is_reached_on_foot(seed: int) -> None:
+    """Flood fill over the floor: where nothing stands between 0.05 m and 1.9 m, shrunk by a walker of 0.4 m width."""
+    plan, surface = furnished(seed)
+    scene = _raycasting_scene(surface)
+    step = 0.05
+    low = surface.vertices.min(0)[:2]
+    high = surface.vertices.max(0)[:2]
+    x, y = (np.arange(a + step / 2, b, step) for a, b in zip(low, high, strict=True))
+    grid = np.stack([*np.meshgrid(x, y, indexing="ij"), np.full((len(x), len(y)), 1.9)], -1).reshape(-1, 3)
+    hit = _cast(scene, grid, np.array([0.0, 0, -1]))
+    on_floor = (np.abs(hit["t_hit"] - 1.9) < 0.05) & (hit["primitive_normals"][:, 2] > 0.9)
+    free = ndimage.binary_erosion(on_floor.reshape(len(x), len(y)), iterations=4)
+    labels, _ = ndimage.label(free)
+    main = np.bincount(labels[labels > 0]).argmax()
+    for room in plan.rooms:
+        inside = np.ix_((x > room.x0) & (x < room.x1), (y > room.y0) & (y < room.y1))
+        assert (labels[inside] == main).sum() * step**2 > 0.5, f"{room.kind} cannot be entered"
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_doors_are_wide_and_high_enough(seed: int) -> None:
+    plan, surface = furnished(seed)
+    scene = _raycasting_scene(surface)
+    count = 0
+    for room in plan.rooms:
+        for side in range(4):
+            corner, right, normal = room.wall_frame(side)
+            for opening in room.openings[side]:
+                if opening.kind == "window":
+                    continue
+                count += 1
+                assert opening.a1 - opening.a0 >= 0.8
+                a, z = np.meshgrid(np.linspace(opening.a0 + 0.03, opening.a1 - 0.03, 12), np.linspace(0.05, 2.0, 12))
+                start = corner + a.ravel()[:, None] * right + z.ravel()[:, None] * [0, 0, 1] + 0.4 * normal
+                hit = _cast(scene, start, -normal)
+                assert (hit["t_hit"] > 0.6).all()  # nothing in the doorway, from 0.4 m before it to 0.1 m behind
+    assert count == 2 * len(plan.doors)
+
+
+FURNITURE: dict[str, Callable[[Style], list[patches_module.Patch]]] = {
+    "sofa": lambda s: furniture.sofa(s, 3),
+    "bed": lambda s: furniture.bed(s, 1.6),
+    "bookshelf": lambda s: furniture.bookshelf(s, 1.0, 2.0),
+    "chair": lambda s: furniture.chair(s, s.wood, s.upholstery),
+    "desk": lambda s: furniture.desk(s, 1.3),
+    "nightstand": lambda s: furniture.nightstand(s, True),
+    "plant": lambda s: decor.plant(s, 1.2, 30, 0.35),
+    "coat": decor.coat,
+    "kitchen": lambda s: fixtures.kitchen_run(s, 2.4, 2.6, False),
+    "bathtub": lambda s: fixtures.bathtub(s, 1.7),
+    "toilet": fixtures.toilet,
+    "radiator": lambda s: fixtures.radiator(s, 1.0, 0.5),
+    "curtain": lambda s: fixtures.curtain(0.5, 2.0, s.upholstery),
+}
+
+
+@pytest.mark.parametrize("name", FURNITURE)
+def test_furniture_is_closed_and_faces_outward(name: str) -> None:
+    """With equal points merged, each directed edge occurs as often as its reverse; rays from outside meet a front."""
+    surface = patches_module.join(FURNITURE[name](Style(np.random.default_rng(3), 0.5, 0.5)))
+    _, point = np.unique(np.floor(surface.vertices * 1e6 + 0.33), axis=0, return_inverse=True)
+    corner = point.ravel()[surface.triangles]
+    edges = np.concatenate([corner[:, [0, 1]], corner[:, [1, 2]], corner[:, [2, 0]]])
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    key = np.sort(edges, axis=1)
+    sign = np.where(edges[:, 0] < edges[:, 1], 1, -1)
+    _, which = np.unique(key, axis=0, return_inverse=True)
+    assert (np.bincount(which.ravel(), weights=sign) == 0).all()
+
+    scene = _raycasting_scene(surface)
+    rng = np.random.default_rng(0)
+    low = surface.vertices.min(0)
+    high = surface.vertices.max(0)
+    directions = rng.normal(size=(20_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = rng.uniform(low, high, (20_000, 3)) - 2 * np.linalg.norm(high - low) * directions
+    hit = _cast(scene, origins, directions)
+    struck = np.isfinite(hit["t_hit"])
+    front = (hit["primitive_normals"] * directions).sum(1) < 1e-6
+    assert struck.mean() > 0.05
+    assert front[struck].mean() > 0.999
+
+
+def test_closed_primitives_enclose_their_volume() -> None:
+    """Divergence theorem: the signed volume of a closed outward-facing surface is that of the solid."""
+    paint = plain(np.random.default_rng(0), (0.5, 0.5, 0.5))
+
+    def volume(patches: list[patches_module.Patch]) -> float:
+        surface = patches_module.join(patches)
+        a, b, c = (surface.vertices[surface.triangles[:, k]] for k in range(3))
+        return float((a * np.cross(b, c)).sum() / 6)
+
+    assert volume(patches_module.box((1, 2, 3), (1.5, 2.4, 3.3), paint)) == pytest.approx(0.5 * 0.4 * 0.3)
+    sides = 64
+    prism = 0.5 * sides * np.sin(2 * np.pi / sides) * 0.3**2 * 0.7
+    assert volume(patches_module.cylinder(0.3, 0.2, 0.9, paint, sides=sides)) == pytest.approx(prism)
+    tube = patches_module.tube([(0, 0, 0), (0, 0, 0.5), (0, 0, 1)], 0.1, paint, sides=sides)
+    assert volume(tube) == pytest.approx(0.5 * sides * np.sin(2 * np.pi / sides) * 0.1**2)
+    # a box of edge 2 rounded to a sphere of radius 1, from the inside
+    ball = volume(patches_module.cushion((-1, -1, -1), (1, 1, 1), paint, radius_m=1.0, rounding=12))
+    assert 0.97 * 4 / 3 * np.pi < ball < 4 / 3 * np.pi
+    front = np.stack(np.meshgrid([0.5, -0.5], [0.0], [1.0, 0.0], indexing="ij"), -1)[:, 0].transpose(1, 0, 2)
+    sheet = patches_module.slab_between(front, front - np.array([0, 0.1, 0]), paint, (1, 1))
+    assert volume(sheet) == pytest.approx(0.1)
+
+
+def test_plans_are_sound() -> None:
+    for seed in range(30):
+        n_rooms = 3 + seed % 4
+        plan = draw_plan(np.random.default_rng(seed), n_rooms, 13.0 * n_rooms, 0.5)
+        assert len(plan.rooms) == n_rooms
+        assert len(plan.doors) >= n_rooms - 1
+        reached = {0}
+        for _ in plan.rooms:
+            reached |= {b for a, b in plan.doors if a in reached} | {a for a, b in plan.doors if b in reached}
+        assert reached == set(range(n_rooms))
+        assert sum(room.kind == "bathroom" for room in plan.rooms) == 1
+        assert sum(not room.lamp_on for room in plan.rooms) == round(0.5 * n_rooms)
+        for a in plan.rooms:
+            for b in plan.rooms[a.index + 1 :]:
+                assert min(a.x1, b.x1) <= max(a.x0, b.x0) or min(a.y1, b.y1) <= max(a.y0, b.y0)
+
+
+def test_patterns_repeat() -> None:
+    config = ApartmentConfig(n_rooms=3, repetition=1.0)
+    _, patches, _, rng = furnish_apartment(config, 3)
+    plan = atlas.plan_atlas(patches, 40.0, 2048)
+    noise = NoiseBank(rng)
+    painted = atlas.paint_charts(plan, noise)
+    covered = repeat_patterns(plan, painted, 1.0, np.random.default_rng(0), noise)
+    own = [n for n, chart in enumerate(plan.charts) if not (chart.material.shared or chart.material.emissive)]
+    large = [n for n in own if min(plan.charts[n].width, plan.charts[n].height) >= 0.7 * plan.charts[n].texels_per_m]
+    assert len(large) > 10
+    for number, (before, after) in enumerate(zip(painted, covered, strict=True)):
+        if number not in large:
+            assert after is before
+    wide = max(large, key=lambda n: plan.charts[n].width)
+    image = covered[wide]
+    scale = plan.charts[wide].texels_per_m
+    periods = [p for p in range(1, image.shape[1]) if np.array_equal(image[:, p:], image[:, :-p])]
+    assert periods and 0.55 <= periods[0] / scale <= 2.05 and image.std() > 0.01
+    assert not any(np.array_equal(painted[wide][:, p:], painted[wide][:, :-p]) for p in periods)
+    few = repeat_patterns(plan, painted, 0.3, np.random.default_rng(0), noise)
+    assert 0.1 < np.mean([few[n] is not painted[n] for n in large]) < 0.5
+
+
+@pytest.mark.slow
+def test_an_enlarged_apartment_is_the_same_but_larger() -> None:
+    small, large = (generate_apartment(replace(FAST, enlarged=by), 7) for by in (1.0, 2.5))
+    np.testing.assert_allclose(large.vertices, 2.5 * small.vertices, rtol=1e-6)
+    assert large.textures[0].tobytes() == small.textures[0].tobytes()
+
+
+def test_apartments_of_before_keep_their_key() -> None:
+    before = {
+        "n_rooms": None, "area_m2": None, "texture_richness": 0.85, "clutter": 0.85, "dark_rooms": 0.2,
+        "texels_per_m": 125.0, "texture_size": 4096, "light_spacing_m": 0.1, "light_rays": 24,
+    }  # fmt: skip
+    assert ApartmentConfig().key() == before  # or all that was made from them would be made again
+    assert ApartmentConfig(vary=True).key() == {**before, "vary": True}
+
+
+def test_varied_apartments_differ_by_their_seed() -> None:
+    varied = ApartmentConfig(vary=True)
+    drawn = [varied.of_seed(seed) for seed in range(40)]
+    assert varied.of_seed(3) == drawn[3] and len({config.area_m2 for config in drawn}) == 40
+    assert all(1 <= config.enlarged <= 3 and 35 <= config.area_m2 <= 130 for config in drawn)
+    assert 0.1 < np.mean([config.repetition == 0 for config in drawn]) < 0.5
+    assert CONFIG.of_seed(3) is CONFIG
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        ({"n_rooms": 2}, "n_rooms"),
+        ({"repetition": -0.1}, "repetition"),
+        ({"enlarged": 0.0}, "enlarged"),
+        ({"enlarged": float("inf")}, "enlarged"),
+        ({"clutter": 1.5}, "clutter"),
+        ({"area_m2": 5.0}, "area_m2"),
+        ({"light_rays": 0}, "light_rays"),
+    ],
+)
+def test_bad_options_are_named(options: dict[str, float], word: str) -> None:
+    with pytest.raises(ConfigError, match=word):
+        ApartmentConfig(**options)  # type: ignore[arg-type]
+
+
+def test_too_small_a_texture_is_refused() -> None:
+    with pytest.raises(SceneError, match="texture is too small"):
+        generate_apartment(ApartmentConfig(n_rooms=3, texture_size=256), 0)

@@ -1,0 +1,247 @@
+"""Adapting log-odds to a place, against scikit-learn's Gaussian process; and weights that know their place."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import expit
+from sklearn.gaussian_process import GaussianProcessClassifier
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+
+from synthetic_dataset import make_dataset
+from wheretolook.evaluation.calibration import expected_calibration_error
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.evaluation.scoring import scorers_of
+from wheretolook.geometry.lattices import fibonacci_sphere
+from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.planning.config import PlanConfig
+from wheretolook.planning.scene_map import planner_scorer
+from wheretolook.scorers.adapted.gp_correction import PRIOR, LocalizedViews, adapt, fit, folds_of, log_losses, splits
+from wheretolook.scorers.adapted.kernel import Correction, nearness
+from wheretolook.scorers.adapted.network import AdaptedNetwork
+from wheretolook.scorers.registry import load_scorer
+from wheretolook.scorers.set.network import SetNetwork
+from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook.utils.errors import WeightsError
+from wheretolook.utils.shipped import WEIGHTS, shipped
+
+SET = shipped(WEIGHTS) / "set.safetensors"
+
+
+def random_views(n_locations: int = 30, n_directions: int = 12, seed: int = 0, shift: float = 0.0) -> LocalizedViews:
+    """Views of a 6 x 6 m room; in one half of it those that look along +x do not localize, whatever a scorer thinks."""
+    rng = np.random.default_rng(seed)
+    centers = np.repeat(rng.uniform((-3, -3, 0.5), (3, 3, 2), (n_locations, 3)), n_directions, axis=0)
+    axes = np.tile(fibonacci_sphere(n_directions), (n_locations, 1))
+    log_odds = rng.normal(0, 2, len(centers))
+    wrong = (centers[:, 0] > 0) & (axes[:, 0] > 0)
+    good = rng.random(len(centers)) < expit(np.where(wrong, -4, log_odds) + shift)
+    return LocalizedViews(log_odds, good, centers, axes, np.repeat(np.arange(n_locations), n_directions))
+
+
+def test_the_correction_is_scikit_learns_gaussian_process() -> None:
+    views = random_views()
+    flat = LocalizedViews(np.zeros(len(views)), views.good, views.centers, views.axes, views.group)
+    # without log-odds, offset and correction are one process, of both kernels; its reach covers the room
+    kernel = ConstantKernel(3.0) * RBF(2.0) + ConstantKernel(1 / PRIOR[1])
+    theirs = GaussianProcessClassifier(kernel, optimizer=None, max_iter_predict=100).fit(views.centers, views.good)
+    theirs = theirs.base_estimator_
+    latent = theirs.kernel_(views.centers, theirs.X_train_) @ (theirs.y_train_ - theirs.pi_)
+    ours = fit(flat, 2.0, 3.0, sharpness=0.0)
+    np.testing.assert_allclose(ours.log_odds(flat), latent, atol=5e-3)
+
+
+def test_a_scorer_that_is_sure_and_wrong_is_corrected() -> None:
+    """Where log-odds are far off, full steps of Newton's method would run away."""
+    views = random_views(60, shift=-8.0)
+    sure = LocalizedViews(views.log_odds + 8, views.good, views.centers, views.axes, views.group)
+    for amplitude in (1.0, 3.0):
+        adapted = fit(sure, 2.0, amplitude)
+        assert log_losses(adapted.log_odds(sure), sure.good).mean() < log_losses(sure.log_odds, sure.good).mean() / 4
+        assert 0 < adapted.scale < 2
+
+
+def test_calibration_alone_is_platts() -> None:
+    from sklearn.linear_model import LogisticRegression
+
+    views = random_views(300, shift=0.7)
+    found = fit(views, 1.0, 0.0)
+    platt = LogisticRegression(C=np.inf).fit(views.log_odds[:, None], views.good)
+    assert abs(found.scale - platt.coef_[0, 0]) < 0.02 and abs(found.offset - platt.intercept_[0]) < 0.02
+    assert len(found.weights) == 0
+
+
+def test_it_learns_where_the_scorer_is_wrong() -> None:
+    views = random_views(60)
+    elsewhere = random_views(60, seed=1)
+    learnt = adapt(views)
+    assert learnt.amplitude > 0
+    unadapted = log_losses(elsewhere.log_odds, elsewhere.good).mean()
+    adapted = log_losses(learnt.adaptation.log_odds(elsewhere), elsewhere.good).mean()
+    assert adapted < 0.7 * unadapted
+    # what is told of views that were not learnt from is true of others
+    assert abs(log_losses(learnt.held_out, views.good).mean() - adapted) < 0.1
+
+
+def test_chance_is_not_learnt() -> None:
+    rng = np.random.default_rng(3)
+    views = random_views(60)
+    honest = LocalizedViews(
+        views.log_odds, rng.random(len(views)) < expit(views.log_odds), views.centers, views.axes, views.group
+    )
+    held_out = adapt(honest).held_out
+    assert log_losses(held_out, honest.good).mean() < log_losses(honest.log_odds, honest.good).mean() + 0.01
+
+
+def test_views_of_a_location_are_left_out_together() -> None:
+    group = np.repeat(np.arange(23), 7)
+    fold = folds_of(group)
+    assert all(len(np.unique(fold[group == number])) == 1 for number in range(23))
+    assert np.bincount(fold).min() >= 4 * 7
+
+
+def photographed(shift: float, seed: int = 0) -> LocalizedViews:
+    """120 photographs in six blocks, each twice: with its block, and with one of two large ones. Everywhere alike, the
+    scorer hopes too little, by a shift of its log-odds."""
+    rng = np.random.default_rng(seed)
+    n = 120
+    photograph = np.concatenate([np.arange(n), np.arange(n)])
+    group = np.concatenate([np.repeat(np.arange(6), n // 6), np.repeat([6, 7], n // 2)])
+    centers = rng.uniform((-3, -3, 0.5), (3, 3, 2), (n, 3))[photograph]
+    axes = fibonacci_sphere(n)[rng.permutation(n)][photograph]
+    log_odds = rng.normal(0, 2, 2 * n)
+    good = rng.random(2 * n) < expit(log_odds + shift)
+    return LocalizedViews(log_odds, good, centers, axes, group, photograph, photograph // 4)
+
+
+def test_photographs_are_judged_by_blocks_that_hold_none_of_those_learnt_from() -> None:
+    views = photographed(0.0)
+    judged = np.zeros(len(views), dtype=int)
+    for out, learnt in splits(views):
+        judged += out
+        assert len(np.unique(views.group[out])) == 1 and len(learnt) > 0
+        assert not np.isin(learnt.photograph, views.photograph[out]).any()
+    assert (judged == 1).all()
+
+
+def test_photographs_calibrate_what_they_say_nothing_else_of() -> None:
+    views = photographed(2.0)
+    learnt = adapt(views)
+    assert log_losses(learnt.held_out, views.good).mean() < log_losses(views.log_odds, views.good).mean() - 0.1
+    before, after = (expected_calibration_error(expit(z), views.good) for z in (views.log_odds, learnt.held_out))
+    assert after < before / 2
+    assert learnt.adaptation.scale == pytest.approx(1, abs=0.4)
+    assert learnt.adaptation.offset == pytest.approx(2, abs=0.8)
+
+
+def test_rendered_views_and_photographs_are_learnt_from_together() -> None:
+    rendered = random_views(20)
+    photographs = photographed(1.0)
+    both = rendered.joined(photographs)
+    assert len(both) == len(rendered) + len(photographs)
+    assert not np.isin(both.group[both.photograph < 0], both.group[both.photograph >= 0]).any()
+    assert not np.isin(both.place[both.photograph < 0], both.place[both.photograph >= 0]).any()
+    assert (both.blocks[: len(rendered)] == -1).all() and len(np.unique(both.blocks[len(rendered) :])) == 8
+    parts = list(splits(both))
+    assert len(parts) == 5 and sum(out.sum() for out, _ in parts) == len(both)
+    for out, learnt in parts:
+        again = np.intersect1d(learnt.photograph, both.photograph[out])
+        assert again.tolist() in ([], [-1])
+
+
+def test_corrections_one_by_one_and_on_a_grid_are_the_plain_sum() -> None:
+    views = random_views(20)
+    weights = np.random.default_rng(0).normal(size=len(views))
+    correction = Correction(views.centers, views.axes, weights, 0.7, 4.0)
+    locations = np.array([[0.0, 0, 1], [1, 2, 1], [50, 0, 0]])
+    directions = fibonacci_sphere(9)
+    at = np.repeat(locations, 9, axis=0)
+    axes = np.tile(directions, (3, 1))
+    plain = nearness(at, axes, views.centers, views.axes, 0.7, 4.0) @ weights
+    np.testing.assert_allclose(correction.at(at, axes), plain, atol=1e-12)
+    np.testing.assert_allclose(correction.grid(locations, directions).ravel(), plain, atol=1e-12)
+    assert (plain[18:] == 0).all()  # far away nothing is known
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> tuple[LocalizationMap, Path]:
+    """A map, and weights adapted to it by one view that is told to be bad."""
+    scene = make_dataset(tmp_path_factory.mktemp("data") / "place", ("test",)).scenes[0]
+    around = LocalizationMap(scene.read_landmarks(), scene.camera)
+    base = TrainedNetwork.load(SET, SetNetwork, "set")
+    network = AdaptedNetwork(base.network, base.scale, base.offset, 1.0, 4.0, 1, 50)
+    network.support_centers = torch.tensor([[0.0, 0, 1]], dtype=torch.float64)
+    network.support_axes = torch.tensor([[1.0, 0, 0]], dtype=torch.float64)
+    network.support_weights = torch.tensor([-3.0], dtype=torch.float64)
+    network.place = torch.from_numpy(around.landmarks.points[:50].copy())
+    path = scene.folder / "adapted.safetensors"
+    TrainedNetwork("adapted", network, base.camera, 0.9, 0.2, base.training_range).save(path, {"scene": "place"})
+    return around, path
+
+
+def test_a_file_of_adapted_weights_scores_as_it_says(place: tuple[LocalizationMap, Path]) -> None:
+    around, path = place
+    adapted = load_scorer(path, around)
+    base = load_scorer(SET, around)
+    locations = np.array([[0.0, 0, 1], [0.5, 0.5, 1]])
+    directions = fibonacci_sphere(20)
+    poses = poses_looking_along(np.repeat(locations, 20, axis=0), np.tile(directions, (2, 1)))
+    chance = base.score(poses)
+    distance = np.linalg.norm(camera_centers(poses) - (0, 0, 1), axis=1)
+    bad = -3 * np.exp(-(distance**2) / 2 + 4 * (poses[:, 2, 0] - 1))
+    expected = expit(0.9 * np.log(chance / (1 - chance)) + 0.2 + bad)
+    np.testing.assert_allclose(adapted.score(poses), expected, atol=1e-9)
+    np.testing.assert_allclose(adapted.report(poses).score, expected, atol=1e-9)
+    np.testing.assert_allclose(adapted.report(poses).expected_inliers, base.report(poses).expected_inliers)
+    np.testing.assert_allclose(adapted.score_around(locations, directions).ravel(), expected, atol=0.01)
+    assert adapted.name == "adapted"
+
+
+def test_they_are_refused_in_another_place_unless_forced(place: tuple[LocalizationMap, Path]) -> None:
+    around, path = place
+    landmarks = around.landmarks
+    moved = Landmarks(**{**landmarks.__dict__, "points": landmarks.points + np.array([0.5, 0, 0])})
+    elsewhere = LocalizationMap(moved, around.camera)
+    with pytest.raises(WeightsError, match="adapted to another place") as caught:
+        load_scorer(path, elsewhere)
+    assert caught.value.path == path
+    assert load_scorer(path, elsewhere, anywhere=True).name == "adapted"
+
+
+def test_evaluations_and_planners_may_insist_on_another_place(place: tuple[LocalizationMap, Path]) -> None:
+    around, path = place
+    points = around.landmarks.points + np.array([0.5, 0, 0])
+    moved = Landmarks(**{**around.landmarks.__dict__, "points": points})
+    elsewhere = LocalizationMap(moved, around.camera)
+    options = {"methods": ("adapted",), "weights": (path,)}
+    with pytest.raises(WeightsError, match=r"--plan\.anywhere true, --evaluate\.anywhere true"):
+        scorers_of(elsewhere, EvaluateConfig(**options), {path: "adapted"})
+    assert [*scorers_of(elsewhere, EvaluateConfig(**options, anywhere=True), {path: "adapted"})] == ["adapted"]
+    scene = SimpleNamespace(localization_map=elsewhere)
+    with pytest.raises(WeightsError, match="adapted to another place"):
+        planner_scorer(scene, None, "adapted", path)
+    assert planner_scorer(scene, None, "adapted", path, PlanConfig(anywhere=True).anywhere).name == "adapted"
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "value"),
+    [
+        ("base", "scale", "nan"),
+        ("base", "offset", "inf"),
+        ("kernel", "length_m", "inf"),
+        ("kernel", "sharpness", "nan"),
+    ],
+)
+def test_kernels_and_calibrations_are_finite(part: str, name: str, value: str) -> None:
+    network = TrainedNetwork.load(SET, SetNetwork, "set").network
+    stored = AdaptedNetwork(network, 1.0, 0.0, 1.0, 4.0, 1, 1).description()
+    AdaptedNetwork.of_description(stored)
+    stored[part][name] = float(value)
+    with pytest.raises(ValueError, match=r"finite|no length"):
+        AdaptedNetwork.of_description(stored)

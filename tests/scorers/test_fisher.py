@@ -1,0 +1,160 @@
+"""Fisher information as a way to choose views: where it must look, and what the scorers share."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+
+import numpy as np
+import pytest
+
+from synthetic_dataset import make_landmarks
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.lattices import fibonacci_sphere
+from wheretolook.geometry.pose_information import information_matrices
+from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.scorers.registry import make_scorer, scorers
+from wheretolook.visibility.frustum import LandmarkSets, PosedViews
+from wheretolook.visibility.occlusion import StoredOcclusion
+from wheretolook_paper.fisher.exact import exact_information_plain
+from wheretolook_paper.fisher.metrics import METRICS
+from wheretolook_paper.scorers.fisher import APPROXIMATIONS, Approximation
+from wheretolook_paper.scorers.fisher.score import (
+    FisherScorer,
+    PoseInformation,
+    StationaryTraceScorer,
+    WorstTraceScorer,
+)
+
+CAMERA = PinholeCamera()
+DIRECTIONS = fibonacci_sphere(300)
+
+
+def with_points(points: Float) -> Landmarks:
+    landmarks = make_landmarks(np.random.default_rng(0), len(points))
+    return Landmarks(**{**vars(landmarks), "points": points})
+
+
+def two_walls(rng: np.random.Generator, n: int = 1500) -> Landmarks:
+    """Landmarks on the walls x = 4 and y = 4 of a room of 8 m x 8 m x 2.6 m."""
+    points = rng.uniform((-4, -4, 0), (4, 4, 2.6), (n, 3))
+    points[np.arange(n), rng.integers(0, 2, n)] = 4
+    return with_points(points)
+
+
+def views_around(locations: Float, directions: Float = DIRECTIONS) -> Float:
+    return poses_looking_along(np.repeat(locations, len(directions), 0), np.tile(directions, (len(locations), 1)))
+
+
+@pytest.mark.parametrize("metric", METRICS)
+@pytest.mark.parametrize("approximation", APPROXIMATIONS)
+def test_of_a_room_with_landmarks_on_two_walls_it_looks_at_them(metric: str, approximation: Approximation) -> None:
+    rng = np.random.default_rng(1)
+    localization_map = LocalizationMap(two_walls(rng), CAMERA)
+    hits = 0
+    for location in rng.uniform((-3, -3, 0.8), (2, 2, 1.8), (20, 3)):
+        scores = FisherScorer(localization_map, metric, approximation).score(views_around(location[None]))
+        best = DIRECTIONS[np.argmax(scores)]
+        # on the ray from here along the axis one of the two walls comes first, not the others, floor or ceiling
+        ahead = np.where(best > 0, 4 - location, -4 - location) / best
+        ahead[2] = ((2.6 if best[2] > 0 else 0) - location[2]) / best[2]
+        nearest = int(np.argmin(ahead))
+        hits += nearest < 2 and best[nearest] > 0
+        assert best[:2].sum() > 0.5, (location, best)
+    assert hits >= 19  # a corner far off may be seen best with half a view of the floor
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_a_wall_that_is_hidden_tells_nothing(metric: str) -> None:
+    rng = np.random.default_rng(2)
+    landmarks = two_walls(rng)
+    location = np.array([[0.3, -0.2, 1.2]])
+    on_x = landmarks.points[:, 0] == 4
+    best = {}
+    for hidden, wall in ((on_x, "y"), (~on_x, "x")):
+        seen = LocalizationMap(landmarks, CAMERA, StoredOcclusion.from_mask(location, ~hidden[None]))
+        for approximation in APPROXIMATIONS:
+            scores = FisherScorer(seen, metric, approximation).score(views_around(location))
+            alone = LocalizationMap(with_points(landmarks.points[~hidden]), CAMERA)
+            expected = FisherScorer(alone, metric, approximation).score(views_around(location))
+            much = np.maximum(scores, expected) > 0.1 * expected.max()  # determinants near zero are ill-conditioned
+            np.testing.assert_allclose(scores[much], expected[much], rtol=1e-3)
+            assert much.sum() > 20
+            best[wall, approximation] = DIRECTIONS[np.argmax(scores)]
+    assert best["x", "exact"][0] > 0.6 and best["y", "exact"][1] > 0.6
+
+
+@pytest.mark.parametrize("about_origin", [False, True])
+def test_exact_scores_are_numpys_of_the_sums(about_origin: bool) -> None:
+    rng = np.random.default_rng(3)
+    landmarks = two_walls(rng, 400)
+    locations = rng.uniform((-3, -3, 0.8), (2, 2, 1.8), (4, 3))
+    mask = rng.random((4, 400)) < 0.6
+    poses = views_around(locations, fibonacci_sphere(25))
+    rows = np.repeat(np.arange(4), 25)
+    numbers = exact_information_plain(PosedViews(CAMERA, poses, landmarks.points, LandmarkSets.from_mask(mask), rows))
+    matrices = information_matrices(numbers, -camera_centers(poses) if about_origin else None)
+    determinant = np.linalg.det(matrices)
+    expected = {
+        "trace": np.trace(matrices, axis1=1, axis2=2),
+        "logdet": np.sign(determinant) * np.log1p(np.abs(determinant)),
+        "mineig": np.linalg.svd(matrices, compute_uv=False)[:, -1],
+    }
+    seen = LocalizationMap(landmarks, CAMERA, StoredOcclusion.from_mask(locations, mask))
+    for metric, values in expected.items():
+        scores = FisherScorer(seen, metric, "exact", about_origin).score(poses)
+        np.testing.assert_allclose(scores, values, rtol=1e-6, atol=1e-6)
+        assert np.ptp(values) > 0.1
+
+
+def test_all_nine_rows_and_the_two_probes_are_methods() -> None:
+    localization_map = LocalizationMap(two_walls(np.random.default_rng(4), 200), CAMERA)
+    rows = {(metric, approximation, False) for metric in METRICS for approximation in APPROXIMATIONS}
+    turned = {(metric, approximation, True) for metric, approximation, _ in rows if metric != "logdet"}
+    found = {
+        name: make_scorer(name, localization_map) for name, method in scorers().items() if method.family == "fisher"
+    }
+    assert {(one.metric, one.approximation, one.about_origin) for one in found.values()} == rows | turned
+    for name, scorer in found.items():
+        assert isinstance(scorer, FisherScorer) and scorer.name == name
+        assert scorers()[name].only_if_named == scorer.about_origin == (name not in EvaluateConfig().methods)
+    probes = [name for name, method in scorers().items() if method.group == "probes"]
+    assert probes == ["fisher-worst-trace", "fisher-stationary-trace"] and {*probes} < {*EvaluateConfig().methods}
+
+
+def test_probes_look_away_from_the_landmarks() -> None:
+    rng = np.random.default_rng(5)
+    localization_map = LocalizationMap(two_walls(rng), CAMERA)
+    locations = rng.uniform((-3, -3, 0.8), (2, 2, 1.8), (5, 3))
+    poses = views_around(locations)
+    for scorer in (WorstTraceScorer(localization_map), StationaryTraceScorer(localization_map)):
+        scores = scorer.score(poses)
+        assert np.all((scores >= 0) & (scores <= 1))
+        best = DIRECTIONS[scores.reshape(5, -1).argmax(1)]
+        # a probe tells one axis: the others' scores fall with the angle from it
+        cosines = np.einsum("li,di->ld", best, DIRECTIONS)
+        assert np.all([np.corrcoef(c, s)[0, 1] > 0.99 for c, s in zip(cosines, scores.reshape(5, -1), strict=True)])
+        assert np.all(best[:, :2].sum(1) < 0)
+
+
+def test_methods_of_a_map_share_their_sums_and_a_map_can_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    localization_map = LocalizationMap(two_walls(np.random.default_rng(6), 200), CAMERA)
+    first = views_around(np.zeros((1, 3)))
+    other = views_around(np.ones((1, 3)))
+    calls: list[str] = []
+    real = PoseInformation._numbers
+    monkeypatch.setattr(PoseInformation, "_numbers", lambda self, a: calls.append(a) or real(self, a))
+    scorers = [FisherScorer(localization_map, metric, "exact") for metric in METRICS]
+    scores = [scorer.score(first) for scorer in scorers]
+    assert calls == ["exact"]
+    scorers[0].score(other)
+    assert calls == ["exact", "exact"]
+    np.testing.assert_array_equal(scorers[0].score(first), scores[0])  # never those of other views
+    assert len(calls) == 3
+    gone = weakref.ref(localization_map)
+    del localization_map, scorers
+    gc.collect()
+    assert gone() is None

@@ -1,0 +1,200 @@
+"""Inputs of the network, and weights on disk."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.inputs.bins import InputStatistics, arrange
+from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, LANDMARK_CHANNELS, PAPER_VARIANTS
+from wheretolook.scorers.mlp.network import BinnedInput, NetworkSpec, ViewpointNetwork, add_noise, move_to_front
+from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook.training.weights import METADATA_KEY, read_training
+from wheretolook.utils.errors import WeightsError
+
+BINS = 6
+INPUTS = {**PAPER_VARIANTS, "2d+3d+landmark": ALL_CHANNELS}
+CAMERA = PinholeCamera(64, 48, 32.0)
+
+
+@pytest.fixture
+def views() -> tuple[torch.Tensor, torch.Tensor]:
+    """Random binned views with all channels; view 0 sees nothing."""
+    generator = torch.Generator().manual_seed(0)
+    filled = torch.rand((50, BINS, BINS), generator=generator) < 0.4
+    filled[0] = False
+    scale = torch.tensor([100.0, 70.0, 1.0, 2.0, 5.0] + [0.3] * len(LANDMARK_CHANNELS))[:, None, None]
+    values = torch.randn((50, len(ALL_CHANNELS), BINS, BINS), generator=generator)
+    return (values + 3) * scale * filled[:, None], filled
+
+
+def make_network(
+    views: tuple[torch.Tensor, torch.Tensor], variant: str = "2d+z", **options: object
+) -> ViewpointNetwork:
+    statistics = InputStatistics.of(*views, torch.arange(50), ALL_CHANNELS).select(INPUTS[variant])
+    torch.manual_seed(1)
+    spec = NetworkSpec(statistics, bins=BINS, hidden=(8, 8), **options)  # type: ignore[arg-type]
+    return ViewpointNetwork(spec).eval()
+
+
+def load(path: Path) -> ViewpointNetwork:
+    return TrainedNetwork.load(path, ViewpointNetwork, "mlp-2d+z", "mlp-2d+3d").network
+
+
+def test_statistics_are_over_filled_bins_of_the_given_views(views: tuple[torch.Tensor, torch.Tensor]) -> None:
+    means, filled = views
+    rows = torch.arange(10, 40)
+    statistics = InputStatistics.of(means, filled, rows, ALL_CHANNELS)
+    for index, name in enumerate(ALL_CHANNELS):
+        values = means[rows, index][filled[rows]].double()
+        assert statistics.mean[statistics.channels.index(name)] == pytest.approx(values.mean().item(), rel=1e-6)
+        assert statistics.std[index] == pytest.approx(values.std(correction=0).item(), rel=1e-5)
+
+
+def test_statistics_of_nothing_and_of_constants_are_harmless() -> None:
+    means = torch.zeros(3, len(CHANNELS), 2, 2)
+    filled = torch.zeros(3, 2, 2, dtype=torch.bool)
+    assert InputStatistics.of(means, filled, torch.arange(3)).std == (1.0,) * len(CHANNELS)
+
+
+@pytest.mark.parametrize("variant", INPUTS)
+def test_standardized_inputs_have_mean_0_and_deviation_1_where_filled_and_are_0_elsewhere(
+    views: tuple[torch.Tensor, torch.Tensor], variant: str
+) -> None:
+    means, filled = views
+    statistics = InputStatistics.of(means, filled, torch.arange(50), ALL_CHANNELS).select(INPUTS[variant])
+    layer = BinnedInput(NetworkSpec(statistics, bins=BINS))
+    chosen = [ALL_CHANNELS.index(name) for name in statistics.channels]
+    values = layer(means[:, chosen], filled).reshape(50, -1, BINS, BINS)
+    assert values.shape[1] == len(INPUTS[variant])
+    for channel in values.unbind(1):
+        assert torch.all(channel[~filled] == 0)
+        assert channel[filled].mean().item() == pytest.approx(0, abs=1e-5)
+        assert channel[filled].std(correction=0).item() == pytest.approx(1, abs=1e-4)
+
+
+def test_what_is_not_known_of_landmarks_is_the_mean_of_what_is(views: tuple[torch.Tensor, torch.Tensor]) -> None:
+    means, filled = views
+    ambiguity, spread = (ALL_CHANNELS.index(name) for name in ("ambiguity", "distance_spread"))
+    known = means.clone()
+    means[:20, ambiguity] = torch.where(filled[:20], torch.nan, 0.0)  # a map without descriptors
+    means[:, spread] = torch.where(filled, torch.nan, 0.0)  # known of no map
+    statistics = InputStatistics.of(means, filled, torch.arange(50), ALL_CHANNELS)
+    rest = InputStatistics.of(means[20:], filled[20:], torch.arange(30), ALL_CHANNELS)
+    assert statistics.mean[ambiguity] == pytest.approx(rest.mean[ambiguity], rel=1e-9)
+    assert statistics.std[ambiguity] == pytest.approx(rest.std[ambiguity], rel=1e-6)
+
+    layer = BinnedInput(NetworkSpec(statistics, bins=BINS))
+    values = layer(means, filled).reshape(known.shape)
+    assert values.isfinite().all()
+    assert torch.all(values[:20, ambiguity] == 0) and values[20:, ambiguity].std() > 0.1
+    assert torch.all(values[:, spread] == 0)
+    # what was never known while it learnt says nothing to a network when it is
+    assert torch.all(layer(known, filled).reshape(known.shape)[:, spread] == 0)
+    means[3, 0, 2, 2] = torch.nan  # where a landmark lies is always known: such an error is not hidden
+    assert layer(means, torch.ones_like(filled)).isnan().any()
+
+
+def test_noise_leaves_what_landmarks_are_like(views: tuple[torch.Tensor, torch.Tensor]) -> None:
+    means, filled = views
+    noisy = add_noise(means, filled, noise_px=2.0, noise_m=0.1, channels=ALL_CHANNELS)
+    changed = (noisy != means).sum((0, 2, 3)) > 0
+    assert changed.tolist() == [name in CHANNELS for name in ALL_CHANNELS]
+
+
+def test_compact_layout_is_the_one_of_features(views: tuple[torch.Tensor, torch.Tensor]) -> None:
+    means, filled = views
+    expected = arrange(means.numpy(), filled.numpy(), "compact")
+    np.testing.assert_array_equal(move_to_front(means, filled).numpy(), expected)
+    in_place = make_network(views)
+    compact = make_network(views, layout="compact")
+    compact.load_state_dict(in_place.state_dict())
+    chosen = means[:, [ALL_CHANNELS.index(name) for name in in_place.spec.channels]]
+    assert not torch.allclose(in_place(chosen, filled), compact(chosen, filled))
+
+
+def test_paper_sizes() -> None:
+    for variant, size in {"2d": 1800, "2d+z": 2700, "2d+3d": 4500}.items():
+        channels = INPUTS[variant]
+        statistics = InputStatistics(channels, (0.0,) * len(channels), (1.0,) * len(channels))
+        layers = ViewpointNetwork(NetworkSpec(statistics)).layers
+        assert [layer.weight.shape for layer in layers if isinstance(layer, torch.nn.Linear)] == [
+            (300, size),
+            (300, 300),
+            (1, 300),
+        ]
+
+
+def test_weights_survive_the_disk(views: tuple[torch.Tensor, torch.Tensor], tmp_path: Path) -> None:
+    network = make_network(views, "2d+3d", input_dropout=0.3)
+    path = tmp_path / "weights" / "mlp.safetensors"
+    trained = TrainedNetwork("mlp-2d+3d", network, CAMERA)
+    trained.save(path, {"dataset_fingerprint": "abc"})
+    loaded = load(path)
+    assert loaded.spec == network.spec
+    assert not loaded.training
+    means = views[0][:, :5]
+    filled = views[1]
+    torch.testing.assert_close(loaded(means, filled), network(means, filled), rtol=0, atol=0)
+    assert read_training(path) == {"dataset_fingerprint": "abc"}
+    assert [file.name for file in path.parent.iterdir()] == ["mlp.safetensors"]
+    first = path.read_bytes()
+    trained.save(path, {"dataset_fingerprint": "abc"})
+    assert path.read_bytes() == first
+
+
+def test_unusable_weights_are_named(views: tuple[torch.Tensor, torch.Tensor], tmp_path: Path) -> None:
+    good = tmp_path / "good.safetensors"
+    TrainedNetwork("mlp-2d+z", make_network(views), CAMERA).save(good)
+    with pytest.raises(WeightsError, match=r"nowhere\.safetensors.*there are no weights"):
+        load(tmp_path / "nowhere.safetensors")
+
+    truncated = tmp_path / "truncated.safetensors"
+    truncated.write_bytes(good.read_bytes()[:-7])
+    with pytest.raises(WeightsError, match="not a readable safetensors file"):
+        load(truncated)
+
+    foreign = tmp_path / "foreign.safetensors"
+    save_file({"a": torch.zeros(3)}, foreign)
+    with pytest.raises(WeightsError, match="not written by wheretolook"):
+        load(foreign)
+
+    tensors = load_file(good)
+    header = {"format_version": 1, **json.loads(_header(good))}
+    other = tmp_path / "other.safetensors"
+    for change, message in (
+        ({"format_version": 99}, "reads weights of format 1"),
+        ({"hidden": [9, 9]}, "do not fit the network"),
+        ({"statistics": {"channels": ["w"], "mean": [0], "std": [1]}}, "unknown channel of the bins.*'w'"),
+        ({"method": "set"}, "not of mlp"),
+        ({"camera": {"width": 0}}, "camera needs a positive image size"),
+    ):
+        save_file(tensors, other, metadata={METADATA_KEY: json.dumps({**header, **change})})
+        with pytest.raises(WeightsError, match=message):
+            load(other)
+
+
+def test_weights_of_older_versions_are_read(views: tuple[torch.Tensor, torch.Tensor], tmp_path: Path) -> None:
+    path = tmp_path / "old.safetensors"
+    network = make_network(views)
+    TrainedNetwork("mlp-2d+z", network, CAMERA).save(path, {"variant": "2d+z"})
+    header = {**json.loads(_header(path)), "variant": "2d+z"}  # as it was, without the name of the method
+    for name in ("method", "scale", "offset"):
+        del header[name]
+    save_file(load_file(path), path, metadata={METADATA_KEY: json.dumps(header)})
+    found = TrainedNetwork.load(path, ViewpointNetwork, "mlp-2d+z")
+    assert (found.method, found.network.spec, found.camera) == ("mlp-2d+z", network.spec, CAMERA)
+    assert read_training(path) == {"method": "mlp-2d+z"}
+
+
+def _header(path: Path) -> str:
+    from safetensors import safe_open
+
+    with safe_open(path, framework="pt") as file:
+        return str(file.metadata()[METADATA_KEY])

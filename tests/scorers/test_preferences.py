@@ -1,0 +1,116 @@
+"""What a scorer that knows its landmarks must prefer, all else alike."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from wheretolook.features.descriptors import quantize_descriptors
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks, nearest_other_cosine
+from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.registry import load_scorer
+
+CAMERA = PinholeCamera(320, 240, 160.0)
+WEIGHTS = Path(__file__).parents[2] / "data" / "release" / "weights" / "set.safetensors"
+"""The scorer that ships."""
+
+
+def only(landmarks: Landmarks, rows: Float) -> Landmarks:
+    """Some of the landmarks."""
+    kept = {name: None if value is None else value[rows] for name, value in vars(landmarks).items()}
+    return Landmarks(**kept)
+
+
+def scores_of(localization_map: LocalizationMap, views: Float) -> Float:
+    scorer: Scorer = load_scorer(WEIGHTS, localization_map)
+    return scorer.score(views)
+
+
+def two_walls(n: int, seed: int) -> Landmarks:
+    """Walls x = -2, where no two patches are alike, and x = 2, its mirror image, whose texture repeats 12 patches."""
+    rng = np.random.default_rng(seed)
+    left = np.column_stack([np.full(n, -2.0), rng.uniform(-1.2, 1.2, n), rng.uniform(0.6, 2.0, n)])
+    patches = np.abs(rng.normal(size=(n, 128)))
+    repeated = patches[rng.integers(0, 12, n)] * rng.normal(1, 0.03, (n, 128))
+    descriptors = np.concatenate([patches, np.abs(repeated)])
+    descriptors = quantize_descriptors(descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True))
+    directions = left - (0, 0, 1.3) + rng.normal(0, 0.3, (n, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    mirror = np.array([-1.0, 1, 1])
+
+    def on_both(values: Float, dtype: type = np.float32) -> Float:
+        return np.tile(values, 2).astype(dtype)
+
+    return Landmarks(
+        ids=np.arange(2 * n),
+        points=np.concatenate([left, left * mirror]),
+        track_length=on_both(rng.integers(2, 6, n), np.int32),
+        reprojection_error_px=on_both(rng.uniform(0.02, 0.3, n)),
+        triangulation_angle_deg=on_both(rng.uniform(4, 30, n)),
+        mapping_direction=np.concatenate([directions, directions * mirror]).astype(np.float32),
+        mapping_direction_spread=on_both(rng.uniform(0, 0.05, n)),
+        mapping_distance_m=on_both(rng.uniform(1.5, 3.0, n)),
+        mapping_distance_spread=on_both(rng.uniform(0, 0.2, n)),
+        descriptors=None,
+        ambiguity=nearest_other_cosine(descriptors),
+    )
+
+
+@pytest.mark.parametrize("n", [40, 80, 160, 400])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_wall_that_repeats_its_texture_is_not_the_one_to_look_at(n: int, seed: int) -> None:
+    landmarks = two_walls(n, seed)
+    views = poses_looking_along([[0, 0, 1.3]] * 2, [[-1.0, 0, 0], [1.0, 0, 0]])
+    localization_map = LocalizationMap(landmarks, CAMERA)
+    visible = localization_map.landmarks_in_view(views)
+    assert len(visible[0]) == len(visible[1]) == n
+    assert np.median(landmarks.ambiguity[visible[1]]) > np.median(landmarks.ambiguity[visible[0]]) + 0.1
+    odds = np.log(1 / scores_of(localization_map, views) - 1)
+    assert odds[0] < odds[1] - 0.1
+
+
+def one_sided_wall(folder: Path, seed: int) -> Landmarks:
+    """A wall y = 0 of 200 landmarks, seen by twelve cameras, all of which stand on the side y < 0."""
+    rng = np.random.default_rng(seed)
+    points = np.column_stack([rng.uniform(-1.2, 1.2, 200), rng.uniform(-0.05, 0.05, 200), rng.uniform(0.5, 2.2, 200)])
+    centers = np.column_stack([rng.uniform(-1.5, 1.5, 12), rng.uniform(-3.0, -2.0, 12), rng.uniform(1.0, 1.8, 12)])
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(camera_id=1, model="SIMPLE_PINHOLE", width=320, height=240, params=[160.0, 160.0, 120.0])
+    model.add_camera_with_trivial_rig(camera)
+    poses = poses_looking_along(centers, points.mean(0) - centers)
+    seen = [rng.choice(12, 5, replace=False) for _ in points]
+    for number, pose in enumerate(poses):
+        rows = [row for row, cameras in enumerate(seen) if number in cameras]
+        pixels = (points[rows] @ pose[:, :3].T + pose[:, 3]) @ np.array([[160, 0, 160], [0, 160, 120], [0, 0, 1.0]]).T
+        image = pycolmap.Image(
+            name=f"{number}.png", camera_id=1, image_id=number + 1, keypoints=pixels[:, :2] / pixels[:, 2:]
+        )
+        turn = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3])
+        model.add_image_with_trivial_frame(image, turn)
+    for row, cameras in enumerate(seen):
+        track = pycolmap.Track()
+        for number in cameras:
+            of_image = [other for other, others in enumerate(seen) if number in others].index(row)
+            track.add_element(int(number) + 1, of_image)
+        model.add_point3D(points[row], track, np.zeros(3, np.uint8))
+    model.write_binary(str(folder))
+    return load_colmap_landmarks(folder)
+
+
+@pytest.mark.parametrize("n", [40, 100, 200])
+def test_of_a_wall_mapped_from_one_side_it_is_that_side_to_look_from(tmp_path: Path, n: int) -> None:
+    landmarks = one_sided_wall(tmp_path, seed=1)
+    landmarks = only(landmarks, np.arange(n))
+    localization_map = LocalizationMap(landmarks, CAMERA)
+    assert (landmarks.mapping_direction[:, 1] > 0.5).all()
+    where = np.array([[0, -2.0, 1.35], [0, 2.0, 1.35]])
+    views = poses_looking_along(where, -where * (0, 1, 0))
+    assert np.diff(localization_map.landmarks_in_view(views).starts).tolist() == [n, n]
+    scores = scores_of(localization_map, views)
+    assert scores[0] > scores[1] + 0.2

@@ -1,0 +1,301 @@
+"""Methods of other packages, and attributes that weights have never heard of: nothing of ours needs a change."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import wheretolook
+from synthetic_dataset import CAMERA, make_landmarks
+from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.scorers import registry
+from wheretolook.scorers.registry import all_methods, best_weights, load_scorer, make_scorer, methods_named, scorers
+from wheretolook.scorers.visible import METHODS
+from wheretolook.training.weights import read_weights, write_weights
+from wheretolook.utils.errors import ConfigError, WeightsError
+from wheretolook.utils.tracking import client
+from wheretolook.utils.tracking_config import TrackingConfig
+
+SOURCE = Path(wheretolook.__file__).parent
+WEIGHTS = Path(__file__).parents[2] / "data" / "release" / "weights"
+
+PLUGIN = '''
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from wheretolook.scorers.base import CountingScorer
+from wheretolook.scorers.method import Method, MethodStyle
+
+
+@dataclass(frozen=True)
+class LinearConfig:
+    """Options of a line through the number of landmarks.
+
+    Args:
+        slope: how much a landmark is worth.
+    """
+
+    slope: float = 0.1
+
+
+class Line(CountingScorer):
+    name = "linear"
+    local = True
+    slope = 1.0
+    middle = 0.0
+
+    def score_counts(self, n_visible, n_filled):
+        return 1 / (1 + np.exp(-self.slope * (n_visible - self.middle)))
+
+
+class Model:
+    def __init__(self, camera, slope, middle):
+        self.camera, self.numbers = camera, {"slope": slope, "middle": middle}
+
+    def save(self, path, training=None):
+        from wheretolook.training.weights import write_weights
+
+        header = {"camera": asdict(self.camera), "numbers": self.numbers, "training": training or {}}
+        write_weights(path, "linear", {}, header)
+
+
+def learn(task):
+    from wheretolook.training.learner import Learnt
+
+    counts = np.concatenate([scene.read_table()["n_visible"] for scene in task.dataset.split("train")])
+    metrics = {"val_average_precision": 0.5}
+    return Learnt(Model(task.dataset.camera, task.options.slope, float(np.median(counts))), metrics, {"n": len(counts)})
+
+
+def build(localization_map, options):
+    from wheretolook.training.weights import read_weights
+
+    line = Line(localization_map)
+    numbers = read_weights(Path(options.weights))[1]["numbers"]
+    line.slope, line.middle = numbers["slope"], numbers["middle"]
+    return line
+
+
+class Fewest(CountingScorer):
+    name = "fewest"
+    local = True
+
+    def score_counts(self, n_visible, n_filled):
+        return 1 / (1.0 + n_visible)
+
+
+METHODS = (
+    Method("linear", "A line through the number of landmarks in view.", MethodStyle("line", "#123456", "o", "-"),
+           "learned", build, "linear", probability=True, learn=learn, config=LinearConfig, folder="linear"),
+    Method("fewest", "The fewest landmarks in view.", MethodStyle("fewest landmarks", "#654321", "s", ":"),
+           build=lambda localization_map, options: Fewest(localization_map)),
+)
+'''
+
+PROGRAM = """
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from box_scenes import box_quads, quads_mesh, random_texture
+from planning.rooms import patiently
+from synthetic_dataset import make_dataset
+from wheretolook.cli import parse_experiment
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.figures.scores import score_figure
+from wheretolook.scenes.loading import save_glb
+from wheretolook.stages.evaluate import evaluate_methods
+from wheretolook.stages.plan import plan
+from wheretolook.stages.train import train_methods
+from wheretolook.utils.files import write_json
+from wheretolook.utils.tracking import newest_run
+from wheretolook.utils.tracking_config import TrackingConfig
+
+Figure.savefig = lambda figure, file, **options: file.write(b"")  # figures are built, which is enough here
+folder = Path(sys.argv[1])
+dataset = make_dataset(folder / "tiny", ("train", "test"), n_locations=8, n_directions=12)
+room = box_quads((-3.1, -3.1, -0.1), (3.1, 3.1, 2.6), inward=True)
+for scene in dataset.scenes:
+    save_glb(quads_mesh(room, [random_texture(np.random.default_rng(0), 8, 8)]), scene.mesh)
+    write_json(scene.folder / "stages.json", {"scenes": "made", "map": "made"})
+tracking = TrackingConfig(str(folder / "mlruns"))
+experiment = parse_experiment("train", ["--train.methods", "[linear]", "--train.linear.slope", "0.2"])
+assert experiment.train.linear.slope == 0.2
+(model,) = train_methods(dataset, experiment.train, tracking, progress=False)
+assert model.path == dataset.root / "weights" / "linear.safetensors"
+assert train_methods(dataset, experiment.train, tracking, progress=False)[0].reused
+table = evaluate_methods(dataset, EvaluateConfig(("random", "bins", "linear", "fewest"), resamples=20), tracking)
+assert {*table["method"]} == {"random", "bins", "linear", "fewest", "oracle"}
+assert (table["reference"] == "linear").all() and table.loc[table["method"] == "linear", "ece"].notna().all()
+labels = [text.get_text() for text in score_figure(table).axes[0].get_yticklabels()]
+assert sorted(labels) == ["fewest landmarks", "line", "random", "reprojections with bins"], labels
+options = ["--data", str(folder), "--name", "tiny", "--tracking.folder", tracking.folder, "--device", "cpu",
+           "--camera.width", "160", "--camera.height", "120", "--camera.focal_px", "80",
+           "--scene", dataset.split("test")[0].name, "--start", "[-1, -1, 1]", "--goal", "[1, 1, 1]",
+           "--method", "linear", "--plan.against", "[fewest]", "--film", "none",
+           "--plan.grid", "[3, 3, 2]", "--plan.directions", "20"]
+experiment = parse_experiment("plan", options)
+
+
+def plan_within(seconds):
+    planner = replace(experiment.plan.planner, time_s=seconds)
+    return plan(replace(experiment, plan=replace(experiment.plan, planner=planner)))
+
+
+path = patiently(plan_within)
+assert path.scores.max() > 0.5 and path.scores.max() <= 1, path.scores
+assert newest_run(tracking, "plan").data.params["methods"] == "fewest linear"
+print("learnt, compared, drawn and planned with")
+"""
+
+
+def run_python(program: str, *arguments: str, path: list[Path]) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, path))}
+    command = [sys.executable, "-c", program, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+
+
+@pytest.mark.slow
+def test_another_package_adds_a_learner_and_a_rule(tmp_path: Path) -> None:
+    installed = tmp_path / "site"
+    about = installed / "wheretolook_linear-1.0.dist-info"
+    about.mkdir(parents=True)
+    (installed / "wheretolook_linear.py").write_text(PLUGIN)
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: wheretolook-linear\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[wheretolook.methods]\nlinear = wheretolook_linear:METHODS\n")
+    client(TrackingConfig(str(tmp_path / "mlruns")))  # a copy of an empty store: MLflow takes seconds to make its own
+    tests = Path(__file__).parents[1]
+    done = run_python(PROGRAM, str(tmp_path), path=[installed, SOURCE.parent, tests])
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "learnt, compared, drawn and planned with" in done.stdout
+
+
+def test_what_other_packages_get_wrong_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for value, message in (
+        ("nowhere.at.all:METHOD", "cannot be loaded.*ModuleNotFoundError.*broken = nowhere"),
+        ("math:pi", "cannot be loaded.*TypeError"),
+        ("os:environ", "no method"),
+        ("wheretolook.scorers.visible:METHODS", "same name.*'visible'"),
+    ):
+        monkeypatch.setattr(
+            registry, "entry_points", lambda group, value=value: [EntryPoint("broken", value, registry.GROUP)]
+        )
+        with pytest.raises(ConfigError, match=message):
+            all_methods.__wrapped__()
+
+
+LIGHT = """
+import sys
+from wheretolook.scorers.registry import describe_methods
+from wheretolook.scorers.train_config import TrainConfig
+TrainConfig(), describe_methods()
+print([name for name in ("torch", "lightning", "pandas", "mlflow", "warp", "scipy") if name in sys.modules])
+"""
+
+
+def test_records_of_methods_are_light() -> None:
+    done = run_python(LIGHT, path=[SOURCE.parent])
+    assert done.stdout.strip() == "[]", done.stdout + done.stderr
+
+
+def test_families_stand_for_their_methods() -> None:
+    names = [method.name for method in methods_named(("mlp", "bins"), scorers())]
+    assert names == ["mlp-2d", "mlp-2d+z", "mlp-2d+3d", "mlp-2d+3d+landmark", "mlp-released", "bins"]
+    assert len(methods_named(("fisher",), scorers())) == 9
+    for wrong in ((), ("bins", "bins"), ("psychic",), ("",), ("matchability",)):
+        with pytest.raises(ConfigError, match="known and named once"):
+            methods_named(wrong, scorers())
+    assert all(method.name == name and METHODS[0] for name, method in all_methods().items())
+
+
+NEW_ATTRIBUTE = """
+import sys
+import numpy as np
+from pathlib import Path
+from synthetic_dataset import CAMERA, make_landmarks
+from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
+from wheretolook.scorers.registry import load_scorer, make_scorer
+
+weights, out = Path(sys.argv[1]), Path(sys.argv[2])
+rng = np.random.default_rng(1)
+views = poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (40, 3)), rng.normal(size=(40, 3)))
+at = LocalizationMap(make_landmarks(np.random.default_rng(0), 200), CAMERA)
+wide = LocalizationMap(at.landmarks, type(CAMERA)(640, 480, 320.0))
+scores = {name: load_scorer(weights / f"{name}.safetensors", wide).score(views) for name in ("set", "mlp-2d+z")}
+scores["expected"] = make_scorer("expected-bins", wide, weights=weights / "matchability.safetensors").score(views)
+scores["n_attributes"] = np.array([len(MAP_ATTRIBUTES)])
+np.savez(out, **scores)
+"""
+
+
+@pytest.mark.slow
+def test_a_new_attribute_leaves_shipped_weights_as_they_are(tmp_path: Path) -> None:
+    """Two files are touched to add one; scores of the weights that ship stay the same to the last bit."""
+    changed = tmp_path / "changed"
+    shutil.copytree(SOURCE, changed / "wheretolook", ignore=shutil.ignore_patterns("__pycache__"))
+    for file, old, new in (
+        ("attribute_names.py", "MAP_ATTRIBUTES = (", 'MAP_ATTRIBUTES = (\n    "height",'),
+        ("landmarks.py", '"track_length": np.log', '"height": self.points[:, 2],\n            "track_length": np.log'),
+    ):
+        path = changed / "wheretolook" / "mapping" / file
+        text = path.read_text()
+        assert text.count(old) == 1
+        path.write_text(text.replace(old, new))
+    found = []
+    for place in (SOURCE.parent, changed):
+        out = tmp_path / f"{len(found)}.npz"
+        done = run_python(NEW_ATTRIBUTE, str(WEIGHTS), str(out), path=[place, Path(__file__).parents[1]])
+        assert done.returncode == 0, done.stderr[-3000:]
+        found.append(dict(np.load(out)))
+    assert found[1].pop("n_attributes") == found[0].pop("n_attributes") + 1
+    for name, scores in found[0].items():
+        np.testing.assert_array_equal(found[1][name], scores)
+        assert len(np.unique(scores)) > 20
+
+
+def test_an_attribute_that_maps_do_not_know_is_named(tmp_path: Path) -> None:
+    tensors, header = read_weights(WEIGHTS / "set.safetensors")
+    header.pop("format_version")
+    header["attributes"] = ["colour" if name == "ambiguity" else name for name in header["attributes"]]
+    write_weights(tmp_path / "set.safetensors", "set", tensors, header)
+    localization_map = LocalizationMap(make_landmarks(np.random.default_rng(0), 20), replace(CAMERA, focal_px=80.0))
+    with pytest.raises(WeightsError, match=r"set\.safetensors.*unknown attribute.*'colour'"):
+        load_scorer(tmp_path / "set.safetensors", localization_map)
+    views = poses_looking_along(np.zeros((1, 3)), np.ones((1, 3)))
+    assert make_scorer("visible", localization_map).score(views).shape == (1,)
+
+
+def test_weights_of_many_cameras_come_before_those_of_one(tmp_path: Path) -> None:
+    """Precision on views of many cameras is lower than on those of one, so that it does not tell which is better."""
+    localization_map = LocalizationMap(make_landmarks(np.random.default_rng(0), 50), CAMERA)
+    for name in ("set", "matchability", "mlp-2d+z"):
+        for suffix in ("safetensors", "json"):
+            shutil.copy(WEIGHTS / f"{name}.{suffix}", tmp_path)
+    for precision, camera, best in ((0.1, None, "set"), (0.1, CAMERA.record(), "mlp-2d+z")):
+        path = tmp_path / "set.safetensors"
+        tensors, header = read_weights(path)
+        header.pop("format_version")
+        write_weights(path, "set", tensors, {**header, "camera": camera})
+        record = json.loads(path.with_suffix(".json").read_text())
+        record["metrics"]["val_average_precision"] = precision
+        path.with_suffix(".json").write_text(json.dumps(record))
+        assert best_weights(tmp_path).stem == best
+        if best == "set":
+            assert load_scorer(tmp_path, localization_map).name == "set"

@@ -1,0 +1,203 @@
+"""Every method against hand-counted views, and the contract that all of them keep."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from learning_options import save_network
+from synthetic_dataset import CAMERA, make_landmarks, make_mapping_poses
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.inputs.bins import BinnedViews, InputStatistics
+from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
+from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber, pool
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.scorers.adapted.network import AdaptedNetwork
+from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.bins import BinsScorer
+from wheretolook.scorers.matchability.network import MatchabilityNetwork
+from wheretolook.scorers.mlp.network import NetworkSpec, ViewpointNetwork
+from wheretolook.scorers.registry import load_scorer, make_scorer, scorers
+from wheretolook.scorers.set.network import SetNetwork
+from wheretolook.scorers.visible import VisibleScorer
+from wheretolook.training.landmark_views import AttributeStatistics
+from wheretolook.utils.errors import ConfigError, PoseError, WeightsError
+from wheretolook_paper.scorers.conv.network import ConvNetwork, ConvSpec
+from wheretolook_paper.scorers.sphere.config import SphereConfig
+from wheretolook_paper.scorers.sphere.network import SphereNetwork
+from wheretolook_paper.scorers.trees.config import TreesConfig
+from wheretolook_paper.scorers.trees.learn import BoostedTrees, PooledViews, fit_trees
+
+
+@pytest.fixture
+def localization_map() -> LocalizationMap:
+    landmarks = make_landmarks(np.random.default_rng(0), 200)
+    return LocalizationMap(landmarks, CAMERA, mapping_poses=make_mapping_poses(0))
+
+
+@pytest.fixture
+def views() -> Float:
+    rng = np.random.default_rng(1)
+    return poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (40, 3)), rng.normal(size=(40, 3)))
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    """An untrained network whose scores differ from view to view."""
+    torch.manual_seed(0)
+    statistics = InputStatistics(CHANNELS, (80.0, 60.0, 0.0, 0.0, 2.0), (40.0, 30.0, 1.0, 1.0, 1.0))
+    path = tmp_path / "mlp.safetensors"
+    return save_network(path, "mlp-2d+3d", ViewpointNetwork(NetworkSpec(statistics, hidden=(16,))))
+
+
+NO_STATISTICS = AttributeStatistics((0.0,) * len(ATTRIBUTES), (1.0,) * len(ATTRIBUTES))
+
+
+def some_trees(localization_map: LocalizationMap) -> BoostedTrees:
+    """Trees whose scores differ from view to view."""
+    rng = np.random.default_rng(2)
+    directions = poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (300, 3)), rng.normal(size=(300, 3)))
+    values = pool(LandmarkDescriber(localization_map).describe(directions), directions, CAMERA).numpy()
+    labels = np.nan_to_num(values[:, 0] + values[:, 10]) + rng.normal(size=300) > 3
+    views = PooledViews(values, labels, np.zeros(300, int), np.arange(300))
+    return fit_trees(views, views, CAMERA, TreesConfig(max_trees=10, max_leaves=15, min_leaf=3))[0]
+
+
+def some_convolutions() -> ConvNetwork:
+    """An untrained network whose scores differ from view to view."""
+    torch.manual_seed(0)
+    mean = (80.0, 60.0, 0.0, 0.0, 2.0, *[0.5] * 10)
+    std = (40.0, 30.0, *[1.0] * 13)
+    return ConvNetwork(ConvSpec(InputStatistics(ALL_CHANNELS, mean, std), 30, (8, 8), 0.0))
+
+
+def weights_of(method: str, path: Path, localization_map: LocalizationMap) -> Path:
+    """Untrained weights of a method."""
+    if method == "trees":
+        some_trees(localization_map).save(path)
+        return path
+    torch.manual_seed(0)
+    if method.startswith("mlp"):
+        statistics = InputStatistics(CHANNELS, (80.0, 60.0, 0.0, 0.0, 2.0), (40.0, 30.0, 1.0, 1.0, 1.0))
+        return save_network(path, method, ViewpointNetwork(NetworkSpec(statistics, hidden=(16,))))
+    network = {
+        "conv": some_convolutions,
+        "sphere": lambda: SphereNetwork(SphereConfig()),
+        "set": lambda: SetNetwork(NO_STATISTICS, pooled=2),
+        "matchability": lambda: MatchabilityNetwork(NO_STATISTICS),
+        "adapted": lambda: AdaptedNetwork(SetNetwork(NO_STATISTICS, pooled=2), 1.0, 0.0, 1.0, 4.0, 0, 0),
+    }[method]()
+    return save_network(path, method, network)
+
+
+@pytest.mark.parametrize("name", scorers())
+def test_scorers_keep_their_contract(
+    name: str, localization_map: LocalizationMap, views: Float, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    needed = scorers()[name].weights
+    if needed:
+        weights = weights_of(needed, weights.with_name(f"{needed}.safetensors"), localization_map)
+    scorer = make_scorer(name, localization_map, seed=3, weights=weights)
+    assert isinstance(scorer, Scorer)
+    assert scorer.name == name
+    scores = scorer.score(views)
+    assert scores.shape == (40,)
+    assert scores.dtype == np.float64
+    assert np.isfinite(scores).all()
+    assert name.startswith("fisher") or np.all((scores >= 0) & (scores <= 1))
+    assert len(np.unique(scores)) > 15
+    order = np.random.default_rng(0).permutation(40)
+    # networks compute in single precision, which a determinant or least eigenvalue of what they weigh magnifies
+    rtol = 2e-5 if "expected" in name else 1e-6
+    np.testing.assert_allclose(scorer.score(views[order]), scores[order], rtol=rtol)  # a pose's score is its own
+    np.testing.assert_allclose(scorer.score(views[7:8]), scores[7:8], rtol=rtol)
+    np.testing.assert_array_equal(scorer.score_binned(views, localization_map.bin_views(views)), scores)
+    monkeypatch.setattr("wheretolook.scorers.base.BLOCK", 7)
+    np.testing.assert_allclose(scorer.score(views), scores, rtol=rtol)
+    assert scorer.score(views[:0]).shape == (0,)
+    for value in (np.nan, np.inf):
+        spoilt = views.copy()
+        spoilt[3, 1, 2] = value
+        for asked in (scorer.score, scorer.in_range, scorer.report):
+            with pytest.raises(PoseError, match=r"NaN or infinite entries, first in pose 3"):
+                asked(spoilt)
+        with pytest.raises(PoseError, match="location is NaN or infinite"):
+            scorer.score_around(np.array([[0.0, 0, 1], [0, value, 1]]), np.eye(3))
+        with pytest.raises(PoseError, match="cannot look along this direction"):
+            scorer.score_around(np.zeros((1, 3)), np.array([[1.0, 0, 0], [0, value, 1]]))
+
+
+def _binned(counts: list[list[int]]) -> BinnedViews:
+    """Views of 2 x 2 bins with so many landmarks each."""
+    array = np.array(counts, dtype=np.int32).reshape(-1, 2, 2)
+    return BinnedViews(np.zeros((len(array), len(CHANNELS), 2, 2), dtype=np.float32), array, CHANNELS)
+
+
+def test_counting_scorers_on_hand_counted_bins(localization_map: LocalizationMap) -> None:
+    binned = _binned([[0, 0, 0, 0], [9, 0, 0, 0], [1, 1, 0, 0], [1, 2, 0, 0], [1, 1, 1, 1], [50, 50, 50, 50]])
+    np.testing.assert_allclose(
+        VisibleScorer(localization_map, bins=2).score_bins(binned) * 200, [0, 9, 2, 3, 4, 200], rtol=1e-12
+    )
+    by_bins = BinsScorer(localization_map, bins=2).score_bins(binned)
+    # one bin with nine landmarks loses to two bins with one each; equal bins are told apart by their landmarks
+    np.testing.assert_array_equal(np.argsort(by_bins), [0, 1, 2, 3, 4, 5])
+    np.testing.assert_array_equal(np.floor(by_bins * 5), [0, 1, 2, 2, 4, 4])
+    assert by_bins.max() < 1
+
+
+def test_random_scores_are_uniform_and_depend_on_the_seed(localization_map: LocalizationMap) -> None:
+    rng = np.random.default_rng(0)
+    views = poses_looking_along(np.zeros((20000, 3)), rng.normal(size=(20000, 3)))
+    a, b = (make_scorer("random", localization_map, seed=seed).score(views) for seed in (0, 1))
+    assert np.abs(np.histogram(a, 20, (0, 1))[0] - 1000).max() < 6 * np.sqrt(1000)
+    assert abs(np.corrcoef(a, b)[0, 1]) < 0.03
+    assert abs(np.corrcoef(a[1:], a[:-1])[0, 1]) < 0.03
+    # a pose that went to disk and back is the same pose
+    np.testing.assert_array_equal(make_scorer("random", localization_map).score(views[:100] * (1 + 1e-16)), a[:100])
+
+
+def test_learned_scores_equal_the_network_by_hand(
+    localization_map: LocalizationMap, views: Float, weights: Path
+) -> None:
+    scorer = load_scorer(weights, localization_map)
+    assert scorer.name == "mlp-2d+3d"
+    binned = localization_map.bin_views(views)
+    network = scorer.network
+    mean = np.array(network.spec.statistics.mean, dtype=np.float32)[:, None, None]
+    std = np.array(network.spec.statistics.std, dtype=np.float32)[:, None, None]
+    values = np.where(binned.counts[:, None] > 0, (binned.means - mean) / std, 0).reshape(40, -1)
+    first = network.layers[0]
+    last = network.layers[-1]
+    hidden = np.maximum(values @ first.weight.numpy().T + first.bias.numpy(), 0)
+    logits = hidden @ last.weight.numpy().T + last.bias.numpy()
+    np.testing.assert_allclose(scorer.score(views), 1 / (1 + np.exp(-logits[:, 0])), rtol=1e-5)
+
+
+def test_another_resolution_of_the_same_field_of_view_scores_the_same(
+    localization_map: LocalizationMap, views: Float, weights: Path
+) -> None:
+    double = PinholeCamera(2 * CAMERA.width, 2 * CAMERA.height, 2 * CAMERA.focal_px)
+    scores = load_scorer(weights, LocalizationMap(localization_map.landmarks, double)).score(views)
+    np.testing.assert_allclose(scores, load_scorer(weights, localization_map).score(views), rtol=1e-5)
+
+
+def test_another_field_of_view_is_refused(localization_map: LocalizationMap, weights: Path) -> None:
+    narrow = PinholeCamera(CAMERA.width, CAMERA.height, 2 * CAMERA.focal_px)
+    with pytest.raises(
+        WeightsError,
+        match=r"mlp\.safetensors.*trained for a camera of 160 x 120 px, 90\.0.*Weights of .*set.* serve every",
+    ):
+        load_scorer(weights, LocalizationMap(localization_map.landmarks, narrow))
+
+
+def test_unknown_methods_and_missing_weights_are_refused(localization_map: LocalizationMap, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"unknown method.*random, .*visible, bins, .*mlp-2d"):
+        make_scorer("oracle", localization_map)
+    with pytest.raises(ConfigError, match="needs weights"):
+        make_scorer("mlp", localization_map)
+    with pytest.raises(WeightsError, match="there are no weights"):
+        make_scorer("mlp", localization_map, weights=tmp_path / "none.safetensors")

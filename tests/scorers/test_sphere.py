@@ -1,0 +1,346 @@
+"""The network of the whole sphere: its lattice, its tokens, its batches, what it learns, and its weights on disk."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from sklearn.metrics import roc_auc_score
+
+from learning_options import changed, train_config
+from synthetic_dataset import CAMERA, make_dataset, make_landmarks, make_mapping_poses
+from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.viewpoint_table import is_good, poses, write_table
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.geometry.lattices import axes_of_angles, fibonacci_sphere, yaw_pitch_angles
+from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.scorers.mlp.network import ViewpointNetwork
+from wheretolook.scorers.registry import load_scorer, make_scorer
+from wheretolook.stages.evaluate import evaluate_methods as evaluate
+from wheretolook.stages.train import train_methods as train
+from wheretolook.training.provenance import TrainedModel
+from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook.training.weights import METADATA_KEY, method_of_weights, read_training
+from wheretolook.utils.errors import ConfigError, MapError, WeightsError
+from wheretolook.utils.tracking import client
+from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.visibility.occlusion import StoredOcclusion
+from wheretolook_paper.scorers.sphere.config import SphereConfig
+from wheretolook_paper.scorers.sphere.network import PITCHES, YAWS, SphereNetwork, on_lattice
+from wheretolook_paper.scorers.sphere.score import SphereScorer
+from wheretolook_paper.scorers.sphere.views import (
+    FEATURES,
+    OFFSET_M,
+    LocationDescriber,
+    LocationLoader,
+    load_sphere_views,
+)
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+FEW = SphereConfig(points=48, cameras=8, width=32, heads=2, layers=1, dropout=0.0, epochs=10, batch_size=40)
+SMALL = train_config("sphere", accelerator="cpu", sphere=FEW)
+NAMES = {name: index for index, name in enumerate(FEATURES)}
+
+
+@pytest.fixture
+def localization_map() -> LocalizationMap:
+    landmarks = make_landmarks(np.random.default_rng(0), 200)
+    return LocalizationMap(landmarks, CAMERA, mapping_poses=make_mapping_poses(0))
+
+
+@pytest.fixture
+def model() -> TrainedNetwork[SphereNetwork]:
+    """Untrained; its logits differ from direction to direction and from place to place."""
+    torch.manual_seed(0)
+    return TrainedNetwork("sphere", SphereNetwork(FEW).requires_grad_(False), CAMERA, 1.5, -0.25)
+
+
+def at_angles(*yaw_pitch_deg: tuple[float, float]) -> torch.Tensor:
+    return torch.from_numpy(axes_of_angles(yaw_pitch_deg))
+
+
+def test_the_lattice_has_its_own_values_at_its_directions_and_means_between() -> None:
+    values = torch.randn(2, PITCHES, YAWS, dtype=torch.float64)
+    axes = torch.from_numpy(axes_of_angles(yaw_pitch_angles()))
+    for lattice in (0, 1):
+        found = on_lattice(values, torch.full((len(axes),), lattice), axes)
+        torch.testing.assert_close(found, values[lattice].flatten(), rtol=0, atol=1e-10)
+        torch.testing.assert_close(on_lattice(values, torch.full((108,), lattice), 3 * axes), found)
+    # yaw 10, pitch -50 is in the middle of four; row 0 is at -60, column 9 at 0
+    found = on_lattice(values, torch.zeros(1, dtype=torch.int64), at_angles((10, -50)))
+    torch.testing.assert_close(found[0], values[0, :2, 9:11].mean())
+    found = on_lattice(values, torch.zeros(1, dtype=torch.int64), at_angles((25, 0)))
+    torch.testing.assert_close(found[0], 0.75 * values[0, 3, 10] + 0.25 * values[0, 3, 11])
+
+
+def test_yaw_wraps_round_and_pitch_ends() -> None:
+    values = torch.randn(1, PITCHES, YAWS, dtype=torch.float64)
+    axes = at_angles((170, 20), (-190, 20), (180, 20), (30, 80), (30, 40), (-70, -90), (-70, -60))
+    found = on_lattice(values, torch.zeros(len(axes), dtype=torch.int64), axes)
+    torch.testing.assert_close(found[0], (values[0, 4, 17] + values[0, 4, 0]) / 2)
+    torch.testing.assert_close(found[1], found[0])
+    torch.testing.assert_close(found[2], values[0, 4, 0])
+    torch.testing.assert_close(found[3], found[4])
+    assert found[5].isfinite()
+    near = on_lattice(values, torch.zeros(2, dtype=torch.int64), at_angles((180 - 1e-9, 0), (-180 + 1e-9, 0)))
+    torch.testing.assert_close(near[0], near[1], rtol=0, atol=1e-7)
+
+
+def test_tokens_tell_of_landmarks_in_free_sight_and_of_cameras(localization_map: LocalizationMap) -> None:
+    points = localization_map.landmarks.points
+    locations = np.array([[0.5, -0.5, 1.2], [0.0, 1.0, 1.0], [1.0, 1.0, 2.0]])
+    mask = np.zeros((3, 200), dtype=bool)
+    mask[0, 7:40] = True  # the third sees nothing
+    mask[1] = True
+    hidden = replace(localization_map, occlusion=StoredOcclusion.from_mask(locations, mask))
+    first, all_seen, blind = LocationDescriber(hidden, FEW).describe(locations)
+    assert [len(tokens) for tokens in (first, all_seen, blind)] == [1 + 33 + 8, 1 + 48 + 8, 1 + 8]
+    offsets = points[7:40] - locations[0]
+    distance = np.linalg.norm(offsets, axis=1)
+    np.testing.assert_allclose(first[1:34, :3] * OFFSET_M, offsets, atol=1e-5)
+    np.testing.assert_allclose(first[1:34, 3:6], offsets / distance[:, None], atol=1e-5)
+    np.testing.assert_allclose(first[1:34, NAMES["log_distance"]], np.log1p(distance), atol=1e-5)
+    for tokens, n in ((first, 33), (all_seen, 200), (blind, 0)):
+        np.testing.assert_allclose(tokens[:, NAMES["log_landmarks"]], np.log1p(n), rtol=1e-6)
+        assert tokens[:, NAMES["is_camera"]].sum() == 8 and tokens[0, -2:].sum() == 0
+    # 48 of 200 landmarks, from the first to the last
+    chosen = all_seen[1:49, :3] * OFFSET_M + torch.from_numpy(locations[1])
+    np.testing.assert_allclose(chosen[[0, -1]], points[[0, -1]], atol=1e-5)
+    cameras = localization_map.mapping_poses
+    assert cameras is not None
+    np.testing.assert_allclose(blind[1, :3] * OFFSET_M, camera_centers(cameras)[0] - locations[2], atol=1e-5)
+    np.testing.assert_allclose(blind[[1, -1], 6:9], cameras[[0, -1], 2, :3], atol=1e-6)
+    assert not first[:34, 6:9].any()
+
+
+def test_turning_a_location_turns_all_that_has_a_direction() -> None:
+    torch.manual_seed(3)
+    tokens = torch.randn(4, 9, len(FEATURES))
+    axes = torch.randn(6, 3)
+    rows = torch.tensor([0, 0, 1, 2, 3, 3])
+    padding = torch.zeros(4, 9, dtype=torch.bool)
+    turned, _, same_rows, turned_axes = SphereNetwork(FEW).augment(SMALL, tokens, padding, rows, axes)
+    assert torch.equal(rows, same_rows)
+    torch.testing.assert_close(turned[..., [2, 5, 8, *range(9, len(FEATURES))]],
+                               tokens[..., [2, 5, 8, *range(9, len(FEATURES))]])  # fmt: skip
+    for start in (0, 3, 6):  # what lies in the direction of the axis still does
+        before = torch.einsum("btc,bc->bt", tokens[rows][..., start : start + 3], axes)
+        after = torch.einsum("btc,bc->bt", turned[rows][..., start : start + 3], turned_axes)
+        torch.testing.assert_close(after, before, rtol=1e-4, atol=1e-5)
+    angle = torch.atan2(turned[..., 1], turned[..., 0]) - torch.atan2(tokens[..., 1], tokens[..., 0])
+    angle = angle.remainder(2 * torch.pi)
+    torch.testing.assert_close(angle, angle[:, :1].expand(-1, 9), rtol=1e-4, atol=1e-4)
+    assert angle[:, 0].diff().abs().min() > 1e-3  # each by its own
+
+
+@pytest.mark.parametrize("world_size", [1, 3])
+def test_batches_hold_whole_locations_and_every_view_once(tmp_path: Path, world_size: int) -> None:
+    dataset = make_dataset(tmp_path / "tiny", ("train", "train"), n_locations=5, n_directions=7)
+    table = dataset.scenes[0].read_table()
+    write_table(table.sample(frac=1.0, random_state=0), dataset.scenes[0].table)  # views of a location lie apart
+    views = load_sphere_views(dataset, dataset.scenes, SMALL, FEW, progress=False)
+    assert len(views.tokens) == 10 and views.padding.shape == views.tokens.shape[:2]
+    chosen = np.flatnonzero(views.location != 2)
+    loaders = [LocationLoader(views, chosen, 20, 4, rank, world_size) for rank in range(world_size)]
+    found = []
+    for shares in zip(*loaders, strict=True):
+        assert {share.total for share in shares} == {sum(len(share.labels) for share in shares)}
+        for share in shares:
+            tokens, padding, rows, axes = share.inputs
+            assert len(tokens) == len(padding) == len(rows.unique()) and len(rows) == 7 * len(tokens)
+            for row, axis, label in zip(rows, axes, share.labels, strict=True):
+                (view,) = np.flatnonzero(
+                    (views.axes == axis).all(1) & (views.tokens[views.rows] == tokens[row]).all(2).all(1)
+                )
+                assert views.labels[view] == label
+                found.append(int(view))
+    assert sorted(found) == chosen.tolist()
+    assert len(loaders[0]) == 3  # three locations at a time
+    orders = [[batch.labels.tolist() for batch in loaders[0]] for _ in range(2)]
+    assert orders[0] != orders[1]
+    fresh = LocationLoader(views, chosen, 20, 4, 0, world_size)
+    assert [batch.labels.tolist() for batch in LocationLoader(views, chosen, 20)] == [
+        batch.labels.tolist() for batch in LocationLoader(views, chosen, 20)
+    ]
+    next(iter(fresh))
+    assert [batch.labels.tolist() for batch in fresh] == orders[0]
+
+
+def test_padding_does_not_count(localization_map: LocalizationMap, model: TrainedNetwork[SphereNetwork]) -> None:
+    (tokens,) = LocationDescriber(localization_map, FEW).describe(np.array([[0.3, 0.2, 1.0]]))
+    alone = model.network.encode(tokens[None])
+    padded = torch.cat([tokens, torch.full((5, len(FEATURES)), 7.0)])[None]
+    padding = torch.arange(padded.shape[1])[None] >= len(tokens)
+    torch.testing.assert_close(model.network.encode(padded, padding), alone, rtol=1e-4, atol=1e-5)
+    assert (model.network.encode(padded) - alone).abs().max() > 1e-3
+
+
+def test_an_empty_share_of_a_batch_has_gradients(model: TrainedNetwork[SphereNetwork]) -> None:
+    network = SphereNetwork(FEW)
+    tokens = torch.empty(0, 4, len(FEATURES))
+    padding = torch.empty(0, 4, dtype=torch.bool)
+    logits = network(tokens, padding, torch.empty(0, dtype=torch.int64), torch.empty(0, 3))
+    assert logits.shape == (0,)
+    logits.sum().backward()  # other processes wait for them
+    assert all(parameter.grad is not None and not parameter.grad.any() for parameter in network.parameters())
+
+
+def look_at_landmarks(dataset: Dataset) -> None:
+    """Labels that follow the direction from the location to the middle of the landmarks."""
+    for scene in dataset.scenes:
+        table = scene.read_table()
+        cam_from_world = poses(table)
+        middle = scene.localization_map(CAMERA).landmarks.points.mean(0) - camera_centers(cam_from_world)
+        cosine = np.einsum("bi,bi->b", middle, cam_from_world[:, 2, :3]) / np.linalg.norm(middle, axis=1)
+        error_m = np.where(cosine > 0.3, 0.01, 1.0)
+        write_table(table.assign(status="localized", error_m=error_m, error_deg=error_m), scene.table)
+
+
+@pytest.fixture(scope="module")
+def tracking(tmp_path_factory: pytest.TempPathFactory) -> TrackingConfig:
+    """One MLflow store for all tests: making its database takes seconds."""
+    return TrackingConfig(str(tmp_path_factory.mktemp("mlruns")))
+
+
+@pytest.fixture(scope="module")
+def learnt(tmp_path_factory: pytest.TempPathFactory, tracking: TrackingConfig) -> tuple[Dataset, TrainedModel]:
+    """A dataset whose labels follow where the landmarks are, and what has been learnt from it."""
+    root = tmp_path_factory.mktemp("learnt") / "tiny"
+    dataset = make_dataset(root, ("train", "val", "test"), n_locations=40, n_directions=20)
+    look_at_landmarks(dataset)
+    return dataset, train(dataset, SMALL, tracking, progress=False)[0]
+
+
+def test_training_learns_where_the_landmarks_are_and_logs_a_run(
+    learnt: tuple[Dataset, TrainedModel], tracking: TrackingConfig
+) -> None:
+    dataset, trained = learnt
+    assert trained.path == dataset.root / "weights" / "sphere.safetensors"
+    assert trained.metrics["val_roc_auc"] > 0.8
+    run = client(tracking).get_run(trained.run_id)
+    assert run.info.status == "FINISHED" and run.data.params["points"] == "48" and run.data.params["n_val"] == "800"
+    assert len(client(tracking).get_metric_history(trained.run_id, "val_bce")) == FEW.epochs
+    views = load_sphere_views(dataset, dataset.split("val"), SMALL, FEW, progress=False)
+    scene = dataset.split("val")[0]
+    scores = load_scorer(trained.path, scene.localization_map(CAMERA)).score(poses(scene.read_table()))
+    assert scores.mean() == pytest.approx(float(views.labels.mean()), abs=1e-3)  # calibrated on these
+    assert roc_auc_score(views.labels, scores) == pytest.approx(trained.metrics["val_roc_auc"], abs=1e-3)
+
+
+def test_what_was_learnt_is_reused_and_evaluated(
+    learnt: tuple[Dataset, TrainedModel], tracking: TrackingConfig
+) -> None:
+    dataset, trained = learnt
+    (again,) = train(dataset, changed(SMALL, learning_rate=0.5), tracking, progress=False)
+    assert again.reused and again.path == trained.path  # the paper's network has its own learning rate
+    config = EvaluateConfig(("visible", "sphere"), resamples=20, top_n=(1,))
+    rows = evaluate(dataset, config, tracking, progress=False).query("scene == 'all'").set_index("method")
+    scene = dataset.split("test")[0]
+    table = scene.read_table()
+    scores = load_scorer(trained.path, scene.localization_map(CAMERA)).score(poses(table))
+    assert rows.loc["sphere", "roc_auc"] == pytest.approx(roc_auc_score(is_good(table), scores), abs=1e-6)
+    assert rows.loc["sphere", "roc_auc"] > 0.75 and 0 <= rows.loc["sphere", "ece"] < 0.3
+
+
+def test_maps_that_do_not_tell_their_cameras_are_refused(
+    learnt: tuple[Dataset, TrainedModel], tracking: TrackingConfig, tmp_path: Path
+) -> None:
+    scene = learnt[0].split("test")[0]
+    blind = replace(scene.localization_map(CAMERA), mapping_poses=None)
+    with pytest.raises(MapError, match=r"map/cameras\.npz.*map stage again"):
+        load_scorer(learnt[1].path, blind)
+    dataset = make_dataset(tmp_path / "tiny", ("train",), n_locations=8, n_directions=8)
+    dataset.scenes[0].mapping_cameras.unlink()
+    with pytest.raises(MapError, match=r"scene-0.map.cameras\.npz.*map stage again"):
+        train(dataset, SMALL, tracking, progress=False)
+
+
+def test_the_same_seed_gives_the_same_weights(tmp_path: Path, tracking: TrackingConfig) -> None:
+    dataset = make_dataset(tmp_path / "tiny", ("train",), n_locations=8, n_directions=8)
+    config = replace(SMALL, sphere=replace(FEW, epochs=1))
+    torch.manual_seed(5)
+    first = train(dataset, config, tracking, progress=False)[0].path.read_bytes()
+    torch.manual_seed(6)
+    assert train(dataset, config, tracking, progress=False, force=True)[0].path.read_bytes() == first
+    assert train(dataset, replace(config, seed=1), tracking, progress=False)[0].path.read_bytes() != first
+
+
+def test_a_pose_has_its_own_score(localization_map: LocalizationMap, model: TrainedNetwork[SphereNetwork]) -> None:
+    rng = np.random.default_rng(2)
+    locations = rng.uniform((-1, -1, 1), (1, 1, 2), (5, 3))
+    mask = rng.random((5, 200)) < 0.5
+    mask[3] = False  # sees nothing, and is scored all the same
+    seen = replace(localization_map, occlusion=StoredOcclusion.from_mask(locations, mask))
+    views = poses_looking_along(np.repeat(locations, 8, axis=0), np.tile(fibonacci_sphere(8), (5, 1)))
+    scorer = SphereScorer(seen, model)
+    scores = scorer.score(views)
+    assert scores.dtype == np.float64 and ((scores > 0) & (scores < 1)).all() and len(np.unique(scores)) == 40
+    order = rng.permutation(40)
+    np.testing.assert_array_equal(scorer.score(views[order]), scores[order])
+    np.testing.assert_array_equal([scorer.score(view[None])[0] for view in views[::7]], scores[::7])
+    # of the network by hand: direction 0 of the lattice at location 3, which is none but cameras
+    (tokens,) = LocationDescriber(seen, FEW).describe(locations[3:4])
+    lattice = poses_looking_along(np.tile(locations[3], (108, 1)), axes_of_angles(yaw_pitch_angles()))
+    logits = 1.5 * model.network.encode(tokens[None]).flatten().double() - 0.25
+    np.testing.assert_allclose(scorer.score(lattice), logits.sigmoid(), rtol=1e-5)
+    rolled = views.copy()
+    rolled[:, :2] *= -1  # by half a turn about the optical axis
+    np.testing.assert_allclose(scorer.score(rolled), scores, rtol=1e-9)
+
+
+def test_weights_survive_the_disk(
+    model: TrainedNetwork[SphereNetwork], localization_map: LocalizationMap, tmp_path: Path
+) -> None:
+    path = tmp_path / "weights" / "sphere.safetensors"
+    model.save(path, {"method": "sphere"})
+    loaded = TrainedNetwork.load(path, SphereNetwork, "sphere")
+    assert (loaded.network.config, loaded.camera, loaded.scale, loaded.offset) == (FEW, CAMERA, 1.5, -0.25)
+    (tokens,) = LocationDescriber(localization_map, FEW).describe(np.zeros((1, 3)))
+    assert torch.equal(loaded.network.encode(tokens[None]), model.network.encode(tokens[None]))
+    content = path.read_bytes()
+    loaded.save(path, {"method": "sphere"})
+    assert path.read_bytes() == content and [file.name for file in path.parent.iterdir()] == [path.name]
+    assert method_of_weights(path) == "sphere" and read_training(path) == {"method": "sphere"}
+    scorer = load_scorer(path, localization_map)
+    assert isinstance(scorer, SphereScorer) and scorer.name == "sphere"
+    with pytest.raises(WeightsError, match=r"sphere\.safetensors.*not of mlp"):
+        TrainedNetwork.load(path, ViewpointNetwork, "mlp-2d")
+    with pytest.raises(WeightsError, match="not of trees"):
+        make_scorer("trees", localization_map, weights=path)
+    wide = replace(localization_map, camera=replace(CAMERA, focal_px=CAMERA.focal_px / 2))
+    with pytest.raises(WeightsError, match=r"sphere\.safetensors.*trained for a camera"):
+        load_scorer(path, wide)
+
+
+def test_unusable_weights_are_named(model: TrainedNetwork[SphereNetwork], tmp_path: Path) -> None:
+    path = tmp_path / "sphere.safetensors"
+    model.save(path)
+    tensors = load_file(path)
+    with safe_open(path, framework="pt") as file:
+        header = json.loads(file.metadata()[METADATA_KEY])
+    for change, message in (
+        ({"method": "mlp-2d"}, "not of sphere"),
+        ({"features": ["height"]}, "other tokens"),
+        ({"options": {**header["options"], "width": 64}}, "do not fit"),
+        ({"options": {**header["options"], "width": 33}}, "damaged description.*multiple of heads"),
+        ({"camera": {"breadth": 3}}, "damaged description"),
+        ({"scale": None}, "damaged description"),
+    ):
+        save_file(tensors, path, metadata={METADATA_KEY: json.dumps({**header, **change})})
+        with pytest.raises(WeightsError, match=rf"sphere\.safetensors.*{message}"):
+            TrainedNetwork.load(path, SphereNetwork, "sphere")
+
+
+@pytest.mark.parametrize("wrong", [{"points": 0}, {"cameras": 0}, {"layers": 0}, {"width": 30, "heads": 4},
+                                   {"dropout": 1.0}, {"epochs": 0}])  # fmt: skip
+def test_options_that_are_none(wrong: dict[str, float]) -> None:
+    with pytest.raises(ConfigError):
+        SphereConfig(**wrong)  # type: ignore[arg-type]

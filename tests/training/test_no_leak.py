@@ -1,0 +1,92 @@
+"""Nothing that is known only after localization reaches a score: learners see the map, the poses and the labels."""
+
+from __future__ import annotations
+
+import inspect
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from learning_options import train_config
+from synthetic_dataset import make_dataset
+from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good, read_table, write_table
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.inputs.landmark_features import ATTRIBUTES, POOLED, LandmarkDescriber
+from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.scorers.matchability.config import MatchabilityConfig
+from wheretolook.scorers.set.config import SetConfig
+from wheretolook.stages.evaluate import evaluate_methods as evaluate
+from wheretolook.stages.train import train_methods as train
+from wheretolook.training.weights import read_weights
+from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook_paper.scorers.trees.config import TreesConfig
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+CONFIG = train_config(
+    "mlp-2d+3d",
+    "trees",
+    "set",
+    epochs=2,
+    trees=TreesConfig(max_trees=5, min_leaf=5),
+    set=SetConfig(epochs=1, landmarks=16, batch_size=16, enlarged=1.0),  # enlarged, labels follow from errors
+    matchability=MatchabilityConfig(epochs=1),
+    accelerator="cpu",
+)
+
+
+@pytest.fixture(scope="module")
+def tracking(tmp_path_factory: pytest.TempPathFactory) -> TrackingConfig:
+    return TrackingConfig(folder=str(tmp_path_factory.mktemp("mlruns")))
+
+
+def same_labels_other_outcomes(source: Dataset, root: Path) -> Dataset:
+    """The dataset with the same labels, but other errors, other failures and other numbers of inliers."""
+    shutil.copytree(source.root, root, ignore=shutil.ignore_patterns("weights", "results"))
+    dataset = Dataset.load(root)
+    for number, scene in enumerate(dataset.scenes):
+        rng = np.random.default_rng(number)
+        table = read_table(scene.table)
+        good = is_good(table)
+        n = len(table)
+        table = table.assign(
+            status=np.where(good, LOCALIZED, rng.choice(["no_pose", "too_few_matches"], n)),
+            error_m=np.where(good, rng.uniform(0, 0.049, n), np.nan),
+            error_deg=np.where(good, rng.uniform(0, 0.39, n), np.nan),
+            n_inliers=rng.integers(0, 500, n).astype(np.int32),
+            n_visible=rng.integers(0, 500, n).astype(np.int32),
+        )
+        assert np.array_equal(is_good(table), good)
+        write_table(table, scene.table)
+    return dataset
+
+
+def test_only_labels_of_the_outcome_are_learnt_from(tmp_path: Path, tracking: TrackingConfig) -> None:
+    one = make_dataset(tmp_path / "one", n_locations=14, n_directions=16)
+    other = same_labels_other_outcomes(one, tmp_path / "other")
+    assert other.fingerprint() != one.fingerprint()
+    for first, second in zip(*(train(data, CONFIG, tracking, progress=False) for data in (one, other)), strict=True):
+        tensors, others = (read_weights(model.path)[0] for model in (first, second))
+        assert all(np.array_equal(tensors[name], others[name]) for name in tensors), first.method
+    config = EvaluateConfig(methods=("bins", "mlp", "trees", "set"), top_n=(1,), resamples=10)
+    columns = ["method", "raw_0.05m_0.4deg", "roc_auc", "average_precision"]
+    tables = [evaluate(data, config, tracking, progress=False)[columns] for data in (one, other)]
+    assert tables[0].equals(tables[1])
+
+
+def test_what_is_known_of_a_landmark_comes_from_map_and_pose() -> None:
+    of_map = {
+        "track_length", "reprojection_error", "triangulation_angle", "direction_spread", "ambiguity",
+        "mapped_distance", "distance_spread", "mapped_pixel_size",
+    }  # fmt: skip
+    of_pose = {"across", "down", "distance", "mapped_angle", "distance_ratio", "pixel_angle", "pixel_size_ratio"}
+    assert set(MAP_ATTRIBUTES) == of_map and set(ATTRIBUTES) == of_map | of_pose
+    assert {name.rsplit("_", 1)[0] for name in POOLED[5:]} == set(ATTRIBUTES)
+    # a describer is built of a map, and asked about poses and what is visible: there is no way in for anything else
+    assert list(inspect.signature(LandmarkDescriber).parameters) == ["localization_map", "attributes"]
+    assert list(inspect.signature(LandmarkDescriber.describe).parameters) == ["self", "cam_from_world", "in_view"]
+    assert list(inspect.signature(Landmarks.attributes).parameters) == ["self"]

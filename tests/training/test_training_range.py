@@ -1,0 +1,78 @@
+"""What the views were like that were learnt from: kept, told, and compared with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.inputs.landmark_features import ViewLandmarks
+from wheretolook.training.training_range import (
+    QUANTITIES,
+    TrainingRange,
+    bin_quantities,
+    camera_quantities,
+    view_quantities,
+)
+
+CAMERA = PinholeCamera()
+
+
+def views_at(distances_m: list[list[float]], camera: PinholeCamera = CAMERA) -> np.ndarray:
+    counts = torch.tensor([0, *map(len, distances_m)])
+    values = torch.tensor([np.log(one) for view in distances_m for one in view], dtype=torch.float32)[:, None]
+    landmarks = ViewLandmarks(counts.cumsum(0), torch.zeros(len(values), dtype=torch.int64), values, ("distance",))
+    return view_quantities(landmarks, counts[1:], camera_quantities(camera))
+
+
+def test_views_by_hand() -> None:
+    distance, depth, in_view, across, down, focal = views_at([[1.0, 4.0], [], [3.0]]).T
+    np.testing.assert_allclose(distance, [2.0, np.nan, 3.0], rtol=1e-6)
+    np.testing.assert_array_equal(in_view, [2, np.nan, 1])
+    assert np.isnan(depth).all()
+    np.testing.assert_allclose([across, down, focal], np.outer([90, 73.7398, 320], np.ones(3)), rtol=1e-5)
+    np.testing.assert_array_equal(bin_quantities(np.array([6.0, 0.0]), np.array([3, 0]))[:, 1], [2.0, np.nan])
+    assert not np.isfinite(views_at([[], []])[:, :3]).any()
+
+
+def test_most_of_what_was_learnt_from_is_in_range() -> None:
+    rng = np.random.default_rng(0)
+    views = views_at([rng.uniform(1, 4, rng.integers(0, 60)).tolist() for _ in range(2000)])
+    known = TrainingRange.of(views)
+    assert known.contains(views).mean() > 0.98 and known.contains(views_at([[]]))[0]
+    assert not known.complaint(views, 0.05) and TrainingRange.of_record(known.record()) == known
+    far = views_at([[12.0] * 9] * 3 + [[]])
+    near = views_at([[2.0] * 9])
+    assert known.contains(far).tolist() == [False] * 3 + [True] and known.contains(near).all()
+    assert not TrainingRange.of(views, enlarged=2).outside(views_at([[6.0] * 9])).any()
+    text = known.complaint(far)
+    assert text.startswith("3 of 3 views are unlike those learnt from: mean distance of the landmarks in view 12 m (")
+    assert known.outside(views_at([[2.0] * 500])).sum(0)[[*QUANTITIES].index("in_view")] == 1
+    assert not known.complaint(np.concatenate([near] * 99 + [far]), 0.05)  # three odd ones in a hundred
+
+
+@pytest.mark.parametrize(
+    ("camera", "inside"),
+    [
+        (CAMERA, True),
+        (replace(CAMERA, focal_px=315.0), True),
+        (PinholeCamera(320, 240, 160.0), True),
+        (PinholeCamera(480, 640, 320.0), False),  # upright
+        (replace(CAMERA, focal_px=900.0), False),
+        (PinholeCamera.of_field_of_view(110, 640, 480), False),
+    ],
+)
+def test_where_only_the_camera_is_known(camera: PinholeCamera, inside: bool) -> None:
+    known = TrainingRange.of_camera(CAMERA)
+    assert known.contains(views_at([[1.0], [], [900.0] * 4000], camera)).tolist() == [inside] * 3
+    assert bool(known.complaint(views_at([[1.0]], camera))) != inside
+    assert TrainingRange.of_camera(None).contains(views_at([[1.0]], camera)).all()
+
+
+def test_nothing_seen_is_nothing_learnt() -> None:
+    assert TrainingRange.of(views_at([[], []])).bounds == {}
+    with pytest.raises((TypeError, IndexError, ValueError)):
+        TrainingRange.of_record({"in_view": [1.0]})

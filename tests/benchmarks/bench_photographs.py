@@ -62,7 +62,7 @@ from wheretolook.mapping.triangulation import (
 )
 from wheretolook.scorers.adapted.gp_correction import adapt
 from wheretolook.utils.colmap import quiet_colmap
-from wheretolook.utils.processes import Processes
+from wheretolook.utils.processes import WorkerPool
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 
 PARTNERS = 20  # that each photograph with a pose is matched with
@@ -110,7 +110,7 @@ def map_known_poses(
     depth_m = np.stack(
         [np.where(one < 65535, one * np.float32(1e-3), np.float32(0)) for one in map(shrink_depth, depth)]
     )
-    with Processes(workers) as processes:
+    with WorkerPool(workers) as processes:
         features = photograph_features(work / "images", work / "photographs", 0, extractor, processes, device)
         names = features.names
         stored = features.stored

@@ -6,11 +6,9 @@ Worker processes import this module to unpickle what the tests hand them.
 from __future__ import annotations
 
 import signal
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -122,13 +120,6 @@ class Deadly:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return signal.raise_signal, (signal.SIGKILL,)
-
-
-def half_a_message(pipe: Connection, number: int) -> None:
-    """Stands in for a worker: dies while it sends its labels."""
-    pipe.recv()
-    pipe._send((1000).to_bytes(4, "big") + b"the beginning")  # type: ignore[attr-defined]
-    sys.exit(1)
 
 
 class BreaksRenderer(SceneJob):

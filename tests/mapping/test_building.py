@@ -21,7 +21,7 @@ from wheretolook.mapping.rendered_map import build_map
 from wheretolook.mapping.walk import plan_walk
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.utils.errors import ConfigError, MapError
-from wheretolook.utils.processes import Processes
+from wheretolook.utils.processes import WorkerPool
 
 CAMERA = PinholeCamera(320, 240, 160.0)
 CONFIG = MapConfig(n_images=14, walk=WalkConfig(image_spacing_m=0.35), keep_database=True, keep_images=True)
@@ -161,7 +161,7 @@ def test_no_two_threads_match_in_one_process(room, room_free_space, renderer, tm
         return match(database, options, *arguments, **named)
 
     monkeypatch.setattr(pycolmap, "match_image_pairs", watched)
-    monkeypatch.setattr(Processes, "map", lambda self, function, items: map(function, items))  # where it is watched
+    monkeypatch.setattr(WorkerPool, "map", lambda self, function, items: map(function, items))  # where it is watched
     build_map(room, renderer, room_free_space, CAMERA, CONFIG, SEED, tmp_path / "map", workers=3, progress=False)
     assert set(threads) == {1}
 

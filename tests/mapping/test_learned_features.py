@@ -29,7 +29,7 @@ from wheretolook.scorers.feature_domain import folder_for
 from wheretolook.scorers.registry import load_scorer
 from wheretolook.select.weights import weights_of
 from wheretolook.utils.errors import MapError, MapWarning, OutOfRangeWarning
-from wheretolook.utils.processes import Processes
+from wheretolook.utils.processes import WorkerPool
 from wheretolook.utils.shipped import shipped
 
 LEARNED = [kind for kind in all_kinds().values() if not kind.in_bytes]
@@ -274,7 +274,7 @@ def test_pairs_of_images_are_matched_by_similarity(tmp_path):
     shared = unit(40, 64)
     pixels = np.zeros((60, 2), np.float32)
     images = [(pixels, kind.store(np.concatenate([shared, unit(20, 64, seed)]))) for seed in (1, 2, 3)]
-    with Processes(1) as processes:
+    with WorkerPool(1) as processes:
         found = list(match_pairs(images, np.array([[0, 1], [1, 2]]), tmp_path, processes, False, kind))
     for matches in found:
         np.testing.assert_array_equal(matches, np.column_stack([np.arange(40)] * 2))

@@ -15,7 +15,7 @@ import pytest
 
 from localization.rooms import is_running, wait_until, workers_of
 from wheretolook.utils.errors import WorkerError
-from wheretolook.utils.processes import Processes
+from wheretolook.utils.processes import WorkerPool
 
 
 def die(item: int) -> int:
@@ -25,7 +25,7 @@ def die(item: int) -> int:
 
 
 def test_a_killed_process_is_a_typed_error() -> None:
-    with Processes(2) as processes, pytest.raises(WorkerError, match="killed"):
+    with WorkerPool(2) as processes, pytest.raises(WorkerError, match="killed"):
         list(processes.map(die, range(6)))
 
 
@@ -37,7 +37,7 @@ def pid_after(seconds: float) -> int:
 @pytest.mark.slow
 def test_processes_outlive_the_thread_that_started_them() -> None:
     first: list[int] = []
-    with Processes(2) as processes:
+    with WorkerPool(2) as processes:
         pids = processes.map(pid_after, [0.1] * 10)
         thread = threading.Thread(target=lambda: first.append(next(pids)))
         thread.start()
@@ -56,9 +56,9 @@ def test_a_process_ends_with_the_killed_one_that_started_it_whatever_it_does(tmp
     script = tmp_path / "parent.py"
     script.write_text(
         "from utils.test_processes import hold_the_interpreter\n"
-        "from wheretolook.utils.processes import Processes\n"
+        "from wheretolook.utils.processes import WorkerPool\n"
         "if __name__ == '__main__':\n"
-        "    with Processes(2) as processes:\n"
+        "    with WorkerPool(2) as processes:\n"
         "        list(processes.map(hold_the_interpreter, [600, 600]))\n"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}

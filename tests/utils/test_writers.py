@@ -19,13 +19,12 @@ from wheretolook.dataset.viewpoint_table import SCHEMA, write_table
 from wheretolook.figures.animation import save_moving
 from wheretolook.figures.style import save_figure
 from wheretolook.mapping.colmap_model import colmap_poses, save_mapping_poses, write_model
-from wheretolook.mapping.rendered_map import partial_folder
 from wheretolook.mapping.triangulation import fill_database
 from wheretolook.scenes.loading import save_glb
 from wheretolook.training.weights import write_weights
 from wheretolook.utils.colmap import storing_in_database
 from wheretolook.utils.errors import StorageError
-from wheretolook.utils.files import copy_file, replacing, write_bytes, write_json, write_text
+from wheretolook.utils.files import atomic_folder, atomic_write, copy_file, write_bytes, write_json, write_text
 from wheretolook.utils.npz_files import load_npy, load_npz, save_npy, save_npz
 from wheretolook.visibility.occlusion import StoredOcclusion
 
@@ -51,7 +50,7 @@ def _table(path: Path) -> None:
 
 
 def _any_parquet(path: Path) -> None:
-    with replacing(path) as partial:
+    with atomic_write(path) as partial:
         pd.DataFrame({"noise": NOISE}).to_parquet(partial)
 
 
@@ -173,6 +172,6 @@ def test_a_database_that_colmap_cannot_write_is_named(limit: int, tmp_path: Path
 def test_a_folder_that_is_moved_later_is_named_as_it_was_to_be(tmp_path: Path) -> None:
     place = tmp_path / "map"
     limited = file_limit(LIMIT)
-    with pytest.raises(StorageError) as raised, limited, partial_folder(place) as partial:
+    with pytest.raises(StorageError) as raised, limited, atomic_folder(place) as partial:
         write_bytes(partial / "deep" / "a.bin", NOISE.tobytes())
     assert raised.value.path == place / "deep" / "a.bin" and not list(tmp_path.iterdir())

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation, rotation_from_quaternion
 from wheretolook.utils.errors import TableError
-from wheretolook.utils.files import replacing
+from wheretolook.utils.files import atomic_write
 from wheretolook.utils.parquet_files import open_parquet, read_columns
 
 POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
@@ -137,7 +137,7 @@ def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
     )
     content = pa.Table.from_pandas(table, schema=schema, preserve_index=False)
     content = content.replace_schema_metadata(None)  # it describes the data frame, not the rows
-    with replacing(path) as partial:
+    with atomic_write(path) as partial:
         pq.write_table(content, partial, compression="zstd", write_page_checksum=True, **options)
 
 

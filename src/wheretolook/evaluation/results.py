@@ -21,7 +21,7 @@ from wheretolook.evaluation.views import CandidateSet
 from wheretolook.geometry.poses import Float
 from wheretolook.scorers.registry import methods_named, scorers
 from wheretolook.scorers.styles import ORACLE
-from wheretolook.utils.files import fingerprint, replacing, temporary_folder
+from wheretolook.utils.files import atomic_write, fingerprint, temporary_folder
 from wheretolook.utils.tracking import (
     FINGERPRINT_TAG,
     NestedRun,
@@ -159,7 +159,7 @@ def _runs_with_locations(
     for one in scored:
         for nested in runs_of_rows(one.table, params):
             chosen = [location_table(one, nested.params["method"], n, one.scenes, config) for n in config.top_n]
-            with replacing(file) as partial:
+            with atomic_write(file) as partial:
                 pd.concat(chosen).to_parquet(partial, index=False)
             yield replace(nested, files=(file,))
 

@@ -14,7 +14,7 @@ from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.extractor import Extraction
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.registry import all_extractors
-from wheretolook.utils.processes import Processes
+from wheretolook.utils.processes import WorkerPool
 
 
 class KeypointExtractor:
@@ -46,7 +46,7 @@ class KeypointExtractor:
         return self._extraction.extract_batch(images)
 
     def extract_many(
-        self, images: Iterable[NDArray[np.uint8]], workers: int | Processes = 1
+        self, images: Iterable[NDArray[np.uint8]], workers: int | WorkerPool = 1
     ) -> Generator[Keypoints, None, None]:
         """Keypoints of many images (H, W, 3) uint8, in their order, extracted in worker processes or in GPU batches.
 
@@ -59,7 +59,7 @@ class KeypointExtractor:
                 more = self.batch_of(first.shape[1], first.shape[0]) - 1
                 yield from self.extract_batch([first, *islice(source, more)])
             return
-        with nullcontext(workers) if isinstance(workers, Processes) else Processes(workers) as processes:
+        with nullcontext(workers) if isinstance(workers, WorkerPool) else WorkerPool(workers) as processes:
             if processes.workers <= 1:
                 yield from map(self.extract, images)
             else:

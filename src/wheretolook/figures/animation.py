@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from wheretolook.utils.errors import ConfigError, StorageError
-from wheretolook.utils.files import MAKE_ROOM, replacing
+from wheretolook.utils.files import STORAGE_FIX, atomic_write
 
 Pixels = NDArray[np.uint8]  # an image (H, W, 3), or several (N, H, W, 3)
 
@@ -37,7 +37,7 @@ def save_moving(frames: Iterable[Pixels], times_ms: int | Sequence[int], path: P
     """
     if path.suffix not in (".webp", ".gif", ".mp4"):
         raise ConfigError("a film is a .webp, a .gif or an .mp4", path=path, value=path.suffix, fix="Name it so.")
-    with replacing(path, path.with_name(f".partial-{path.name}")) as partial:
+    with atomic_write(path, path.with_name(f".partial-{path.name}")) as partial:
         if path.suffix == ".mp4":
             _save_mp4(frames, times_ms, partial, path)
         else:
@@ -81,4 +81,4 @@ def _save_mp4(frames: Iterable[Pixels], times_ms: int | Sequence[int], partial: 
         whole = written.get(cv2.CAP_PROP_FRAME_COUNT) == n_frames
         written.release()
         if not whole:
-            raise StorageError("cannot be written whole: is the disk full?", path=path, fix=MAKE_ROOM)
+            raise StorageError("cannot be written whole: is the disk full?", path=path, fix=STORAGE_FIX)

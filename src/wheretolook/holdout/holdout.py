@@ -30,7 +30,7 @@ from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.files import fingerprint, write_json, write_text
 from wheretolook.utils.npz_files import load_npz, save_npz
-from wheretolook.utils.processes import Processes
+from wheretolook.utils.processes import WorkerPool
 from wheretolook.utils.reading import read_json_object
 
 MIN_ANGLE_DEG = 1.5  # COLMAP's own least angle between the rays of a landmark
@@ -116,7 +116,7 @@ def leave_out(
             open_blocks.add(block.number)
     if jobs:
         write_model(source.model, model)
-    with Processes(max(1, min(workers, len(jobs)))) as processes:
+    with WorkerPool(max(1, min(workers, len(jobs)))) as processes:
         # the largest first, so that no process works alone at the end
         jobs.sort(key=lambda job: -len(job.block.looked_at))
         done = processes.map(_run, jobs)

@@ -22,7 +22,7 @@ import pandas as pd
 
 from wheretolook.localization.shard import LabelledShard, SceneJob, Shard, ShardWorker
 from wheretolook.utils.errors import ConfigError, WhereToLookError, WorkerError
-from wheretolook.utils.files import replacing
+from wheretolook.utils.files import atomic_write
 
 MAX_RETRIES = 5
 """How often Ray restarts a shard whose process or machine was lost."""
@@ -153,7 +153,7 @@ def _cached_file(folder: Path, content: bytes, suffix: str) -> Path:
         os.utime(path)
     except FileNotFoundError:
         partial = path.with_name(f"{path.name}.{os.getpid()}.partial")  # other workers may write the same file
-        with replacing(path, partial):
+        with atomic_write(path, partial):
             partial.write_bytes(content)
         for file in folder.iterdir():
             with suppress(FileNotFoundError):  # another worker may have removed it

@@ -18,7 +18,7 @@ from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.pipeline import Step, run_pipeline
 from wheretolook.utils.errors import WhereToLookError, WorkerError
-from wheretolook.utils.workers import use_one_core
+from wheretolook.utils.processes import use_one_core
 
 if TYPE_CHECKING:
     from wheretolook.features.keypoints import Keypoints

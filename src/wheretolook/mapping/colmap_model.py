@@ -27,7 +27,7 @@ from wheretolook.mapping.colmap_files import (
 )
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import MapError, StorageError
-from wheretolook.utils.files import MAKE_ROOM, storing, temporary_folder
+from wheretolook.utils.files import STORAGE_FIX, storage_errors, temporary_folder
 from wheretolook.utils.npz_files import load_npz, save_npz
 
 CAMERAS_FILE = "cameras.npz"  # lies beside the landmarks, small enough to travel without the COLMAP model
@@ -108,7 +108,7 @@ def write_model(reconstruction: Any, folder: Path) -> None:
     pycolmap does not notice a full disk, so that what was written is checked. Raises StorageError, which names the file
     that is not whole.
     """
-    with storing(folder):
+    with storage_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     try:
         reconstruction.write_binary(str(folder))
@@ -116,7 +116,7 @@ def write_model(reconstruction: Any, folder: Path) -> None:
     except (MapError, RuntimeError, ValueError) as error:
         path = (error.path if isinstance(error, MapError) else None) or folder
         problem = f"cannot be written whole: is the disk full? ({getattr(error, 'problem', error)})"
-        raise StorageError(problem, path=path, fix=MAKE_ROOM) from error
+        raise StorageError(problem, path=path, fix=STORAGE_FIX) from error
 
 
 def model_arrays(reconstruction: Any) -> ModelArrays:
@@ -235,7 +235,7 @@ def _stored_points(reconstruction: Any) -> _StoredPoints:
     starts = point_starts(data.tobytes())
     if starts[-1] < 0:  # pycolmap does not notice a full disk
         path = folder / "points3D.bin"
-        raise StorageError("cannot be written whole: is the disk full?", path=path, fix=MAKE_ROOM)
+        raise StorageError("cannot be written whole: is the disk full?", path=path, fix=STORAGE_FIX)
     heads = point_heads(data, starts)
     elements = track_elements(data, starts).astype(np.int64)
     lengths = heads["n"].astype(np.int64)

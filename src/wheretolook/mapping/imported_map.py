@@ -35,9 +35,9 @@ from wheretolook.mapping.sfm import PhotographFeatures, photograph_features
 from wheretolook.mapping.triangulation import choose_pairs, color_points, triangulate_model
 from wheretolook.utils.confine import path_within
 from wheretolook.utils.errors import ConfigError, MapError
-from wheretolook.utils.files import copy_file, write_text
+from wheretolook.utils.files import atomic_folder, copy_file, write_text
 from wheretolook.utils.images import image_size
-from wheretolook.utils.processes import Processes
+from wheretolook.utils.processes import WorkerPool
 
 _PROPORTIONS = 0.01  # by which a photograph's proportions may differ from those of its camera
 _ORIENTATION = 274  # number of EXIF's entry, and its values for photographs that lie on a side
@@ -103,7 +103,7 @@ def map_existing(
         n_points = model.num_points3D()
         database = settings.database
         turned = True
-    with building.partial_folder(out_dir) as partial, Processes(workers) as processes:
+    with atomic_folder(out_dir) as partial, WorkerPool(workers) as processes:
         worst_px = settings.max_reprojection_error_px
         if photographs.images is not None:
             with clock("extract"):
@@ -181,7 +181,7 @@ def _triangulate(
     config: MapConfig,
     clock: Clock,
     seed: int,
-    processes: Processes,
+    processes: WorkerPool,
     progress: bool,
 ) -> Any:
     """New landmarks at the poses of a model, from keypoints of its images with a pose. Returns a new model."""

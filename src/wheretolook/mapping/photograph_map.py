@@ -21,8 +21,8 @@ from wheretolook.mapping.scale import MapScale, Similarity
 from wheretolook.mapping.sfm import map_incrementally, photograph_features
 from wheretolook.mapping.triangulation import color_points
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.files import copy_file, write_text
-from wheretolook.utils.processes import Processes
+from wheretolook.utils.files import atomic_folder, copy_file, write_text
+from wheretolook.utils.processes import WorkerPool
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def map_photographs(
     building.refuse_foreign_folder(out_dir)
     known = KnownScale.read(settings.scale)  # a damaged table is reported before the work
     work.mkdir(parents=True, exist_ok=True)
-    with building.partial_folder(out_dir, replacing) as partial, Processes(workers) as processes:
+    with atomic_folder(out_dir, replacing) as partial, WorkerPool(workers) as processes:
         with clock("extract"):
             side_px = settings.max_side_px
             extractor = config.extractor

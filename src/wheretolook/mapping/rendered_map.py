@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -28,8 +26,8 @@ from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.triangulation import image_name, triangulate_known_poses
 from wheretolook.mapping.walk import FreeSpaceQueries, Walk, plan_walk
 from wheretolook.utils.errors import MapError
-from wheretolook.utils.files import moved_later, storing, write_bytes, write_json
-from wheretolook.utils.processes import Processes
+from wheretolook.utils.files import atomic_folder, write_bytes, write_json
+from wheretolook.utils.processes import WorkerPool
 
 if TYPE_CHECKING:
     from wheretolook.rendering.raycasting import MeshRaycaster
@@ -98,7 +96,7 @@ def build_map(
     out_dir = Path(out_dir)
     clock = Clock()
     refuse_foreign_folder(out_dir)
-    with partial_folder(out_dir, replacing) as partial, Processes(workers) as processes:
+    with atomic_folder(out_dir, replacing) as partial, WorkerPool(workers) as processes:
         with clock("walk"):
             if poses is None:
                 walk = plan_walk(free_space, mesh.bounds, config.n_images, config.walk, seed)
@@ -195,38 +193,11 @@ class Clock:
         self.seconds[step] = round(time.perf_counter() - start, 3)
 
 
-@contextmanager
-def partial_folder(out_dir: Path, replacing: Callable[[], None] = lambda: None) -> Iterator[Path]:
-    """An empty folder beside `out_dir` that takes its place if the block succeeds and is removed if it does not.
-
-    `replacing` is called right before it takes it.
-    """
-    partial, old = (out_dir.with_name(f".{out_dir.name}.{suffix}") for suffix in ("partial", "replaced"))
-    for leftover in (partial, old):
-        shutil.rmtree(leftover, ignore_errors=True)
-    with storing(partial):
-        partial.mkdir(parents=True)
-    try:
-        with moved_later(partial, out_dir):
-            yield partial
-        replacing()
-        with storing(out_dir):
-            if out_dir.exists():
-                os.replace(out_dir, old)
-            os.replace(partial, out_dir)
-        shutil.rmtree(old, ignore_errors=True)
-    except BaseException:
-        if old.exists() and not out_dir.exists():
-            os.replace(old, out_dir)
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
-
-
 def extract_with_colors(
     extractor: KeypointExtractor,
     images: Iterable[NDArray[np.uint8]],
     n_images: int,
-    processes: Processes,
+    processes: WorkerPool,
     title: str,
     progress: bool,
     same_size: bool = True,

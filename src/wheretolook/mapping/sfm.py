@@ -28,7 +28,7 @@ from wheretolook.utils.colmap import quiet_colmap, storing_in_database
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.files import write_json
 from wheretolook.utils.npz_files import load_npz, save_npz
-from wheretolook.utils.processes import Processes
+from wheretolook.utils.processes import WorkerPool
 from wheretolook.utils.reading import read_json_object
 
 _LEAST_IMAGES = 3  # of a model: two photographs alone do not determine a camera
@@ -62,7 +62,7 @@ def photograph_features(
     work: Path,
     max_side_px: int,
     extractor: ExtractorConfig,
-    processes: Processes,
+    processes: WorkerPool,
     device: str = "cpu",
     progress: bool = True,
     names: list[str] | None = None,
@@ -95,7 +95,7 @@ def map_incrementally(
     exhaustive_up_to: int,
     overlap: int,
     seed: int,
-    processes: Processes,
+    processes: WorkerPool,
     progress: bool = True,
 ) -> MappedPhotographs:
     """Match photographs, verify the matches, and map incrementally (Schonberger and Frahm, CVPR 2016).
@@ -133,7 +133,7 @@ def _extract(
     names: list[str],
     max_side_px: int,
     extractor: KeypointExtractor,
-    processes: Processes,
+    processes: WorkerPool,
     progress: bool,
     turned: bool = True,
 ) -> dict[str, NDArray[Any]]:
@@ -182,7 +182,7 @@ def _fill(
 
 
 def _reconstruct(
-    database: Path, folder: Path, n_images: int, given: bool, seed: int, processes: Processes, progress: bool
+    database: Path, folder: Path, n_images: int, given: bool, seed: int, processes: WorkerPool, progress: bool
 ) -> list[int]:
     """Verify matches, map, and write the largest model. Returns the number of photographs in each, largest first."""
     import pycolmap

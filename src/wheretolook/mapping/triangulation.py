@@ -21,7 +21,7 @@ from wheretolook.geometry.poses import camera_centers, transform
 from wheretolook.mapping.feature_files import name_kind
 from wheretolook.utils.colmap import quiet_colmap, storing_in_database
 from wheretolook.utils.files import temporary_folder
-from wheretolook.utils.processes import Processes
+from wheretolook.utils.processes import WorkerPool
 
 if TYPE_CHECKING:
     from wheretolook.mapping.config import MapConfig
@@ -50,7 +50,7 @@ def triangulate_known_poses(
     config: MapConfig,
     clock: Callable[[str], AbstractContextManager[None]],
     seed: int,
-    processes: Processes,
+    processes: WorkerPool,
     progress: bool,
 ) -> Any:
     """Triangulate what images (I) of one camera see from known poses (I, 3, 4); see `triangulate_model`."""
@@ -69,7 +69,7 @@ def triangulate_model(
     config: MapConfig,
     clock: Callable[[str], AbstractContextManager[None]],
     seed: int,
-    processes: Processes,
+    processes: WorkerPool,
     progress: bool,
 ) -> Any:
     """Match pairs of images, verify the matches against the known poses, and triangulate.
@@ -142,7 +142,7 @@ def match_pairs(
     stored: Sequence[Stored],
     pairs: NDArray[np.int64],
     folder: Path,
-    processes: Processes,
+    processes: WorkerPool,
     progress: bool = True,
     kind: DescriptorKind = SIFT,
 ) -> Generator[NDArray[np.uint32], None, None]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.utils.errors import MapFormatError
-from wheretolook.utils.files import moved_later, sha256, storing, write_json, write_text
+from wheretolook.utils.files import moved_later, sha256, storage_errors, write_json, write_text
 from wheretolook.utils.locks import hold
 from wheretolook.utils.npz_files import save_npy
 from wheretolook.utils.reading import read_json
@@ -119,12 +119,12 @@ def write_map(
             inside = {path.name for path in left.iterdir()} if left.is_dir() and not left.is_symlink() else {"a file"}
             if inside <= {_NEW} or (inside <= {_NEW, _OLD} and (folder / DESCRIPTION).is_file()):
                 shutil.rmtree(left, ignore_errors=True)  # of a process that was killed while it wrote, or afterwards
-        with storing(folder):
+        with storage_errors(folder):
             work = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
         new = work / _NEW
         old = work / _OLD
         try:
-            with moved_later(new, folder), storing(folder):
+            with moved_later(new, folder), storage_errors(folder):
                 new.mkdir()
                 _write(new, grid, origin, arrays)
             if folder.exists():

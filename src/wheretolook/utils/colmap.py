@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from wheretolook.utils.errors import StorageError
-from wheretolook.utils.files import MAKE_ROOM
+from wheretolook.utils.files import STORAGE_FIX
 
 
 @contextmanager
@@ -35,4 +35,4 @@ def storing_in_database(database: Path) -> Iterator[None]:
         if not found:
             raise
         reason = found[1] or "SQLite cannot make it"
-        raise StorageError(f"cannot be written: {reason}", path=database, fix=MAKE_ROOM) from error
+        raise StorageError(f"cannot be written: {reason}", path=database, fix=STORAGE_FIX) from error

@@ -1,57 +1,55 @@
-"""Files that are written whole or not at all, with errors that name them, and their fingerprints."""
+"""Atomic writes of files and folders, with errors that name them, and checksums of files."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
-import secrets
 import shutil
-import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from wheretolook.utils.errors import StorageError
 
-MAKE_ROOM = "Make room, or lift what forbids it, and run again: what is finished is kept."
+STORAGE_FIX = "Free disk space or fix permissions, then run again; finished work is kept."
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON, as `replacing` does, keys in the order given."""
+    """Write a value as JSON with `atomic_write`; keys keep their order."""
     write_text(path, json.dumps(content, indent=2) + "\n")
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text, as `replacing` does."""
-    with replacing(path) as partial:
+    """Write a text with `atomic_write`."""
+    with atomic_write(path) as partial:
         partial.write_text(text, encoding="utf-8")
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write bytes, as `replacing` does."""
-    with replacing(path) as partial:
+    """Write bytes with `atomic_write`."""
+    with atomic_write(path) as partial:
         partial.write_bytes(content)
 
 
 def copy_file(source: Path, target: Path) -> None:
-    """Copy a file's content, as `replacing` does. Raises OSError if the source cannot be read."""
-    with source.open("rb") as file, replacing(target) as partial, partial.open("wb") as copy:
+    """Copy a file's content with `atomic_write`. Raises OSError if the source cannot be read."""
+    with source.open("rb") as file, atomic_write(target) as partial, partial.open("wb") as copy:
         shutil.copyfileobj(file, copy, 2**20)
 
 
 @contextmanager
-def replacing(path: Path, partial: Path | None = None) -> Iterator[Path]:
-    """Yield the path of a file to write beside `path`, whose place it takes when the block is done.
+def atomic_write(path: Path, partial: Path | None = None) -> Iterator[Path]:
+    """Yield a path to write to, which replaces `path` at the end of the block; after an error, `path` is unchanged.
 
-    The folder is made if missing. If anything fails, that file is removed, and what was at `path` stays. `partial` is
-    the name to write to, for those who need a certain ending. Raises StorageError, which names `path`, if it cannot be
-    written: the disk is full, the folder is read-only, or files have a limit.
+    The parent folder is created if missing. `partial` is the path to write to, if it needs a certain ending; its
+    default is `path` with ".partial" appended. Raises StorageError, naming `path`, if it cannot be written.
     """
     partial = partial or path.with_name(path.name + ".partial")
     try:
-        with storing(path, partial):
+        with storage_errors(path, partial):
             path.parent.mkdir(parents=True, exist_ok=True)
             yield partial
             os.replace(partial, path)
@@ -62,20 +60,52 @@ def replacing(path: Path, partial: Path | None = None) -> Iterator[Path]:
 
 
 @contextmanager
-def storing(path: Path, partial: Path | None = None) -> Iterator[None]:
-    """Turn an OSError into a StorageError that names the file: `path`, which is written as `partial`, or its folder."""
+def atomic_folder(folder: Path, before_replace: Callable[[], None] = lambda: None) -> Iterator[Path]:
+    """Yield an empty sibling folder, which replaces `folder` at the end of the block; after an error, it is removed.
+
+    The sibling is `.<name>.partial`; the old folder is `.<name>.replaced` until the new one is in place. What a killed
+    process left of them is cleaned up first. `before_replace` is called when the new folder is complete. Raises
+    StorageError, naming paths in `folder`, if something cannot be written. Only one process at a time may do this.
+    """
+    partial = folder.with_name(f".{folder.name}.partial")
+    old = folder.with_name(f".{folder.name}.replaced")
+    if old.exists() and not folder.exists():
+        os.replace(old, folder)
+    for leftover in (partial, old):
+        shutil.rmtree(leftover, ignore_errors=True)
+    with storage_errors(folder, partial):
+        partial.mkdir(parents=True)
+    try:
+        with moved_later(partial, folder):
+            yield partial
+        before_replace()
+        with storage_errors(folder, partial):
+            if folder.exists():
+                os.replace(folder, old)
+            os.replace(partial, folder)
+        shutil.rmtree(old, ignore_errors=True)
+    except BaseException:
+        if old.exists() and not folder.exists():
+            os.replace(old, folder)
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+@contextmanager
+def storage_errors(path: Path, partial: Path | None = None) -> Iterator[None]:
+    """Re-raise OSErrors as StorageErrors that name the file; `partial` is reported as `path`."""
     try:
         yield
     except OSError as error:
         named = Path(os.fsdecode(error.filename)) if isinstance(error.filename, str | bytes) else path
         concerned = path if named == partial else named
         reason = os.strerror(error.errno) if error.errno else str(error)
-        raise StorageError(f"cannot be written: {reason}", path=concerned, fix=MAKE_ROOM) from error
+        raise StorageError(f"cannot be written: {reason}", path=concerned, fix=STORAGE_FIX) from error
 
 
 @contextmanager
 def moved_later(folder: Path, place: Path) -> Iterator[None]:
-    """Let StorageErrors about files in a folder name them as they were to lie, once the folder is moved to `place`."""
+    """Let StorageErrors about files in `folder` name their final paths in `place`."""
     try:
         yield
     except StorageError as error:
@@ -86,21 +116,10 @@ def moved_later(folder: Path, place: Path) -> Iterator[None]:
 
 
 @contextmanager
-def temporary_folder(suffix: str = "", prefix: str = "wheretolook-", parent: Path | None = None) -> Iterator[Path]:
-    """A folder, that of temporary files as a parent or another one, that is removed at the end.
-
-    Unlike one of `tempfile.TemporaryDirectory`, Ctrl-C leaves none behind when it comes while it is made or removed.
-    """
-    folder = Path(tempfile.gettempdir() if parent is None else parent) / f"{prefix}{secrets.token_hex(8)}{suffix}"
-    try:
-        folder.mkdir(mode=0o700)
-        yield folder
-    finally:
-        try:
-            shutil.rmtree(folder, ignore_errors=True)
-        except KeyboardInterrupt:
-            shutil.rmtree(folder, ignore_errors=True)
-            raise
+def temporary_folder(suffix: str = "", parent: Path | None = None) -> Iterator[Path]:
+    """Yield a new folder, among the system's temporary files or in `parent`, which is removed with its content."""
+    with TemporaryDirectory(suffix, "wheretolook-", parent, ignore_cleanup_errors=True) as name:
+        yield Path(name)
 
 
 def sha256(path: Path) -> str:

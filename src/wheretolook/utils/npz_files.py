@@ -10,7 +10,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from wheretolook.utils.files import replacing
+from wheretolook.utils.files import atomic_write
 from wheretolook.utils.reading import check_file
 
 MAX_RATIO = 100
@@ -23,13 +23,13 @@ FREE_BYTES = 128_000_000
 def save_npz(path: Path, arrays: Mapping[str, NDArray[Any]], compress: bool = False) -> None:
     """Write arrays by name, atomically. The same arrays give the same bytes."""
     write: Any = np.savez_compressed if compress else np.savez
-    with replacing(path) as partial, partial.open("wb") as file:
+    with atomic_write(path) as partial, partial.open("wb") as file:
         write(file, **arrays)
 
 
 def save_npy(path: Path, array: NDArray[Any]) -> None:
     """Write an array, atomically."""
-    with replacing(path) as partial, partial.open("wb") as file:
+    with atomic_write(path) as partial, partial.open("wb") as file:
         npy.write_array(_Plain(file), array, allow_pickle=False)
 
 

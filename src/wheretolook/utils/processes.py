@@ -1,69 +1,215 @@
-"""Spreads work over processes, which read a few items ahead of the results."""
+"""Worker processes that ignore Ctrl-C, end with their parent, and are restarted when one is killed."""
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
+import os
+import signal
+import threading
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
 from itertools import islice
+from multiprocessing.connection import Connection
 from types import TracebackType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from wheretolook.utils.errors import WorkerError
-from wheretolook.utils.workers import end_with_parent, in_main_thread, spawning, use_one_core
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+PROGRESS_INTERVAL_S = 0.5
 
-class Processes:
-    """`workers` processes of one thread each, spawned when first needed and ended with the block; 1 is this process."""
+_PR_SET_PDEATHSIG = 1  # sys/prctl.h
+_M_TRIM_THRESHOLD = -1  # malloc.h
+_M_MMAP_THRESHOLD = -3
+
+
+class WorkerPool:
+    """Runs functions in `workers` spawned processes of one thread each; with one worker, `map` runs in this process.
+
+    WorkerPool start when first needed. They end with the block, at once if it raises.
+    """
 
     def __init__(self, workers: int) -> None:
         self.workers = workers
-        self._pool: ProcessPoolExecutor | None = None
+        self._executor: ProcessPoolExecutor | None = None
+        self._stop: Connection | None = None  # workers exit when it is closed
+        self._progress: Any = ()  # what each worker has reported of its current item
 
-    def __enter__(self) -> Processes:
+    def __enter__(self) -> WorkerPool:
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        if self._pool is not None:
-            self._pool.shutdown()
+        self._close(kill=kind is not None)
 
     def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Generator[Result, None, None]:
-        """Apply a function, defined at the top level of a module, to items. Yields results in their order.
+        """Apply a module-level function to items and yield results in their order, reading a few items ahead.
 
         Raises WorkerError if a process was killed.
         """
         if self.workers <= 1:
             yield from map(function, items)
             return
-        if self._pool is None:  # here, since the thread that begins to use it starts the processes
-            context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(self.workers, context, _start_worker, (in_main_thread(),))
         source = iter(items)
         pending = deque[Future[Result]]()
         try:
             while True:
                 for item in islice(source, 4 * self.workers - len(pending)):
-                    with spawning():
-                        pending.append(self._pool.submit(function, item))
+                    pending.append(self._submit(function, item))
                 if not pending:
                     return
                 yield pending.popleft().result()
         except BrokenProcessPool as error:
-            problem = "a process was killed, probably for lack of memory"
-            fix = "Use fewer workers (--label.workers, or --workers) and run again."
-            raise WorkerError(problem, value=f"{self.workers} workers", fix=fix) from error
+            raise self._killed("a process was killed") from error
         finally:
             for future in pending:
                 future.cancel()
 
+    def map_unordered(
+        self,
+        function: Callable[[Item], Result],
+        items: Iterable[Item],
+        retries: int = 2,
+        on_progress: Callable[[int], None] = lambda in_flight: None,
+    ) -> Generator[tuple[Item, Result], None, None]:
+        """Apply a module-level function to items in worker processes and yield items with results as they finish.
 
-def _start_worker(of_main_thread: bool) -> None:
-    end_with_parent(of_main_thread)
+        If a process is killed, all unfinished items start again; after `retries` such restarts without a finished item
+        between them, WorkerError is raised. `on_progress` gets the sum of what `report_progress` reported for
+        unfinished items.
+        """
+        waiting = deque(items)
+        running = dict[Future[Result], Item]()
+        restarts = 0
+        while waiting or running:
+            done: set[Future[Result]] = set()
+            try:
+                while waiting and len(running) < 2 * self.workers:
+                    future = self._submit(function, waiting[0])
+                    running[future] = waiting.popleft()
+                done, _ = wait(running, PROGRESS_INTERVAL_S, FIRST_COMPLETED)
+                results = [(future, future.result()) for future in done]
+            except BrokenProcessPool as error:
+                restarts += 1
+                if restarts > retries:
+                    raise self._killed(f"processes were killed {restarts} times at the same items") from error
+                waiting.extendleft(reversed(running.values()))
+                running.clear()
+                self._close(kill=True)
+                continue
+            on_progress(sum(self._progress))
+            for future, result in results:
+                restarts = 0
+                yield running.pop(future), result
+
+    def _submit(self, function: Callable[[Item], Result], item: Item) -> Future[Result]:
+        if self._executor is None:
+            context = multiprocessing.get_context("spawn")
+            numbers = context.SimpleQueue()
+            for number in range(self.workers):
+                numbers.put(number)
+            self._progress = context.RawArray("q", self.workers)
+            stopped, self._stop = context.Pipe(duplex=False)
+            start = (numbers, self._progress, stopped, in_main_thread())
+            self._executor = ProcessPoolExecutor(self.workers, context, _start_worker, start)
+        with ignoring_sigint():
+            return self._executor.submit(_run_item, function, item)
+
+    def _close(self, kill: bool) -> None:
+        if self._executor is None or self._stop is None:
+            return
+        if kill:
+            self._stop.close()
+        self._executor.shutdown(cancel_futures=True)
+        self._stop.close()
+        self._executor = None
+
+    def _killed(self, problem: str) -> WorkerError:
+        fix = "Use fewer workers (--label.workers, or --workers) and run again; finished work is kept."
+        return WorkerError(f"{problem}, probably for lack of memory", value=f"{self.workers} workers", fix=fix)
+
+
+@contextmanager
+def ignoring_sigint() -> Iterator[None]:
+    """Let processes spawned in this block ignore SIGINT from their start, also during their imports."""
+    if not in_main_thread():
+        yield
+        return
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+
+
+def in_main_thread() -> bool:
+    """Whether the caller runs in the main thread."""
+    return threading.current_thread() is threading.main_thread()
+
+
+_number = 0
+_progress: Any = [0]
+
+
+def worker_number() -> int:
+    """Number of this worker process in its pool, from 0."""
+    return _number
+
+
+def report_progress(amount: int) -> None:
+    """Add an amount to the progress of this worker's current item (see `WorkerPool.map_unordered`)."""
+    _progress[_number] += amount
+
+
+def _run_item(function: Callable[[Item], Result], item: Item) -> Result:
+    try:
+        return function(item)
+    finally:
+        _progress[_number] = 0
+
+
+def _start_worker(numbers: Any, progress: Any, stopped: Connection, started_by_main_thread: bool) -> None:
+    """Initialize a worker process.
+
+    On Linux the kernel kills it when the thread that started it ends, even inside a compiled function that holds the
+    interpreter lock (prctl(2)); that is used only if this thread is the main thread, which lives as long as its
+    process. Elsewhere a thread ends the worker.
+    """
+    global _number, _progress
+    if started_by_main_thread:
+        with suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    threading.Thread(target=_exit_when_stopped, args=(stopped,), daemon=True).start()
+    _number = numbers.get()
+    _progress = progress
     use_one_core()
+
+
+def _exit_when_stopped(stopped: Connection) -> None:
+    with suppress(EOFError, OSError):
+        stopped.recv()  # returns at the end of the pipe: the parent has closed it or has ended
+    os._exit(1)
+
+
+def use_one_core() -> None:
+    """Let OpenCV use one thread and the C library keep freed memory, for workers that run SIFT, one per core.
+
+    SIFT allocates about 70 MB for each 640 x 480 image; requesting it from the system each time took a third of its
+    time.
+    """
+    import cv2
+
+    cv2.setNumThreads(1)
+    try:
+        library = ctypes.CDLL("libc.so.6")
+        library.mallopt(_M_MMAP_THRESHOLD, 32 * 2**20)  # the largest value that glibc allows
+        library.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
+    except (OSError, AttributeError):  # another C library
+        pass

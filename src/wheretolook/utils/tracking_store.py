@@ -22,7 +22,7 @@ from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, cast
 
 from wheretolook.utils.errors import StorageError, TrackingError, TrackingWarning
-from wheretolook.utils.files import copy_file, storing, temporary_folder, write_json
+from wheretolook.utils.files import copy_file, storage_errors, temporary_folder, write_json
 from wheretolook.utils.locks import hold
 from wheretolook.utils.tracking_config import TrackingConfig
 
@@ -53,7 +53,7 @@ def check_store(tracking: TrackingConfig) -> None:
         _check_limit(database)
         Path(tracking.artifacts).mkdir(exist_ok=True)
         for folder in (root, Path(tracking.artifacts)):
-            with storing(folder), TemporaryFile(dir=folder) as file:
+            with storage_errors(folder), TemporaryFile(dir=folder) as file:
                 file.write(bytes(ROOM_BYTES))
 
 
@@ -94,7 +94,7 @@ def _opened(root: Path, uri: str) -> MlflowClient:
         if found or not _is_text(root):
             problem = "MLflow misreads the path of this folder"
             raise TrackingError(problem, path=root, value=found and found[0], fix="Name another: --tracking.folder.")
-        with storing(root):
+        with storage_errors(root):
             root.mkdir(parents=True, exist_ok=True)
         if not database.exists() or (database.is_file() and database.stat().st_size == 0):
             _make(root, database)
@@ -118,11 +118,11 @@ def _make(root: Path, database: Path) -> None:
     with hold(root / ".making.lock", "making the MLflow store", wait_s=_MAKING_S):
         if database.exists() and database.stat().st_size:
             return  # another process has made it
-        for leftover in root.glob(".making-*"):
+        for leftover in root.glob("*.making"):
             shutil.rmtree(leftover, ignore_errors=True)
-        with storing(root), TemporaryFile(dir=root) as file:
+        with storage_errors(root), TemporaryFile(dir=root) as file:
             file.write(bytes(2 * ROOM_BYTES))
-        with temporary_folder(prefix=".making-", parent=root) as folder:
+        with temporary_folder(".making", parent=root) as folder:
             new = folder / "mlflow.db"
             mlflow_package().MlflowClient(tracking_uri=f"sqlite:///{new}").search_experiments(max_results=1)
             copy_file(new, database)

@@ -12,7 +12,7 @@ from tqdm.auto import tqdm
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.utils.errors import StorageError
-from wheretolook.utils.files import replacing
+from wheretolook.utils.files import atomic_write
 from wheretolook.view import drawing
 from wheretolook.view.scores import landmarks_seen, look_around
 from wheretolook.view.shared import Shared
@@ -38,7 +38,7 @@ def record(shared: Shared, path: Path, state: ViewState = ViewState()) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StorageError(f"cannot be written: {error}", path=path, fix="Name a file in another folder.") from error
-    with replacing(path) as partial:
+    with atomic_write(path) as partial:
         stream = rerun.RecordingStream("wheretolook")
         stream.save(str(partial))
         stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)

@@ -23,7 +23,7 @@ from wheretolook.mapping.rendered_map import (
 from wheretolook.mapping.triangulation import choose_pairs, shrink_depth, surface_overlap, triangulate_known_poses
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.images import read_image as read_file
-from wheretolook.utils.processes import Processes
+from wheretolook.utils.processes import WorkerPool
 from wheretolook_paper.benchmark.folder import DRAWN_CAMERA, BenchmarkScene
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def build_query_map(
     for start in range(0, len(poses), _RENDER_BATCH):
         depth.extend(shrink_depth(renderer.render(DRAWN_CAMERA, poses[start : start + _RENDER_BATCH]).depth_m))
     pairs = choose_pairs(surface_overlap(DRAWN_CAMERA, poses, np.stack(depth)), config.partners)
-    with Processes(workers) as processes:
+    with WorkerPool(workers) as processes:
         images = _read(files, camera)
         found = extract_with_colors(
             KeypointExtractor(config.extractor, device), images, len(files), processes, "map: extract", progress

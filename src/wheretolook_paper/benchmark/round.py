@@ -20,7 +20,7 @@ from wheretolook.localization.config import LocalizerConfig
 from wheretolook.select.waypoints import Waypoints, read_waypoints
 from wheretolook.utils.confine import entry_of
 from wheretolook.utils.errors import SceneError, StorageError, TableError
-from wheretolook.utils.files import fingerprint, write_bytes, write_json
+from wheretolook.utils.files import atomic_folder, fingerprint, write_bytes, write_json
 from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.version import VERSION
 from wheretolook_paper.benchmark.actloc_baseline import MAX_ERROR_PX, MENDED, SHIPPED, shipped_views
@@ -238,13 +238,13 @@ class SceneRound:
     def _localizer(self) -> Localizer:
         from wheretolook.localization.localizer import Localizer
         from wheretolook.mapping.landmarks import Landmarks
-        from wheretolook.mapping.rendered_map import LANDMARKS_FILE, partial_folder
+        from wheretolook.mapping.rendered_map import LANDMARKS_FILE
         from wheretolook_paper.benchmark.query_map import build_query_map
 
         folder = self.folder / MAP_FOLDER
         config = self.config
         if _key(folder, "map") != self._map_key or not (folder / LANDMARKS_FILE).is_file():
-            with partial_folder(folder) as partial:
+            with atomic_folder(folder) as partial:
                 build_query_map(self.scene, self._renderer, partial, config.workers, config.device, config.progress)
                 _note(partial, "map", self._map_key)
         return Localizer(Landmarks.load(folder / LANDMARKS_FILE), CAMERA, LOCALIZER, device=config.device)

@@ -20,7 +20,7 @@ from wheretolook.dataset.viewpoint_table import SCHEMA, UNLABELLED, read_parquet
 from wheretolook.planning.config import FORWARD, PathsConfig
 from wheretolook.stages.preconditions import Say, Tick, dataset_after, extractor_of, open_scene
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.utils.files import fingerprint, replacing, write_json, write_text
+from wheretolook.utils.files import atomic_write, fingerprint, write_json, write_text
 from wheretolook.utils.reading import read_json, read_json_object
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
@@ -104,7 +104,7 @@ def _plan(
     found = plan_pairs(draw_pairs(scene.space, config), scene.space, maps, config, f"plan {scene.name}")
     made.unlink(missing_ok=True)
     for name, path in tables.items():
-        with replacing(path) as partial:
+        with atomic_write(path) as partial:
             getattr(found, name).to_parquet(partial, index=False, write_page_checksum=True)
     write_json(made, key)
     failed = int((~found.paths["planned"]).sum())
@@ -213,7 +213,7 @@ def _report(
     markdown = report.path_markdown(summary, config)
     write_text(folder / report.PATHS_CSV, summary.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
     write_text(folder / report.PATHS_MD, markdown)
-    with replacing(folder / FOLDER / "views.parquet") as partial:
+    with atomic_write(folder / FOLDER / "views.parquet") as partial:
         views.to_parquet(partial, index=False)
     save_figure(paths_figure(summary), folder / report.PATHS_PNG)
     params = {"dataset": dataset.name, "pairs": config.pairs, "seed": config.seed, "time_s": config.planner.time_s}

@@ -21,7 +21,7 @@ from wheretolook.geometry.poses import Float, camera_centers, poses_looking_alon
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.planning.config import PathsConfig
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.files import replacing, write_json
+from wheretolook.utils.files import atomic_write, write_json
 from wheretolook.utils.reading import read_json
 
 if TYPE_CHECKING:
@@ -238,6 +238,6 @@ def _kept(path: Path, key: str) -> pd.DataFrame | None:
 
 def _keep(table: pd.DataFrame, path: Path, key: str) -> None:
     path.with_suffix(".json").unlink(missing_ok=True)
-    with replacing(path) as partial:
+    with atomic_write(path) as partial:
         table.to_parquet(partial, index=False, write_page_checksum=True)
     write_json(path.with_suffix(".json"), key)

@@ -38,9 +38,10 @@ from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.rendered_map import build_map
 from wheretolook.rendering.warp_renderer import WarpRenderer
-from wheretolook.scorers.registry import load_scorer, make_scorer
+from wheretolook.scorers.registry import make_scorer
 from wheretolook.utils.npz_files import load_npz, save_npz
 from wheretolook.visibility.occlusion import MeshOcclusion
+from wheretolook.weights.resolve import load_scorer
 
 CAMERA = PinholeCamera()
 

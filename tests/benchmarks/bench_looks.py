@@ -21,8 +21,8 @@ from wheretolook.dataset.viewpoint_table import poses, read_table
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.looks.around import best_looks
-from wheretolook.scorers.registry import load_scorer
 from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.weights.resolve import load_scorer
 
 
 def main() -> None:

@@ -29,11 +29,11 @@ from wheretolook.holdout.holdout import LeftOut, left_out_blocks, without
 from wheretolook.holdout.photo_map import PhotographedMap, open_map
 from wheretolook.scorers.adapted.gp_correction import LocalizedViews, adapt
 from wheretolook.scorers.adapted.score import log_odds_of
-from wheretolook.scorers.registry import load_scorer
 from wheretolook.stages.adapt import labelled_views
 from wheretolook.stages.preconditions import open_scene
 from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.weights.resolve import load_scorer
 
 
 def scanned_scene(source: PhotographedMap, left_out: LeftOut, args: argparse.Namespace) -> str:

@@ -23,8 +23,9 @@ from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.registry import load_scorer, make_scorer
+from wheretolook.scorers.registry import make_scorer
 from wheretolook.visibility.occlusion import StoredOcclusion
+from wheretolook.weights.resolve import load_scorer
 
 
 def room_map(n_landmarks: int, locations: Float, device: str) -> LocalizationMap:

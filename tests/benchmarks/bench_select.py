@@ -27,12 +27,12 @@ from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.scorers.registry import load_scorer
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.shipped import WEIGHTS, shipped
 from wheretolook.visibility.cached_occlusion import RememberedOcclusion
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import NoOcclusion
+from wheretolook.weights.resolve import load_scorer
 
 SIDE_M = 20.0
 ROOM_M = 5.0

@@ -31,9 +31,10 @@ from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.registry import load_scorer, make_scorer
+from wheretolook.scorers.registry import make_scorer
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.visibility.occlusion import MeshOcclusion
+from wheretolook.weights.resolve import load_scorer
 from wheretolook_rooms.generator import generate_apartment
 
 

@@ -27,8 +27,8 @@ from wheretolook.localization import confidence
 from wheretolook.localization.joint_labels import label_sets
 from wheretolook.looks import set_score as worth
 from wheretolook.looks.joint_visibility import log_position_variance, seen_around
-from wheretolook.scorers.registry import load_scorer
 from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.weights.resolve import load_scorer
 
 VARIANCE = 0.375  # how much the log of the position's variance counts, against the log-odds
 SURE = 0.99

@@ -33,8 +33,8 @@ from wheretolook.localization.joint_labels import label_sets
 from wheretolook.looks.joint_visibility import PRIOR, SeenAround, information_matrices, seen_around
 from wheretolook.looks.selection import Turns, best_one_by_one, choose_looks, evenly_spread
 from wheretolook.looks.set_score import SetWorth, count_worth
-from wheretolook.scorers.registry import load_scorer
 from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.weights.resolve import load_scorer
 
 DRAWN = {2: 14, 3: 10, 5: 3}
 """Sets drawn at a place, by their number of looks."""

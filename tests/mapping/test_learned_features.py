@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import sqlite3
 import warnings
 from dataclasses import replace
@@ -25,12 +26,10 @@ from wheretolook.mapping.colmap_model import model_arrays
 from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import Landmarks, features_of, load_colmap_landmarks
 from wheretolook.mapping.triangulation import fill_database, match_pairs
-from wheretolook.scorers.feature_domain import folder_for
-from wheretolook.scorers.registry import load_scorer
-from wheretolook.select.weights import weights_of
 from wheretolook.utils.errors import MapError, MapWarning, OutOfRangeWarning
 from wheretolook.utils.processes import WorkerPool
 from wheretolook.utils.shipped import shipped
+from wheretolook.weights.resolve import load_scorer, resolve_weights
 
 LEARNED = [kind for kind in all_kinds().values() if not kind.in_bytes]
 
@@ -293,9 +292,13 @@ def test_weights_that_have_learnt_by_the_features_of_the_map_score_it():
     assert own.name == "set" and np.isfinite(expected).all()
     np.testing.assert_array_equal(own.score(pose[None]), expected)
     np.testing.assert_array_equal(by_folder.score(pose[None]), expected)
-    assert weights_of("", None, "aliked") == weights_of("set", None, "aliked") == shipped(theirs)
-    assert weights_of("", None, "sift") == weights_of("", None) == shipped("data/release/weights/set.safetensors")
-    assert weights_of("mlp-2d+z", None, "aliked") == shipped("data/release/weights/mlp-2d+z.safetensors")
+    assert resolve_weights("", None, "aliked") == resolve_weights("set", None, "aliked") == shipped(theirs)
+    assert (
+        resolve_weights("", None, "sift")
+        == resolve_weights("", None)
+        == shipped("data/release/weights/set.safetensors")
+    )
+    assert resolve_weights("mlp-2d+z", None, "aliked") == shipped("data/release/weights/mlp-2d+z.safetensors")
 
     with pytest.warns(OutOfRangeWarning, match=r"learnt from maps by sift, and this one is by aliked") as said:
         other = load_scorer("data/release/weights/set.safetensors", looked)
@@ -325,9 +328,9 @@ def test_without_weights_by_aliked_a_folder_s_own_score_learned_features(tmp_pat
     for name in ("", "disk"):
         folder_of = tmp_path / "some" / name
         folder_of.mkdir(parents=True, exist_ok=True)
-        (folder_of / "set.safetensors").touch()
-    assert folder_for(tmp_path / "some", "xfeat") == tmp_path / "some"
-    assert folder_for(tmp_path / "some", "disk") == tmp_path / "some" / "disk"
+        shutil.copy(shipped("data/release/weights/set.safetensors"), folder_of)
+    assert resolve_weights(path=tmp_path / "some", features="xfeat").parent == tmp_path / "some"
+    assert resolve_weights(path=tmp_path / "some", features="disk").parent == tmp_path / "some" / "disk"
 
 
 @pytest.mark.parametrize(("name", "told"), [("disk", "they lose 14"), ("xfeat", "they lose 18"), ("superpoint", "not")])

@@ -15,7 +15,7 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.robot.wheretolook_robot import RobotScorer
 from wheretolook.scenes.loading import save_glb
-from wheretolook.scorers.registry import load_scorer
+from wheretolook.weights.resolve import load_scorer
 
 WEIGHTS = Path("data/release/weights/set.safetensors").absolute()
 

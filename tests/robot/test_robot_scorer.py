@@ -26,7 +26,6 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.robot import wheretolook_robot
 from wheretolook.robot.export import export_robot, pinhole_of
 from wheretolook.robot.wheretolook_robot import RobotScorer
-from wheretolook.scorers.registry import load_scorer
 from wheretolook.scorers.set.network import ALL_TOLD, TOLD_ONCE, SetNetwork
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.training.landmark_views import AttributeStatistics
@@ -34,6 +33,7 @@ from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.training_range import TrainingRange
 from wheretolook.utils.errors import CameraError, ConfigError, WeightsError
 from wheretolook.visibility.occlusion import MeshOcclusion, OcclusionModel
+from wheretolook.weights.resolve import load_scorer
 
 pytestmark = pytest.mark.filterwarnings("ignore::wheretolook.utils.errors.OutOfRangeWarning")
 

@@ -25,11 +25,11 @@ from wheretolook.planning.scene_map import planner_scorer
 from wheretolook.scorers.adapted.gp_correction import PRIOR, LocalizedViews, adapt, fit, folds_of, log_losses, splits
 from wheretolook.scorers.adapted.kernel import Correction, nearness
 from wheretolook.scorers.adapted.network import AdaptedNetwork
-from wheretolook.scorers.registry import load_scorer
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import WeightsError
 from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.weights.resolve import load_scorer
 
 SET = shipped(WEIGHTS) / "set.safetensors"
 

@@ -25,7 +25,7 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.binned_network import BinnedNetworkScorer
 from wheretolook.scorers.mlp.network import ViewpointNetwork
-from wheretolook.scorers.registry import load_scorer, make_scorer
+from wheretolook.scorers.registry import make_scorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
 from wheretolook.training.data import ViewpointDataModule
@@ -34,6 +34,7 @@ from wheretolook.training.weights import METADATA_KEY, method_of_weights, read_t
 from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, WeightsError
 from wheretolook.utils.tracking import client
 from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.scorers.conv.config import ConvConfig
 from wheretolook_paper.scorers.conv.network import ConvNetwork, ConvSpec
 

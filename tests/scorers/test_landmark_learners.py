@@ -29,7 +29,7 @@ from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.matchability.config import MatchabilityConfig
 from wheretolook.scorers.matchability.learn import LandmarkBatches
 from wheretolook.scorers.matchability.network import MatchabilityNetwork, bearing_numbers, expected_parts
-from wheretolook.scorers.registry import load_scorer, make_scorer
+from wheretolook.scorers.registry import make_scorer
 from wheretolook.scorers.set.config import SetConfig
 from wheretolook.scorers.set.learn import of_size
 from wheretolook.scorers.set.network import (
@@ -49,6 +49,7 @@ from wheretolook.training.trained_network import StoredNetwork, TrainedNetwork
 from wheretolook.training.weights import METADATA_KEY, method_of_weights, read_weights, write_weights
 from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, TableError, WeightsError
 from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.weights.resolve import load_scorer
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 

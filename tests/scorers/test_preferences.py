@@ -14,7 +14,7 @@ from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks, nearest_other_cosine
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.registry import load_scorer
+from wheretolook.weights.resolve import load_scorer
 
 CAMERA = PinholeCamera(320, 240, 160.0)
 WEIGHTS = Path(__file__).parents[2] / "data" / "release" / "weights" / "set.safetensors"

@@ -19,12 +19,13 @@ from synthetic_dataset import CAMERA, make_landmarks
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scorers import registry
-from wheretolook.scorers.registry import all_methods, best_weights, load_scorer, make_scorer, methods_named, scorers
+from wheretolook.scorers.registry import all_methods, make_scorer, methods_named, scorers
 from wheretolook.scorers.visible import METHODS
 from wheretolook.training.weights import read_weights, write_weights
 from wheretolook.utils.errors import ConfigError, WeightsError
 from wheretolook.utils.tracking import client
 from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.weights.resolve import load_scorer, resolve_weights
 
 SOURCE = Path(wheretolook.__file__).parent
 WEIGHTS = Path(__file__).parents[2] / "data" / "release" / "weights"
@@ -231,7 +232,8 @@ from synthetic_dataset import CAMERA, make_landmarks
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
-from wheretolook.scorers.registry import load_scorer, make_scorer
+from wheretolook.scorers.registry import make_scorer
+from wheretolook.weights.resolve import load_scorer
 
 weights, out = Path(sys.argv[1]), Path(sys.argv[2])
 rng = np.random.default_rng(1)
@@ -296,6 +298,6 @@ def test_weights_of_many_cameras_come_before_those_of_one(tmp_path: Path) -> Non
         record = json.loads(path.with_suffix(".json").read_text())
         record["metrics"]["val_average_precision"] = precision
         path.with_suffix(".json").write_text(json.dumps(record))
-        assert best_weights(tmp_path).stem == best
+        assert resolve_weights(path=tmp_path).stem == best
         if best == "set":
             assert load_scorer(tmp_path, localization_map).name == "set"

@@ -21,11 +21,12 @@ from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.bins import BinsScorer
 from wheretolook.scorers.matchability.network import MatchabilityNetwork
 from wheretolook.scorers.mlp.network import NetworkSpec, ViewpointNetwork
-from wheretolook.scorers.registry import load_scorer, make_scorer, scorers
+from wheretolook.scorers.registry import make_scorer, scorers
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.visible import VisibleScorer
 from wheretolook.training.landmark_views import AttributeStatistics
 from wheretolook.utils.errors import ConfigError, PoseError, WeightsError
+from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.scorers.conv.network import ConvNetwork, ConvSpec
 from wheretolook_paper.scorers.sphere.config import SphereConfig
 from wheretolook_paper.scorers.sphere.network import SphereNetwork

@@ -22,7 +22,7 @@ from wheretolook.geometry.lattices import axes_of_angles, fibonacci_sphere, yaw_
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scorers.mlp.network import ViewpointNetwork
-from wheretolook.scorers.registry import load_scorer, make_scorer
+from wheretolook.scorers.registry import make_scorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
 from wheretolook.training.provenance import TrainedModel
@@ -32,6 +32,7 @@ from wheretolook.utils.errors import ConfigError, MapError, WeightsError
 from wheretolook.utils.tracking import client
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.visibility.occlusion import StoredOcclusion
+from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.scorers.sphere.config import SphereConfig
 from wheretolook_paper.scorers.sphere.network import PITCHES, YAWS, SphereNetwork, on_lattice
 from wheretolook_paper.scorers.sphere.score import SphereScorer

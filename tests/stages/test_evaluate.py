@@ -18,7 +18,6 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses, write_table
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.results import latest_scores
-from wheretolook.scorers.registry import load_scorer
 from wheretolook.scorers.visible import VisibleScorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
@@ -33,6 +32,7 @@ from wheretolook.utils.tracking import (
     ui_command,
 )
 from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.weights.resolve import load_scorer
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 

@@ -29,7 +29,7 @@ from wheretolook.inputs.channels import CHANNELS
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.localization import labeller
 from wheretolook.scorers.mlp.network import ViewpointNetwork
-from wheretolook.scorers.registry import load_scorer, scorers
+from wheretolook.scorers.registry import scorers
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.space.tsdf_space import TsdfSpace
@@ -41,6 +41,7 @@ from wheretolook.utils.tracking import artifact, client, finished_runs, newest_r
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import StoredOcclusion
+from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.paths.path_comparison import draw_pairs
 
 pytestmark = pytest.mark.slow  # the whole line, several times over

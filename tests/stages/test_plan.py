@@ -14,12 +14,12 @@ from planning.rooms import CAMERA, build, occlusion, room_landmarks, room_map
 from wheretolook.cli import main
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.planning.map_building import build_viewpoint_map
-from wheretolook.planning.scene_map import default_weights
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.scenes.loading import save_glb
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.utils.files import write_json
 from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.weights.resolve import resolve_weights
 
 LANDMARKS = room_landmarks(200)
 SHIPPED = Path(__file__).parents[2] / "data" / "release" / "weights"
@@ -75,10 +75,10 @@ def test_the_papers_network_scores_for_its_field_of_view_alone(dataset: Path) ->
     for suffix in ("safetensors", "json"):
         shutil.copy(SHIPPED / f"mlp-2d+z.{suffix}", weights)
     rooms = Dataset.load(dataset / "data" / "rooms")
-    assert default_weights(rooms) == weights / "mlp-2d+z.safetensors"
+    assert resolve_weights(dataset=rooms) == weights / "mlp-2d+z.safetensors"
     narrow = tuple(replace(scene, camera=replace(CAMERA, focal_px=70.0)) for scene in rooms.scenes)
-    assert default_weights(replace(rooms, scenes=narrow)) == shipped(WEIGHTS) / "set.safetensors"
-    assert default_weights(replace(rooms, scenes=narrow), kinds=["mlp-2d+z"]) is None
+    assert resolve_weights(dataset=replace(rooms, scenes=narrow)) == shipped(WEIGHTS) / "set.safetensors"
+    assert resolve_weights("mlp-2d+z", dataset=replace(rooms, scenes=narrow)) is None
 
 
 def test_without_any_weights_those_that_ship_score(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -101,15 +101,17 @@ def test_the_best_weights_there_are_score(dataset: Path, capsys: pytest.CaptureF
     assert run(dataset, "--scene", "a", "--method", "bins") == 0
     assert ViewpointMap.load(folder).origin.scorer == "bins"
     rooms = Dataset.load(dataset / "data" / "rooms")
-    assert default_weights(rooms) == weights / "set.safetensors"
+    assert resolve_weights(dataset=rooms) == weights / "set.safetensors"
     narrow = tuple(replace(scene, camera=replace(CAMERA, focal_px=70.0)) for scene in rooms.scenes)
-    assert default_weights(replace(rooms, scenes=narrow)) == weights / "set.safetensors"  # it serves every camera
+    assert (
+        resolve_weights(dataset=replace(rooms, scenes=narrow)) == weights / "set.safetensors"
+    )  # it serves every camera
     own = dataset / "data" / "rooms" / "weights"
     shutil.copytree(weights, own)  # learnt from other scenes than those of the dataset
     shutil.copy(weights / "set.safetensors", own / "trees.safetensors")  # without a record
     (own / "conv.safetensors").write_bytes(b"damaged")
     said: list[str] = []
-    assert default_weights(rooms, said.append) == weights / "set.safetensors"
+    assert resolve_weights(dataset=rooms, log=said.append) == weights / "set.safetensors"
     assert [text.split(":")[1].split("/")[-1] for text in said] == [
         "conv.safetensors", "set.safetensors", "trees.safetensors",
     ]  # fmt: skip

@@ -21,7 +21,6 @@ from wheretolook.dataset.names import RELEASE_FILE
 from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, UNLABELLED, is_good, write_table
 from wheretolook.inputs.bins import InputStatistics
 from wheretolook.scorers.mlp.network import ViewpointNetwork
-from wheretolook.scorers.registry import load_scorer
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.stages.train import train_methods as train
 from wheretolook.training.data import BatchLoader, ViewpointDataModule, balance_classes, hold_out_locations
@@ -32,6 +31,7 @@ from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.tracking import client
 from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.weights.resolve import load_scorer
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 

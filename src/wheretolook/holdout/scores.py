@@ -22,12 +22,12 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import compact_poses
 from wheretolook.mapping.landmarks import load_colmap_landmarks
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.registry import find, load_scorer, make_scorer
-from wheretolook.select.weights import weights_of
+from wheretolook.scorers.registry import find, make_scorer
 from wheretolook.training.weights import method_of_weights
 from wheretolook.utils.errors import MapWarning, OutOfRangeWarning
 from wheretolook.visibility.cached_occlusion import RememberedOcclusion
 from wheretolook.visibility.occlusion import OcclusionModel
+from wheretolook.weights.resolve import load_scorer, resolve_weights
 
 VISIBLE = "visible"  # the method that all are compared with: its score here is the number of landmarks in view
 
@@ -43,7 +43,7 @@ class Scoring:
 
     def check(self) -> None:
         """Raise a WeightsError if weights are missing or damaged, of any of the methods."""
-        for weights in (self.chosen, *(weights_of(name, None) for name in self.also)):
+        for weights in (self.chosen, *(resolve_weights(name) for name in self.also)):
             if weights is not None:
                 method_of_weights(weights)
 
@@ -54,7 +54,7 @@ class Scoring:
 
     def chosen_for(self, features: str) -> Path | None:
         """The file of weights of the method that is checked, on a map by some features."""
-        return weights_of(self.method, self.weights, features)
+        return resolve_weights(self.method, self.weights, features)
 
     def scorer(self, localization_map: LocalizationMap) -> Scorer:
         """The scorer that is checked."""
@@ -131,7 +131,7 @@ def _score(around: LocalizationMap, poses: Float, scoring: Scoring) -> dict[str,
     found[VISIBLE] = told.n_visible
     for other in scoring.also:
         if other not in (VISIBLE, scorer.name):
-            beside = make_scorer(other, around, weights=weights_of(other, None, around.landmarks.features))
+            beside = make_scorer(other, around, weights=resolve_weights(other, features=around.landmarks.features))
             found[other] = _quietly(beside.score, poses) * number_of(other, around)
     return found
 

@@ -16,9 +16,10 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.planning.config import FORWARD, PlanConfig
 from wheretolook.planning.routes import PathView, PlannedPath
 from wheretolook.planning.rrt import check_ends, plan_path
-from wheretolook.planning.scene_map import check_methods, planner_map, planner_scorer, weights_for
+from wheretolook.planning.scene_map import check_methods, planner_map, planner_scorer
 from wheretolook.planning.stops import can_stop, check_stopping, stops_along, within_pitch
 from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.weights.resolve import resolve_weights
 
 
 def plan_by_methods(
@@ -37,7 +38,7 @@ def plan_by_methods(
     get stops (`stops_along`) by methods whose scores are probabilities; the last method's must be.
 
     Methods are "forward", or names of scorers; empty for that of the weights, or bins without. `config` has weights for
-    methods that have learnt, if they are of their kind (`weights_for`). Returns paths by the names of their methods, in
+    methods that have learnt, if they are of their kind (`resolve_weights`). Returns paths by the names of their methods, in
     the order given. Raises ConfigError if a method needs weights or there is none of that name, or the last cannot
     stop; PlanningError if no path can be found.
     """
@@ -54,7 +55,7 @@ def plan_by_methods(
             name = method
             path = plan_path(start, goal, space, space.bounds, None, config.planner)
         else:
-            weights = weights_for(method, dataset, config.weights)
+            weights = resolve_weights(method, config.weights, dataset=dataset)
             scorer = planner_scorer(scene, dataset, method, weights, config.anywhere)
             if stopping and number == len(methods):
                 check_stopping(scorer.name)

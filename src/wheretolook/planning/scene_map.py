@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,19 +10,14 @@ import numpy as np
 
 from wheretolook.dataset.environment import Scene
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.names import RELEASE
-from wheretolook.geometry.camera import camera_of_record
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.rrt import Space
 from wheretolook.planning.viewpoint_map import ViewpointMap
-from wheretolook.scorers.base import Scorer, same_field_of_view
-from wheretolook.scorers.feature_domain import folder_for
-from wheretolook.scorers.registry import fallback, find, load_scorer, make_scorer, members, methods_named, scorers
-from wheretolook.training.provenance import was_trained_on
-from wheretolook.training.weights import method_of_weights, preference, read_training, read_weights
-from wheretolook.utils.errors import ConfigError, WeightsError
-from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.registry import fallback, find, make_scorer, members, methods_named, scorers
+from wheretolook.utils.errors import ConfigError
+from wheretolook.weights.resolve import load_scorer
 
 REACH = 2  # a voxel borrows from voxels at most this many away along each axis
 
@@ -53,60 +48,10 @@ def scene_viewpoint_map(scene: Scene, views: ViewLattice, scorer: Scorer) -> Vie
     return build_viewpoint_map(scorer, grid, free, views.axes(), views.lattice, f"viewpoint map {scene.name}")
 
 
-def weights_for(
-    method: str, dataset: Dataset, given: Path | None = None, say: Callable[[str], None] = print
-) -> Path | None:
-    """The weights that a method scores with: those given if they are of its kind, or else the best there are.
-
-    An empty `method` stands for whatever the weights are of; `say` is told of files that cannot be used, and why. None
-    for a method that has learnt nothing, or if there are no weights (`default_weights`). Raises WeightsError if the
-    file given is missing or damaged.
-    """
-    kinds = {known.weights for known in members(method, scorers())}
-    if "" in kinds or (method and not kinds):
-        return None
-    if given is not None and (not method or method_of_weights(given) in kinds):
-        return given
-    return default_weights(dataset, say, kinds)
-
-
-def default_weights(dataset: Dataset, say: Callable[[str], None] = print, kinds: Collection[str] = ()) -> Path | None:
-    """The best weights of a dataset, or else of the release beside it, or else that ship, that serve its cameras.
-
-    They are of one of the methods named by `kinds`; empty for all that score views by themselves. Of folders that hold
-    some for the features of the dataset's maps, these are taken.
-    """
-    kinds = kinds or {name for name, method in scorers().items() if method.weights == name}
-    own = dataset.root / "weights"
-    others = (dataset.root.parent / RELEASE / "weights", shipped(WEIGHTS))
-    features = dataset.features
-    for folder in dict.fromkeys((own, *(folder_for(other, features) for other in others), *others)):
-        fitting: dict[Path, tuple[bool, float]] = {}
-        for path in sorted(folder.glob("*.safetensors")):
-            try:
-                if method_of_weights(path) not in kinds:
-                    continue
-                header = read_weights(path)[1]
-                training = read_training(path)
-                serves_all = not scorers()[method_of_weights(path)].one_camera
-                trained = None if serves_all else camera_of_record(header["camera"])
-                preferred = preference(path)
-            except (WeightsError, ConfigError, KeyError, TypeError, ValueError) as error:
-                say(f"not used: {path}: {error}")
-                continue
-            if folder == own and not was_trained_on(dataset, training):
-                say(f"not used: {path}: trained on other data than the dataset now holds")
-            elif trained is None or all(same_field_of_view(trained, camera) for camera in dataset.cameras):
-                fitting[path] = preferred
-        if fitting:
-            return max(fitting, key=lambda path: fitting[path])
-    return None
-
-
 def planner_scorer(
     scene: Scene, dataset: Dataset, method: str = "", weights: Path | None = None, anywhere: bool = False
 ) -> Scorer:
-    """The scorer by which paths are planned in a scene of a dataset, with weights from `weights_for`.
+    """The scorer by which paths are planned in a scene of a dataset, with weights from `resolve_weights`.
 
     `anywhere` as of `scene_scorer`. Raises as that; where weights are missing, the error names the dataset.
     """

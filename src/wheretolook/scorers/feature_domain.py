@@ -1,4 +1,4 @@
-"""Which weights fit a map by its features, and what is said where none that have learnt from such maps are given."""
+"""Which weights suit the local features of a map."""
 
 from __future__ import annotations
 
@@ -20,21 +20,9 @@ _LOST = {
 (docs/features.md)."""
 
 
-_NEAREST = {"disk": "aliked", "xfeat": "aliked", "superpoint": "aliked"}
+SUBSTITUTES = {"disk": "aliked", "xfeat": "aliked", "superpoint": "aliked"}
 """Features whose weights choose better than those by SIFT where a map's own have none: so on the val scenes by DISK and
 XFeat (docs/features.md). SuperPoint, learned as these are, was not measured."""
-
-
-def folder_for(folder: Path, features: str) -> Path:
-    """Of a folder of weights, the one in it for maps by these features, `<folder>/<features>`, or by the nearest ones
-    that there are weights for; itself if none is there.
-
-    The weights that lie in it directly are those for all maps, learnt by SIFT if they ship.
-    """
-    for name in (features, _NEAREST.get(features, "")):
-        if name and next((folder / name).glob("*.safetensors"), None) is not None:
-            return folder / name
-    return folder
 
 
 def warn_of_features(of_map: str, weights: Path, stacklevel: int) -> None:
@@ -47,7 +35,7 @@ def warn_of_features(of_map: str, weights: Path, stacklevel: int) -> None:
     text = f"the weights {weights.name} have learnt from maps by {', '.join(learnt)}, and this one is by {of_map}"
     lost = _LOST.get((learnt[0], of_map), "") if len(learnt) == 1 else ""
     fix = f"{lost or 'How much is lost is not known'} (docs/features.md); `wheretolook check` measures it on your map"
-    theirs = _NEAREST.get(of_map, of_map)
+    theirs = SUBSTITUTES.get(of_map, of_map)
     if theirs not in learnt and or_shipped(f"{WEIGHTS}/{theirs}").is_dir():
         fix = f"Weights that suit it better ship, {WEIGHTS}/{theirs}: they are taken if none are named. {fix}"
     warnings.warn(f"{text}. {fix}.", OutOfRangeWarning, stacklevel=stacklevel + 1)

@@ -8,12 +8,11 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING
 
-from wheretolook.scorers.feature_domain import folder_for, warn_of_features
+from wheretolook.scorers.feature_domain import warn_of_features
 from wheretolook.scorers.method import Method, ScorerOptions
 from wheretolook.utils.errors import CameraError, ConfigError, WeightsError
-from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -132,103 +131,36 @@ def make_scorer(
     heading: tuple[tuple[float, float, float], ...] = (),
     anywhere: bool = False,
 ) -> Scorer:
-    """Build a method by its name, or by that of its family, for which the weights tell which one it is.
+    """Build the scorer of a method, or of the member of a family that the weights are of.
 
     The heading is for "forward": one direction, or the waypoints of a path; empty for one drawn for each location.
-    With `anywhere`, weights that are adapted to one place score in another, too.
+    With `anywhere`, weights adapted to one scene score in another.
 
-    Raises a ConfigError if there is no such method, or it needs weights; a WeightsError if these cannot be used; a
-    MapError if the map lacks what the method needs.
+    Raises:
+        ConfigError: there is no such method, or it needs weights.
+        WeightsError: the weights are unusable or of another method.
+        MapError: the map lacks what the method needs.
     """
-    known = scorers()
-    family = members(name, known)
-    if name not in known and len({method.weights for method in family} - {""}) == len(family) > 0:
-        method = _of_weights(name, family, weights)
-    else:
-        method = check_method(name)
-    path = None if weights is None else Path(weights)
-    if not method.weights:
-        return _build(method, localization_map, ScorerOptions(seed, None, heading))
-    if path is None:
-        raise ConfigError("the method needs weights", value=name, fix="Give a file that the train stage wrote.")
-    _of_weights(name, [method], path)
-    return _build(method, localization_map, ScorerOptions(seed, path, heading, anywhere))
-
-
-@overload
-def load_scorer(localization_map: LocalizationMap, /) -> Scorer: ...
-
-
-@overload
-def load_scorer(weights: str | Path | None, localization_map: LocalizationMap, anywhere: bool = False) -> Scorer: ...
-
-
-def load_scorer(
-    weights: str | Path | LocalizationMap | None = None,
-    localization_map: LocalizationMap | None = None,
-    anywhere: bool = False,
-) -> Scorer:
-    """The learned scorer of a map: `load_scorer(map).score(cam_from_world)`, or with `load_scorer(weights, map)`.
-
-    Without weights, or with None, the best of those that ship score, for the features of the map. Else they are a file
-    that the train stage wrote, in which stands what method it is; or a folder of such files, of which `best_weights`
-    takes one; what ships is found
-    under its name, such as `data/release/weights`, from any folder. With `anywhere`, weights that are adapted to one
-    place score in another, too.
-
-    Raises a WeightsError if the file cannot be used, was trained for another field of view than the map's camera, or is
-    adapted to another place; a MapError if the map lacks what the method needs.
-    """
-    if weights is not None and not isinstance(weights, (str, Path)):
-        weights, localization_map = None, weights
-    if localization_map is None:
-        fix = "Call load_scorer(localization_map), or load_scorer(weights, localization_map)."
-        raise ConfigError("a scorer needs a map", fix=fix)
-    path = shipped(WEIGHTS) if weights is None else or_shipped(weights)
-    path = best_weights(path, localization_map.landmarks.features) if path.is_dir() else path
-    method = _of_weights("a scorer", [method for method in scorers().values() if method.name == method.weights], path)
-    return _build(method, localization_map, ScorerOptions(weights=path, anywhere=anywhere))
-
-
-def best_weights(folder: str | Path, features: str = "") -> Path:
-    """The best weights of a folder that score views by themselves, see `wheretolook.training.weights.preference`.
-
-    For a map by some features (`Landmarks.features`) they are those in `<folder>/<features>/` if there are any.
-
-    Raises a WeightsError if there are none, or a record of training is missing or damaged.
-    """
-    from wheretolook.training.weights import preference
-
-    paths = [
-        path
-        for path in sorted(folder_for(Path(folder), features).glob("*.safetensors"))
-        if not _scores_nothing(path.stem)
-    ]
-    if not paths:
-        raise WeightsError("there are no weights of a scorer", path=folder, fix="Run the train stage first.")
-    return max(paths, key=preference)
-
-
-def _scores_nothing(name: str) -> bool:
-    method = find(name)
-    return method is not None and method.build is None
-
-
-def _of_weights(name: str, methods: list[Method], weights: str | Path | None) -> Method:
-    """The one of several methods that a file of weights serves."""
     from wheretolook.training.weights import method_of_weights
 
+    methods = members(name, scorers())
+    kinds = [method.weights for method in methods]
+    if name not in scorers() and (not kinds or "" in kinds or len({*kinds}) < len(kinds)):
+        check_method(name)
+    if kinds == [""]:
+        return build_scorer(methods[0], localization_map, ScorerOptions(seed, None, heading))
     if weights is None:
-        raise ConfigError("the method needs weights", value=name, fix="Give a file that the train stage wrote.")
+        raise ConfigError("the method needs weights", value=name, fix="Give a file that the train command wrote.")
     kind = method_of_weights(weights)
-    for method in methods:
-        if method.weights == kind:
-            return method
-    fix = f"Give weights of {' or '.join(dict.fromkeys(method.weights for method in methods))}, or train them."
-    raise WeightsError(f"these weights are not of {name}", path=weights, value=kind, fix=fix)
+    if kind not in kinds:
+        fix = f"Give weights of {' or '.join(dict.fromkeys(kinds))}, or train them."
+        raise WeightsError(f"these weights are not of {name}", path=weights, value=kind, fix=fix)
+    return build_scorer(
+        methods[kinds.index(kind)], localization_map, ScorerOptions(seed, Path(weights), heading, anywhere)
+    )
 
 
-def _build(method: Method, localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+def build_scorer(method: Method, localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
     """Build a scorer; errors name the file of weights."""
     assert method.build is not None
     try:

@@ -25,7 +25,6 @@ from wheretolook.select.limits import check_limits
 from wheretolook.select.surroundings import grid_waypoints, map_space, surroundings, usable_waypoints
 from wheretolook.select.views import SelectedViews, joined
 from wheretolook.select.waypoints import Waypoints
-from wheretolook.select.weights import weights_of
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility.cached_occlusion import RememberedOcclusion
@@ -113,7 +112,8 @@ class WhereToLook:
             ConfigError: no such method, camera, occlusion, lattice or device.
         """
         from wheretolook.geometry.camera_text import camera_of_view, parse_camera
-        from wheretolook.scorers.registry import load_scorer, make_scorer
+        from wheretolook.scorers.registry import make_scorer
+        from wheretolook.weights.resolve import load_scorer, resolve_weights
 
         model = Path(path)
         device = usable_device(device)
@@ -124,7 +124,7 @@ class WhereToLook:
             camera = parse_camera(camera)
         elif fov_deg is not None:
             camera = camera_of_view(fov_deg)
-        weights_of(method, weights)  # so that one that cannot be had is known before anything is read
+        resolve_weights(method, weights)  # so that one that cannot be had is known before anything is read
         hides, space = surroundings(
             None if mesh is None else Path(mesh), None if depth is None else Path(depth), depth_scale, occlusion, model,
             device,
@@ -139,7 +139,7 @@ class WhereToLook:
         around = LocalizationMap.from_colmap(model, camera, occlusion=hides, device=device, **options)
         if mesh is not None:
             warn_of_mesh(mesh, around.landmarks.points, space.raycaster)
-        weights = weights_of(method, weights, around.landmarks.features)
+        weights = resolve_weights(method, weights, around.landmarks.features)
         if method:
             scorer = make_scorer(method, around, weights=weights, anywhere=anywhere)
         else:

@@ -21,14 +21,12 @@ from wheretolook.dataset.environment import Scene
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.config import ExistingModelConfig
-from wheretolook.scorers.feature_domain import folder_for
 from wheretolook.stages.holdout_photos import check_name, knows_photographs, leave_photographs_out
 from wheretolook.stages.preconditions import Say, Tick, extractor_of, open_scene, refuse_release
 from wheretolook.utils.errors import ConfigError, MapError, OutOfRangeWarning, SceneError, TableError, WeightsError
 from wheretolook.utils.files import fingerprint, write_text
 from wheretolook.utils.locks import hold
 from wheretolook.utils.reading import read_json_object
-from wheretolook.utils.shipped import WEIGHTS, shipped
 from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
 
 if TYPE_CHECKING:
@@ -75,7 +73,8 @@ def adapt(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
         MapError: the map is not in metres, or lies on its side, or its photographs' features are not known.
     """
     config = experiment.adapt
-    weights = config.weights or _to_start_from("")
+    weights = resolve_weights("set", config.weights)
+    assert weights is not None
     if config.map is not None:
         return _adapt_map(experiment, config.map, weights, say, tick)
     refuse_release(experiment.root)
@@ -83,7 +82,8 @@ def adapt(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
         dataset = Dataset.load(experiment.root)
         files = _scene(dataset, config.scene)
         if config.weights is None:
-            weights = _to_start_from(dataset.features)
+            weights = resolve_weights("set", features=dataset.features)
+            assert weights is not None
         path = config.out or dataset.root / FOLDER / f"{files.name}.safetensors"
         _check_out(path, weights)
         check_store(experiment.tracking)
@@ -106,11 +106,6 @@ def adapt(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
         _check_enough(views, files.table if table is not None else files.map)
         place = _Place(files.name, dataset.name, files.table, weights, path)
         return _learn(experiment, place, views, files.read_landmarks().points, say, tick)
-
-
-def _to_start_from(features: str) -> Path:
-    """The set scorer that ships, for maps by some features."""
-    return folder_for(shipped(WEIGHTS), features) / "set.safetensors"
 
 
 def _adapt_map(experiment: Experiment, model: Path, weights: Path, say: Say, tick: Tick) -> Path | None:
@@ -312,7 +307,7 @@ def labelled_views(files: SceneFolder, scene: Scene, table: pd.DataFrame, weight
 
 
 def _scorer(weights: Path, localization_map: LocalizationMap) -> Scorer:
-    from wheretolook.scorers.registry import load_scorer
+    from wheretolook.weights.resolve import load_scorer
 
     _set_scorer_file(weights)
     return load_scorer(weights, localization_map)

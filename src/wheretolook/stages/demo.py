@@ -22,17 +22,16 @@ from wheretolook.evaluation.report import best_in_words
 from wheretolook.evaluation.results import SCORES_CSV, SCORES_MD, SCORES_PNG, results_folder
 from wheretolook.evaluation.scores import read_scores
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
-from wheretolook.scorers.feature_domain import folder_for
-from wheretolook.scorers.registry import best_weights, load_scorer, methods_named, scorers
+from wheretolook.scorers.registry import methods_named, scorers
 from wheretolook.stages.evaluate import not_logged
 from wheretolook.stages.preconditions import Say, Tick, dataset_after, open_scene
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import fingerprint, write_json
 from wheretolook.utils.reading import read_json
-from wheretolook.utils.shipped import WEIGHTS, shipped
 from wheretolook.utils.tracking import ui_command
 from wheretolook.utils.tracking_store import check_store
 from wheretolook.utils.version import VERSION
+from wheretolook.weights.resolve import load_scorer, resolve_weights
 
 SECONDS = {"scenes": 5.0, "map": 15.0, "sample": 1.0, "label": 75.0, "train": 25.0, "evaluate": 6.0}
 """Rough cost of a stage on two cores (the first four for each scene), from which the share done is estimated."""
@@ -85,8 +84,9 @@ def compare(experiment: Experiment, say: Say, tick: Tick) -> None:
     tracking = experiment.tracking
     results = results_folder(dataset, config)
     stamp = experiment.root / STAMP
-    folders = (experiment.root / "weights", folder_for(shipped(WEIGHTS), dataset.features))
-    files = config.weights or [path for folder in folders for path in sorted(folder.glob("*.safetensors"))]
+    bundled = resolve_weights(features=dataset.features)
+    assert bundled is not None
+    files = config.weights or [*sorted((experiment.root / "weights").glob("*.safetensors")), bundled]
     made_from: list[Any] = [dataset.fingerprint(), [fingerprint(path) for path in files if path.is_file()]]
     made_from += [asdict(config), asdict(experiment.occlusion), VERSION]
     scores = results / SCORES_CSV
@@ -105,7 +105,7 @@ def compare(experiment: Experiment, say: Say, tick: Tick) -> None:
         from wheretolook.evaluation.scoring import own_weights
         from wheretolook.stages.evaluate import evaluate_methods
 
-        models = list(config.weights) or [*own_weights(dataset), best_weights(shipped(WEIGHTS), dataset.features)]
+        models = list(config.weights) or [*own_weights(dataset), bundled]
         (results / OVERVIEW).unlink(missing_ok=True)
         device = experiment.warp_device
         occlusion = experiment.occlusion

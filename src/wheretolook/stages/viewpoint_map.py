@@ -23,11 +23,16 @@ def viewpoint_map(experiment: Experiment, say: Say = print, tick: Tick = lambda 
         ConfigError: no such scene or method, or the method needs weights. WeightsError: the weights cannot be used.
         SceneError: there is no mesh, or no voxel is free. MapFormatError: something else is where the map belongs.
     """
-    from wheretolook.planning.scene_map import default_weights, scene_scorer, scene_viewpoint_map
+    from wheretolook.planning.scene_map import scene_scorer, scene_viewpoint_map
+    from wheretolook.weights.resolve import resolve_weights
 
     dataset = dataset_after(experiment, "map")
     config = experiment.viewpoint_map
-    if not config.method and config.weights is None and (weights := default_weights(dataset, say)) is not None:
+    if (
+        not config.method
+        and config.weights is None
+        and (weights := resolve_weights(dataset=dataset, log=say)) is not None
+    ):
         say(f"scored by {weights}")
         config = replace(config, weights=weights)
     built: dict[str, ViewpointMap] = {}

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from wheretolook.utils.errors import WeightsError
 from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped
 
 if TYPE_CHECKING:
@@ -58,7 +56,7 @@ def given_weights(path: Path, features: str = "") -> KnownWeights:
 
 
 def scene_weights(files: SceneFolder, landmarks: Float, features: str = "") -> KnownWeights:
-    """Those of a scene of a dataset: adapted to it, or else those its dataset has trained (`default_weights`).
+    """Those of a scene of a dataset: adapted to it, or else those its dataset has trained (`resolve_weights`).
 
     `landmarks` (N, 3) m are those of the scene's map, by these features.
     """
@@ -68,9 +66,9 @@ def scene_weights(files: SceneFolder, landmarks: Float, features: str = "") -> K
         own.append((adapted, ADAPTED))
     if any((root / "weights").glob("*.safetensors")):
         from wheretolook.dataset.layout import Dataset
-        from wheretolook.planning.scene_map import default_weights
+        from wheretolook.weights.resolve import resolve_weights
 
-        trained = default_weights(Dataset.load(root))
+        trained = resolve_weights(dataset=Dataset.load(root))
         if trained is not None and trained.is_relative_to(root):
             own.append((trained, TRAINED))
     return _known(own, features)
@@ -85,21 +83,11 @@ def map_weights(model: Path, data: Path, landmarks: Float, features: str = "") -
 
 
 def _known(own: Iterable[tuple[Path, str]], features: str) -> KnownWeights:
-    from wheretolook.scorers.feature_domain import folder_for
-    from wheretolook.scorers.registry import best_weights
-    from wheretolook.training.weights import method_of_weights
+    from wheretolook.weights.resolve import weights_by_method
 
     known = KnownWeights({}, {})
-    all_places = [*own, (shipped(WEIGHTS), SHIPPED)]
-    # of a folder first those that have learnt from such features
-    places = [(part, source) for place, source in all_places for part in (folder_for(place, features), place)]
-    for place, source in dict.fromkeys(places):
-        best = best_weights(place) if place.is_dir() else place
-        files = {method_of_weights(best): best}
-        for path in sorted(place.glob("*.safetensors")):
-            with suppress(WeightsError):  # what cannot be used is not offered
-                files.setdefault(method_of_weights(path), path)
-        for kind, path in files.items():
+    for place, source in [*own, (shipped(WEIGHTS), SHIPPED)]:
+        for kind, path in weights_by_method(place, features).items():
             if kind not in known.files:
                 known.files[kind] = path
                 known.sources[kind] = source

@@ -151,9 +151,9 @@ class SceneRound:
         return views.waypoint_id, views.cam_from_world
 
     def _weights(self, method: str) -> Path | None:
-        from wheretolook.select.weights import weights_of
+        from wheretolook.weights.resolve import resolve_weights
 
-        return weights_of("" if method == BEST else method, self.config.weights)
+        return resolve_weights("" if method == BEST else method, self.config.weights)
 
     def _check_frame(self, points: Float) -> None:
         """Raise a SceneError if landmarks (N, 3) do not lie on the mesh."""

@@ -46,7 +46,8 @@ def compare_paths(experiment: Experiment, say: Say = print, tick: Tick = lambda 
         SceneError: a scene has no mesh, or too little room for starts and goals.
         TrackingError: the tracking store cannot be used.
     """
-    from wheretolook.planning.scene_map import check_methods, weights_for
+    from wheretolook.planning.scene_map import check_methods
+    from wheretolook.weights.resolve import resolve_weights
 
     with reading(experiment.root, "compare-paths", FOLDER):
         dataset = dataset_after(experiment, "map")
@@ -55,7 +56,9 @@ def compare_paths(experiment: Experiment, say: Say = print, tick: Tick = lambda 
         joint_paths.check_joint(config)
         check_store(experiment.tracking)
         scenes = [open_scene(experiment, dataset, files) for files in _chosen(dataset, config)]
-        weights = {method: weights_for(method, dataset, config.weights, say) for method in config.methods}
+        weights = {
+            method: resolve_weights(method, config.weights, dataset=dataset, log=say) for method in config.methods
+        }
         planned = {scene.name: _plan(scene, dataset, config, weights, say) for scene in scenes}
         found = _localize(scenes, planned, dataset, weights, experiment)
         paths = pd.concat([one.paths.assign(scene=name) for name, one in found.items()], ignore_index=True)

@@ -45,15 +45,14 @@ def evaluate_looks(
 ) -> pd.DataFrame | None:
     """`look_table` of a split's scenes, `looks.csv` and `looks.md` beside its scores, and an MLflow run.
 
-    Views are scored by the first of `evaluate.weights`, or those that `planning.scene_map.default_weights` finds. None
+    Views are scored by the first of `evaluate.weights`, or those that `weights.resolve.resolve_weights` finds. None
     if no scene's labels keep where landmarks were matched (`--label.store_pixels true`).
     """
     from wheretolook.evaluation.results import results_folder
-    from wheretolook.planning.scene_map import default_weights
-    from wheretolook.scorers.registry import load_scorer
+    from wheretolook.weights.resolve import load_scorer, resolve_weights
 
     scenes = scenes_with_pixels(dataset, evaluate.split)
-    weights = evaluate.weights[0] if evaluate.weights else default_weights(dataset)
+    weights = evaluate.weights[0] if evaluate.weights else resolve_weights(dataset=dataset)
     if not scenes or weights is None:
         return None
     maps = [scene.localization_map(device=device) for scene in scenes]

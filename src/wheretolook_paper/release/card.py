@@ -77,13 +77,14 @@ def write_card(release: Dataset, defaults: Mapping[str, Any]) -> Path:
 
 def release_card(release: Dataset, defaults: Mapping[str, Any]) -> str:
     """The card. Raises as `write_card`."""
-    from wheretolook.scorers.registry import best_weights
     from wheretolook.training.provenance import training_fingerprint
     from wheretolook.training.weights import read_record, read_training
+    from wheretolook.weights.resolve import resolve_weights
 
     about = read_about(release)
     weights = _network(release)
-    best = best_weights(weights.parent)
+    best = resolve_weights(path=weights.parent)
+    assert best is not None
     training = read_training(weights)
     record = read_record(weights)
     tables = {scene.name: scene.read_table() for scene in release.scenes}

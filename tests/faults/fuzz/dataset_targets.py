@@ -19,11 +19,11 @@ from wheretolook.dataset.viewpoint_table import has_matches, read_table, write_t
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.landmark_features import POOLED
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.scorers.registry import load_scorer
 from wheretolook.stages.preconditions import extractor_of
 from wheretolook.training.provenance import trained_before
 from wheretolook.training.weights import METADATA_KEY, preference, read_training, read_weights
 from wheretolook.visibility.occlusion import NoOcclusion, StoredOcclusion
+from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.release.copy import _manifest, read_about
 from wheretolook_paper.scorers.trees.learn import BoostedTrees
 

@@ -25,7 +25,7 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.report import score_markdown
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.mlp.network import ViewpointNetwork
-from wheretolook.scorers.registry import load_scorer, make_scorer
+from wheretolook.scorers.registry import make_scorer
 from wheretolook.scorers.set.config import SetConfig
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
@@ -36,6 +36,7 @@ from wheretolook.utils.errors import ConfigError, StorageError, TableError, Weig
 from wheretolook.utils.files import write_json
 from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.visibility.occlusion import StoredOcclusion
+from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.commands.release import release_settings
 from wheretolook_paper.release import copy as releases
 from wheretolook_paper.release.card import release_card

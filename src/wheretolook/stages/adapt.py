@@ -28,6 +28,7 @@ from wheretolook.utils.files import fingerprint, write_text
 from wheretolook.utils.locks import hold
 from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
+from wheretolook.weights.resolve import resolve_weights
 
 if TYPE_CHECKING:
     from wheretolook.evaluation.adaptation import Gain

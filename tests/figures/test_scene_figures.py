@@ -20,9 +20,9 @@ from wheretolook.figures.dollhouse import dollhouse, frustum_corners, frustum_se
 from wheretolook.figures.overview import Overview, View, overview_figure
 from wheretolook.figures.style import TWO_COLUMNS_IN, save_figure
 from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.geometry.poses import poses_looking_along, transform
-from wheretolook.planning.camera_turns import pan_tilt_angles
 from wheretolook.stages.demo import _ends
 from wheretolook_paper.figures.inputs import BinnedImage, inputs_figure
 from wheretolook_paper.figures.network_walkthrough import learning_figure

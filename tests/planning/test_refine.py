@@ -9,7 +9,7 @@ import pytest
 
 from planning.rooms import DIRECTIONS, GRID, free_voxels, room_landmarks, room_map
 from wheretolook.geometry.poses import Float
-from wheretolook.planning.refine import refine_directions, score_directions
+from wheretolook.planning.refine import refine_directions
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
 
@@ -53,14 +53,14 @@ def test_the_angle_keeps_to_its_limit_and_reaches_it() -> None:
 def test_no_method_gets_worse_and_batches_change_nothing(method: str) -> None:
     scorer = make_scorer(method, room_map(room_landmarks(400)))
     locations = GRID.centers()[list(free_voxels())]
-    scores = score_directions(scorer, locations, DIRECTIONS)
+    scores = scorer.score_around(locations, DIRECTIONS)
     assert scores.shape == (len(locations), len(DIRECTIONS))
     best = DIRECTIONS[scores.argmax(axis=1)]
     found = refine_directions(scorer, locations, best)
     np.testing.assert_allclose(found.start_scores, scores.max(axis=1), rtol=1e-12)
     assert np.all(found.scores >= found.start_scores)
     assert np.mean(found.scores > found.start_scores) > 0.3
-    again = [score_directions(scorer, [at], [axis])[0, 0] for at, axis in zip(locations, found.axes, strict=True)]
+    again = [scorer.score_around(at[None], axis[None])[0, 0] for at, axis in zip(locations, found.axes, strict=True)]
     np.testing.assert_allclose(again, found.scores, rtol=1e-6)
     assert angle_deg(found.axes, best).max() <= 10 + 1e-6
     alone = refine_directions(scorer, locations[4], best[4])

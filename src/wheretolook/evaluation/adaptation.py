@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import expit
 from sklearn.metrics import roc_auc_score
 
-from wheretolook.evaluation.bootstrap import LocationBootstrap
+from wheretolook.evaluation.bootstrap import ClusterBootstrap
 from wheretolook.evaluation.calibration import expected_calibration_error
 from wheretolook.geometry.poses import Float
 from wheretolook.scorers.adapted.gp_correction import log_losses
@@ -63,10 +63,10 @@ def compare_log_odds(
     squares = np.unique(np.floor(centers[first, :2] / NEIGHBOURS_M), axis=0, return_inverse=True)[1].reshape(-1)
     if blocks is not None:
         squares = np.where(blocks[first] >= 0, squares.max() + 1 + blocks[first], squares)
-    bootstrap = LocationBootstrap(np.zeros(len(ids), dtype=np.int64), RESAMPLES, seed, squares)
+    bootstrap = ClusterBootstrap(squares, RESAMPLES, seed)
 
     def less(values: Float, counts: Float) -> tuple[float, float, float]:
-        low, high = bootstrap.ratio(values[:, None], counts[:, None])
+        low, high = bootstrap.ratio_interval(values[:, None], counts[:, None])
         return float(values.sum() / max(1e-12, counts.sum())), float(low[0]), float(high[0])
 
     def missed(log_odds: Float) -> Float:

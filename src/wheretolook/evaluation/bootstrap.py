@@ -1,4 +1,4 @@
-"""Intervals of shares by resampling neighbourhoods of locations, and paired tests by flipping their signs."""
+"""Bootstrap intervals and paired permutation tests over clusters of dependent observations."""
 
 from __future__ import annotations
 
@@ -9,85 +9,108 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float
 
-PERCENTILES = (2.5, 97.5)  # ends of a 95 % interval
-_SIGNS = 1  # sets the random numbers of the sign flips apart from those of the resamples
+_PERCENTILES = (2.5, 97.5)  # ends of a 95 % interval
+_SIGNS = 1  # separates the random numbers of the sign flips from those of the resamples
 
 
-class LocationBootstrap:
-    """Resamples of blocks of locations, with replacement within each scene, drawn once for all methods.
+class ClusterBootstrap:
+    """Draws clusters with replacement within each stratum; the draws serve all methods, so differences are paired.
 
-    Views of a location share landmarks, and so do neighbouring locations: taken for independent, they would make
-    intervals too narrow (on the release's test scenes by half, for voxels above one another). A block stays together.
-    Scenes stay as they are: an interval says how sure a value is for these scenes, not for scenes to come. As every
-    method sees the same resamples, differences between methods are paired.
+    Views at neighbouring locations share landmarks. Treated as independent they would make intervals too narrow (by half
+    for stacked voxels of the release's test scenes), so a cluster is drawn as a whole. Strata, such as scenes, keep
+    their sizes: an interval covers these scenes, not unseen ones.
 
-    Of L locations `location_scene` and `location_block` (L,) tell scene and block, None for each by itself; blocks of
-    different scenes are different whatever their numbers. The seed and the locations decide on the resamples, R in
-    number, and as many sign flips.
+    Args:
+        clusters: (L,) cluster of each observation. Clusters of different strata are different, whatever their numbers.
+        resamples: number R of resamples, and of sign flips.
+        seed: with the clusters and strata, it determines the resamples.
+        strata: (L,) stratum of each observation, a number of at least 0; None for one stratum.
+
+    Attributes:
+        times: (1 + R, K) how often each of K clusters counts: once in the first row, as often as drawn in the others.
+        cluster: (L,) column in `times` of each observation.
     """
 
     def __init__(
         self,
-        location_scene: NDArray[np.integer[Any]],
+        clusters: NDArray[np.integer[Any]],
         resamples: int,
         seed: int,
-        location_block: NDArray[np.integer[Any]] | None = None,
+        strata: NDArray[np.integer[Any]] | None = None,
     ) -> None:
-        if location_block is None:
-            location_block = np.arange(len(location_scene))
-        pairs = np.stack([location_scene, location_block], axis=1)
-        blocks, self._block = np.unique(pairs, axis=0, return_inverse=True)
-        self._block = self._block.reshape(-1)
-        times = np.zeros((resamples, len(blocks)), dtype=np.float32)  # how often a block was drawn
-        for scene in np.unique(location_scene):
-            columns = np.flatnonzero(blocks[:, 0] == scene)
-            draws = np.random.default_rng([seed, int(scene)]).integers(0, len(columns), (resamples, len(columns)))
-            flat = draws + np.arange(resamples)[:, None] * len(columns)
-            drawn = np.bincount(flat.reshape(-1), minlength=resamples * len(columns))
-            times[:, columns] = drawn.reshape(resamples, -1)
-        self._times = times
-        self._sizes = np.bincount(blocks[:, 0])
+        if strata is None:
+            strata = np.zeros_like(clusters)
+        pairs, cluster = np.unique(np.stack([strata, clusters], axis=1), axis=0, return_inverse=True)
+        self.cluster = cluster.reshape(-1)
+        self.times = np.ones((1 + resamples, len(pairs)))
+        for stratum in np.unique(strata):
+            columns = np.flatnonzero(pairs[:, 0] == stratum)
+            n = len(columns)
+            draws = np.random.default_rng([seed, int(stratum)]).integers(0, n, (resamples, n))
+            flat = draws + np.arange(resamples)[:, None] * n
+            self.times[1:, columns] = np.bincount(flat.reshape(-1), minlength=resamples * n).reshape(resamples, n)
+        self._has_intervals = np.bincount(pairs[:, 0]).max(initial=0) > 1
         self._seed = seed
 
-    def _by_block(self, values: Float) -> Float:
-        """Sums (K, C) over the locations of each block of values (L, C)."""
-        sums = np.zeros((self._times.shape[1], values.shape[1]))
-        np.add.at(sums, self._block, values)
+    @property
+    def n_clusters(self) -> int:
+        """K."""
+        return self.times.shape[1]
+
+    def sums(self, values: Float) -> Float:
+        """Sum values (L, ...) over the observations of each cluster; (K, ...)."""
+        sums = np.zeros((self.n_clusters, *values.shape[1:]))
+        np.add.at(sums, self.cluster, values)
         return sums
 
-    def ratio(self, numerator: Float, denominator: Float) -> tuple[Float, Float]:
-        """95 % percentile interval of the ratio of two sums over locations, of (L, C) and (L, C) or (L, 1).
+    def ratios(self, numerator: Float, denominator: Float) -> Float:
+        """Ratios (1 + R, ...) of sums over all observations of (L, ...): of the data first, then of each resample.
 
-        Returns lower and upper ends, (C,) each; NaN where no scene has two blocks, or a denominator is always zero.
+        NaN where the denominator's sum is not positive.
         """
-        ends = np.full((2, numerator.shape[1]), np.nan)
-        if self._sizes.max(initial=0) < 2:
+        return divide(self.times @ self.sums(numerator), self.times @ self.sums(denominator))
+
+    def interval(self, values: Float) -> tuple[Float, Float]:
+        """95 % percentile interval of statistics (1 + R, C), of the data and of the resamples, without NaN.
+
+        Returns lower and upper ends, (C,) each; NaN where all are NaN, or where no stratum has two clusters.
+        """
+        ends = np.full((2, values.shape[1]), np.nan)
+        if not self._has_intervals:
             return ends[0], ends[1]
-        top = self._times @ self._by_block(numerator)
-        bottom = self._times @ self._by_block(denominator)
-        ratio = np.divide(top, bottom, out=np.full(top.shape, np.nan), where=bottom > 0)
-        known = np.isfinite(ratio)
-        whole = known.all(0)
-        ends[:, whole] = np.percentile(ratio[:, whole], PERCENTILES, axis=0)
-        for column in np.flatnonzero(known.any(0) & ~whole):
-            ends[:, column] = np.percentile(ratio[known[:, column], column], PERCENTILES)
+        resampled = values[1:]
+        known = np.isfinite(resampled)
+        complete = known.all(0)
+        ends[:, complete] = np.percentile(resampled[:, complete], _PERCENTILES, axis=0)
+        for column in np.flatnonzero(known.any(0) & ~complete):
+            ends[:, column] = np.percentile(resampled[known[:, column], column], _PERCENTILES)
         return ends[0], ends[1]
 
-    def paired_p(self, differences: Float) -> Float:
-        """Two-sided p-values (C,) of the paired permutation test that two methods are worth the same in every block.
+    def ratio_interval(self, numerator: Float, denominator: Float) -> tuple[Float, Float]:
+        """95 % interval of the ratio of two sums over observations, of (L, C) and (L, C) or (L, 1); see `interval`."""
+        return self.interval(self.ratios(numerator, denominator))
 
-        If they are, a block's difference (of `differences`, (L, C)) is as likely with either sign. The p-value is the
-        share of random signs, those observed among them, that bring the sum over blocks as far from zero as it is, or
-        farther; it is at least 1 / (R + 1), and NaN without locations. It does not hold for expectations, as those of
-        random choice, which are no draws.
+    def paired_p(self, differences: Float) -> Float:
+        """Two-sided p-values (C,) of paired permutation tests that two methods are equally good in every cluster.
+
+        Under that hypothesis the difference of a cluster (sum of `differences`, (L, C)) has a random sign. The p-value
+        is the share of sign flips, the observed signs included, whose sum over clusters is at least as far from zero as
+        the observed one: at least 1 / (R + 1); NaN without observations. The test does not apply to expectations, such
+        as those of random choice.
         """
-        resamples, n_blocks = self._times.shape
-        if n_blocks == 0:
+        if self.n_clusters == 0:
             return np.full(differences.shape[1], np.nan)
-        generator = np.random.default_rng([self._seed, 0, _SIGNS])
-        signs = 1 - 2.0 * generator.integers(0, 2, self._times.shape, dtype=np.int8)
-        # sums that are equal but for rounding count as equal
-        differences = self._by_block(differences)
-        observed = np.abs(differences.sum(0)) - 1e-9 * np.abs(differences).sum(0)
-        as_far = (np.abs(signs @ differences) >= observed).sum(0)
-        return np.asarray((1 + as_far) / (resamples + 1))
+        shape = (len(self.times) - 1, self.n_clusters)
+        signs = 1 - 2.0 * np.random.default_rng([self._seed, 0, _SIGNS]).integers(0, 2, shape, dtype=np.int8)
+        by_cluster = self.sums(differences)
+        # sums that are equal up to rounding count as equal
+        observed = np.abs(by_cluster.sum(0)) - 1e-9 * np.abs(by_cluster).sum(0)
+        as_far = (np.abs(signs @ by_cluster) >= observed).sum(0)
+        return np.asarray((1 + as_far) / (len(signs) + 1))
+
+
+def divide(numerator: Float, denominator: Float | float) -> Float:
+    """Divide arrays that broadcast; NaN where the denominator is not positive."""
+    denominator = np.asarray(denominator)
+    shape = np.broadcast_shapes(np.shape(numerator), denominator.shape)
+    return np.asarray(np.divide(numerator, denominator, out=np.full(shape, np.nan), where=denominator > 0))

@@ -9,15 +9,22 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
-from scipy.special import expit, logit
+from scipy.special import expit
 
 from wheretolook.geometry.poses import Float
 from wheretolook.training.old_names import with_names
+from wheretolook.utils.probability import finite_log_odds
 
 Good = NDArray[np.bool_]  # whether each view localizes, (B,)
 BINS = 15  # bins of equal width that probabilities are sorted into
 TINY = 1e-15  # probabilities are kept this far from 0 and 1, so that their logits are finite
 TEMPERATURES = (0.01, 100.0)  # range in which a temperature is sought
+
+
+def bins_of(probability: Float, bins: int = BINS) -> NDArray[np.int64]:
+    """Number (B,) of the bin of equal width that holds each probability (B,)."""
+    edges = np.linspace(0, 1, bins + 1)
+    return np.clip(np.searchsorted(edges, probability, side="right") - 1, 0, bins - 1)
 
 
 def reliability(probability: Float, good: Good, bins: int = BINS) -> pd.DataFrame:
@@ -27,7 +34,7 @@ def reliability(probability: Float, good: Good, bins: int = BINS) -> pd.DataFram
     mean_predicted, share_good (both NaN where the bin is empty) and n (views).
     """
     edges = np.linspace(0, 1, bins + 1)
-    rows = np.clip(np.searchsorted(edges, probability, side="right") - 1, 0, bins - 1)
+    rows = bins_of(probability, bins)
     n = np.bincount(rows, minlength=bins)
     predicted, observed = (np.bincount(rows, weights=values, minlength=bins) for values in (probability, good))
     unknown = np.full((2, bins), np.nan)
@@ -50,7 +57,7 @@ def expected_calibration_error(probability: Float, good: Good, bins: int = BINS)
 
 def negative_log_likelihood(probability: Float, good: Good) -> float:
     """Mean over the views of minus the logarithm of the probability that was given to what happened, in nats."""
-    return _mean_loss(logit(np.clip(probability, TINY, 1 - TINY)), good)
+    return _mean_loss(finite_log_odds(probability, TINY), good)
 
 
 def fit_temperature(probability: Float, good: Good) -> float:
@@ -61,7 +68,7 @@ def fit_temperature(probability: Float, good: Good) -> float:
     """
     if not len(good) or good.all() or not good.any():
         return float("nan")
-    logits = logit(np.clip(probability, TINY, 1 - TINY))
+    logits = finite_log_odds(probability, TINY)
     how: Any = {"bounds": tuple(np.log(TEMPERATURES)), "method": "bounded", "options": {"xatol": 1e-6}}
     best = minimize_scalar(lambda log_t: _mean_loss(logits / np.exp(log_t), good), **how)
     return float(np.exp(best.x))
@@ -69,7 +76,7 @@ def fit_temperature(probability: Float, good: Good) -> float:
 
 def scale_probability(probability: Float, temperature: float) -> Float:
     """Probabilities (B,) whose logits are divided by a temperature; their order stays."""
-    return np.asarray(expit(logit(np.clip(probability, TINY, 1 - TINY)) / temperature))
+    return np.asarray(expit(finite_log_odds(probability, TINY) / temperature))
 
 
 def calibration_rows(probability: Float, good: Good, temperature: float) -> pd.DataFrame:

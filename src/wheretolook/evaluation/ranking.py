@@ -22,7 +22,7 @@ class TestViews:
     good: NDArray[np.bool_]  # (B, T) bool, whether the view localizes within each of T thresholds
     location_scene: NDArray[np.int64]  # (L,) int64, number of each location's scene
     # (L,) int64, number of the block of neighbouring locations that each is resampled with, see
-    # `wheretolook.evaluation.bootstrap.LocationBootstrap`; None for each by itself
+    # `wheretolook.evaluation.bootstrap.ClusterBootstrap`; None for each by itself
     location_block: NDArray[np.int64] | None = None
 
     @property

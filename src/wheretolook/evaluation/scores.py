@@ -10,7 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from wheretolook.dataset.thresholds import ALL, threshold_key
-from wheretolook.evaluation.bootstrap import LocationBootstrap
+from wheretolook.evaluation.bootstrap import ClusterBootstrap, divide
 from wheretolook.evaluation.calibration import expected_calibration_error, scale_probability
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.ranking import TestViews, TopN, choose_at_random, choose_best, choose_by_truth, rank_views
@@ -104,9 +104,9 @@ def score_table(
     - any_*: share of locations with at least one good view.
     - regret_*: the oracle's raw share less the method's, at least 0.
     - difference_*: the method's raw share less the reference's (`EvaluateConfig.reference`), and p_*, the p-value of
-      `LocationBootstrap.paired_p`; NaN without a reference, p_* also for random choice, an expectation.
+      `ClusterBootstrap.paired_p`; NaN without a reference, p_* also for random choice, an expectation.
     - low_* and high_* of raw_, normalized_, any_, regret_ and difference_, such as raw_low_*: bootstrap interval over
-      blocks of locations, paired where two methods meet (`LocationBootstrap.ratio`).
+      blocks of locations, paired where two methods meet (`ClusterBootstrap.ratio_interval`).
 
     Then reference (the method that differences are from, "" for none); average_precision and roc_auc of the scores
     against the first threshold, NaN where all views are of one class; and for learned methods, NaN for others, ece
@@ -123,8 +123,9 @@ def score_table(
     rows: list[dict[str, object]] = []
     for name, locations in pools:
         inside = locations[views.location]
-        block = None if views.location_block is None else views.location_block[locations]
-        bootstrap = LocationBootstrap(views.location_scene[locations], config.resamples, config.seed, block)
+        block = np.arange(views.n_locations) if views.location_block is None else views.location_block
+        scene = views.location_scene[locations]
+        bootstrap = ClusterBootstrap(block[locations], config.resamples, config.seed, strata=scene)
         good = views.good[inside, 0]
         metrics = {ORACLE: {"average_precision": 1.0, "roc_auc": 1.0, **dict.fromkeys(_CALIBRATION, float("nan"))}}
         for method, values in scores.items():
@@ -145,7 +146,7 @@ def _only(choices: Choices, n: int, locations: NDArray[np.bool_]) -> dict[str, T
 
 
 def _shares(
-    tops: Mapping[str, TopN], reference: str, bootstrap: LocationBootstrap, config: EvaluateConfig
+    tops: Mapping[str, TopN], reference: str, bootstrap: ClusterBootstrap, config: EvaluateConfig
 ) -> dict[str, dict[str, float]]:
     """Columns of all methods for one N and one pool of locations; M methods are computed together."""
     good = np.stack([top.good for top in tops.values()], axis=1)  # (L, M, T)
@@ -154,20 +155,20 @@ def _shares(
     best = np.broadcast_to(tops[ORACLE].good[:, None], good.shape)
     n_locations = len(good)
     n_views = float(chosen.sum())
-    columns = {"good": good.sum(0), "raw": _quotient(good.sum(0), n_views)}
+    columns = {"good": good.sum(0), "raw": divide(good.sum(0), n_views)}
     columns["raw_low"], columns["raw_high"] = _interval(bootstrap, good, chosen)
-    columns["normalized"] = _quotient(good.sum(0), best.sum(0))
+    columns["normalized"] = divide(good.sum(0), best.sum(0))
     columns["normalized_low"], columns["normalized_high"] = _interval(bootstrap, good, best)
-    columns["any"] = _quotient(any_good.sum(0), n_locations)
+    columns["any"] = divide(any_good.sum(0), n_locations)
     columns["any_low"], columns["any_high"] = _interval(bootstrap, any_good, np.ones((n_locations, 1)))
     columns["released"] = columns["raw"] / RELEASED_DIVISOR
-    columns["regret"] = _quotient((best - good).sum(0), n_views)
+    columns["regret"] = divide((best - good).sum(0), n_views)
     columns["regret_low"], columns["regret_high"] = _interval(bootstrap, best - good, chosen)
     if not reference:
         columns |= dict.fromkeys(_PAIRED, np.full(good.shape[1:], np.nan))
     else:
         difference = good - tops[reference].good[:, None]
-        columns["difference"] = _quotient(difference.sum(0), n_views)
+        columns["difference"] = divide(difference.sum(0), n_views)
         columns["difference_low"], columns["difference_high"] = _interval(bootstrap, difference, chosen)
         columns["p"] = bootstrap.paired_p(_flat(difference)).reshape(good.shape[1:])
         expected = [by_chance(reference) or by_chance(method) for method in tops]
@@ -184,15 +185,10 @@ def _flat(values: Float) -> Float:
     return values.reshape(len(values), values.shape[1] * values.shape[2])
 
 
-def _interval(bootstrap: LocationBootstrap, numerator: Float, denominator: Float) -> tuple[Float, Float]:
+def _interval(bootstrap: ClusterBootstrap, numerator: Float, denominator: Float) -> tuple[Float, Float]:
     """Interval of the ratio of sums over locations, (M, T) each end, of (L, M, T) and (L, M, T) or (L, 1)."""
-    low, high = bootstrap.ratio(_flat(numerator), denominator if denominator.ndim == 2 else _flat(denominator))
+    low, high = bootstrap.ratio_interval(_flat(numerator), denominator if denominator.ndim == 2 else _flat(denominator))
     return low.reshape(numerator.shape[1:]), high.reshape(numerator.shape[1:])
-
-
-def _quotient(top: Float, bottom: Float | float) -> Float:
-    """Their quotient, NaN where the bottom is 0."""
-    return np.asarray(np.divide(top, bottom, out=np.full(top.shape, np.nan), where=np.asarray(bottom) > 0))
 
 
 def _ranking_metrics(good: NDArray[np.bool_], scores: Float) -> dict[str, float]:

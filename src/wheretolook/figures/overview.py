@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from wheretolook.figures.config import Look
 from wheretolook.figures.dollhouse import Dollhouse, draw_house
 from wheretolook.figures.style import BLUE, INK, RC, VERMILION, new_figure
+from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.poses import Float
-from wheretolook.planning.camera_turns import pan_tilt_angles
 from wheretolook_paper.figures.inputs import frame
 
 

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wheretolook.geometry.camera_turns import TOLERANCE_DEG
 from wheretolook.geometry.poses import Float
 from wheretolook.looks.joint_visibility import seen_around
-from wheretolook.looks.selection import TOLERANCE_DEG, ChosenLooks, Turns, Worth, choose_looks
+from wheretolook.looks.selection import ChosenLooks, Turns, Worth, choose_looks
 from wheretolook.looks.set_score import SetWorth
 from wheretolook.utils.errors import ConfigError
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wheretolook.geometry.camera_turns import TOLERANCE_DEG
 from wheretolook.geometry.poses import Float, rotation_angle_deg, rotation_looking_along
 from wheretolook.utils.errors import ConfigError, PlanningError
 
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
 MOST_LOOKS = 6  # the order of so many is found by trying all
 EXCHANGES = 3  # rounds in which each look may be exchanged for a better one
-TOLERANCE_DEG = 1e-5  # angles may exceed a limit by this much, for rounding
 
 Worth = Callable[[Float, Float], Float]
 """Worths (B,) of sets from their sums (B, N_SUMS) and the chances (B,) that none of their looks localizes alone; higher

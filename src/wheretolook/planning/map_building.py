@@ -12,10 +12,9 @@ from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid
-from wheretolook.geometry.poses import Float, rotation_looking_along
+from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.planning.config import MAX_DIRECTIONS
-from wheretolook.planning.refine import score_directions
 from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
 from wheretolook.scorers.base import Scorer
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
@@ -136,11 +135,17 @@ def _score_and_count(
     with tqdm(total=len(locations), desc=text, unit="voxel", disable=progress is None) as bar:
         for begin in range(0, len(locations), block):
             rows = slice(begin, begin + block)
-            values = score_directions(scorer, locations[rows], directions)
+            values = _score_exactly(scorer, locations[rows], directions)
             ranked[rows] = np.argsort(-values, axis=1, kind="stable")
             scores[rows] = values
             bar.update(len(values))
     return ranked, scores, counted.counts.astype(np.uint32)
+
+
+def _score_exactly(scorer: Scorer, locations: Float, directions: Float) -> Float:
+    """Scores (L, D) of directions (D, 3) at locations (L, 3) m; `Scorer.score_around` may approximate them."""
+    poses = poses_looking_along(np.repeat(locations, len(directions), axis=0), np.tile(directions, (len(locations), 1)))
+    return scorer.score(poses).reshape(len(locations), len(directions))
 
 
 def _ids(free: ArrayLike, n_voxels: int) -> NDArray[np.int64]:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wheretolook.geometry.camera_turns import angles_to_axis_deg
 from wheretolook.geometry.poses import Float, poses_looking_along
-from wheretolook.planning.camera_turns import angles_to_axis_deg
 from wheretolook.scorers.base import Scorer
 
 COMPASS = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=1)
@@ -27,17 +27,6 @@ class RefinedViews:
     scores: Float
     start_scores: Float
     n_scored: int
-
-
-def score_directions(scorer: Scorer, locations: ArrayLike, directions: ArrayLike) -> Float:
-    """Scores (L, D) of cameras without roll at locations (L, 3) m that look along each of directions (D, 3).
-
-    Raises ValueError if a location or a direction is not finite, or a direction has no length.
-    """
-    at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
-    axes = np.asarray(directions, dtype=np.float64)
-    poses = poses_looking_along(np.repeat(at, len(axes), axis=0), np.tile(axes, (len(at), 1)))
-    return scorer.score(poses).reshape(len(at), len(axes))
 
 
 def refine_directions(

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import axes_of_angles
 from wheretolook.geometry.poses import Float
-from wheretolook.planning.camera_turns import pan_tilt_angles
 from wheretolook.planning.config import PathConfig
 from wheretolook.planning.view_sequence import TurnLimit, best_sequence, between, lengths_along
 from wheretolook.planning.viewpoint_map import ViewpointMap

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
+from wheretolook.geometry.camera_turns import check_axis
 from wheretolook.geometry.lattices import axes_of_angles
 from wheretolook.geometry.poses import Float
-from wheretolook.planning.camera_turns import check_axis
 from wheretolook.planning.config import PathConfig
 from wheretolook.planning.routes import IMPROVEMENT, SEARCH, SHORT_ROUTE, PlannedPath, RouteSamples, RouteViews
 from wheretolook.planning.view_sequence import between, lengths_along

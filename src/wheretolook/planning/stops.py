@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import expit
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.poses import Float, poses_looking_along
@@ -16,6 +17,7 @@ from wheretolook.looks.set_score import SetWorth
 from wheretolook.planning.config import PathConfig, StopConfig
 from wheretolook.planning.routes import Stop, turning_deg
 from wheretolook.utils.errors import ConfigError, PlanningError
+from wheretolook.utils.probability import finite_log_odds
 
 if TYPE_CHECKING:
     from wheretolook.scorers.base import Scorer
@@ -27,7 +29,7 @@ NEAR_DEG = 60.0
 NEAR = 8
 """So many of the candidates for further looks lie no farther from the path's view, so that small turns are possible."""
 
-LEAST_CHANCE = 1e-3  # of localizing, or of not, that odds are taken of
+MIN_PROBABILITY = 1e-3  # probabilities are clipped to this distance from 0 and 1 before odds are taken
 
 
 def stops_along(
@@ -122,7 +124,7 @@ def _stop(
                 continue
             further = [look for look in chosen.looks if look != 0]
             turn = turning_deg(np.concatenate([axis[None], looked[further], axis[None]]))
-            together = _risen(own, before, chosen.worth)
+            together = _raised(own, before, chosen.worth)
             stop = Stop(place, looked[further], alone[further], together, turn)
             if together >= config.least_score:
                 return stop
@@ -134,12 +136,7 @@ def _stop(
     return best
 
 
-def _risen(score: float, before: float, after: float) -> float:
-    """A probability whose odds rise as those of another that was before and is after."""
-    odds = _log_odds(score) + _log_odds(after) - _log_odds(before)
-    return 1 / (1 + math.exp(-odds))
-
-
-def _log_odds(chance: float) -> float:
-    chance = min(max(chance, LEAST_CHANCE), 1 - LEAST_CHANCE)
-    return math.log(chance / (1 - chance))
+def _raised(probability: float, before: float, after: float) -> float:
+    """Raise the odds of a probability by the ratio of the odds of `after` and `before`."""
+    a, b, c = finite_log_odds([probability, before, after], MIN_PROBABILITY)
+    return float(expit(a + c - b))

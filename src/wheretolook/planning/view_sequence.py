@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wheretolook.geometry import camera_turns as turns
 from wheretolook.geometry.poses import Float, rotation_looking_along
-from wheretolook.planning import camera_turns as turns
 from wheretolook.utils.errors import PlanningError
 
 SPACING_M = 0.2

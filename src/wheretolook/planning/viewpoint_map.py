@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wheretolook.geometry.camera_turns import angles_to_axis_deg, check_axis, turns_from_deg, within
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.looks.around import best_looks
-from wheretolook.planning.camera_turns import angles_to_axis_deg, check_axis, turns_from_deg, within
 from wheretolook.planning.map_file import ARRAYS, DESCRIPTION, REBUILD, read_map, write_map
 from wheretolook.training.old_names import name_of
 from wheretolook.utils.errors import ConfigError, MapFormatError

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation
-from wheretolook.planning.camera_turns import pan_tilt_angles
 from wheretolook.select.formats import save_views
 
 

@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, check_poses, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.looks.around import best_looks
 from wheretolook.mapping.sanity import warn_of_mesh
-from wheretolook.planning.camera_turns import pan_tilt_angles
 from wheretolook.planning.config import StopConfig
 from wheretolook.planning.routes import PlannedPath
 from wheretolook.planning.stops import check_stopping, stops_along

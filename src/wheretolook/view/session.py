@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import axes_of_angles
 from wheretolook.geometry.poses import Float, poses_looking_along, quaternion_from_rotation, rotation_from_quaternion
-from wheretolook.planning.camera_turns import pan_tilt_angles
 from wheretolook.utils.errors import ConfigError, TableError, WhereToLookError
 from wheretolook.view import drawing
 from wheretolook.view.controls import build, check_value, value_of

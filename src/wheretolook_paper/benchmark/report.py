@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 
 from wheretolook.dataset.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
+from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.poses import camera_centers
-from wheretolook.planning.camera_turns import pan_tilt_angles
 from wheretolook.utils.files import write_text
 from wheretolook.utils.markdown import markdown_table
 from wheretolook_paper.benchmark.scores import (

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.figures.config import Look
 from wheretolook.figures.overview import View
 from wheretolook.figures.style import BLUE, INK, PRINT, TWO_COLUMNS_IN, VERMILION, new_figure
+from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.poses import Float
-from wheretolook.planning.camera_turns import pan_tilt_angles
 from wheretolook_paper.figures.inputs import frame
 
 _WIDE = 27  # letters below a view

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from wheretolook.figures.config import Look
 from wheretolook.figures.dollhouse import Dollhouse, draw_house, draw_points, draw_segments
 from wheretolook.figures.style import BLUE, INK, ORANGE, PRINT, SKY, TWO_COLUMNS_IN, VERMILION, new_figure
+from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float
-from wheretolook.planning.camera_turns import pan_tilt_angles
 
 _SIGHT_LINES = 120
 _MARGIN_PX = 0.04

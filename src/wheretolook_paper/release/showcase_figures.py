@@ -17,7 +17,6 @@ from wheretolook.geometry.poses import Float, poses_looking_along, rotation_look
 from wheretolook.inputs.channels import CHANNELS
 from wheretolook.planning.config import PathsConfig, PlanConfig
 from wheretolook.planning.method_paths import path_views, plan_by_methods
-from wheretolook.planning.refine import score_directions
 from wheretolook.planning.routes import PathView
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.binned_network import BinnedNetworkScorer
@@ -162,7 +161,8 @@ def peaks_of(showcase: Showcase, scorer: Scorer, location_id: int, n: int = 3, a
         return rendered_views(showcase, rows.iloc[found], scores[found], outcome_in_brief)
 
     known = (rows["status"] != UNLABELLED).to_numpy()
-    everywhere = score_directions(scorer, showcase.center(location_id), showcase.directions)[0]
+    center = np.broadcast_to(showcase.center(location_id), showcase.directions.shape)
+    everywhere = scorer.score(poses_looking_along(center, showcase.directions))
     tried = axes[known], is_good(rows[known])
     return Peaks(showcase.directions, everywhere, views(True), views(False), tried)
 

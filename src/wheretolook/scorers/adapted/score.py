@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit, logit
+from scipy.special import expit
 
 from wheretolook.geometry.poses import Float, camera_centers, check_locations, check_poses
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -18,6 +18,7 @@ from wheretolook.scorers.method import ScorerOptions
 from wheretolook.scorers.set.score import SetScorer
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import WeightsError
+from wheretolook.utils.probability import finite_log_odds
 
 TINY = 1e-12  # chances are kept this far from 0 and 1, so that their log-odds are finite
 
@@ -82,7 +83,7 @@ class AdaptedScorer(Scorer):
 
 def log_odds_of(chance: Float) -> Float:
     """Finite log-odds of chances in [0, 1]."""
-    return np.asarray(logit(np.clip(chance, TINY, 1 - TINY)))
+    return finite_log_odds(chance, TINY)
 
 
 def _check_place(place: Float, localization_map: LocalizationMap) -> None:

@@ -7,8 +7,17 @@ import pandas as pd
 import pytest
 from sklearn.metrics import roc_auc_score
 
+from wheretolook.evaluation.bootstrap import ClusterBootstrap
 from wheretolook.evaluation.calibration import expected_calibration_error
-from wheretolook.holdout.metrics import BlockResamples, measure, places_of, regret_of_places
+from wheretolook.holdout.metrics import (
+    RESAMPLES,
+    measure,
+    measured,
+    places_of,
+    regret_of_places,
+    resampled_auc,
+    resampled_calibration_error,
+)
 
 
 @pytest.fixture(scope="module")
@@ -26,52 +35,45 @@ def views() -> pd.DataFrame:
 
 
 def test_auc_is_that_of_scikit_learn_for_every_resample(views: pd.DataFrame) -> None:
-    resamples = BlockResamples(views["block"].to_numpy(), resamples=20)
+    bootstrap = ClusterBootstrap(views["block"].to_numpy(), resamples=20, seed=0)
     good = views["good"].to_numpy()
     score = views["score"].to_numpy()
-    found = resamples.auc(good, score)
-    assert found[0] == pytest.approx(roc_auc_score(good, score), abs=1e-12)
-    for times, value in zip(resamples.times[1:], found[1:], strict=True):
-        weights = times[resamples.row]
-        assert value == pytest.approx(roc_auc_score(good, score, sample_weight=weights), abs=1e-12)
+    areas = resampled_auc(bootstrap, good, score)
+    for times, area in zip(bootstrap.times, areas, strict=True):
+        weights = times[bootstrap.cluster]
+        assert area == pytest.approx(roc_auc_score(good, score, sample_weight=weights), abs=1e-12)
 
 
-def test_auc_within_blocks_takes_pairs_of_one_block_only(views: pd.DataFrame) -> None:
+def test_auc_within_blocks_counts_pairs_of_one_block(views: pd.DataFrame) -> None:
     good, score, block = (views[name].to_numpy() for name in ("good", "score", "block"))
+    bootstrap = ClusterBootstrap(block, 10, seed=0)
     wins = pairs = 0.0
     for number in np.unique(block):
         mine = block == number
         n_pairs = int((good & mine).sum() * (~good & mine).sum())
         wins += roc_auc_score(good[mine], score[mine]) * n_pairs
         pairs += n_pairs
-    assert BlockResamples(block).auc(good, score, within=True)[0] == pytest.approx(wins / pairs)
-    # shifting the scores of whole blocks changes what is between blocks, not what is within
-    shifted = score + 10 * block
-    assert BlockResamples(block).auc(good, shifted, within=True)[0] == pytest.approx(wins / pairs)
-    assert BlockResamples(block).auc(good, shifted)[0] < wins / pairs
+    shifted = score + 10 * block  # changes the order between blocks only
+    assert resampled_auc(bootstrap, good, score, within=True)[0] == pytest.approx(wins / pairs)
+    assert resampled_auc(bootstrap, good, shifted, within=True)[0] == pytest.approx(wins / pairs)
+    assert resampled_auc(bootstrap, good, shifted)[0] < wins / pairs
 
 
 def test_calibration_error_is_that_of_evaluations(views: pd.DataFrame) -> None:
     score = views["score"].to_numpy()
     good = views["good"].to_numpy()
-    found = BlockResamples(views["block"].to_numpy()).calibration_error(score, good)
-    assert found.value == pytest.approx(expected_calibration_error(score, good))
-    assert found.low < found.value < found.high + 0.02
+    errors = resampled_calibration_error(ClusterBootstrap(views["block"].to_numpy(), 10, seed=0), score, good)
+    assert errors[0] == pytest.approx(expected_calibration_error(score, good))
 
 
-def test_intervals_are_as_wide_as_blocks_differ() -> None:
+def test_intervals_reflect_differences_between_blocks() -> None:
     block = np.repeat(np.arange(10), 20)
-    resamples = BlockResamples(block)
-    same = resamples.ratio(np.tile([1.0, 0.0], 100), np.ones(200))
+    bootstrap = ClusterBootstrap(block, RESAMPLES, seed=0)
+    same = measured(bootstrap, bootstrap.ratios(np.tile([1.0, 0.0], 100), np.ones(200)))
     assert (same.value, same.low, same.high) == (0.5, 0.5, 0.5)
-    apart = resamples.ratio((block < 5).astype(float), np.ones(200))
+    apart = measured(bootstrap, bootstrap.ratios((block < 5).astype(float), np.ones(200)))
     # the mean of ten fair draws: binomial, whose 2.5 % points are 0.2 and 0.8
     assert apart.value == 0.5 and apart.low == pytest.approx(0.2) and apart.high == pytest.approx(0.8)
-
-
-def test_one_block_has_no_interval() -> None:
-    found = BlockResamples(np.ones(4, dtype=int)).ratio(np.ones(4), np.full(4, 2.0))
-    assert found.value == 0.5 and np.isnan([found.low, found.high]).all()
 
 
 def test_places_are_within_a_radius_and_a_block() -> None:

@@ -298,10 +298,9 @@ def _photographs(folder: Path) -> None:
 def _labelled(folder: Path) -> None:
     """A dataset of two labelled scenes, whose labels are made up."""
     from synthetic_dataset import make_dataset
-    from wheretolook.dataset.artifact_cache import write_stamp
 
     for scene in make_dataset(folder / "data" / "synthetic", ("train", "test")).scenes:
-        write_stamp(scene, "label", "key")
+        scene.stage_cache("label", "key").store()
 
 
 def _counts(folder: Path) -> dict[str, Any]:

@@ -12,7 +12,6 @@ import pytest
 from mapping.conftest import box_room
 from synthetic_dataset import make_dataset
 from wheretolook.cli import main
-from wheretolook.dataset.artifact_cache import write_stamp
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import is_good, poses, write_table
 from wheretolook.evaluation.adaptation import compare_log_odds
@@ -29,7 +28,7 @@ def dataset(tmp_path: Path) -> Dataset:
     """Two labelled scenes of weak landmarks, of which the weights that ship expect other labels than they have."""
     dataset = make_dataset(tmp_path / "data" / "tiny", ("train", "test"))
     for scene in dataset.scenes:
-        write_stamp(scene, "label", "key")
+        scene.stage_cache("label", "key").store()
     return dataset
 
 

@@ -15,7 +15,6 @@ import pytest
 from learning_options import train_config
 from synthetic_dataset import make_dataset
 from wheretolook.cli import main
-from wheretolook.dataset.artifact_cache import write_stamp
 from wheretolook.dataset.dataset_lock import changing, reading
 from wheretolook.dataset.layout import Dataset
 from wheretolook.stages.train import train_methods
@@ -36,7 +35,7 @@ with changing(Path(sys.argv[1]), "label"):
 def dataset(tmp_path: Path) -> Dataset:
     dataset = make_dataset(tmp_path / "data" / "tiny")
     for scene in dataset.scenes:
-        write_stamp(scene, "label", "key")
+        scene.stage_cache("label", "key").store()
     return dataset
 
 

@@ -10,8 +10,6 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from wheretolook.dataset.artifact_cache import forget_stamp, is_done, read_stamp, write_stamp
-from wheretolook.dataset.layout import SceneFolder
 from wheretolook.mapping.colmap_model import load_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.matchability.network import LandmarkNetwork
@@ -23,18 +21,6 @@ from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_paper.scorers.sphere.network import SphereNetwork
 
 N = 5  # landmarks
-
-
-@pytest.mark.parametrize("content", ["5", "null", "[]", "[1]", '"a"', '{"map": 5}', "{", ""])
-def test_damaged_stamps(content: str, tmp_path: Path) -> None:
-    scene = SceneFolder(tmp_path, "train")
-    write_stamp(scene, "scenes", "a")
-    write_stamp(scene, "map", "b")
-    assert is_done(scene, "map", "b") and read_stamp(scene, "label") is None
-    (tmp_path / "stages.json").write_text(content)
-    for use in (read_stamp, forget_stamp, lambda scene, stage: write_stamp(scene, stage, "c")):
-        with pytest.raises(TableError, match=r"stages\.json: damaged record"):
-            use(scene, "map")
 
 
 @pytest.mark.parametrize("header", ["5", "[1]", "null", '"a"', '{"format_version": 1, "training": 5}', "[" * 100_000])

@@ -19,6 +19,7 @@ from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of_record,
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, compact_poses, holds_model, load_mapping_poses
 from wheretolook.mapping.scale import read_scale
+from wheretolook.utils.artifact_cache import ArtifactCache
 from wheretolook.utils.confine import check_links, entry_of
 from wheretolook.utils.errors import ConfigError, SceneError, TableError
 from wheretolook.utils.files import fingerprint, write_json
@@ -27,6 +28,9 @@ from wheretolook.utils.reading import read_json_object
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.mapping.landmarks import Landmarks
+
+STAGES = ("scenes", "map", "sample", "label")
+"""Stages that work scene by scene, in order; the names in `stages.json`."""
 
 MappedFloor = tuple[tuple[float, float, float, float], ...]
 """The floor that a map is made from: rectangles (x0, y0, x1, y1) in metres; empty for all of it."""
@@ -116,6 +120,10 @@ class SceneFolder:
         Raises MapError if it has no mesh, and its map's report is damaged.
         """
         return not self.mesh.is_file() and read_scale(self.map) is not None
+
+    def stage_cache(self, stage: str, key: str = "") -> ArtifactCache:
+        """The key that a stage of `STAGES` was finished with, in `stages.json`."""
+        return ArtifactCache(self.folder, key, stage, "stages.json", STAGES)
 
     def mapped_floor(self) -> MappedFloor:
         """What `save_mapped_floor` has kept. Raises SceneError if its file is damaged."""

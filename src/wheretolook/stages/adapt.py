@@ -15,7 +15,6 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from wheretolook.config import Experiment
-from wheretolook.dataset.artifact_cache import read_stamp
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.environment import Scene
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
@@ -217,7 +216,7 @@ def _labelled(
 
     None where there are photographs alone.
     """
-    if read_stamp(files, "label") is not None:
+    if files.stage_cache("label").stored_key is not None:
         shutil.rmtree(files.adapt_shards, ignore_errors=True)  # of views that have labels now
         return files.read_table()
     if not files.mesh.is_file():
@@ -226,7 +225,7 @@ def _labelled(
         problem = "this scene has neither labels, nor a mesh to render views of, nor the photographs of its map"
         fix = "Give --database or --images, the map's photographs, or use the weights that ship."
         raise SceneError(problem, path=files.folder, fix=fix)
-    if read_stamp(files, "sample") is None:
+    if files.stage_cache("sample").stored_key is None:
         if has_photographs:
             say(f"{files.name}: no viewpoints are sampled, so photographs alone are learnt from")
             return None

@@ -16,8 +16,7 @@ from tqdm.auto import tqdm
 
 from wheretolook import stages
 from wheretolook.config import Experiment
-from wheretolook.dataset.artifact_cache import STAGES, stage_key
-from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.layout import STAGES, Dataset
 from wheretolook.evaluation.report import best_in_words
 from wheretolook.evaluation.results import SCORES_CSV, SCORES_MD, SCORES_PNG, results_folder
 from wheretolook.evaluation.scores import read_scores
@@ -25,6 +24,7 @@ from wheretolook.geometry.poses import Float, camera_centers, poses_looking_alon
 from wheretolook.scorers.registry import methods_named, scorers
 from wheretolook.stages.evaluate import not_logged
 from wheretolook.stages.preconditions import Say, Tick, dataset_after, open_scene
+from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import fingerprint, write_json
 from wheretolook.utils.reading import read_json
@@ -94,7 +94,7 @@ def compare(experiment: Experiment, say: Say, tick: Tick) -> None:
 
     def made() -> dict[str, str]:
         content = [fingerprint(path) for path in (scores, report)]
-        return {"key": stage_key("evaluate", [*made_from, *content]), "runs": str(tracking.root)}
+        return {"key": cache_key("evaluate", [*made_from, *content]), "runs": str(tracking.root)}
 
     try:
         known = read_json(stamp) == made() and (tracking.root / "mlflow.db").is_file()

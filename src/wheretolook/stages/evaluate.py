@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from wheretolook.config import Experiment
-from wheretolook.dataset.artifact_cache import read_stamp
 from wheretolook.dataset.dataset_lock import reading, reads_dataset
 from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
@@ -42,7 +41,7 @@ def evaluate(experiment: Experiment, say: Say = print, tick: Tick = lambda work:
     if config.photographs:
         how["photographs"] = _photographs(experiment, dataset, say)
     scores = evaluate_methods(dataset, config, experiment.tracking, **how)
-    labelled = tuple(scene for scene in dataset.scenes if read_stamp(scene, "label") is not None)
+    labelled = tuple(scene for scene in dataset.scenes if scene.stage_cache("label").stored_key is not None)
     if any(scene.split == config.split for scene in labelled):
         evaluate_looks(replace(dataset, scenes=labelled), config, experiment.tracking, device=device)
     tick(1)

@@ -11,7 +11,6 @@ from pathlib import Path
 import pandas as pd
 
 from wheretolook.config import Experiment
-from wheretolook.dataset.artifact_cache import forget_stamp, is_done, read_stamp, stage_key, write_stamp
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.thresholds import ALL
@@ -25,6 +24,7 @@ from wheretolook.localization.report import (
     label_summary,
 )
 from wheretolook.stages.preconditions import Say, Tick, dataset_after, existing, extractor_of, open_scene
+from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.errors import MapError, SceneError, TableError
 from wheretolook.utils.files import write_json, write_text
 from wheretolook.utils.reading import read_json_object
@@ -57,8 +57,8 @@ def label(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
         ]
         made_from = [existing(files.mesh, SceneError, "scenes"), existing(files.landmarks, MapError, "map")]
         matches = [name for name in ("store_matches", "store_pixels") if getattr(config, name)]
-        key = stage_key("label", [*parts, *made_from, read_stamp(files, "sample"), *matches])
-        if is_done(files, "label", key, files.table):
+        key = cache_key("label", [*parts, *made_from, files.stage_cache("sample").stored_key, *matches])
+        if files.stage_cache("label", key).is_current(files.table):
             shutil.rmtree(_shards(files), ignore_errors=True)  # killed before it could remove them
             _report(files, files.read_table(), say)
             tick(1)
@@ -102,10 +102,10 @@ def _label(
                 replacing = True
                 (dataset.root / "results" / LABELS_MD).unlink(missing_ok=True)
                 for other, _ in to_label:
-                    forget_stamp(other, "label")
+                    other.stage_cache("label").clear()
             write_table(labelled.table, files.table)
             write_json(files.label_manifest, labelled.manifest)
-            write_stamp(files, "label", key)
+            files.stage_cache("label", key).store()
             shutil.rmtree(labelled.task.shards, ignore_errors=True)
             shutil.rmtree(files.adapt_shards, ignore_errors=True)  # a part of the same views
             for step, spent in labelled.seconds.items():

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import asdict, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from wheretolook.config import NOT_SCENES, Experiment
-from wheretolook.dataset.artifact_cache import forget_stamp, is_done, read_stamp, stage_key, write_stamp
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, describe_camera, draw_camera
@@ -27,6 +25,7 @@ from wheretolook.stages.preconditions import (
     open_scene,
     refuse_release,
 )
+from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.confine import check_folder_name, entry_of, path_within
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.utils.files import fingerprint
@@ -57,9 +56,9 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
         floor = files.mapped_floor()
         camera = _mapping_camera(experiment.map, scene.camera, seed)
         shown_by = [asdict(scene.config.free_space), camera.record(), seed, made_from, *([floor] if floor else [])]
-        key = stage_key("map", [settings, *shown_by])
+        key = cache_key("map", [settings, *shown_by])
         model = [files.map / name for name in ("cameras.bin", "images.bin", "points3D.bin")]
-        if is_done(files, "map", key, files.landmarks, *model):
+        if files.stage_cache("map", key).is_current(files.landmarks, *model):
             say(f"{scene.name}: reusing {files.map}")
         else:
             from wheretolook.mapping.rendered_map import build_map
@@ -72,9 +71,9 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
                 workers = experiment.n_workers
                 device = scene.device
                 how = (scene.raycaster, workers, device)
-                forget = partial(forget_stamp, files, "map")
+                forget = files.stage_cache("map").clear
                 report = build_map(*shown, experiment.map, seed, files.map, *how, replacing=forget, poses=taken)
-            write_stamp(files, "map", key)
+            files.stage_cache("map", key).store()
             found = f"{report.n_landmarks:,} landmarks from {report.n_registered} images"
             off = f"median {report.median_distance_to_mesh_cm:.2f} cm from the mesh"
             say(f"{scene.name}: {found}, {off} -> {files.map}")
@@ -140,14 +139,14 @@ def _map_photographs(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
     images = [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
     used = [asdict(replace(settings, assume_metric=False)), experiment.map.extractor.record()]
     made_from = [images, [fingerprint(path) for path in tables]]
-    key = stage_key("map", [*used, experiment.map.keep_database, _seed(scene), *made_from])
-    if not is_done(scene, "map", key, scene.landmarks, scene.mapping_cameras):
+    key = cache_key("map", [*used, experiment.map.keep_database, _seed(scene), *made_from])
+    if not scene.stage_cache("map", key).is_current(scene.landmarks, scene.mapping_cameras):
         from wheretolook.mapping.photograph_map import map_photographs
 
         how = (scene.folder / "photographs", _seed(scene), experiment.n_workers, experiment.warp_device)
-        forget = partial(forget_stamp, scene, "map")
+        forget = scene.stage_cache("map").clear
         report = map_photographs(experiment.map, scene.map, *how, replacing=forget)
-        write_stamp(scene, "map", key)
+        scene.stage_cache("map", key).store()
         used_images = f"{report.n_registered} of {report.n_images} photographs"
         say(f"{scene.name}: {report.n_landmarks:,} landmarks from {used_images} -> {scene.map}")
         if report.unregistered:
@@ -192,8 +191,10 @@ def _map_existing(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
     made_from = [(str(path), stat.st_size, stat.st_mtime_ns) for path, stat in stats]
     mesh = [] if settings.mesh is None else [mesh_fingerprint(settings.mesh)]
     chosen = {name: value for name, value in _record(experiment.map).items() if name not in ("camera", "draw_camera")}
-    key = stage_key("map", [chosen, _seed(scene), made_from, mesh])
-    if is_done(scene, "map", key, scene.landmarks, scene.mapping_cameras, *([scene.mesh] if mesh else [])):
+    key = cache_key("map", [chosen, _seed(scene), made_from, mesh])
+    if scene.stage_cache("map", key).is_current(
+        scene.landmarks, scene.mapping_cameras, *([scene.mesh] if mesh else [])
+    ):
         say(f"{scene.name}: reusing {scene.map}")
     else:
         from wheretolook.mapping.imported_map import map_existing
@@ -202,7 +203,7 @@ def _map_existing(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
         from wheretolook.scenes.loading import load_mesh, save_glb
 
         loaded = None if settings.mesh is None else load_mesh(settings.mesh, settings.mesh_up, colored=False)
-        forget_stamp(scene, "map")
+        scene.stage_cache("map").clear()
         how = (scene.folder / "photographs", _seed(scene), experiment.n_workers, experiment.warp_device)
         report = map_existing(experiment.map, scene.map, *how, reconstruction=model)
         scene.mesh.unlink(missing_ok=True)
@@ -210,7 +211,7 @@ def _map_existing(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
             caster = MeshRaycaster(loaded, experiment.warp_device)
             warn_of_mesh(settings.mesh, scene.read_landmarks().points, caster)
             save_glb(loaded, scene.mesh)
-        write_stamp(scene, "map", key)
+        scene.stage_cache("map", key).store()
         left_out = f", {report.n_landmarks_removed:,} points left out" if report.n_landmarks_removed else ""
         anew = ", triangulated anew," if report.triangulated_anew else ""
         found = f"{report.n_landmarks:,} landmarks{anew} from {report.n_images} images{left_out}"
@@ -253,6 +254,6 @@ def _with_photographs(scene: SceneFolder, experiment: Experiment) -> Dataset:
         others = [other for other in known.scenes if not (other.own_camera or scene.own_camera)]
         for other in others:
             if other.camera != scene.camera:  # what was sampled with another camera is no longer valid
-                write_stamp(other, "map", read_stamp(other, "map") or "")
+                other.stage_cache("map", other.stage_cache("map").stored_key or "").store()
         scenes = [replace(other, camera=scene.camera) if other in others else other for other in scenes]
     return Dataset(root, tuple(sorted(scenes, key=lambda scene: scene.name)))

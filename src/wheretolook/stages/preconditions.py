@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wheretolook.config import Experiment
-from wheretolook.dataset.artifact_cache import read_stamp
 from wheretolook.dataset.environment import Scene, SceneConfig
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.names import RELEASE_FILE
@@ -47,7 +46,7 @@ def dataset_after(
         problem = "the dataset was made with another camera"
         raise ConfigError(problem, path=experiment.root, value=others[0], fix=fix)
     for scene in dataset.scenes:
-        if read_stamp(scene, needs) is None and not but(scene):
+        if scene.stage_cache(needs).stored_key is None and not but(scene):
             problem = f"the {needs} stage has not been run for this scene since its input was made"
             raise TableError(problem, path=scene.folder, fix=f"Run `wheretolook {needs}`.")
     return dataset

@@ -8,13 +8,13 @@ from dataclasses import asdict
 import numpy as np
 
 from wheretolook.config import Experiment
-from wheretolook.dataset.artifact_cache import forget_stamp, is_done, stage_key, write_stamp
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.environment import Scene
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.geometry.camera import Camera, draw_camera, write_cameras
 from wheretolook.stages.preconditions import Say, Tick, dataset_after, existing, naming_scene, open_scene
+from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.errors import MapError, SceneError
 
 
@@ -32,11 +32,11 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
     for files in dataset.scenes:
         scene = open_scene(experiment, dataset, files)
         key = _key(scene, config)
-        if is_done(files, "sample", key, files.table, files.occlusion):
+        if files.stage_cache("sample", key).is_current(files.table, files.occlusion):
             say(f"{scene.name}: reusing {files.table}")
         else:
             _sample(scene, config, say)
-            write_stamp(files, "sample", key)
+            files.stage_cache("sample", key).store()
         tick(1)
     return dataset
 
@@ -57,7 +57,7 @@ def _key(scene: Scene, config: SampleConfig) -> str:
     chosen["max_directions"] = config.directions_of(files.split)
     made_from = [existing(scene.source, SceneError, stage), existing(files.landmarks, MapError, "map")]
     settings = [chosen, scene.occlusion_config.settings(), space, scene.camera.record()]
-    return stage_key("sample", [*settings, *made_from])
+    return cache_key("sample", [*settings, *made_from])
 
 
 def _cameras(scene: Scene, config: SampleConfig) -> Camera | dict[int, Camera]:
@@ -79,7 +79,7 @@ def _sample(scene: Scene, config: SampleConfig, say: Say) -> None:
         seen = (scene.landmarks, cameras, scene.occlusion)
         title = f"sample {scene.name}"
         table, occlusion = sample_viewpoints(grid, free, *seen, config, scene.device, title, files.split)
-    forget_stamp(files, "sample")
+    files.stage_cache("sample").clear()
     files.cameras_file.unlink(missing_ok=True)
     if isinstance(cameras, dict):
         write_cameras(cameras, files.cameras_file)

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from wheretolook.config import NOT_SCENES, Experiment
-from wheretolook.dataset.artifact_cache import forget_stamp, is_done, read_stamp, stage_key, write_stamp
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import CameraConfig, camera_of_record, describe_camera
 from wheretolook.scans.config import RgbdConfig
 from wheretolook.stages.preconditions import Say, Tick
+from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.confine import check_folder_name, entry_of
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.files import write_json
@@ -31,8 +31,8 @@ def scan_scene(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
     check_folder_name("a scene's name, scenes.rgbd.name,", settings.scene_name, NOT_SCENES)
     scene = SceneFolder(entry_of(root, settings.scene_name, "a scene's name"), settings.split, experiment.camera.camera)
     others = _others(root, scene)
-    key = stage_key("scenes", ["rgbd", *_made_from(settings)])
-    if is_done(scene, "scenes", key, scene.mesh, scene.folder / REPORT, scene.frames):
+    key = cache_key("scenes", ["rgbd", *_made_from(settings)])
+    if scene.stage_cache("scenes", key).is_current(scene.mesh, scene.folder / REPORT, scene.frames):
         say(f"{scene.name}: reusing {scene.mesh}")
     else:
         from wheretolook.scans.fusion import make_scan
@@ -40,12 +40,12 @@ def scan_scene(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
 
         scan = make_scan(settings, experiment.warp_device)
         scene.folder.mkdir(parents=True, exist_ok=True)
-        forget_stamp(scene, "scenes")  # so that no stamp is of what it no longer stands for, whenever it is killed
+        scene.stage_cache("scenes").clear()  # a killed run leaves no key of results it replaced
         save_glb(scan.mesh, scene.mesh)
         scene.save_mapped_floor(())
         scan.save_model(scene.frames)
         write_json(scene.folder / REPORT, {**scan.report(), "config": _as_text(settings)})
-        write_stamp(scene, "scenes", key)
+        scene.stage_cache("scenes", key).store()
         for line in scan.describe():
             say(f"{scene.name}: {line}")
         say(f"{scene.name}: {len(scan.mesh.triangles):,} triangles -> {scene.mesh}")
@@ -54,7 +54,7 @@ def scan_scene(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
     say(f"{scene.name}: looked at with {describe_camera(scene.camera)}")
     known = {other.name: other for other in Dataset.load(root).scenes} if (root / "dataset.json").is_file() else {}
     if scene.name in known and known[scene.name].camera != scene.camera:
-        forget_stamp(scene, "sample")
+        scene.stage_cache("sample").clear()
     dataset = Dataset(root, tuple(sorted([*others, scene], key=lambda one: one.name)))
     dataset.save()
     tick(1)
@@ -70,7 +70,7 @@ def _others(root: Path, scene: SceneFolder) -> list[SceneFolder]:
     if not (root / "dataset.json").is_file():
         return []
     others = [other for other in Dataset.load(root).scenes if other.name != scene.name]
-    without = [other.name for other in others if read_stamp(other, "scenes") is None]
+    without = [other.name for other in others if other.stage_cache("scenes").stored_key is None]
     if without:
         fix = "Give the recording a dataset of its own: --name."
         raise ConfigError("this dataset holds scenes that no mesh was made for", path=root, value=without, fix=fix)

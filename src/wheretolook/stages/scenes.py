@@ -9,12 +9,12 @@ from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.config import Experiment, MeshSource
-from wheretolook.dataset.artifact_cache import forget_stamp, is_done, stage_key, write_stamp
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, MappedFloor, SceneFolder
 from wheretolook.dataset.sampling_config import Split
 from wheretolook.scenes.config import SceneKind
 from wheretolook.stages.preconditions import Say, Tick, mesh_fingerprint, refuse_release
+from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.confine import entry_of
 from wheretolook.utils.errors import ConfigError, SceneError
 
@@ -55,19 +55,19 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
         keys[scene] = [mesh_fingerprint(source.path), source.up]
 
     for scene, make in sources.items():
-        key = stage_key("scenes", keys[scene])
-        if is_done(scene, "scenes", key, scene.mesh):
+        key = cache_key("scenes", keys[scene])
+        if scene.stage_cache("scenes", key).is_current(scene.mesh):
             say(f"{scene.name}: reusing {scene.mesh}")
         else:
             from wheretolook.scenes.loading import save_glb
 
             mesh, mapped = make()
             scene.folder.mkdir(parents=True, exist_ok=True)
-            forget_stamp(scene, "scenes")  # so that no stamp is of what it no longer stands for, whenever it is killed
+            scene.stage_cache("scenes").clear()  # a killed run leaves no key of results it replaced
             shutil.rmtree(scene.frames, ignore_errors=True)  # of a recording that was here before
             save_glb(mesh, scene.mesh)
             scene.save_mapped_floor(mapped)
-            write_stamp(scene, "scenes", key)
+            scene.stage_cache("scenes", key).store()
             say(f"{scene.name}: {len(mesh.triangles):,} triangles -> {scene.mesh}")
         tick(1)
     dataset = Dataset(root, tuple(sources))
@@ -79,7 +79,7 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
         cameras = {scene.name: scene.camera for scene in before}
         for scene in dataset.scenes:  # what was seen by another camera is no longer valid; maps know theirs
             if cameras.get(scene.name, camera) != camera:
-                forget_stamp(scene, "sample")
+                scene.stage_cache("sample").clear()
     dataset.save()
     return dataset
 

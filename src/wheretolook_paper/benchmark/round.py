@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.dataset.artifact_cache import stage_key
 from wheretolook.geometry.lattices import Lattice
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.select.waypoints import Waypoints, read_waypoints
+from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.confine import entry_of
 from wheretolook.utils.errors import SceneError, StorageError, TableError
 from wheretolook.utils.files import atomic_folder, fingerprint, write_bytes, write_json
@@ -112,7 +112,7 @@ class SceneRound:
         if not baseline:
             weights = self._weights(method)
             parts += [_files_key(weights), config.directions, config.lattice, config.max_turn_deg]
-        key = stage_key("select", parts)
+        key = cache_key("select", parts)
         if _key(folder, "select") == key and path.is_file():
             return read_poses(path)
         _refuse_foreign(folder)
@@ -191,7 +191,7 @@ class SceneRound:
 
         errors = folder / ERRORS
         estimates = folder / ESTIMATES
-        key = stage_key("localize", [self._map_key, LOCALIZER.record()])
+        key = cache_key("localize", [self._map_key, LOCALIZER.record()])
         noted = _key(folder, "localize")
         done = {}
         if errors.is_file() and noted is None:
@@ -268,7 +268,7 @@ class SceneRound:
         from wheretolook.mapping.colmap_model import MODEL_FILES
 
         paths = [self.scene.model / (name + suffix) for name in MODEL_FILES for suffix in (".bin", ".txt")]
-        return stage_key("model", [(path.name, fingerprint(path)) for path in paths if path.is_file()])
+        return cache_key("model", [(path.name, fingerprint(path)) for path in paths if path.is_file()])
 
     @cached_property
     def _mesh_key(self) -> str:
@@ -278,7 +278,7 @@ class SceneRound:
     def _map_key(self) -> str:
         from wheretolook.localization.labeller import versions
 
-        return stage_key("map", [self._model_key, self._mesh_key, versions()])
+        return cache_key("map", [self._model_key, self._mesh_key, versions()])
 
     def _blocks(self, rows: NDArray[np.int64], total: int, title: str) -> Iterator[NDArray[np.int64]]:
         """Rows that are worked on together, with a progress bar of all."""

@@ -12,13 +12,13 @@ import numpy as np
 import pandas as pd
 
 from wheretolook.config import Experiment
-from wheretolook.dataset.artifact_cache import stage_key
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.environment import Scene
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_table import SCHEMA, UNLABELLED, read_parquet
 from wheretolook.planning.config import FORWARD, PathsConfig
 from wheretolook.stages.preconditions import Say, Tick, dataset_after, extractor_of, open_scene
+from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.files import atomic_write, fingerprint, write_json, write_text
 from wheretolook.utils.reading import read_json, read_json_object
@@ -92,7 +92,7 @@ def _plan(
     poses = files.mapping_cameras if files.mapping_cameras.is_file() else None
     made_from = [path and fingerprint(path) for path in (files.mesh, files.landmarks, poses)]
     used = [path and fingerprint(path) for path in weights.values()]
-    key = stage_key("paths 2", [settings, *looked_at, *made_from, used])
+    key = cache_key("paths 2", [settings, *looked_at, *made_from, used])
     tables = {name: folder / f"{name}.parquet" for name in ("paths", "views")}
     made = folder / MADE
     if all(path.is_file() for path in tables.values()) and _holds(made, key):

@@ -12,7 +12,6 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.dataset.artifact_cache import stage_key
 from wheretolook.dataset.environment import Scene
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import pose_columns, poses, read_parquet
@@ -20,6 +19,7 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.planning.config import PathsConfig
+from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import atomic_write, write_json
 from wheretolook.utils.reading import read_json
@@ -72,7 +72,7 @@ def choose_further(
     names = [*KEY, "waypoint", "look", "score", "together", "turn_deg"]
     if config.stops.looks < 2:
         return pd.DataFrame(columns=names)
-    key = stage_key("stops 1", [planned_key, asdict(config.stops)])
+    key = cache_key("stops 1", [planned_key, asdict(config.stops)])
     if (kept := _kept(folder / "stops.parquet", key)) is not None:
         return kept
     directions = within_pitch(config.axes(), config.planner)
@@ -123,7 +123,7 @@ def localize_together(
 
     def add(name: str, settings: list[Any], looks: pd.DataFrame, localize: Callable[[str], pd.DataFrame]) -> None:
         file = folder / f"{name}-together.parquet"
-        key = stage_key(f"{name} together 1", [made_from, settings])
+        key = cache_key(f"{name} together 1", [made_from, settings])
         table = _kept(file, key)
         if table is None:
             table = localize(f"{name} {scene.name}")

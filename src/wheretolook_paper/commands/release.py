@@ -7,7 +7,6 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from wheretolook.config import Experiment
-from wheretolook.dataset.artifact_cache import read_stamp, write_stamp
 from wheretolook.dataset.dataset_lock import changing, reading, reads_dataset
 from wheretolook.dataset.layout import Dataset
 from wheretolook.stages.evaluate import evaluate
@@ -39,9 +38,9 @@ def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: 
         with changing(root, "release"):
             copy = releases.copy_dataset(dataset, root, release_settings(experiment))
             for scene, source in zip(copy.scenes, dataset.scenes, strict=True):
-                stamp = read_stamp(source, "label")
+                stamp = source.stage_cache("label").stored_key
                 assert stamp is not None  # `dataset_after` has checked it
-                write_stamp(scene, "label", stamp)
+                scene.stage_cache("label", stamp).store()
         say(f"{len(copy.scenes)} scenes -> {copy.root}: {releases.size_text(releases.sizes(copy.root, weights=False))}")
         say("next: train on it, then `wheretolook release` with its own configuration")
         return copy

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from wheretolook.dataset.artifact_cache import forget_stamp
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.names import RELEASE_FILE
 from wheretolook.dataset.viewpoint_table import write_table
@@ -56,7 +55,7 @@ def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> D
     before = _release_of(root, dataset.name)
     fingerprint = None if before is None else before.fingerprint()
     for scene in before.scenes if before is not None else ():
-        forget_stamp(scene, "label")  # until all is copied, nothing may learn from what is there
+        scene.stage_cache("label").clear()  # until all is copied, nothing may learn from what is there
     copied = [
         (scene, SceneFolder(entry_of(root, scene.name, "a scene's name"), scene.split, scene.camera))
         for scene in dataset.scenes

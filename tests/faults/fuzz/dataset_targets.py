@@ -13,8 +13,7 @@ from safetensors.torch import save, save_file
 
 from faults.fuzz.execution import Target
 from synthetic_dataset import CAMERA, make_landmarks, make_scene
-from wheretolook.dataset.artifact_cache import STAGES, read_stamp, write_stamp
-from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.dataset.layout import STAGES, Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_table import has_matches, read_table, write_table
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.landmark_features import POOLED
@@ -59,8 +58,8 @@ def _read_description(path: Path) -> None:
     elif path.name == "release.json":
         read_about(Dataset(path.parent, ()))
     elif path.name == "stages.json":
-        read_stamp(scene, "map")
-        write_stamp(scene, "label", "0")
+        scene.stage_cache("map").clear()
+        scene.stage_cache("label", "0").store()
     elif path.name == "labels.json":
         _manifest(path)
     elif path.name == "scene.json":

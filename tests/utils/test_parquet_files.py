@@ -12,8 +12,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from wheretolook.dataset.viewpoint_table import has_matches, read_parquet
+from wheretolook.dataset.viewpoint_table import has_matches
 from wheretolook.utils import parquet_files
+from wheretolook.utils.parquet_files import read_parquet
 
 
 def _list(n: int, path: Path) -> None:

@@ -150,16 +150,6 @@ def _shared_centers(table: pd.DataFrame) -> Float:
     return np.round(np.where(apart, centers, shared), CENTER_DECIMALS) + 0.0  # no negative zero
 
 
-def read_parquet(path: Path) -> pd.DataFrame:
-    """Read any table in a Parquet file. ValueError if it is none, or unfolds to far more than it has bytes."""
-    try:
-        with open_parquet(path, page_checksum_verification=True) as file:
-            frame: pd.DataFrame = read_columns(file, path, file.schema_arrow.names).to_pandas()
-            return frame
-    except ValueError as error:
-        raise ValueError(f"not a readable Parquet file: {error}") from error
-
-
 def has_matches(path: Path, pixels: bool = False) -> bool:
     """Whether a table holds `MATCH_FIELDS`, with `pixels` also `PIXEL_FIELD`; a file that cannot be read does not."""
     try:

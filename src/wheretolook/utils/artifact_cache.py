@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from wheretolook.utils.files import replacing, write_json
+from wheretolook.utils.files import atomic_write, write_json
 from wheretolook.utils.reading import read_json, read_json_object
 
 if TYPE_CHECKING:
@@ -111,5 +111,5 @@ def _write(path: Path, value: Any) -> None:
         save_npz(path, value)
     else:
         table: pd.DataFrame = value
-        with replacing(path) as partial:
+        with atomic_write(path) as partial:
             table.to_parquet(partial, index=False, write_page_checksum=True)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -65,6 +66,16 @@ def read_columns(file: pq.ParquetFile, path: Path, names: Sequence[str]) -> pa.T
     if told != {table.num_rows}:
         raise ValueError(f"it says that it has {max(told):,} rows, and has {table.num_rows:,}")
     return table
+
+
+def read_parquet(path: Path) -> pd.DataFrame:
+    """Read a Parquet file as a table. Raises ValueError if it is damaged, or unfolds to far more than its size."""
+    try:
+        with open_parquet(path, page_checksum_verification=True) as file:
+            table: pd.DataFrame = read_columns(file, path, file.schema_arrow.names).to_pandas()
+            return table
+    except ValueError as error:
+        raise ValueError(f"not a readable Parquet file: {error}") from error
 
 
 def _description(path: Path) -> dict[int, Any]:

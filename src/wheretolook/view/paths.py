@@ -131,7 +131,7 @@ def _compared(path: Path, pair: int) -> Paths:
 
 def _labelled(path: Path) -> pd.DataFrame:
     """Compared paths of a scene, with their labels, which stand in the table of all scenes beside its folder."""
-    from wheretolook.dataset.viewpoint_table import read_parquet
+    from wheretolook.utils.parquet_files import read_parquet
 
     everything = path.parent.parent / path.name
     if everything.is_file():

@@ -14,7 +14,7 @@ from tqdm.auto import tqdm
 
 from wheretolook.dataset.environment import Scene
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.viewpoint_table import pose_columns, poses, read_parquet
+from wheretolook.dataset.viewpoint_table import pose_columns, poses
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.localization.config import LocalizerConfig
@@ -22,6 +22,7 @@ from wheretolook.planning.config import PathsConfig
 from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import atomic_write, write_json
+from wheretolook.utils.parquet_files import read_parquet
 from wheretolook.utils.reading import read_json
 
 if TYPE_CHECKING:

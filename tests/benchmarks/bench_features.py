@@ -1,14 +1,13 @@
-"""Does a scorer learnt with SIFT rank views for learned features too? A map and labels by each extractor, one scorer.
+"""Measure how a scorer trained with SIFT ranks views of maps by other features: one map and labels per extractor.
 
     python tests/benchmarks/bench_features.py --work FOLDER --features opencv aliked=aliked-n16rot.pth xfeat=xfeat.pt
     python tests/benchmarks/bench_features.py --work FOLDER ... --scenes 1 2 --locations 60 --directions 12
 
-Each scene is an apartment made from its seed. Extractors map it along the same walk, and localize the same views of it:
-of locations anywhere, in directions all around. Keypoints are kept in --work, so that an interrupted run goes on, and
-other limits on the similarity (--similarities) are tried quickly. A table shows, for each extractor, the share of views
-that localize within 5 cm and 0.4 degrees; the scorer's AUC; and its regret: how much more often the best view of a
-location localizes than the one it chooses, over locations with any that does, in points. Beside it the same of `bins`,
-of the scorer without the landmarks' ambiguity, and of --weights. Intervals are of 95 %, by a bootstrap over locations.
+Each scene is an apartment generated from its seed. All extractors map it along the same walk and localize the same
+random views. Keypoints are cached in --work, so an interrupted run resumes and other similarity limits (--similarities)
+are cheap. The table has, for each extractor, the share of views localized within 5 cm and 0.4 degrees, and the AUC and
+regret (in percentage points, over locations with a view that localizes) of the bundled scorer, of the scorer without
+the landmarks' ambiguity, of `bins` and of --weights, with 95 % bootstrap intervals over locations.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import bench_scenes
 import numpy as np
+from common import Scene, free_points, open_scene, use_one_thread
 from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score
 from tqdm.auto import tqdm
@@ -46,26 +45,24 @@ from wheretolook.weights.resolve import load_scorer
 CAMERA = PinholeCamera()
 
 
-def looked_at(scene: bench_scenes.Scene, locations: int, directions: int, seed: int) -> NDArray[np.float64]:
-    """Poses (locations x directions, 3, 4): free places 0.8 to 2 m high, looked from all around."""
+def random_views(scene: Scene, locations: int, directions: int, seed: int) -> NDArray[np.float64]:
+    """Return poses (locations x directions, 3, 4) at free locations 0.8 to 2 m high, with yaws all around."""
     rng = np.random.default_rng(seed)
-    (low, high) = scene.mesh.bounds
-    found = np.empty((0, 3))
-    while len(found) < locations:
-        places = rng.uniform((*low[:2], 0.8), (*high[:2], 2.0), (2000, 3))
-        found = np.concatenate([found, places[scene.free_space.is_free(places)]])
+    low, high = scene.mesh.bounds
+    bounds = np.array([(*low[:2], 0.8), (*high[:2], 2.0)])
+    positions = free_points(scene.free_space, bounds, locations, rng)
     yaw = rng.uniform(0, 2 * np.pi, (locations, 1)) + 2 * np.pi * np.arange(directions) / directions
     pitch = rng.uniform(-0.5, 0.5, (locations, directions))
     ahead = np.stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)], axis=-1)
-    return poses_looking_along(np.repeat(found[:locations], directions, axis=0), ahead.reshape(-1, 3))
+    return poses_looking_along(np.repeat(positions, directions, axis=0), ahead.reshape(-1, 3))
 
 
 def keypoints_of(
-    poses: NDArray[np.float64], scene: bench_scenes.Scene, extractor: KeypointExtractor, folder: Path, device: str
+    poses: NDArray[np.float64], scene: Scene, extractor: KeypointExtractor, folder: Path, device: str
 ) -> tuple[list[Keypoints], list[float]]:
-    """Keypoints of views (B, 3, 4), by an extractor and kept in a folder; and the CPU seconds that each took."""
+    """Return keypoints of views (B, 3, 4), cached in a folder, and the CPU seconds of each extraction."""
     renderer: Any = None
-    found = []
+    keypoints = []
     seconds = []
     for row, pose in enumerate(tqdm(poses, f"{extractor.config.method}: extract", unit="view")):
         path = folder / f"{row:05}.npz"
@@ -73,28 +70,29 @@ def keypoints_of(
             renderer = renderer or WarpRenderer(scene.mesh, device)
             rgb = renderer.render(CAMERA, pose[None]).rgb[0]
             start = time.process_time()
-            made = extractor.extract(rgb)
-            took = np.array(time.process_time() - start)
+            extracted = extractor.extract(rgb)
+            elapsed = np.array(time.process_time() - start)
             folder.mkdir(parents=True, exist_ok=True)
-            save_npz(path, {"pixels": made.pixels, "descriptors": made.descriptors.astype(np.float16), "took": took})
-        kept = load_npz(path)
-        ones = np.ones(len(kept["pixels"]), np.float32)
-        found.append(Keypoints(kept["pixels"], kept["descriptors"].astype(np.float32), ones))
-        seconds.append(float(kept["took"]))
-    return found, seconds
+            descriptors = extracted.descriptors.astype(np.float16)
+            save_npz(path, {"pixels": extracted.pixels, "descriptors": descriptors, "seconds": elapsed})
+        cached = load_npz(path)
+        scales = np.ones(len(cached["pixels"]), np.float32)
+        keypoints.append(Keypoints(cached["pixels"], cached["descriptors"].astype(np.float32), scales))
+        seconds.append(float(cached["seconds"]))
+    return keypoints, seconds
 
 
 def localize(
     localizer: Localizer, keypoints: list[Keypoints], poses: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], float]:
-    """Which views localize within 5 cm and 0.4 degrees, (B,), and the milliseconds to match one."""
+    """Return which views localize within 5 cm and 0.4 degrees, (B,), and the milliseconds of matching per view."""
     good = []
     spent = 0.0
-    for found, pose in zip(keypoints, poses, strict=True):
+    for of_view, pose in zip(keypoints, poses, strict=True):
         start = time.process_time()
-        ((rows, landmarks),) = localizer.match([found])
+        ((rows, landmarks),) = localizer.match([of_view])
         spent += time.process_time() - start
-        result = localizer.estimate(found, rows, landmarks)
+        result = localizer.estimate(of_view, rows, landmarks)
         estimate = np.full((3, 4), np.nan) if result.cam_from_world is None else result.cam_from_world
         error_m, error_deg = pose_error(estimate, pose)
         good.append(result.status == LOCALIZED and error_m < 0.05 and error_deg < 0.4)
@@ -102,24 +100,26 @@ def localize(
 
 
 def numbers(scores: NDArray[Any], good: NDArray[np.bool_], locations: NDArray[np.int64], seed: int = 0) -> str:
-    """AUC and regret of scores (L x D,) with intervals over the L locations, as text."""
+    """Format AUC and regret of scores (L x D,) with intervals over the L locations."""
     rng = np.random.default_rng(seed)
     n = locations.max() + 1
-    per = scores.reshape(n, -1), good.reshape(n, -1)
 
-    def of(rows: NDArray[np.int64]) -> tuple[float, float]:
-        s, g = (part[rows] for part in per)
-        able = g.any(1)
+    def measure(rows: NDArray[np.int64]) -> tuple[float, float]:
+        s = scores.reshape(n, -1)[rows]
+        g = good.reshape(n, -1)[rows]
+        possible = g.any(1)
         chosen = np.take_along_axis(g, s.argmax(1)[:, None], axis=1)[:, 0]
         auc = roc_auc_score(g.ravel(), s.ravel()) if 0 < g.mean() < 1 else np.nan
-        return auc, 100 * float(1 - chosen[able].mean()) if able.any() else np.nan
+        return auc, 100 * float(1 - chosen[possible].mean()) if possible.any() else np.nan
 
-    draws = np.array([of(rng.integers(0, n, n)) for _ in range(500)])
-    (auc, regret), low, high = of(np.arange(n)), *np.nanpercentile(draws, (2.5, 97.5), axis=0)
+    auc, regret = measure(np.arange(n))
+    draws = np.array([measure(rng.integers(0, n, n)) for _ in range(500)])
+    low, high = np.nanpercentile(draws, (2.5, 97.5), axis=0)
     return f"{auc:.3f} ({low[0]:.3f} to {high[0]:.3f}) | {regret:.1f} ({low[1]:.1f} to {high[1]:.1f})"
 
 
 def main() -> None:
+    """Map, localize and score every scene by every extractor, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--features", nargs="+", default=["opencv"], metavar="NAME[=WEIGHTS]", help="extractors (opencv)")
@@ -128,56 +128,56 @@ def main() -> None:
     add("--directions", type=int, default=12)
     add("--map-images", type=int, default=100)
     add("--max-keypoints", type=int, default=2048)
-    add("--similarities", nargs="*", type=float, default=[], help="limits to try beside the extractor's own")
+    add("--similarities", nargs="*", type=float, default=[], help="limits to try besides the extractor's own")
     add("--weights", nargs="*", default=[], metavar="NAME=FILE", help="of other scorers to compare")
     add("--device", default="cpu")
-    add("--work", type=Path, required=True, metavar="FOLDER", help="where maps and keypoints are kept")
+    add("--work", type=Path, required=True, metavar="FOLDER", help="cache of maps and keypoints")
     args = parser.parse_args()
-    bench_scenes.use_one_thread()
+    use_one_thread()
 
     rows: dict[tuple[str, float | None], list[Any]] = {}
     for seed in args.scenes:
         folder = args.work / f"scene-{seed}"
         mesh = folder / "mesh.glb"
         folder.mkdir(parents=True, exist_ok=True)
-        scene = bench_scenes.open_scene(mesh if mesh.is_file() else None, folder, seed, args.device)
-        poses = looked_at(scene, args.locations, args.directions, seed)
+        scene = open_scene(mesh if mesh.is_file() else None, folder, seed, args.device)
+        poses = random_views(scene, args.locations, args.directions, seed)
         occlusion = MeshOcclusion(scene.free_space.raycaster, two_sided=scene.free_space.two_sided)
         for each in args.features:
             name, _, weights = each.partition("=")
             config = ExtractorConfig(name, max_keypoints=args.max_keypoints, weights=weights)
-            place = folder / name / "map"
-            if not (place / "landmarks.npz").is_file():
+            map_folder = folder / name / "map"
+            if not (map_folder / "landmarks.npz").is_file():
                 settings = MapConfig(n_images=args.map_images, extractor=config)
                 build_map(scene.mesh, WarpRenderer(scene.mesh, args.device), scene.free_space, CAMERA, settings, seed,
-                          place, scene.free_space.raycaster, workers=1, device=args.device)  # fmt: skip
+                          map_folder, scene.free_space.raycaster, workers=1, device=args.device)  # fmt: skip
             extractor = KeypointExtractor(config, args.device)
             keypoints, seconds = keypoints_of(poses, scene, extractor, folder / name / "keypoints", args.device)
-            landmarks = Landmarks.load(place / "landmarks.npz")
-            looked = LocalizationMap(landmarks, CAMERA, occlusion, args.device)
-            unsure = replace(looked, landmarks=replace(landmarks, ambiguity=np.full_like(landmarks.ambiguity, np.nan)))
-            scorers = {"shipped": load_scorer(looked), "without ambiguity": load_scorer(unsure)}
-            scorers |= {name: load_scorer(file, looked) for name, _, file in (w.partition("=") for w in args.weights)}
-            scorers["bins"] = make_scorer("bins", looked)
+            landmarks = Landmarks.load(map_folder / "landmarks.npz")
+            full = LocalizationMap(landmarks, CAMERA, occlusion, args.device)
+            without = replace(full, landmarks=replace(landmarks, ambiguity=np.full_like(landmarks.ambiguity, np.nan)))
+            scorers = {"bundled": load_scorer(full), "without ambiguity": load_scorer(without)}
+            scorers |= {name: load_scorer(file, full) for name, _, file in (w.partition("=") for w in args.weights)}
+            scorers["bins"] = make_scorer("bins", full)
             scores = {scorer: one.score(poses) for scorer, one in scorers.items()}
             limits: list[float | None] = [None, *(args.similarities if landmarks.features != "sift" else [])]
             for limit in limits:
                 localizer = Localizer(landmarks, CAMERA, LocalizerConfig(min_similarity=limit), device=args.device)
                 good, match_ms = localize(localizer, keypoints, poses)
-                found = (good, scores, seconds, [len(one) for one in keypoints], len(landmarks), match_ms)
-                rows.setdefault((name, limit), []).append(found)
+                result = (good, scores, seconds, [len(one) for one in keypoints], len(landmarks), match_ms)
+                rows.setdefault((name, limit), []).append(result)
 
     print("| features | landmarks | keypoints | s an image | ms to match | localize | scorer | AUC | regret |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     for (name, limit), parts in rows.items():
         good = np.concatenate([part[0] for part in parts])
         locations = np.repeat(np.arange(len(good) // args.directions), args.directions)
-        about = f"{np.mean([part[4] for part in parts]):,.0f} | {np.median(np.concatenate([p[3] for p in parts])):.0f}"
-        about += f" | {np.median(np.concatenate([p[2] for p in parts])):.2f} | {np.mean([p[5] for p in parts]):.0f}"
+        sizes = f"{np.mean([part[4] for part in parts]):,.0f} | {np.median(np.concatenate([p[3] for p in parts])):.0f}"
+        sizes += f" | {np.median(np.concatenate([p[2] for p in parts])):.2f} | {np.mean([p[5] for p in parts]):.0f}"
         for scorer in parts[0][1]:
             values = numbers(np.concatenate([part[1][scorer] for part in parts]), good, locations)
-            called = name if limit is None else f"{name}, from {limit}"
-            print(f"| {called} | {about} | {100 * good.mean():.1f} % | {scorer} | {values} |")
+            label = name if limit is None else f"{name}, from {limit}"
+            print(f"| {label} | {sizes} | {100 * good.mean():.1f} % | {scorer} | {values} |")
 
 
 if __name__ == "__main__":

@@ -1,19 +1,19 @@
-"""Fisher information: building fields, asking them, and exact sums over a whole grid of viewpoints.
+"""Measure Fisher information: building and querying fields, and exact sums over a grid of viewpoints.
 
     python tests/benchmarks/bench_fisher.py [--device cuda]
 
-Landmarks lie on the walls of a room; half of them, at random, are hidden from each location. Prints the median of the
-repeats and their range, and beside each kernel its NumPy twin on a small part, scaled up. On the CPU also how near the
-approximations come to the exact information, over the samples of the Gaussian process.
+Landmarks are on the walls of a room; a random half is occluded from each location. Prints the median and the range over
+repeats, and the time of each kernel's NumPy twin, extrapolated from a small part. On the CPU also the errors of the
+approximations against the exact information, by the number of samples of the Gaussian process.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
 
 import numpy as np
+from common import ROOM_M, room_landmarks, timed
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
@@ -31,34 +31,10 @@ from wheretolook_paper.fisher.soft_visibility import (
     cone_half_angle,
 )
 
-ROOM_M = ((-5.0, -4.0, 0.0), (5.0, 4.0, 2.6))
 
-
-def room_landmarks(n: int, seed: int = 0) -> Float:
-    """(n, 3) on walls, floor and ceiling."""
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(*ROOM_M, (n, 3))
-    axis = rng.integers(0, 3, n)
-    points[np.arange(n), axis] = np.array(ROOM_M)[rng.integers(0, 2, n), axis]
-    return points
-
-
-def timed(label: str, work: Callable[[], object], repeats: int, unit: float = 1.0, units: str = "s") -> float:
-    """Print the median and the range of the repeats, after one that is not counted; the median in seconds."""
-    work()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    middle = float(np.median(times))
-    print(f"{label:62} {middle * unit:9.3f} {units} [{min(times) * unit:.3f}, {max(times) * unit:.3f}]", flush=True)
-    return middle
-
-
-def ask(locations: Float, points: Float, visibilities: dict[str, SoftVisibility], axes: Float) -> None:
-    """A planner's query: every direction at one location, on the CPU."""
-    print(f"asking a field for {len(axes)} directions at one location")
+def query(locations: Float, points: Float, visibilities: dict[str, SoftVisibility], axes: Float) -> None:
+    """Time a planner's query: all directions at one location, on the CPU."""
+    print(f"querying a field for {len(axes)} directions at one location")
     for name, visibility in visibilities.items():
         field = FisherField.build(locations, points, visibility)
         for metric in METRICS:
@@ -68,10 +44,10 @@ def ask(locations: Float, points: Float, visibilities: dict[str, SoftVisibility]
         timed(f"  {name} eigenvalues, NumPy", lambda n=numbers: eigenvalues_plain(n), 200, 1e3, "ms")
 
 
-def errors_over_samples(samples: tuple[int, ...] = (10, 15, 20, 30, 50, 70, 100, 150)) -> None:
-    """Approximations against what the camera really sees, over the samples of the Gaussian process."""
+def errors_over_samples(samples: list[int], n_landmarks: int) -> None:
+    """Print the errors of the approximations against the true view, by the samples of the Gaussian process."""
     camera = PinholeCamera()
-    points = room_landmarks(5000)
+    points = room_landmarks(n_landmarks)
     axes = fibonacci_sphere(300)
     locations = np.random.default_rng(1).uniform((-4, -3, 0.6), (4, 3, 2.0), (20, 3))
     views = poses_looking_along(np.repeat(locations, len(axes), axis=0), np.tile(axes, (len(locations), 1)))
@@ -102,14 +78,18 @@ def errors_over_samples(samples: tuple[int, ...] = (10, 15, 20, 30, 50, 70, 100,
 
 
 def main() -> None:
+    """Parse the options, measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", default="cpu", help="Warp's device")
     parser.add_argument("--landmarks", type=int, default=25_000)
+    parser.add_argument("--voxels", type=int, default=8, help="along each axis")
+    parser.add_argument("--directions", type=int, default=500)
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--samples", type=int, nargs="+", default=[10, 15, 20, 30, 50, 70, 100, 150])
     parser.add_argument("--errors", action="store_true", help="only the errors of the approximations")
     args = parser.parse_args()
     if args.errors:
-        errors_over_samples()
+        errors_over_samples(args.samples, 5000)
         return
     rng = np.random.default_rng(0)
     repeats = args.repeats
@@ -122,29 +102,29 @@ def main() -> None:
         "gp": GaussianProcessVisibility.fitted(cone_half_angle(camera)),
     }
 
-    voxels = VoxelGrid(*map(np.array, ROOM_M), (8, 8, 8)).centers()
+    voxels = VoxelGrid(*map(np.array, ROOM_M), (args.voxels,) * 3).centers()
     free = rng.random((len(voxels), len(points))) < 0.5
     print(f"fields of {len(voxels)} voxels and {len(points):,} landmarks, on {device}")
     for name, visibility in visibilities.items():
-        for label, mask in (("none hidden", None), ("half hidden", free)):
+        for label, mask in (("none occluded", None), ("half occluded", free)):
             timed(f"  {name} ({visibility.n_factors} factors), {label}",
                   lambda v=visibility, m=mask: FisherField.build(voxels, points, v, m, device), repeats)  # fmt: skip
         start = time.perf_counter()
         field_sums_plain(voxels[:2], points, visibility)
         print(f"  {'  NumPy, from two voxels':60} {(time.perf_counter() - start) * len(voxels) / 2:9.1f} s")
 
-    axes = fibonacci_sphere(500)
+    axes = fibonacci_sphere(args.directions)
     if device == "cpu":
-        ask(voxels[:8], points, visibilities, axes)
-        errors_over_samples()
+        query(voxels[:8], points, visibilities, axes)
+        errors_over_samples(args.samples, min(5000, args.landmarks))
 
-    locations = VoxelGrid(*map(np.array, ROOM_M), (9, 9, 8)).centers()
-    views = poses_looking_along(np.repeat(locations, 500, axis=0), np.tile(axes, (len(locations), 1)))
-    rows = np.repeat(np.arange(len(locations)), 500)
+    locations = VoxelGrid(*map(np.array, ROOM_M), (args.voxels + 1, args.voxels + 1, args.voxels)).centers()
+    views = poses_looking_along(np.repeat(locations, len(axes), axis=0), np.tile(axes, (len(locations), 1)))
+    rows = np.repeat(np.arange(len(locations)), len(axes))
     print(f"exact, {len(views):,} viewpoints")
     for label, mask in (
-        ("none hidden", np.ones((len(locations), len(points)), bool)),
-        ("half hidden", rng.random((len(locations), len(points))) < 0.5),
+        ("none occluded", np.ones((len(locations), len(points)), bool)),
+        ("half occluded", rng.random((len(locations), len(points))) < 0.5),
     ):
         sets = LandmarkSets.from_mask(mask)
         few = max(1, repeats // 2)

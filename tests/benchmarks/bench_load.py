@@ -1,13 +1,12 @@
-"""How much memory a command takes with all its processes, and whether it grows.
+"""Measure the memory of a command with all its processes, and whether it grows.
 
     python tests/benchmarks/bench_load.py --minutes 60 label --config configs/small.yaml
     python tests/benchmarks/bench_load.py --limit-gb 16 select --map sparse/0 --at waypoints.csv --out views.csv
 
-Runs `wheretolook` with what is given, interrupts it as Ctrl-C does when the minutes are over, and kills it beyond the
-limit. The memory of the command and of all its processes is read every `--every` seconds: the resident, and the
-processes' own, in which what several of them share counts once. A line a minute is told while it runs; at the end the
-peaks and, of what took ten minutes or more, the slope of a line through all readings after the first tenth of the time,
-by when every worker has met its largest batches. Nothing here fails on time.
+Runs `wheretolook` with the given arguments, interrupts it like Ctrl-C after `--minutes`, and kills it above
+`--limit-gb`. Every `--every` seconds it reads the resident memory and the proportional memory (shared pages count once)
+of all processes. Prints a line per minute and finally the peaks; for runs of ten minutes or more also the slope of a
+line fitted to the readings after the first tenth of the time.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ COMMAND = [sys.executable, "-c", "import sys; from wheretolook.cli import main; 
 
 
 def memory_mb(root: psutil.Process) -> tuple[float, float, int]:
-    """Resident and own memory in 10^6 bytes of a process and of all below it, and how many they are."""
+    """Return resident and proportional memory in MB of a process and its descendants, and their number."""
     resident = 0
     own = 0
     n = 0
@@ -36,7 +35,7 @@ def memory_mb(root: psutil.Process) -> tuple[float, float, int]:
     for process in processes:
         try:
             memory = process.memory_full_info()
-        except psutil.Error:  # it has just ended
+        except psutil.Error:  # the process has just ended
             continue
         resident = resident + memory.rss
         own = own + memory.pss
@@ -44,11 +43,12 @@ def memory_mb(root: psutil.Process) -> tuple[float, float, int]:
     return resident / 1e6, own / 1e6, n
 
 
-def tell(rows: list[tuple[float, float, float]]) -> None:
+def summarize(rows: list[tuple[float, float, float]]) -> None:
+    """Print peaks and growth of readings (seconds, resident MB, proportional MB)."""
     seconds, resident, own = np.array(rows).T
     settled = seconds >= seconds[-1] / 10
-    for name, megabytes in (("resident", resident), ("own", own)):
-        line = f"{name:8} peak {megabytes.max():.0f} MB"
+    for name, megabytes in (("resident", resident), ("proportional", own)):
+        line = f"{name:12} peak {megabytes.max():.0f} MB"
         if seconds[-1] >= 600:
             slope = np.polyfit(seconds[settled] / 3600, megabytes[settled], 1)[0]
             quarters = ", ".join(f"{np.median(part):.0f}" for part in np.array_split(megabytes[settled], 4))
@@ -57,6 +57,7 @@ def tell(rows: list[tuple[float, float, float]]) -> None:
 
 
 def main() -> int:
+    """Run the command and sample its memory."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--limit-gb", type=float, default=float("inf"))
@@ -64,11 +65,11 @@ def main() -> int:
     parser.add_argument("command", nargs=argparse.REMAINDER, help="what follows `wheretolook`")
     args = parser.parse_args()
     start = time.monotonic()
-    told = 0
-    asked = 0.0
+    minute = 0
+    interrupted_s = 0.0
     ended = ""
     rows: list[tuple[float, float, float]] = []
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background commands would ignore
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a shell ignore it
     process = subprocess.Popen([*COMMAND, *args.command], start_new_session=True)
     root = psutil.Process(process.pid)
     while process.poll() is None:
@@ -76,23 +77,23 @@ def main() -> int:
         seconds = time.monotonic() - start
         if n:
             rows.append((seconds, resident, own))
-        if seconds // 60 > told:
-            told = int(seconds // 60)
-            print(f"{told:4} min: {resident:6.0f} MB resident, {own:6.0f} MB own, {n} processes", flush=True)
+        if seconds // 60 > minute:
+            minute = int(seconds // 60)
+            print(f"{minute:4} min: {resident:6.0f} MB resident, {own:6.0f} MB proportional, {n} processes", flush=True)
         if resident > 1e3 * args.limit_gb:
             ended = f", killed beyond {args.limit_gb} GB"
             for child in root.children(recursive=True):
                 child.kill()
             process.kill()
             process.wait()
-        elif seconds > max(60 * args.minutes, asked + 30):  # again if it came at a bad time
-            ended = ", interrupted when the time was over"
-            asked = seconds
+        elif seconds > max(60 * args.minutes, interrupted_s + 30):
+            ended = ", interrupted after the given time"
+            interrupted_s = seconds
             process.send_signal(signal.SIGINT)
         time.sleep(args.every)
     print(f"exit {process.returncode} after {time.monotonic() - start:.1f} s{ended}")
     if rows:
-        tell(rows)
+        summarize(rows)
     return 0
 
 

@@ -1,12 +1,11 @@
-"""Ten million queries of a viewpoint map from eight processes: equal answers, time and memory.
+"""Measure ten million queries of a viewpoint map from eight processes: consistency, time and memory.
 
     python tests/benchmarks/bench_queries.py [FOLDER] [--queries 10000000] [--processes 8]
 
-Without a folder of a viewpoint map one is made of random scores, of 4096 voxels and 500 directions (20 MB). The
-processes map the files into memory (`ViewpointMap.load(folder, mmap=True)`) and ask for the best view at all points,
-the same for all of them but in an order of their own: all in batches of 10,000, and one in a hundred alone, too. The
-answers must be equal. Told are the times, and the memory of the processes, resident and their own, before and after.
-Nothing here fails on time.
+Without the folder of a viewpoint map, a map of random scores with 4096 voxels and 500 directions (20 MB) is made. All
+processes memory-map its files and query the best view at the same points in different orders, in batches of 10,000 and
+for one point in a hundred also alone. All answers must be equal. Prints times, and the resident and unique memory of
+the processes before and after.
 """
 
 from __future__ import annotations
@@ -26,11 +25,11 @@ from wheretolook.geometry.poses import Float
 from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
 
 BATCH = 10_000
-ONE_BY_ONE = 100  # of so many queries one is asked alone
+ONE_BY_ONE = 100  # every such point is also queried alone
 
 
-def made_up(folder: Path) -> Path:
-    """A viewpoint map of random scores."""
+def random_map(folder: Path) -> Path:
+    """Save a viewpoint map of random scores; return its folder."""
     rng = np.random.default_rng(0)
     grid = VoxelGrid((0.0, 0.0, 0.0), (16.0, 16.0, 16.0), (16, 16, 16))
     directions = fibonacci_sphere(500)
@@ -48,13 +47,13 @@ def made_up(folder: Path) -> Path:
 
 
 def memory_mb() -> tuple[float, float]:
-    """Resident memory of this process, and its share of it, in 10^6 bytes."""
+    """Return resident and unique memory of this process in MB."""
     memory = psutil.Process().memory_full_info()
     return memory.rss / 1e6, memory.uss / 1e6
 
 
-def ask(folder: Path, n: int, number: int) -> tuple[str, float, float, tuple[float, float], tuple[float, float]]:
-    """Digest of the answers to n queries, seconds of batches and of single queries, memory before and after."""
+def query(folder: Path, n: int, number: int) -> tuple[str, float, float, tuple[float, float], tuple[float, float]]:
+    """Return a digest of the answers to n queries, seconds of batches and of single queries, memory before and after."""
     viewpoint_map = ViewpointMap.load(folder, mmap=True)
     before = memory_mb()
     low = np.asarray(viewpoint_map.grid.lower)
@@ -69,9 +68,9 @@ def ask(folder: Path, n: int, number: int) -> tuple[str, float, float, tuple[flo
         found = viewpoint_map.best_many(points)
         batches_s += time.perf_counter() - start
         start = time.perf_counter()
-        alone = [viewpoint_map.best(point) for point in points[::ONE_BY_ONE]]
+        singles = [viewpoint_map.best(point) for point in points[::ONE_BY_ONE]]
         singles_s += time.perf_counter() - start
-        for choice, row in zip(alone, range(0, len(points), ONE_BY_ONE), strict=True):
+        for choice, row in zip(singles, range(0, len(points), ONE_BY_ONE), strict=True):
             if choice is not None and choice.direction_id != found.direction_id[row]:
                 raise AssertionError(f"point {row} of block {block} has two answers")
         answers = b"".join(
@@ -82,28 +81,29 @@ def ask(folder: Path, n: int, number: int) -> tuple[str, float, float, tuple[flo
 
 
 def main() -> None:
+    """Query from several processes and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--queries", type=int, default=10_000_000)
     parser.add_argument("--processes", type=int, default=8)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
-        folder = args.folder or made_up(Path(temporary) / "map")
+        folder = args.folder or random_map(Path(temporary) / "map")
         n = -(-args.queries // args.processes)
         start = time.perf_counter()
         with multiprocessing.get_context("spawn").Pool(args.processes) as pool:
-            results = pool.starmap(ask, [(folder, n, number) for number in range(args.processes)])
+            results = pool.starmap(query, [(folder, n, number) for number in range(args.processes)])
         seconds = time.perf_counter() - start
     digests, batches, singles, before, after = zip(*results, strict=True)
-    of = f"{n * args.processes:,} queries of {args.processes} processes"
-    print(f"{of} in {seconds:.1f} s: {len(set(digests))} answer(s) to each")
+    total = f"{n * args.processes:,} queries of {args.processes} processes"
+    print(f"{total} in {seconds:.1f} s: {len(set(digests))} answer(s) to each")
     each = np.array(batches) / n * 1e6
-    print(f"in batches {np.median(each):.2f} us each [{each.min():.2f}, {each.max():.2f}], of the clock, by process")
-    alone = np.array(singles) / -(-n // ONE_BY_ONE) * 1e6
-    print(f"one by one {np.median(alone):.1f} us each [{alone.min():.1f}, {alone.max():.1f}], with the comparison")
-    for name, column in (("resident", 0), ("its own", 1)):
+    print(f"in batches {np.median(each):.2f} us each [{each.min():.2f}, {each.max():.2f}] wall time, by process")
+    single = np.array(singles) / -(-n // ONE_BY_ONE) * 1e6
+    print(f"one by one {np.median(single):.1f} us each [{single.min():.1f}, {single.max():.1f}]")
+    for name, column in (("resident", 0), ("unique", 1)):
         was, now = (np.array(values)[:, column] for values in (before, after))
-        print(f"memory of a process, {name}: {was.max():.0f} MB once loaded, {now.max():.0f} MB at the end (greatest)")
+        print(f"memory of a process, {name}: {was.max():.0f} MB once loaded, {now.max():.0f} MB at the end (maximum)")
     if len(set(digests)) > 1:
         raise SystemExit("the processes got different answers")
 

@@ -1,11 +1,10 @@
-"""Learned scorers: viewpoints a second from landmarks to scores, and the time that one pose takes.
+"""Measure learned scorers: viewpoints per second from landmarks to scores, and the time of a single pose.
 
     python tests/benchmarks/bench_scorers.py [--device cuda] [--weights data/release/weights/set.safetensors ...]
 
-A map of 25,000 landmarks on the walls of a room, of which half, at random, are hidden from each location. A batch is
-every direction at many locations; what is measured begins with the poses and the landmarks free of occlusion, and ends
-with scores in memory of the host. One pose is asked for at another location every time. Prints medians of the repeats
-and their range.
+The map has 25,000 landmarks on the walls of a room; a random half is occluded from each location. A batch holds every
+direction at many locations. The time runs from poses and unoccluded landmarks to scores in host memory. Single poses
+are each at another location. Prints the median and the range over repeats.
 """
 
 from __future__ import annotations
@@ -15,40 +14,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from bench_fisher import ROOM_M, room_landmarks, timed
+from common import ROOM_M, room_map, timed
 
-from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
-from wheretolook.geometry.poses import Float, poses_looking_along
-from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
-from wheretolook.visibility.occlusion import StoredOcclusion
+from wheretolook.utils.errors import WhereToLookError
 from wheretolook.weights.resolve import load_scorer
 
 
-def room_map(n_landmarks: int, locations: Float, device: str) -> LocalizationMap:
-    """Landmarks with attributes at random, mapped from the middle of the room."""
-    rng = np.random.default_rng(0)
-    points = room_landmarks(n_landmarks)
-    offsets = points - np.mean(ROOM_M, axis=0)
-
-    def some(low: float, high: float) -> np.ndarray:
-        return rng.uniform(low, high, n_landmarks).astype(np.float32)
-
-    distance = np.linalg.norm(offsets, axis=1)
-    landmarks = Landmarks(
-        np.arange(n_landmarks), points, rng.integers(2, 9, n_landmarks).astype(np.int32), some(0, 0.5), some(2, 40),
-        (offsets / distance[:, None]).astype(np.float32), some(0, 1), distance.astype(np.float32), some(0, 0.5), None,
-        some(0.5, 1),
-    )  # fmt: skip
-    occlusion = StoredOcclusion.from_mask(locations, rng.random((len(locations), n_landmarks)) < 0.5)
-    return LocalizationMap(landmarks, PinholeCamera(), occlusion, device)
-
-
 def main() -> None:
-    """Print a table."""
+    """Parse the options, measure and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
     parser.add_argument(
@@ -58,6 +35,7 @@ def main() -> None:
     parser.add_argument("--locations", type=int, default=200)
     parser.add_argument("--directions", type=int, default=500)
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--poses", type=int, default=200, help="single poses to time")
     args = parser.parse_args()
     rng = np.random.default_rng(1)
     low, high = np.array(ROOM_M)
@@ -73,13 +51,13 @@ def main() -> None:
     for path in args.weights:
         try:
             scorers[path.stem] = load_scorer(path, localization_map)
-        except Exception as error:  # matchability is no scorer by itself
+        except WhereToLookError as error:  # matchability is no scorer by itself
             print(f"{path.stem}: {error}")
     for name, scorer in scorers.items():
         median = timed(f"{name}: all views", lambda s=scorer: s.score(views), args.repeats)
         print(f"{'':62} {len(views) / median:,.0f} views a second")
-        poses = iter(np.tile(views[rng.permutation(len(views))[:400]], (3, 1, 1)))
-        timed(f"{name}: one pose", lambda s=scorer, p=poses: s.score(next(p)[None]), 200, 1e3, "ms")
+        poses = iter(views[rng.permutation(len(views))[: args.poses + 1]])
+        timed(f"{name}: one pose", lambda s=scorer, p=poses: s.score(next(p)[None]), args.poses, 1e3, "ms")
 
 
 if __name__ == "__main__":

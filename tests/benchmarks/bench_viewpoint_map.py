@@ -1,10 +1,10 @@
-"""The viewpoint map: time of a query, of a batch, of building and updating it, and of views along a path.
+"""Measure viewpoint maps: single and batch queries, building, updating, and the choice of views along a path.
 
     python tests/benchmarks/bench_viewpoint_map.py [--device cuda] [--weights data/release/weights/set.safetensors]
 
-A generated apartment with landmarks on its surfaces and true occlusion; 512 free voxels (as many as 8 x 8 x 8) and 500
-directions. The scorer is "bins" unless weights are given. Queries are timed over points at random in free voxels, each
-repeat over all of them; what is printed is the time of one. Prints medians of the repeats and their range.
+A generated apartment with landmarks on its surfaces and mesh occlusion, 512 free voxels and 500 directions. The scorer
+is `bins` unless weights are given. Queries are at random points in free voxels. Prints the median and the range over
+repeats.
 """
 
 from __future__ import annotations
@@ -17,9 +17,7 @@ from itertools import cycle
 from pathlib import Path
 
 import numpy as np
-from bench_fisher import timed
-from bench_scorers import room_map
-from bench_visibility import on_surface
+from common import points_on_surface, room_map, timed
 
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -39,30 +37,29 @@ from wheretolook_rooms.generator import generate_apartment
 
 
 def rows_of(landmarks: Landmarks, rows: slice) -> Landmarks:
-    """Some of the landmarks."""
+    """Return a slice of the landmarks."""
     return Landmarks(**{name: None if value is None else value[rows] for name, value in vars(landmarks).items()})
 
 
-def queries(viewpoint_map: ViewpointMap, repeats: int) -> None:
-    """Single points and batches, in memory."""
+def queries(viewpoint_map: ViewpointMap, n: int, repeats: int) -> None:
+    """Time queries of single points and of a batch of n points."""
     rng = np.random.default_rng(0)
     grid = viewpoint_map.grid
-    rows = rng.integers(0, len(viewpoint_map.scores), 1_000_000)
+    rows = rng.integers(0, len(viewpoint_map.scores), n)
     points = viewpoint_map.locations[rows] + rng.uniform(-0.5, 0.5, (len(rows), 3)) * grid.voxel_m
     arrays = list(points[:5000])
     tuples = points[:5000].tolist()
     axis = np.array([0.6, -0.8, 0.0])
-    n = len(arrays)
 
-    def each(query, asked=arrays):
+    def each(query, points=arrays):
         def work() -> None:
-            for point in asked:
+            for point in points:
                 query(point)
 
         return work
 
-    unit = 1e6 / n
-    units = f"us for each of {n:,}"
+    unit = 1e6 / len(arrays)
+    units = f"us for each of {len(arrays):,}"
     timed("best, point an array", each(viewpoint_map.best), repeats, unit, units)
     timed("best, point a tuple", each(viewpoint_map.best, tuples), repeats, unit, units)
     timed("best 10", each(lambda p: viewpoint_map.best_n(p, 10)), repeats, unit, units)
@@ -74,8 +71,8 @@ def queries(viewpoint_map: ViewpointMap, repeats: int) -> None:
     print(f"{'':62} {len(points) / median / 1e6:.1f} million points a second")
 
 
-def sequences(repeats: int, n: int = 200, d: int = 500) -> None:
-    """Views along a path."""
+def sequences(repeats: int, n: int, d: int) -> None:
+    """Time the choice of views along a path of n waypoints among d directions."""
     scores = np.random.default_rng(0).random((n, d))
     directions = fibonacci_sphere(d)
     limit = TurnLimit.of(directions)
@@ -85,7 +82,7 @@ def sequences(repeats: int, n: int = 200, d: int = 500) -> None:
 
 
 def main() -> None:
-    """Print a table."""
+    """Parse the options, measure and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--weights", type=Path)
@@ -94,20 +91,22 @@ def main() -> None:
     parser.add_argument("--directions", type=int, default=500)
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--builds", type=int, default=3)
+    parser.add_argument("--queries", type=int, default=1_000_000, help="points of a batch query")
+    parser.add_argument("--waypoints", type=int, default=200, help="of a path whose views are chosen")
     args = parser.parse_args()
     mesh = generate_apartment(ApartmentConfig(), 0, device=args.device)
     grid = VoxelGrid.over(mesh.bounds, (24, 24, 8))
     free_space = FreeSpace(mesh, device=args.device)
     free = np.flatnonzero(free_space.is_free(grid.centers()))[: args.voxels]
-    points = on_surface(mesh, args.landmarks, np.random.default_rng(0))
-    points = points[np.argsort(-np.linalg.norm(points - points[0], axis=1))]  # the last ten lie together
-    made = room_map(args.landmarks, grid.centers()[:1], args.device)  # for its attributes
-    landmarks = replace(made.landmarks, points=points)
+    points = points_on_surface(mesh, args.landmarks, np.random.default_rng(0))
+    points = points[np.argsort(-np.linalg.norm(points - points[0], axis=1))]  # the last ten are neighbours
+    room = room_map(args.landmarks, grid.centers()[:1], args.device)  # its random attributes are used
+    landmarks = replace(room.landmarks, points=points)
     occlusion = MeshOcclusion(MeshRaycaster(mesh, args.device), two_sided=free_space.two_sided)
     directions = fibonacci_sphere(args.directions)
 
     def scorer_on(some: Landmarks) -> Scorer:
-        one = LocalizationMap(some, made.camera, occlusion, args.device)
+        one = LocalizationMap(some, room.camera, occlusion, args.device)
         return load_scorer(args.weights, one) if args.weights else make_scorer("bins", one)
 
     scorer = scorer_on(landmarks)
@@ -128,8 +127,8 @@ def main() -> None:
         size = sum(file.stat().st_size for file in path.iterdir())
         timed(f"load, {size / 1e6:.1f} MB", lambda: ViewpointMap.load(path), args.repeats, 1e3, "ms")
         timed("load, memory-mapped", lambda: ViewpointMap.load(path, mmap=True), args.repeats, 1e3, "ms")
-        queries(ViewpointMap.load(path, mmap=True), args.repeats)
-    sequences(args.repeats)
+        queries(ViewpointMap.load(path, mmap=True), args.queries, args.repeats)
+    sequences(args.repeats, args.waypoints, args.directions)
     best = directions[viewpoint_map.ranked[:, 0]]
     rows = cycle(range(len(best)))
 
@@ -137,7 +136,7 @@ def main() -> None:
         row = next(rows)
         refine_directions(scorer, viewpoint_map.locations[row], best[row])
 
-    timed("refine the best direction of one location", refine_one, 50, 1e3, "ms")
+    timed("refine the best direction of one location", refine_one, 7 * args.repeats, 1e3, "ms")
     some = slice(0, 64)
     found = refine_directions(scorer, viewpoint_map.locations[some], best[some])
     gain = found.scores - found.start_scores

@@ -1,4 +1,4 @@
-"""How fast visibility is: occlusion, counts and the best 100, against the plain NumPy twin in the same run.
+"""Measure visibility: occlusion rays, landmark counts and the best 100 directions, next to the plain NumPy twin.
 
     python tests/benchmarks/bench_visibility.py                           # one thread and all cores, the paper's size
     python tests/benchmarks/bench_visibility.py --device cuda --out h200.json
@@ -7,7 +7,7 @@
     python tests/benchmarks/bench_visibility.py --draw FOLDER/runtimes.csv h200.json --figures FOLDER  # adds one
 
 The size is the paper's (Sec. "Runtimes"): 648 locations, 24,919 landmarks and the 500 directions of its released
-configuration, in a synthetic apartment whose mesh is cut into at least 250,000 triangles. Nothing here fails on time.
+configuration, in a synthetic apartment whose mesh is subdivided into at least 250,000 triangles.
 """
 
 from __future__ import annotations
@@ -31,32 +31,45 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import warp as wp
+from common import free_points, points_on_surface
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import rotation_looking_along
 from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.counting import FrustumCounter, count_plain
 from wheretolook.visibility.occlusion import DevicePoints, MeshOcclusion, NoOcclusion
 from wheretolook.visibility.survey import survey
+from wheretolook_rooms.generator import generate_apartment
 
 CAMERA = PinholeCamera()
+COUNTS = "counts alone"
+EVERYTHING = "occlusion, counts, best 100"
+TWIN = "NumPy twin, counts alone, scaled"
 FLOPS_PER_PROJECTION = 22
 """A plain projection: 9 multiplies and 6 additions of the rotation, 3 of the offset, 4 of focal length and centre."""
 
+SCALING = {
+    "landmarks": (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000, 2_000_000),
+    "locations": (8, 16, 32, 64, 128, 256, 512, 1024, 2048, 5000),
+    "directions": (50, 100, 200, 500, 1000, 2000, 5000),
+}
+BASE = {"landmarks": 24_919, "locations": 64, "directions": 500}
 
-def with_triangles(mesh: TexturedMesh, least: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of a mesh whose largest triangles are cut into four until there are `least`."""
+
+def subdivided(mesh: TexturedMesh, min_triangles: int) -> TexturedMesh:
+    """Return an untextured copy of a mesh whose largest triangles are cut into four until there are `min_triangles`."""
     vertices = mesh.vertices.astype(np.float64)
     triangles = mesh.triangles
-    while len(triangles) < least:
+    while len(triangles) < min_triangles:
         a, b, c = np.moveaxis(vertices[triangles], 1, 0)
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        cut = np.argsort(-area)[: -(-(least - len(triangles)) // 3)]
+        cut = np.argsort(-area)[: -(-(min_triangles - len(triangles)) // 3)]
         n = len(vertices)
         m = len(cut)
         a, b, c = np.moveaxis(vertices[triangles[cut]], 1, 0)
@@ -67,44 +80,41 @@ def with_triangles(mesh: TexturedMesh, least: int) -> tuple[np.ndarray, np.ndarr
         i, j, k = triangles[cut].T
         parts = np.concatenate([np.stack(part, 1) for part in ((i, ab, ca), (ab, j, bc), (ca, bc, k), (ab, bc, ca))])
         triangles = np.concatenate([np.delete(triangles, cut, 0), parts])
-    return vertices.astype(np.float32), triangles.astype(np.int32)
+    n = len(triangles)
+    corners = np.zeros((n, 3, 2), np.float32)
+    texture = np.zeros((1, 1, 3), np.uint8)
+    return TexturedMesh(
+        vertices.astype(np.float32), triangles.astype(np.int32), corners, np.zeros(n, np.int32), (texture,)
+    )
 
 
-def untextured(vertices: np.ndarray, triangles: np.ndarray) -> TexturedMesh:
-    return TexturedMesh(vertices, triangles, np.zeros((len(triangles), 3, 2), np.float32),
-                        np.zeros(len(triangles), np.int32), (np.zeros((1, 1, 3), np.uint8),))  # fmt: skip
+class Setup:
+    """The mesh, landmarks, locations and occlusion of one run."""
+
+    def __init__(self, args: argparse.Namespace, device: str, n_landmarks: int, n_locations: int) -> None:
+        self.rng = np.random.default_rng(0)
+        base = load_mesh(args.scene) if args.scene else generate_apartment(ApartmentConfig(), 0, device=device)
+        self.mesh = subdivided(base, args.triangles)
+        self.points = points_on_surface(self.mesh, n_landmarks, self.rng)
+        space = FreeSpace(self.mesh, device=device)
+        self.locations = free_points(space, self.mesh.bounds, n_locations, self.rng)
+        self.occlusion = MeshOcclusion(MeshRaycaster(self.mesh, device))
+        self.device = device
+        self.on_gpu = wp.get_device(device).is_cuda
+        self.threads = 1 if self.on_gpu else len(os.sched_getaffinity(0))
 
 
-def on_surface(mesh: TexturedMesh, number: int, rng: np.random.Generator) -> np.ndarray:
-    """Points spread over a mesh by area, 5 mm off, as landmarks are."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.triangles].astype(np.float64), 1, 0)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    rows = rng.choice(len(area), number, p=area / area.sum())
-    u, v = rng.random((2, number, 1))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    return a[rows] + u * (b - a)[rows] + v * (c - a)[rows] + rng.normal(scale=0.005, size=(number, 3))
-
-
-def free_points(mesh: TexturedMesh, number: int, rng: np.random.Generator, device: str) -> np.ndarray:
-    free_space = FreeSpace(mesh, device=device)
-    found = np.empty((0, 3))
-    while len(found) < number:
-        candidates = rng.uniform(*mesh.bounds, (20_000, 3))
-        found = np.concatenate([found, candidates[free_space.is_free(candidates)]])
-    return found[:number]
-
-
-class Peak:
-    """The most memory in use while a block runs: of the process, or of the device's pool."""
+class PeakMemory:
+    """Measures the peak memory of a block: of the process, or of the device's pool."""
 
     def __init__(self, device: str) -> None:
         self.device = device
         self.bytes = 0
 
-    def __enter__(self) -> Peak:
+    def __enter__(self) -> PeakMemory:
         gc.collect()
         with contextlib.suppress(OSError, AttributeError):
-            ctypes.CDLL("libc.so.6").malloc_trim(0)  # or memory kept from earlier would not be seen to be used again
+            ctypes.CDLL("libc.so.6").malloc_trim(0)  # otherwise reuse of freed memory would not be measured
         self._done = threading.Event()
         self._before = self._now()
         self._thread = threading.Thread(target=self._watch)
@@ -125,8 +135,8 @@ class Peak:
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
-def timed(work: Callable[[], object], repeats: int) -> dict[str, float]:
-    """Median, least and most seconds over repeats, after one run to warm up."""
+def seconds_of(work: Callable[[], object], repeats: int) -> dict[str, float]:
+    """Return median, minimum and maximum seconds over repeats, after one warm-up run."""
     work()
     seconds = []
     for _ in range(repeats):
@@ -160,18 +170,20 @@ def _multiply_add_kernel(n: wp.int32, out: wp.array[wp.float32]):
 
 
 def peak_flops(device: str) -> float:
-    """Single-precision multiply-adds a second that independent chains reach here, times two."""
-    threads, n = (1 << 21, 2048) if wp.get_device(device).is_cuda else (256, 1 << 16)
+    """Return the single-precision operations per second of independent multiply-add chains on a GPU."""
+    threads = 1 << 21
+    n = 2048
     out = wp.empty(threads, dtype=wp.float32, device=device)
 
     def work() -> None:
         wp.launch(_multiply_add_kernel, threads, [n], [out], device=device)
         wp.synchronize_device(device)
 
-    return threads * n * 8 * 2 / timed(work, 5)["min_s"]
+    return threads * n * 8 * 2 / seconds_of(work, 5)["min_s"]
 
 
 def machine(device: str) -> dict[str, Any]:
+    """Return the name of the device and of the host's processor, and the number of usable cores."""
     host = platform.machine()
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -182,160 +194,103 @@ def machine(device: str) -> dict[str, Any]:
 
 
 def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
-    from wheretolook.scenes.config import ApartmentConfig
-    from wheretolook_rooms.generator import generate_apartment
-
-    rng = np.random.default_rng(0)
-    base = load_mesh(args.scene) if args.scene else generate_apartment(ApartmentConfig(), 0, device=device)
-    mesh = untextured(*with_triangles(base, args.triangles))
-    points = on_surface(mesh, args.landmarks, rng)
-    locations = free_points(mesh, args.locations, rng, device)
+    """Time every kind of work at the paper's size, print the times, and return a row for each."""
+    setup = Setup(args, device, args.landmarks, args.locations)
     rotations = rotation_looking_along(fibonacci_sphere(args.directions))
-    n = len(locations) * len(rotations) * len(points)
-    landmarks = DevicePoints(points, device)
-    occlusion = MeshOcclusion(MeshRaycaster(mesh, device))
-    counter = FrustumCounter(CAMERA, rotations, len(points), device)
-    print(f"{len(mesh.triangles):,} triangles, {len(locations)} locations, {len(rotations)} directions, "
-          f"{len(points):,} landmarks: {n / 1e9:.2f} G projections; {machine(device)}")  # fmt: skip
-    on_gpu = wp.get_device(device).is_cuda
+    landmarks = DevicePoints(setup.points, device)
+    counter = FrustumCounter(CAMERA, rotations, len(setup.points), device)
+    size = {"locations": args.locations, "directions": args.directions, "landmarks": args.landmarks}
+    size["triangles"] = len(setup.mesh.triangles)
+    n = args.locations * args.directions * args.landmarks
+    print(f"{size}: {n / 1e9:.2f} G projections; {machine(device)}")
     rows: list[dict[str, Any]] = []
-    size = {"locations": len(locations), "directions": len(rotations), "landmarks": len(points),
-            "triangles": len(mesh.triangles)}  # fmt: skip
 
-    def add(what: str, threads: int, work: Callable[[], object], repeats: int = args.repeats) -> None:
-        row = {"what": what, "threads": threads, **size, **timed(work, repeats)}
+    def add(what: str, threads: int, work: Callable[[], object], repeats: int = args.repeats, scale: float = 1) -> None:
+        times = seconds_of(work, repeats)
+        times |= {name: scale * times[name] for name in ("median_s", "min_s", "max_s")}
+        row = {"what": what, "threads": threads, **size, **times, "scale": scale}
         row["projections_per_s"] = n / row["median_s"]
         rows.append(row)
-        spread = f"({1e3 * row['min_s']:,.2f} to {1e3 * row['max_s']:,.2f}, {repeats} repeats)"
-        rate = f"{row['projections_per_s'] / 1e9:10,.2f} G/s"
-        print(f"{what:32} {threads} thread(s): {1e3 * row['median_s']:12,.2f} ms  {spread}, {rate}")
+        print(f"{what:32} {threads:3} thread(s): {1e3 * row['median_s']:12,.2f} ms  ({1e3 * row['min_s']:,.2f} to "
+              f"{1e3 * row['max_s']:,.2f}), {row['projections_per_s'] / 1e9:10,.2f} G/s")  # fmt: skip
 
-    def everything(threads: int) -> object:
-        return survey(CAMERA, rotations, locations, landmarks, occlusion, keep=100, threads=threads)
+    shared = (CAMERA, rotations, setup.locations, landmarks)
+    counts_only = {"keep": 1, "keep_occlusion": False}
+    for threads in sorted({1, setup.threads}):
+        add(EVERYTHING, threads, partial(survey, *shared, setup.occlusion, keep=100, threads=threads))
+        add(COUNTS, threads, partial(survey, *shared, NoOcclusion(), **counts_only, threads=threads))
+    if setup.on_gpu:
 
-    def counts_alone(threads: int) -> object:
-        return survey(CAMERA, rotations, locations, landmarks, NoOcclusion(), keep=1, keep_occlusion=False,
-                      threads=threads)  # fmt: skip
-
-    for threads in (1,) if on_gpu else sorted({1, len(os.sched_getaffinity(0))}):
-        add("occlusion, counts, best 100", threads, lambda threads=threads: everything(threads))
-        add("counts alone", threads, lambda threads=threads: counts_alone(threads))
-    if on_gpu:
-        rays = occlusion.raycaster
-
-        def cast() -> None:
-            rays.unoccluded_on_device(locations, landmarks.single, 0.05)
+        def cast() -> Any:
+            mask = setup.occlusion.unoccluded_on_device(setup.locations, landmarks)
             wp.synchronize_device(device)
+            return mask
 
         add("occlusion alone", 1, cast)
-
-        def unoccluded() -> object:
-            mask = rays.unoccluded_on_device(locations, landmarks.single, 0.05)
-            return counter.count(locations, landmarks.double, mask).numpy()
-
-        add("occlusion, counts", 1, unoccluded)
-    add("cells of the sphere (once)", 1, lambda: FrustumCounter(CAMERA, rotations, len(points), device))
-
-    some = rng.choice(len(locations), args.twin_locations, replace=False)
-    everywhere = np.ones((len(some), len(points)), dtype=bool)
-    plain: dict[str, np.ndarray] = {}
-
-    def twin() -> None:
-        plain["counts"] = count_plain(CAMERA, rotations, locations[some], points, everywhere)
-
-    twin_time = timed(twin, args.twin_repeats)
-    scale = len(locations) / len(some)
-    row = {"what": "NumPy twin, counts alone, scaled", "threads": 1, **size, "repeats": args.twin_repeats,
-           "scale": scale,
-           **{key: twin_time[key] * scale for key in ("median_s", "min_s", "max_s")}}  # fmt: skip
-    rows.append({**row, "projections_per_s": n / row["median_s"]})
-    print(f"{row['what']:32} 1 thread(s): {row['median_s']:12,.1f} s   ({row['min_s']:,.1f} to {row['max_s']:,.1f}, "
-          f"{args.twin_repeats} repeats on {len(some)} locations)")  # fmt: skip
-    for ours in [row for row in rows if row["what"] in ("counts alone", "occlusion, counts, best 100")]:
-        times = rows[-1]["median_s"] / ours["median_s"]
-        print(f"{ours['what']}, {ours['threads']} thread(s): {times:,.1f} times as fast as the twin's counts alone")
-    counts = counter.count(locations[some], landmarks.double).numpy()
-    print("counts equal the twin's:", bool(np.array_equal(counts, plain["counts"])))
-    seen = survey(CAMERA, rotations, locations[some], landmarks, occlusion, keep=100)
-    mask = occlusion.unoccluded(locations[some], points)
-    masked = count_plain(CAMERA, rotations, locations[some], points, mask)
-    print(
-        "counts with occlusion equal the twin's:", bool(np.array_equal(seen.counts, masked)), f"{mask.mean():.1%} free"
-    )
-    if on_gpu:
+        add("occlusion, counts", 1, lambda: counter.count(setup.locations, landmarks.double, cast()).numpy())
+    add("cells of the sphere (once)", 1, lambda: FrustumCounter(CAMERA, rotations, len(setup.points), device))
+    some = setup.locations[setup.rng.choice(len(setup.locations), args.twin_locations, replace=False)]
+    everything = np.ones((len(some), len(setup.points)), dtype=bool)
+    twin = partial(count_plain, CAMERA, rotations, some, setup.points, everything)
+    add(TWIN, 1, twin, args.twin_repeats, len(setup.locations) / len(some))
+    print("counts equal the twin's:", np.array_equal(counter.count(some, landmarks.double).numpy(), twin()))
+    mask = setup.occlusion.unoccluded(some, setup.points)
+    seen = survey(CAMERA, rotations, some, landmarks, setup.occlusion, keep=100)
+    masked = count_plain(CAMERA, rotations, some, setup.points, mask)
+    print("counts with occlusion equal the twin's:", np.array_equal(seen.counts, masked))
+    if setup.on_gpu:
         flops = peak_flops(device)
-        alone = next(row for row in rows if row["what"] == "counts alone")
-        share = alone["projections_per_s"] * FLOPS_PER_PROJECTION / flops
+        rate = next(row["projections_per_s"] for row in rows if row["what"] == COUNTS)
+        share = rate * FLOPS_PER_PROJECTION / flops
         rows.append({"what": "peak", "threads": 1, "flops": flops, "equivalent_share_of_peak": share})
-        print(f"measured peak {flops / 1e12:.1f} TFLOP/s in single precision; projecting everything as fast as counts "
-              f"alone would take {share:.0%} of it, at {FLOPS_PER_PROJECTION} operations a projection")  # fmt: skip
+        print(f"measured peak {flops / 1e12:.1f} TFLOP/s; projecting everything as fast would take {share:.0%} of it")
     return rows
 
 
-SCALING = {
-    "landmarks": (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000, 2_000_000),
-    "locations": (8, 16, 32, 64, 128, 256, 512, 1024, 2048, 5000),
-    "directions": (50, 100, 200, 500, 1000, 2000, 5000),
-}
-BASE = {"landmarks": 24_919, "locations": 64, "directions": 500}
-
-
 def scaling(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
-    from wheretolook.scenes.config import ApartmentConfig
-    from wheretolook_rooms.generator import generate_apartment
-
-    rng = np.random.default_rng(0)
-    base = load_mesh(args.scene) if args.scene else generate_apartment(ApartmentConfig(), 0, device=device)
-    mesh = untextured(*with_triangles(base, args.triangles))
-    points = on_surface(mesh, max(SCALING["landmarks"]), rng)
-    locations = free_points(mesh, max(SCALING["locations"]), rng, device)
-    occlusion = MeshOcclusion(MeshRaycaster(mesh, device))
-    on_gpu = wp.get_device(device).is_cuda
+    """Measure how time and memory grow along each axis of `SCALING`, up to `--scaling-limit` of each."""
+    axes = {axis: [value for value in values if value <= args.scaling_limit] for axis, values in SCALING.items()}
+    base = {axis: min(value, max(axes[axis])) for axis, value in BASE.items()}
+    setup = Setup(args, device, max(*axes["landmarks"], base["landmarks"]), max(*axes["locations"], base["locations"]))
     rows = []
-    for axis, values in SCALING.items():
+    for axis, values in axes.items():
         for value in values:
-            size = {**BASE, axis: value}
+            size = {**base, axis: value}
             rotations = rotation_looking_along(fibonacci_sphere(size["directions"]))
-            landmarks = DevicePoints(points[: size["landmarks"]], device)
-            for what, model in (("with occlusion", occlusion), ("counts alone", NoOcclusion())):
+            landmarks = DevicePoints(setup.points[: size["landmarks"]], device)
+            for what, model in (("with occlusion", setup.occlusion), (COUNTS, NoOcclusion())):
                 work = partial(
-                    survey, CAMERA, rotations, locations[: size["locations"]], landmarks, model, keep=100,
-                    keep_occlusion=model is occlusion, memory_bytes=round(args.memory_gb * 1e9),
+                    survey, CAMERA, rotations, setup.locations[: size["locations"]], landmarks, model, keep=100,
+                    keep_occlusion=model is setup.occlusion, memory_bytes=round(args.memory_gb * 1e9),
                 )  # fmt: skip
-                n = size["locations"] * size["directions"] * size["landmarks"]
-                slow = not on_gpu and (n > 5e10 or (model is occlusion and size["locations"] * size["landmarks"] > 2e7))
-                with Peak(device) as peak:
-                    found = timed(work, 1 if slow else args.scaling_repeats)
-                threads = 1 if on_gpu else len(os.sched_getaffinity(0))
-                rows.append({"axis": axis, **size, "what": what, "threads": threads, **found, "peak_bytes": peak.bytes})
-                print(f"{axis:10} {value:9,} {what:15} {found['median_s']:10.4f} s {peak.bytes / 1e6:10,.1f} MB")
+                n_rays = size["locations"] * size["landmarks"] if model is setup.occlusion else 0
+                n_projections = size["locations"] * size["landmarks"] * size["directions"]
+                slow = not setup.on_gpu and (n_projections > 5e10 or n_rays > 2e7)
+                with PeakMemory(device) as peak:
+                    times = seconds_of(work, 1 if slow else args.scaling_repeats)
+                about = {"axis": axis, **size, "what": what, "threads": setup.threads}
+                rows.append({**about, **times, "peak_bytes": peak.bytes})
+                print(f"{axis:10} {value:9,} {what:15} {times['median_s']:10.4f} s {peak.bytes / 1e6:10,.1f} MB")
     return rows
 
 
 def bounded(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
-    """2 million landmarks x 5,000 locations within the memory allowed."""
-    from wheretolook.scenes.config import ApartmentConfig
-    from wheretolook_rooms.generator import generate_apartment
-
-    rng = np.random.default_rng(0)
-    mesh = untextured(*with_triangles(generate_apartment(ApartmentConfig(), 0, device=device), args.triangles))
-    points = on_surface(mesh, 2_000_000, rng)
-    locations = free_points(mesh, 5_000, rng, device)
-    occlusion = MeshOcclusion(MeshRaycaster(mesh, device)) if wp.get_device(device).is_cuda else NoOcclusion()
+    """Run 2 million landmarks x 5,000 locations within a memory bound; return its time and peak memory."""
+    setup = Setup(args, device, 2_000_000, 5_000)
     rotations = rotation_looking_along(fibonacci_sphere(args.directions))
+    occlusion = setup.occlusion if setup.on_gpu else NoOcclusion()
     start = time.perf_counter()
-    with Peak(device) as peak:
-        survey(CAMERA, rotations, locations, points, occlusion, keep=100, device=device, progress="2 M landmarks",
-               memory_bytes=round(args.memory_gb * 1e9))  # fmt: skip
-    rss = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    row = {"what": "bounded", "occlusion": type(occlusion).__name__, "seconds": time.perf_counter() - start,
-           "peak_bytes": peak.bytes, "peak_rss_bytes": rss}  # fmt: skip
+    with PeakMemory(device) as peak:
+        survey(CAMERA, rotations, setup.locations, setup.points, occlusion, keep=100, device=device,
+               progress="2 M landmarks", memory_bytes=round(args.memory_gb * 1e9))  # fmt: skip
+    row = {"what": "bounded", "occlusion": type(occlusion).__name__, "seconds": time.perf_counter() - start}
+    row |= {"peak_bytes": peak.bytes, "peak_rss_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024}
     print(row)
     return [row]
 
 
 def rows_of(file: Path, part: str) -> list[dict[str, Any]]:
-    """Rows of results of an earlier run, or of a table made of such."""
+    """Return the rows of an earlier result (JSON), or of a table made of such (CSV)."""
     if file.suffix == ".csv":
         return pd.read_csv(file).to_dict("records") if part == "paper_size" else []
     result = json.loads(file.read_text())
@@ -343,6 +298,7 @@ def rows_of(file: Path, part: str) -> list[dict[str, Any]]:
 
 
 def draw(args: argparse.Namespace) -> None:
+    """Write tables and figures of earlier results, and log them to MLflow if asked to."""
     from wheretolook.figures.style import save_figure
     from wheretolook.utils.tracking_config import TrackingConfig
     from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
@@ -364,20 +320,22 @@ def draw(args: argparse.Namespace) -> None:
 
 
 def main() -> None:
+    """Parse the options and measure, or draw earlier results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", help="mesh file; default: a synthetic apartment")
     parser.add_argument("--device", default="cpu", help="Warp's device")
     parser.add_argument("--locations", type=int, default=648)
     parser.add_argument("--directions", type=int, default=500)
     parser.add_argument("--landmarks", type=int, default=24_919)
-    parser.add_argument("--triangles", type=int, default=250_000, help="least number of triangles")
+    parser.add_argument("--triangles", type=int, default=250_000, help="minimum number of triangles")
     parser.add_argument("--repeats", type=int, default=20)
-    parser.add_argument("--twin-locations", type=int, default=2, help="the twin runs on these, its time is scaled up")
+    parser.add_argument("--twin-locations", type=int, default=2, help="locations of the twin, whose time is scaled up")
     parser.add_argument("--twin-repeats", type=int, default=20)
-    parser.add_argument("--scaling", action="store_true", help="how time and memory grow, too")
+    parser.add_argument("--scaling", action="store_true", help="also measure how time and memory grow")
+    parser.add_argument("--scaling-limit", type=int, default=2_000_000, help="largest size along each axis")
     parser.add_argument("--scaling-repeats", type=int, default=5)
-    parser.add_argument("--bounded", action="store_true", help="2 million landmarks x 5,000 locations, too")
-    parser.add_argument("--memory-gb", type=float, default=2.0, help="bound on the blocks in work")
+    parser.add_argument("--bounded", action="store_true", help="also run 2 million landmarks x 5,000 locations")
+    parser.add_argument("--memory-gb", type=float, default=2.0, help="memory bound of the blocks in work")
     parser.add_argument("--out", help="write the results to this JSON file")
     parser.add_argument("--draw", nargs="+", metavar="JSON", help="draw earlier results, or a table of such")
     parser.add_argument("--figures", default=".", help="folder for figures and tables")

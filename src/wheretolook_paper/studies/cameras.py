@@ -1,7 +1,7 @@
 """Which scorer to ship for any camera: regret, AUC and calibration over unlike scenes and over fields of view.
 
-    python tests/benchmarks/study_cameras.py data/cameras --split val --weights data/release/weights --out cameras.csv
-    python tests/benchmarks/study_cameras.py data/test-45 data/test-60 ... --split test --weights ...
+    python -m wheretolook_paper.studies.cameras data/cameras --split val --weights data/release/weights --out cameras.csv
+    python -m wheretolook_paper.studies.cameras data/test-45 data/test-60 ... --split test --weights ...
 
 Each dataset has been labelled; the first line is the choice on the val scenes of `configs/cameras.yaml`, the second the
 test by angle: datasets of the same scenes and maps, made with `--camera.fov_deg 45 --map.camera '{fov_deg: 90}'` and so

@@ -1,6 +1,6 @@
 """Fits what ships with looks: the confidence in a joint pose, and what a set of looks is worth.
 
-    python tests/benchmarks/fit_looks.py SCENE_FOLDER... [--places 60] [--sets 4]
+    python -m wheretolook_paper.studies.fit_looks SCENE_FOLDER... [--places 60] [--sets 4]
 
 Of validation scenes whose labels keep their pixels (`wheretolook label --label.store_pixels true`), looked at by one
 camera. At each place sets of 1, 2, 3 and 5 looks are drawn at random, the likelier the higher their scores, and joined.

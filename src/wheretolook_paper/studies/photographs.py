@@ -1,8 +1,8 @@
 """How well methods rank real photographs, by `wheretolook check` on maps made here: of photographs, or of known poses.
 
-    python tests/benchmarks/bench_photographs.py --images fox --work work/fox --out photographs.csv
-    python tests/benchmarks/bench_photographs.py --poses kitchen --work work/kitchen --out photographs.csv
-    python tests/benchmarks/bench_photographs.py --poses kitchen --work work/aliked --extractor aliked=aliked-n16rot.pth
+    python -m wheretolook_paper.studies.photographs --images fox --work work/fox --out photographs.csv
+    python -m wheretolook_paper.studies.photographs --poses kitchen --work work/kitchen --out photographs.csv
+    python -m wheretolook_paper.studies.photographs --poses kitchen --work work/aliked --extractor aliked=aliked-n16rot.pth
 
 Photographs are mapped as `wheretolook map --images` does, or from the poses beside them (7-Scenes layout:
 frame-*.color.*, .depth.png, .pose.txt with world_from_cam in metres). Such poses choose the pairs to match and the

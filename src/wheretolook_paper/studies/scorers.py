@@ -1,9 +1,9 @@
 """Which learner to ship: seeds, ablations and learning curves, all judged on the validation scenes alone.
 
-    python tests/benchmarks/study_scorers.py seeds --data data --dataset release --out study
-    python tests/benchmarks/study_scorers.py attributes ...   the set network without each attribute of a landmark
-    python tests/benchmarks/study_scorers.py options ...      the set network with other options
-    python tests/benchmarks/study_scorers.py curves ...       with fewer training scenes and viewpoints
+    python -m wheretolook_paper.studies.scorers seeds --data data --dataset release --out study
+    python -m wheretolook_paper.studies.scorers attributes ...   the set network without each attribute of a landmark
+    python -m wheretolook_paper.studies.scorers options ...      the set network with other options
+    python -m wheretolook_paper.studies.scorers curves ...       with fewer training scenes and viewpoints
 
 The protocol, fixed before the test scenes were looked at: options are chosen by the mean validation average precision
 over seeds; of all learners the one with the best mean ships, made by the train stage with the best seed; test scenes

@@ -1,7 +1,7 @@
 """How much adapting to a place gains: learnt from half of each scene's labelled locations, judged by the other half.
 
-    python tests/benchmarks/bench_adapt.py data/cameras --split val
-    python tests/benchmarks/bench_adapt.py data/test-90 --split test --out adapted.csv
+    python -m wheretolook_paper.studies.adapt data/cameras --split val
+    python -m wheretolook_paper.studies.adapt data/test-90 --split test --out adapted.csv
 
 A row for each scene, and the means: regret in percentage points, AUC and calibration error of the weights that ship, of
 the adapted ones and, to compare, of bins.

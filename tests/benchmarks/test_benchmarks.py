@@ -1,0 +1,78 @@
+"""Every benchmark runs once at small size."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parent
+ROOT = FOLDER.parents[1]
+WEIGHTS = ROOT / "data" / "release" / "weights" / "set.safetensors"
+
+pytestmark = pytest.mark.slow
+
+SMALL = {
+    "fisher": "--landmarks 300 --voxels 2 --directions 20 --repeats 1 --samples 10",
+    "load": "--every 0.2 bogus",
+    "looks": f"{ROOT}/data/release/apartment-209 --directions 30 --places 2",
+    "queries": "--queries 4000 --processes 2",
+    "robot": f"--weights {WEIGHTS} --landmarks 500 --directions 20 --repeats 2",
+    "scorers": f"--weights {WEIGHTS} --landmarks 500 --locations 2 --directions 20 --repeats 1 --poses 2",
+    "view": "--landmarks 400 --turns 2 --clients 1 --seconds 4",
+    "viewpoint_map": "--landmarks 300 --voxels 4 --directions 20 --repeats 1 --builds 1 --queries 100 --waypoints 5",
+}
+
+
+def run(name: str, *arguments: str) -> str:
+    """Run a benchmark; return what it prints."""
+    command = [sys.executable, str(FOLDER / f"bench_{name}.py"), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_small(name: str) -> None:
+    assert run(name, *SMALL[name].split())
+
+
+def test_visibility_is_measured_and_drawn(tmp_path: Path) -> None:
+    out = tmp_path / "cpu.json"
+    sizes = [
+        "--locations",
+        "4",
+        "--directions",
+        "20",
+        "--landmarks",
+        "300",
+        "--triangles",
+        "500",
+        "--repeats",
+        "1",
+        "--twin-repeats",
+        "1",
+    ]
+    run("visibility", *sizes, "--scaling", "--scaling-limit", "1000", "--scaling-repeats", "1", "--out", str(out))
+    assert {"paper_size", "scaling"} < json.loads(out.read_text()).keys()
+    run("visibility", "--draw", str(out), "--figures", str(tmp_path))
+    assert {"runtimes.csv", "runtimes.png", "scaling.csv"} < {path.name for path in tmp_path.iterdir()}
+
+
+def test_features_and_labelling(tmp_path: Path) -> None:
+    sizes = ("--map-images", "12", "--locations", "2", "--directions", "2")
+    assert "| opencv |" in run("features", "--work", str(tmp_path), *sizes)
+    scene = tmp_path / "scene-901"
+    shutil.copytree(scene / "opencv" / "map", scene / "map")
+    printed = run("labelling", str(scene), "--views", "8", "--batches", "4", "--workers", "1")
+    assert "ms per view" in printed and "views per second" in printed
+
+
+def test_every_benchmark_is_run() -> None:
+    names = {path.stem.removeprefix("bench_") for path in FOLDER.glob("bench_*.py")}
+    assert names == {*SMALL, "features", "labelling", "visibility"}

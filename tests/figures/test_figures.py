@@ -1,105 +1,124 @@
-"""Figures can be drawn and say what the data say."""
+"""Figures of labels, scores, calibration and the overview draw the numbers of their input."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
-from matplotlib.colors import to_rgb
+from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
+from matplotlib.colors import to_hex
+from matplotlib.lines import Line2D
 
-from wheretolook.figures.style import save_figure
-from wheretolook.geometry.lattices import fibonacci_sphere, released_lattice
-from wheretolook.scorers.styles import method_group, method_style
-from wheretolook_paper.figures.lattices import covering_radius_deg, fibonacci_figure, nearest_angles_deg
-from wheretolook_paper.figures.training import training_figure
-from wheretolook_paper.scorers.fisher import APPROXIMATIONS, METRICS
+from box_scenes import furnished_room
+from synthetic_dataset import make_dataset
+from synthetic_scores import EVERY_METHOD, FISHER, KEYS, make_scores
+from wheretolook.evaluation.calibration import calibration_rows
+from wheretolook.figures.calibration import calibration_figure
+from wheretolook.figures.dollhouse import dollhouse
+from wheretolook.figures.labels import SHADES, label_figure
+from wheretolook.figures.overview import Overview, View, overview_figure
+from wheretolook.figures.scores import regret_figure, score_figure
+from wheretolook.geometry.camera_turns import pan_tilt_angles
+from wheretolook.geometry.lattices import fibonacci_sphere
+from wheretolook.localization.report import POSITIVE, label_summary
+from wheretolook.scorers.styles import method_style
 
-
-def test_covering_radius_of_platonic_solids() -> None:
-    octahedron = np.concatenate([np.eye(3), -np.eye(3)])
-    cube = np.stack(np.meshgrid(*[[-1, 1]] * 3), -1).reshape(-1, 3) / np.sqrt(3)
-    assert covering_radius_deg(octahedron) == pytest.approx(np.degrees(np.arccos(1 / np.sqrt(3))))
-    assert covering_radius_deg(cube) == pytest.approx(np.degrees(np.arccos(1 / np.sqrt(3))))
-    np.testing.assert_allclose(nearest_angles_deg(octahedron), 90)
-    np.testing.assert_allclose(nearest_angles_deg(cube), np.degrees(np.arccos(1 / 3)))
-
-
-@pytest.mark.parametrize("lattice", [fibonacci_sphere, released_lattice])
-def test_covering_radius_against_a_dense_search(lattice) -> None:  # type: ignore[no-untyped-def]
-    directions = lattice(200)
-    probes = np.random.default_rng(0).normal(size=(100_000, 3))
-    probes /= np.linalg.norm(probes, axis=1, keepdims=True)
-    searched = np.degrees(np.arccos((probes @ directions.T).max(1).min()))
-    assert searched <= covering_radius_deg(directions) + 1e-9
-    assert searched == pytest.approx(covering_radius_deg(directions), rel=0.05)
+FEW = ("random", "visible", "bins", "mlp-2d")
 
 
-def test_fibonacci_figure_tells_the_radii(tmp_path: Path) -> None:
-    figure = fibonacci_figure(500)
-    titles = [axes.get_title() for axes in figure.axes]
-    assert len(titles) == 3
-    captions = [axes.texts[0].get_text() for axes in figure.axes]
-    assert captions[0] == "covering radius 7.0°\nnearest neighbours 7.9° to 9.0°"
-    assert "covering radius 20.4°" in captions[2]
-    _assert_draws(figure, tmp_path)
+def test_label_figure_draws_shares_and_errors(tmp_path: Path) -> None:
+    dataset = make_dataset(tmp_path, ("test", "train", "val"), n_locations=6, n_directions=10, n_landmarks=200)
+    tables = {scene.name: scene.read_table() for scene in dataset.scenes}
+    summary = label_summary(tables, {scene.name: scene.split for scene in dataset.scenes})
+    figure: Any = label_figure(summary)
+    scenes, errors = figure.axes
+    names = [label.get_text() for label in scenes.get_yticklabels()]
+    assert names == ["scene 0 (test)", "scene 1 (train)", "scene 2 (val)", "all scenes"]
+    rows = summary.shares.iloc[[0, 1, 2, -1]]
+    for shade, column in zip(SHADES, (POSITIVE[0], POSITIVE[-1]), strict=True):
+        widths = [bar.get_width() for bar in scenes.patches if to_hex(bar.get_facecolor()) == shade]
+        np.testing.assert_allclose(widths, 100 * rows[column])
+    assert sum(bar.get_height() for bar in errors.patches) == pytest.approx(100)
+    assert errors.patches[-1].get_height() == pytest.approx(100 * summary.overall["without_pose"])
 
 
-def test_training_figure_marks_the_best_epoch(tmp_path: Path) -> None:
-    history = pd.DataFrame({"epoch": range(5), "train_bce": 0.5, "val_bce": 0.6, "train_average_precision": 0.9,
-                            "val_average_precision": [0.1, 0.4, 0.8, 0.7, 0.8]})  # fmt: skip
-    figure = training_figure({"mlp-2d": history, "mlp-2d+3d": history + 0.01})
-    rings = [line for line in figure.axes[1].lines if line.get_marker() == "o"]
-    assert [line.get_xdata()[0] for line in rings] == [3, 3.01]
-    _assert_draws(figure, tmp_path)
+def row_of(scores: pd.DataFrame, method: str) -> pd.Series:
+    return scores[(scores["method"] == method) & (scores["scene"] == "all") & (scores["top_n"] == 1)].iloc[0]
 
 
-def test_training_figure_names_learners_as_other_figures_do() -> None:
-    history = pd.DataFrame({name: [0.5, 0.6] for name in (
-        "train_bce", "val_bce", "train_average_precision", "val_average_precision")}).assign(epoch=[0, 1])  # fmt: skip
-    labels = training_figure({"set": history}).axes[1].get_legend_handles_labels()[1]
-    assert labels == ["set of landmarks: training", "set of landmarks: validation"]
+def mark_of(axes: Axes, method: str) -> Line2D:
+    (mark,) = (line for line in axes.lines if line.get_label() == method_style(method).label)
+    return mark
 
 
-def test_methods_look_different() -> None:
-    methods = ["oracle", "random", "forward", "visible", "bins", "max-visibility",
-               "max-visibility-swapped", "fisher-worst-trace", "fisher-stationary-trace", "mlp-2d", "mlp-2d+z",
-               "mlp-2d+3d", "mlp-released"]  # fmt: skip
-    styles = [method_style(method) for method in methods]
-    for name in ("label", "color", "marker"):
-        assert len({getattr(style, name) for style in styles}) == len(methods)
-    assert method_style("new") == method_style("new")
-    assert {method_group(name) for name in methods[:7]} == {"rules"}
+def whisker(axes: Any, y: float) -> list[float]:
+    segments = [segment for lines in axes.collections for segment in lines.get_segments()]
+    (segment,) = (segment for segment in segments if np.allclose(segment[:, 1], y))
+    return [float(value) for value in segment[:, 0]]
 
 
-def test_fisher_rows_are_one_family() -> None:
-    """A marker for each metric, a shade for each approximation, dark to light also in greyscale."""
-    styles = {
-        f"{metric} {approximation}": method_style(f"fisher-{metric}-{approximation}")
-        for metric in METRICS
-        for approximation in APPROXIMATIONS
-    }
-    assert len({style.label for style in styles.values()}) == len(styles) == 9
-    for name, style in styles.items():
-        metric, approximation = name.split()
-        assert style.marker == styles[f"{metric} exact"].marker
-        assert style.color == styles[f"mineig {approximation}"].color
-    assert len({style.marker for style in styles.values()}) == len({style.color for style in styles.values()}) == 3
-    weights = np.array([0.299, 0.587, 0.114])
-    greys = [weights @ to_rgb(styles[f"trace {one}"].color) for one in ("exact", "quadratic", "gp")]
-    assert np.diff(greys).min() > 0.15
-    assert styles["mineig exact"].label == "Fisher, min. eigenvalue, exact"
-    assert method_group("fisher-trace-gp") == "Fisher"
-    assert method_group("fisher-worst-trace") == method_group("fisher-stationary-trace") == "probes"
-    assert method_group("mlp-2d") == "learned"
+@pytest.mark.parametrize("methods", [EVERY_METHOD, FEW])
+def test_score_figure_draws_the_best_methods_first(methods: tuple[str, ...]) -> None:
+    scores = make_scores(methods, reference="")
+    figure = score_figure(scores)
+    first = scores[(scores["scene"] == "all") & (scores["top_n"] == 1) & (scores["method"] != "oracle")]
+    ordered = first.sort_values(f"normalized_{KEYS[0]}", ascending=False, kind="stable")["method"]
+    fisher = [name for name in ordered if name in FISHER][:3]
+    shown = [name for name in ordered if name in fisher or not name.startswith("fisher")]
+    labels = [text.get_text().replace("\n", " ") for text in figure.axes[0].get_yticklabels()]
+    assert labels == [method_style(method).label for method in shown]
+    for axes, key in zip(figure.axes, (KEYS[0], KEYS[-1]), strict=True):
+        for y, method in enumerate(shown):
+            row = row_of(scores, method)
+            assert mark_of(axes, method).get_xdata() == pytest.approx([100 * row[f"normalized_{key}"]])
+            assert whisker(axes, y) == pytest.approx([100 * row[f"normalized_{end}_{key}"] for end in ("low", "high")])
 
 
-def _assert_draws(figure, folder: Path) -> None:  # type: ignore[no-untyped-def]
-    from matplotlib.image import imread
+def test_regret_figure_draws_regret_and_difference() -> None:
+    scores = make_scores()
+    worse = make_scores(seed=1).assign(occlusion="none")  # of a second occlusion model, not drawn
+    figure = regret_figure(pd.concat([scores, worse], ignore_index=True))
+    for axes, name in zip(figure.axes, ("regret", "difference"), strict=True):
+        for method in ("bins", "mlp-2d", "visible"):
+            mark = mark_of(axes, method)
+            assert mark.get_xdata() == pytest.approx([100 * row_of(scores, method)[f"{name}_{KEYS[0]}"]])
+    assert len(regret_figure(make_scores(FEW, reference="")).axes) == 1
+    with pytest.raises(ValueError, match="regret"):
+        regret_figure(scores.drop(columns=[name for name in scores if "regret" in str(name)]))
 
-    save_figure(figure, folder / "figure.png")
-    image = imread(folder / "figure.png")
-    assert image.shape[0] > 300
-    assert image.std() > 0.01
-    assert [path.name for path in folder.iterdir()] == ["figure.png"]
+
+def test_calibration_figure_draws_the_curves() -> None:
+    rng = np.random.default_rng(0)
+    probability = rng.random(500)
+    table = calibration_rows(probability, rng.random(500) < probability, 2.0).assign(method="mlp-2d", temperature=2.0)
+    figure: Any = calibration_figure(table)
+    curve, counts = figure.axes
+    for line, patch, when in zip(curve.lines[1:], counts.patches, ("before", "after"), strict=True):
+        rows = table[table["when"] == when]
+        np.testing.assert_allclose(line.get_xydata(), rows.loc[rows["n"] > 0, ["mean_predicted", "share_good"]])
+        np.testing.assert_array_equal(patch.get_data().values, rows["n"])
+
+
+def test_overview_draws_locations_scores_and_both_views() -> None:
+    plan = dollhouse(furnished_room(), elevation_deg=90, cut_m=1.5, one_sided=False, width_px=240)
+    locations = np.array([[1.0, 2.0, 1.4], [2.0, 3.0, 1.4], [3.0, 1.0, 1.4]])
+    directions = fibonacci_sphere(80)
+    scores = np.linspace(0, 1, 80)
+    shares = np.array([0.2, 0.9, 0.5])
+    rgb = np.full((48, 64, 3), 90, np.uint8)
+    best, worst = (View(rgb, directions[row], float(scores[row]), f"outcome {row}") for row in (79, 30))
+    figure = overview_figure(
+        Overview("a room", "set", plan, locations, shares, locations[1], directions, scores, best, worst)
+    )
+    sphere = next(axes for axes in figure.axes if axes.name == "hammer")
+    (dots,) = (one for one in figure.axes[0].collections if isinstance(one, PathCollection))
+    order = np.argsort(shares)
+    np.testing.assert_allclose(dots.get_offsets(), plan.pixels(locations)[order])
+    np.testing.assert_allclose(dots.get_array(), shares[order])
+    np.testing.assert_allclose(sphere.collections[0].get_offsets(), np.transpose(pan_tilt_angles(directions)))
+    for text, view in zip(sphere.texts, (best, worst), strict=True):
+        np.testing.assert_allclose(text.get_position(), np.ravel(pan_tilt_angles(view.direction)))

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from wheretolook.utils.errors import ConfigError
 
-Look = dict[str, Any]  # keyword arguments of Matplotlib's functions, such as colours and sizes
-KINDS = ("png", "pdf", "svg")  # kinds of files that figures are written as
+KINDS = ("png", "pdf", "svg")  # file formats of figures
 
 
 @dataclass(frozen=True)
@@ -17,9 +15,9 @@ class FiguresConfig:
     """Options of the figures stage.
 
     Args:
-        out: folder of the files; `<dataset>/results/figures` if not given.
-        only: names of what to draw, as `wheretolook figures --list` tells; empty for all.
-        kinds: kinds of files of a figure: png, pdf, svg.
+        out: output folder; `<dataset>/results/figures` by default.
+        only: names of the figures and tables to draw, as listed by `wheretolook figures --list`; all by default.
+        kinds: file formats of figures: png, pdf, svg.
     """
 
     out: Path | None = None

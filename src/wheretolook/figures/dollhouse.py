@@ -1,4 +1,4 @@
-"""A picture of a scene from obliquely above, without its ceiling and the near walls, and drawing on it."""
+"""Render a scene from obliquely above, without ceiling and near walls, and draw world points on the image."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.cutting import cut_above
 from wheretolook.utils.errors import ConfigError, SceneError
 
-FAR = 25.0  # distance of the eye in diagonals of the scene: so far that parallel lines stay parallel in the picture
+EYE_DISTANCE = 25.0  # in diagonals of the scene: close to an orthographic projection
 
 
 @dataclass(frozen=True, eq=False)
 class Dollhouse:
-    """A picture of a scene on which world points can be drawn, with the camera that took it and its pose."""
+    """Image of a scene from outside, with the camera and pose that project world points onto it."""
 
-    rgb: NDArray[np.uint8]  # (H, W, 3); white where there is no surface
-    depth_m: NDArray[np.float32]  # (H, W), from the eye; 0 where there is no surface
+    rgb: NDArray[np.uint8]  # (H, W, 3); white without a surface
+    depth_m: NDArray[np.float32]  # (H, W), from the eye; 0 without a surface
     camera: PinholeCamera
     cam_from_world: Float  # (3, 4)
 
     def pixels(self, points: ArrayLike) -> Float:
-        """Pixels (..., 2) of world points (..., 3) in metres."""
+        """Project world points (..., 3) m to pixels (..., 2)."""
         world = np.asarray(points, dtype=np.float64)
         return self.camera.project(transform(self.cam_from_world, world.reshape(-1, 3))).reshape(*world.shape[:-1], 2)
 
     def shows(self, points: ArrayLike, margin_m: float = 0.1) -> NDArray[np.bool_]:
-        """Which world points (N, 3) in metres lie on a surface in the picture, to the margin; (N,).
+        """Test which world points (N, 3) m are on a visible surface of the image, within a margin; (N,).
 
-        Not, then, points of what is hidden, and of walls that are cut off or left out: they would float.
+        Points on hidden or removed surfaces are not.
         """
         in_camera = transform(self.cam_from_world, points)
         pixels = self.camera.project(in_camera)
@@ -58,13 +58,19 @@ def dollhouse(
 ) -> Dollhouse:
     """Render a scene from outside.
 
-    The azimuth of the eye counts counter-clockwise from +x. Its elevation is in (0, 90]; 90 gives a plan with +x to the
-    right and +y up, whatever the azimuth. What lies above the world height `cut_m` is cut off. With `one_sided`, for
-    meshes that are wound reliably, triangles that turn their backs to the eye are left out, such as ceilings. Raises
-    ConfigError if the elevation or width is out of range, SceneError if no triangle is left.
+    Args:
+        mesh: the scene.
+        azimuth_deg: direction of the eye, counter-clockwise from +x.
+        elevation_deg: of the eye, in (0, 90]; 90 gives a plan with +x to the right and +y up.
+        cut_m: world height above which the mesh is cut off.
+        width_px: width of the image.
+        one_sided: leave out triangles that face away from the eye, such as ceilings; needs consistent winding.
+        device: where to render.
+
+    Raises ConfigError if elevation or width is out of range, SceneError if no triangle remains.
     """
     if not 0 < elevation_deg <= 90 or width_px < 2:
-        raise ConfigError("the eye must be above the scene, and the picture wide", value=(elevation_deg, width_px))
+        raise ConfigError("the elevation must be in (0, 90] and the width at least 2", value=(elevation_deg, width_px))
     low, high = mesh.bounds
     if cut_m is not None:
         mesh = cut_above(mesh, cut_m)
@@ -76,13 +82,13 @@ def dollhouse(
     if one_sided:
         mesh = mesh.only(mesh.normals @ to_eye > 0)
     if len(mesh.triangles) == 0:
-        raise SceneError("nothing of the scene is left to be seen", value=cut_m, fix="Cut higher.")
+        raise SceneError("no triangle of the scene is visible", value=cut_m, fix="Cut higher.")
     corners = np.stack(np.meshgrid(*np.stack([low, high], axis=1), indexing="ij"), axis=-1).reshape(-1, 3)
     rotation = rotation_looking_along(-to_eye)
     in_eye_frame = corners @ rotation.T
     extent = np.ptp(in_eye_frame[:, :2], axis=0)
     center = (in_eye_frame.min(0) + in_eye_frame.max(0)) / 2 @ rotation
-    distance = FAR * float(np.linalg.norm(high - low))
+    distance = EYE_DISTANCE * float(np.linalg.norm(high - low))
     focal_px = 0.98 * width_px * distance / extent[0]
     height_px = max(2, int(np.ceil(width_px * extent[1] / extent[0])))
     camera = PinholeCamera(width_px, height_px, float(focal_px))
@@ -95,9 +101,9 @@ def dollhouse(
 
 
 def draw_house(axes: Axes, house: Dollhouse, fade: float = 0.5) -> None:
-    """Draw the picture, with axes in its pixels; `fade` makes it paler, from 0 (as it is) to 1 (white)."""
+    """Draw the image with axes in its pixels; `fade` blends it with white, from 0 (unchanged) to 1 (white)."""
     height, width = house.rgb.shape[:2]
-    rgb = 255 * (house.rgb / 255.0) ** 0.7  # rooms without a lamp are dark
+    rgb = 255 * (house.rgb / 255.0) ** 0.7  # brightens rooms without lamps
     axes.imshow((rgb + fade * (255 - rgb)).astype(np.uint8), extent=(0, width, height, 0))
     axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal")
     axes.axis("off")
@@ -118,10 +124,10 @@ def draw_segments(axes: Axes, house: Dollhouse, segments: ArrayLike, **style: An
 
 
 def frustum_corners(camera: Camera, cam_from_world: ArrayLike, depth_m: float) -> Float:
-    """Corners (B, 5, 3) m of cameras (B, 3, 4): centre, then the image's corners at a depth, from top left."""
+    """Compute the frustum corners (B, 5, 3) m of poses (B, 3, 4): centre, then image corners at a depth, from top left."""
     pixels = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (camera.width, camera.height)
     rays = camera.unproject(pixels)
-    if isinstance(camera, PinholeCamera):  # a fisheye's corners can lie behind it: it is drawn to a distance
+    if isinstance(camera, PinholeCamera):  # corners of a fisheye can be behind it: they are at a distance
         rays = rays / rays[:, 2:]
     corners = np.concatenate([np.zeros((1, 3)), depth_m * rays])
     world_from_cam = invert_poses(np.asarray(cam_from_world, dtype=np.float64).reshape(-1, 3, 4))
@@ -129,6 +135,6 @@ def frustum_corners(camera: Camera, cam_from_world: ArrayLike, depth_m: float) -
 
 
 def frustum_segments(camera: Camera, cam_from_world: ArrayLike, depth_m: float) -> Float:
-    """The eight edges (B, 8, 2, 3) m of camera frusta down to a depth."""
+    """Compute the eight edges (B, 8, 2, 3) m of camera frusta to a depth."""
     edges = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
     return frustum_corners(camera, cam_from_world, depth_m)[:, edges]

@@ -1,4 +1,4 @@
-"""The score figures: how well methods choose, what they lose against the oracle, and against a reference."""
+"""Score figures: how often the chosen views localize, relative to the oracle and to a reference method."""
 
 from __future__ import annotations
 
@@ -14,53 +14,46 @@ from matplotlib.style import context
 from matplotlib.ticker import MaxNLocator
 
 from wheretolook.dataset.thresholds import ALL, threshold_label
-from wheretolook.evaluation.score_table import main_rows, methods_of, reference_of, threshold_keys
+from wheretolook.evaluation.score_table import main_rows, reference_of, threshold_keys
 from wheretolook.evaluation.scores import by_chance
-from wheretolook.figures.config import Look
-from wheretolook.figures.style import INK, RC, new_figure
+from wheretolook.figures.style import INK, RC, Style, new_figure
 from wheretolook.scorers.styles import ORACLE, method_group, method_style
 
-_MOST = {"Fisher": 3, "probes": 0}  # of a group's methods that a figure shows, the best ones; else all
-_WRAP = 36  # longer names of methods are broken into two lines
+_MAX_METHODS = {"Fisher": 3, "probes": 0}  # the best methods of a group that a figure shows; all of other groups
+_WRAP = 36  # characters; longer labels are broken into two lines
 _WHISKERS = "whiskers: 95 % bootstrap interval over locations"
+_DASHED: Style = {"color": INK, "linewidth": 1, "linestyle": "--", "zorder": 1}
 
 
 def score_figure(scores: pd.DataFrame) -> Figure:
-    """How often the view that a method chooses localizes, at the finest and at the coarsest threshold.
+    """Draw how often the first N views chosen by each method localize, in % of the oracle, with intervals.
 
-    One row for each method, the best at the finest threshold on top: the share of its chosen views, in % of the
-    oracle's, as a mark with its bootstrap interval, and as a number. The axes hold the methods that come at least
-    halfway from chance to the oracle; arrows point to the others. Shown are the first N and `methods_to_show`; all
-    other numbers stand in the table.
-
-    `scores` is a table of `wheretolook.evaluation.scores.score_table`; its rows over all scenes are drawn, those of the
-    first occlusion model and the first set of candidates if there are several.
+    One panel for the finest and one for the coarsest threshold, one row per method of `methods_to_show`, the best on
+    top. The axes span the methods at least halfway from random choice to the oracle; arrows point to the others.
+    `scores` is a table of `wheretolook.evaluation.scores.score_table`; rows over all scenes of its first occlusion
+    model and candidate set are drawn.
     """
     pooled = _pooled(scores)
     keys = threshold_keys(scores)
     shown = methods_to_show(pooled, keys[0])
     columns = {f"normalized_{key}": f"within {threshold_label(key)}" for key in dict.fromkeys((keys[0], keys[-1]))}
-    lowest = _ends_of(pooled, _near(pooled, shown, keys[0]), list(columns))[0]
+    low = min(_range(pooled, _close_to_oracle(pooled, shown, keys[0]), list(columns))[0], 95.0)
+    margin = 0.04 * (100 - low)
     with context(RC):
         figure, panels = _rows_and_panels(pooled, shown, columns)
         for axes in panels:
-            low = min(lowest, 95.0)
-            axes.set_xlim(low - 0.04 * (100 - low), 100 + 0.04 * (100 - low))
-            axes.axvline(100, color=INK, linewidth=1, linestyle="--", zorder=1)
-            _point_beyond(axes, shown)
+            _set_range(axes, shown, low - margin, 100 + margin, 100)
         oracle = method_style(ORACLE).label
-        figure.supxlabel(
-            f"{_chosen(pooled)} that localize, % of what the {oracle} reaches (dashed)\n{_WHISKERS}", fontsize=9
-        )
+        reached = f"{_chosen_views(pooled)} that localize, % of what the {oracle} reaches (dashed)"
+        figure.supxlabel(f"{reached}\n{_WHISKERS}", fontsize=9)
         return figure
 
 
 def regret_figure(scores: pd.DataFrame) -> Figure:
-    """What methods lose against the oracle and against the reference, at the finest threshold.
+    """Draw the regret against the oracle and the paired difference to the reference, at the finest threshold.
 
-    Rows and `scores` are as in `score_figure`. Left the regret, right the paired difference to the reference if the
-    table has one, with bootstrap intervals, in percentage points of the chosen views. Raises ValueError if the table is
-    of an older version, without regret.
+    Rows and `scores` are as in `score_figure`; values are percentage points of the chosen views. Raises ValueError if
+    the table has no regret.
     """
     pooled = _pooled(scores)
     key = threshold_keys(scores)[0]
@@ -74,54 +67,54 @@ def regret_figure(scores: pd.DataFrame) -> Figure:
     with context(RC):
         figure, panels = _rows_and_panels(pooled, shown, columns)
         for axes, column in zip(panels, columns, strict=True):
-            low, high = _ends_of(pooled, _near(pooled, shown, key), [column])
+            low, high = _range(pooled, _close_to_oracle(pooled, shown, key), [column])
             low = min(low, 0.0)
             high = max(high, 0.0)
             margin = 0.06 * max(high - low, 1.0)
-            axes.set_xlim(low - margin, high + margin)
-            axes.axvline(0, color=INK, linewidth=1, linestyle="--", zorder=1)
-            _point_beyond(axes, shown)
-        share = f"{_chosen(pooled)} within {threshold_label(key)}, percentage points"
-        figure.supxlabel(f"{share}\n{_WHISKERS}", fontsize=9)
+            _set_range(axes, shown, low - margin, high + margin, 0)
+        views = f"{_chosen_views(pooled)} within {threshold_label(key)}, percentage points"
+        figure.supxlabel(f"{views}\n{_WHISKERS}", fontsize=9)
         return figure
 
 
 def methods_to_show(pooled: pd.DataFrame, key: str) -> list[str]:
-    """Methods of a score table that a figure shows, best first: of the Fisher methods three, and no probes.
+    """Select the methods that a figure shows, best first: three Fisher methods, no probes, all others.
 
     Args:
         pooled: rows of a score table over all scenes.
-        key: the threshold they are ordered by, at the first N.
+        key: threshold by which methods are ordered, at the first N.
     """
-    rows = pooled[(pooled["top_n"] == pooled["top_n"].iloc[0]) & (pooled["method"] != ORACLE)]
-    shares = rows.set_index("method")[f"normalized_{key}"].fillna(0.0)
-    ordered = sorted(methods_of(rows), key=lambda method: -shares[method])
-    shown = []
-    seen = dict.fromkeys(_MOST, 0)
+    rows = _first_rows(pooled).drop(index=ORACLE, errors="ignore")
+    ordered = rows[f"normalized_{key}"].fillna(0.0).sort_values(ascending=False, kind="stable").index
+    shown: list[str] = []
+    counts = dict.fromkeys(_MAX_METHODS, 0)
     for method in ordered:
         group = method_group(method)
-        seen[group] = seen.get(group, 0) + 1
-        if seen[group] <= _MOST.get(group, len(ordered)):
+        counts[group] = counts.get(group, 0) + 1
+        if counts[group] <= _MAX_METHODS.get(group, len(ordered)):
             shown.append(method)
-    return shown or ordered
+    return shown or list(ordered)
 
 
-def _near(pooled: pd.DataFrame, shown: Sequence[str], key: str) -> list[str]:
-    """Methods that come at least halfway from chance to the oracle."""
+def _close_to_oracle(pooled: pd.DataFrame, shown: Sequence[str], key: str) -> list[str]:
+    """Select the methods at least halfway from random choice to the oracle, or all."""
     shares = _first_rows(pooled)[f"normalized_{key}"].fillna(0.0)
-    chance = max((shares[method] for method in methods_of(pooled) if by_chance(method)), default=0.0)
-    return [method for method in shown if shares[method] >= (1 + chance) / 2] or list(shown)
+    baseline = max((share for method, share in shares.items() if by_chance(str(method))), default=0.0)
+    return [method for method in shown if shares[method] >= (1 + baseline) / 2] or list(shown)
 
 
-def _point_beyond(axes: Axes, shown: Sequence[str]) -> None:
-    """Arrows at the ends of the axis to marks beyond them."""
-    low, high = axes.get_xlim()
+def _set_range(axes: Axes, shown: Sequence[str], low: float, high: float, dashed: float) -> None:
+    """Set the range of the x axis, draw a dashed line, and point arrows to marks outside the range."""
+    axes.set_xlim(low, high)
+    axes.axvline(dashed, **_DASHED)
     for y, method in enumerate(shown):
-        label = method_style(method).label
-        (value,) = (float(line.get_xdata()[0]) for line in axes.lines if line.get_label() == label)  # type: ignore[index,arg-type]
-        for beyond, end, text, side in ((value < low, low, "◂", "left"), (value > high, high, "▸", "right")):
-            if beyond:
-                axes.text(end, y, text, color=method_style(method).color, fontsize=13, va="center", ha=side)
+        style = method_style(method)
+        (value,) = (float(line.get_xdata()[0]) for line in axes.lines if line.get_label() == style.label)  # type: ignore[index,arg-type]
+        text: Style = {"color": style.color, "fontsize": 13, "va": "center"}
+        if value < low:
+            axes.text(low, y, "◂", ha="left", **text)
+        elif value > high:
+            axes.text(high, y, "▸", ha="right", **text)
 
 
 def _pooled(scores: pd.DataFrame) -> pd.DataFrame:
@@ -130,27 +123,29 @@ def _pooled(scores: pd.DataFrame) -> pd.DataFrame:
 
 
 def _first_rows(pooled: pd.DataFrame) -> pd.DataFrame:
-    """A row for each method, of the first N, by its name."""
+    """Select the row of each method at the first N, indexed by method."""
     return pooled[pooled["top_n"] == pooled["top_n"].iloc[0]].set_index("method")
 
 
 def _interval(row: Any, column: str) -> tuple[float, float, float]:
-    """Value and ends of the interval in a row of the table, in percent; NaN where they are not known."""
+    """Read value, lower and upper end of an interval from a row of the table, in percent; NaN if missing."""
     name, _, key = column.partition("_")
-    names = (column, f"{name}_low_{key}", f"{name}_high_{key}")
-    value, low, high = (100 * float(row.get(one, np.nan)) for one in names)
+    value, low, high = (
+        100 * float(row.get(part, np.nan)) for part in (column, f"{name}_low_{key}", f"{name}_high_{key}")
+    )
     return value, low, high
 
 
-def _ends_of(pooled: pd.DataFrame, shown: Sequence[str], columns: Sequence[str]) -> tuple[float, float]:
-    """Ends of an axis that holds the columns and their intervals."""
+def _range(pooled: pd.DataFrame, methods: Sequence[str], columns: Sequence[str]) -> tuple[float, float]:
+    """Find the smallest and largest finite value or interval end of methods in columns of the table, in percent."""
     rows = _first_rows(pooled)
-    known = [x for method in shown for column in columns for x in _interval(rows.loc[method], column) if np.isfinite(x)]
-    return min(known, default=0.0), max(known, default=0.0)
+    values = np.array([_interval(rows.loc[method], column) for method in methods for column in columns])
+    values = values[np.isfinite(values)]
+    return (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
 
 
 def _rows_and_panels(pooled: pd.DataFrame, shown: Sequence[str], columns: dict[str, str]) -> tuple[Figure, list[Axes]]:
-    """A panel for each column of the table, with its title; a row for each method, a mark, whiskers and a number."""
+    """Draw one titled panel per column of the table, one row per method: mark, whiskers and number."""
     figure = new_figure(3.1 + 2.9 * len(columns), 1.5 + 0.3 * len(shown))
     panels: list[Axes] = list(figure.subplots(1, len(columns), sharey=True, squeeze=False)[0])
     rows = _first_rows(pooled)
@@ -162,14 +157,13 @@ def _rows_and_panels(pooled: pd.DataFrame, shown: Sequence[str], columns: dict[s
         axes.grid(axis="y", visible=False)
         for y, method in enumerate(shown):
             style = method_style(method)
-            (value, low, high) = _interval(rows.loc[method], column)
+            value, low, high = _interval(rows.loc[method], column)
             axes.hlines(y, low, high, color=style.color, linewidth=1.6)
             filled = style.marker in Line2D.filled_markers
-            edge: Look = {"markeredgecolor": INK if filled else style.color, "markeredgewidth": 0.5 if filled else 1.6}
+            edge: Style = {"markeredgecolor": INK if filled else style.color, "markeredgewidth": 0.5 if filled else 1.6}
             axes.plot(value, y, style.marker, color=style.color, markersize=7, label=style.label, **edge)
             number = "" if np.isnan(value) else f"{value:.1f}".replace("-", "−")
-            place: Look = {"xycoords": ("axes fraction", "data"), "va": "center", "fontsize": 8.5}
-            axes.annotate(number, (1.02, y), **place)
+            axes.annotate(number, (1.02, y), xycoords=("axes fraction", "data"), va="center", fontsize=8.5)
     labels = [method_style(method).label for method in shown]
     labels = [",\n".join(label.rsplit(", ", 1)) if len(label) > _WRAP else label for label in labels]
     panels[0].set_yticks(range(len(shown)), labels, fontsize=9)
@@ -177,6 +171,6 @@ def _rows_and_panels(pooled: pd.DataFrame, shown: Sequence[str], columns: dict[s
     return figure, panels
 
 
-def _chosen(pooled: pd.DataFrame) -> str:
+def _chosen_views(pooled: pd.DataFrame) -> str:
     n = int(pooled["top_n"].iloc[0])
     return "best views of locations" if n == 1 else f"the best {n} views of locations"

@@ -1,4 +1,4 @@
-"""One look for every figure: colours that the colour-blind can tell apart, and marks that survive in greyscale."""
+"""Shared style of all figures: colour-blind-safe colours, Matplotlib parameters, file output."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
@@ -15,10 +16,11 @@ from wheretolook.figures.config import KINDS
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import write_bytes
 
+Style = dict[str, Any]  # keyword arguments of Matplotlib functions
+
 ONE_COLUMN_IN = 3.5
 TWO_COLUMNS_IN = 7.2
-"""Widths of figures for one and for two columns of a paper, inches. Their letters are as large as they will be in
-print: `PRINT`. Figures for the screen are wider, with the letters of `RC`."""
+"""Widths of one-column and two-column figures in print, inches; draw them with `PRINT`."""
 
 INK = "#333333"
 GREY = "#7a7a7a"
@@ -30,35 +32,70 @@ GREEN = "#009E73"
 ORANGE = "#E69F00"
 VERMILION = "#D55E00"
 PURPLE = "#CC79A7"
-"""The colours of Okabe and Ito (2008), which colour-blind people can tell apart."""
+"""Colour-blind-safe palette of Okabe and Ito (2008)."""
 
-_INKED = ("axes.edgecolor", "axes.labelcolor", "text.color", "xtick.color", "ytick.color")
-RC: dict[str, Any] = {**dict.fromkeys(_INKED, INK), "grid.color": GRID}
-RC |= {"font.size": 10, "axes.titlesize": 11, "axes.labelsize": 10, "legend.fontsize": 9}
-RC |= {"axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True}
-RC |= {"grid.linewidth": 0.6, "lines.linewidth": 1.6, "hatch.linewidth": 0.7, "legend.frameon": False}
-RC |= {"figure.dpi": 100, "savefig.dpi": 160, "savefig.bbox": "tight"}
-RC |= {"svg.hashsalt": "wheretolook", "svg.fonttype": "none", "pdf.fonttype": 42}
-"""Matplotlib's parameters for figures on the screen."""
+RC: dict[str, Any] = {
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "grid.color": GRID,
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.labelsize": 10,
+    "legend.fontsize": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.6,
+    "hatch.linewidth": 0.7,
+    "legend.frameon": False,
+    "figure.dpi": 100,
+    "savefig.dpi": 160,
+    "savefig.bbox": "tight",
+    "svg.hashsalt": "wheretolook",
+    "svg.fonttype": "none",
+    "pdf.fonttype": 42,
+}
+"""Matplotlib parameters of figures on screen."""
 
-PRINT = {**RC, "font.size": 8, "axes.titlesize": 8.5, "axes.labelsize": 8, "legend.fontsize": 7}
-PRINT |= {"xtick.labelsize": 7, "ytick.labelsize": 7, "axes.linewidth": 0.6, "hatch.linewidth": 0.5}
-PRINT |= {"lines.linewidth": 1.2, "lines.markersize": 4}
-"""`RC` with the letters and lines of a printed column."""
+PRINT = RC | {
+    "font.size": 8,
+    "axes.titlesize": 8.5,
+    "axes.labelsize": 8,
+    "legend.fontsize": 7,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "axes.linewidth": 0.6,
+    "hatch.linewidth": 0.5,
+    "lines.linewidth": 1.2,
+    "lines.markersize": 4,
+}
+"""`RC` with font sizes and line widths for print."""
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure in this style, independent of pyplot and its global state. Draw in `with context(RC):`."""
+    """Create an empty figure independent of pyplot. Draw into it within `with context(RC):`."""
     with context(RC):
         return Figure(figsize=(width_in, height_in), layout="constrained")
 
 
+def frame(axes: Axes, color: str = INK, linewidth: float = 0.5) -> None:
+    """Draw a frame around the axes of an image, without ticks and grid."""
+    axes.set(xticks=[], yticks=[])
+    axes.grid(False)
+    axes.spines[:].set(visible=True, linewidth=linewidth, color=color)
+
+
 _SCENES = {"aws_house": "furnished house", "nexuiz": "game level"}
-"""Names that say nothing to people: of the scenes made by others, and of the package that some are from."""
+"""Display names of external scenes and of the package that some of them come from."""
 
 
 def scene_label(name: str) -> str:
-    """The name of a scene for people: "apartment 210" of "apartment-210", "game level aggressor" of its file's name."""
+    """Return the display name of a scene, such as "apartment 210" for "apartment-210"."""
     if name in _SCENES:
         return _SCENES[name]
     package, _, rest = name.partition("_")
@@ -67,40 +104,46 @@ def scene_label(name: str) -> str:
     return name.replace("_", " ").replace("-", " ")
 
 
-_NOTE = {"png": "Description", "pdf": "Subject", "svg": "Description"}
+_NOTE = {"png": "Description", "pdf": "Subject", "svg": "Description"}  # metadata field of the note
+_UNDATED: dict[str, dict[str, Any]] = {
+    "png": {"Software": None},
+    "pdf": {"CreationDate": None, "Creator": None},
+    "svg": {"Date": None},
+}
+"""Metadata without dates and versions: equal figures give equal bytes."""
+
+
+def _kind(path: Path) -> str:
+    kind = path.suffix[1:].lower()
+    if kind not in KINDS:
+        raise ConfigError("unsupported figure format", path=path, fix=f"Use {', '.join(KINDS)}.")
+    return kind
 
 
 def save_figure(figure: Figure, path: Path, note: str = "") -> None:
-    """Write a figure, atomically, the same figure as the same bytes; its folder is made when needed.
+    """Write a figure to `path` (.png, .pdf or .svg) atomically; equal figures give equal bytes.
 
-    The path's suffix says what kind of file: .png, .pdf or .svg, the latter two as vectors. The note, such as the runs
-    that the figure was made from, is kept in the file's metadata. Raises ConfigError for other kinds of files.
+    `note`, such as the runs that the figure shows, is stored in the file's metadata. Raises ConfigError for another
+    format.
     """
-    kind = path.suffix[1:].lower()
-    if kind not in KINDS:
-        raise ConfigError("figures are not written as such files", path=path, fix=f"Use {', '.join(KINDS)}.")
-    # without dates and versions
-    metadata: dict[str, Any] = {"pdf": {"CreationDate": None, "Creator": None}, "svg": {"Date": None}}.get(kind, {})
-    if note:
-        metadata[_NOTE[kind]] = note
-    drawn = io.BytesIO()  # not into the file: of a full disk, PDFs tell no cause
+    kind = _kind(path)
+    metadata = _UNDATED[kind] | ({_NOTE[kind]: note} if note else {})
+    buffer = io.BytesIO()  # the PDF writer does not report the cause of a failed write
     with context(RC):
-        figure.savefig(drawn, format=kind, metadata={**metadata, **({"Software": None} if kind == "png" else {})})
-    write_bytes(path, drawn.getvalue())
+        figure.savefig(buffer, format=kind, metadata=metadata)
+    write_bytes(path, buffer.getvalue())
 
 
 def note_of(path: Path) -> str:
-    """What `save_figure` kept in a figure's metadata; empty if nothing. Raises ConfigError for other kinds of files."""
-    kind = path.suffix[1:].lower()
+    """Read the note that `save_figure` stored in a file; empty if there is none. Raises ConfigError as it does."""
+    kind = _kind(path)
     if kind == "png":
         from PIL import Image
 
         with Image.open(path) as image:
             return str(image.info.get(_NOTE[kind], ""))
     if kind == "svg":
-        found = re.search(r"<dc:description>(.*?)</dc:description>", path.read_text(encoding="utf-8"), re.DOTALL)
-        return html.unescape(found[1]).strip() if found else ""
-    if kind == "pdf":
-        subject = re.search(rb"/Subject \((.*?)(?<!\\)\)", path.read_bytes(), re.DOTALL)
-        return re.sub(rb"\\(.)", rb"\1", subject[1]).decode("latin-1") if subject else ""
-    raise ConfigError("figures are not written as such files", path=path, fix=f"Use {', '.join(KINDS)}.")
+        description = re.search(r"<dc:description>(.*?)</dc:description>", path.read_text(encoding="utf-8"), re.DOTALL)
+        return html.unescape(description[1]).strip() if description else ""
+    subject = re.search(rb"/Subject \((.*?)(?<!\\)\)", path.read_bytes(), re.DOTALL)
+    return re.sub(rb"\\(.)", rb"\1", subject[1]).decode("latin-1") if subject else ""

@@ -124,10 +124,9 @@ def draw_overview(experiment: Experiment, weights: Path) -> None:
     """
     from wheretolook.dataset.viewpoint_table import instructive_location, outcome_in_words, poses, shares_good
     from wheretolook.figures.dollhouse import dollhouse
-    from wheretolook.figures.overview import Overview, overview_figure
+    from wheretolook.figures.overview import Overview, overview_figure, rendered_views
     from wheretolook.figures.style import save_figure, scene_label
     from wheretolook.scorers.styles import method_style
-    from wheretolook_paper.release.showcase_figures import rendered_views
 
     dataset = Dataset.load(experiment.root)
     scene = open_scene(experiment, dataset, dataset.scenes[-1])

@@ -12,9 +12,8 @@ from matplotlib.style import context
 from tqdm.auto import tqdm
 
 from wheretolook.figures.animation import pixels_of, save_moving
-from wheretolook.figures.config import Look
 from wheretolook.figures.dollhouse import Dollhouse, dollhouse, draw_house, draw_segments, frustum_segments
-from wheretolook.figures.style import BLUE, GREEN, RC, VERMILION, new_figure
+from wheretolook.figures.style import BLUE, GREEN, RC, VERMILION, Style, new_figure
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.utils.errors import ConfigError
@@ -121,5 +120,5 @@ def _draw_view(axes: Axes, image: drawing.Rgb, name: str, good: bool, so_far: np
     share = f"{100 * np.mean(so_far):.0f} % so far"
     verdict = f"localized: {share}" if good else f"LOST, localized: {share}"
     box = {"boxstyle": "square,pad=0.3", "facecolor": GREEN if good else VERMILION, "edgecolor": "none"}
-    place: Look = {"transform": axes.transAxes, "ha": "left", "va": "bottom"}
+    place: Style = {"transform": axes.transAxes, "ha": "left", "va": "bottom"}
     axes.text(0.03, 0.04, verdict, fontsize=10, color="white", fontweight="bold", bbox=box, **place)

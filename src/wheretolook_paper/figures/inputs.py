@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 from numpy.typing import NDArray
 
-from wheretolook.figures.style import INK, ORANGE, PRINT, TWO_COLUMNS_IN, new_figure
+from wheretolook.figures.style import ORANGE, PRINT, TWO_COLUMNS_IN, frame, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.channels import PAPER_VARIANTS
 
@@ -106,10 +106,3 @@ def draw_channel(axes: Axes, image: BinnedImage, name: str) -> None:
     ends = " to ".join(dict.fromkeys(f"{end:.{digits}f}" for end in (low, high))).replace("-", "−")
     axes.set_xlabel(ends if values.count() else "no landmark", fontsize=6.5, labelpad=1)
     frame(axes)
-
-
-def frame(axes: Axes, color: str = INK, linewidth: float = 0.5) -> None:
-    """Axes of an image: a frame without ticks and grid."""
-    axes.set(xticks=[], yticks=[])
-    axes.grid(False)
-    axes.spines[:].set(visible=True, linewidth=linewidth, color=color)

@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike
 
 from wheretolook.dataset.thresholds import THRESHOLDS
 from wheretolook.figures.animation import Pixels, pixels_of
-from wheretolook.figures.config import Look as Style
 from wheretolook.figures.dollhouse import Dollhouse, draw_house, draw_segments, frustum_segments
-from wheretolook.figures.style import BLUE, GREEN, INK, RC, VERMILION, new_figure
+from wheretolook.figures.style import BLUE, GREEN, INK, RC, VERMILION, Style, new_figure
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, camera_centers, pose_error
 from wheretolook.localization.confidence import Confidence

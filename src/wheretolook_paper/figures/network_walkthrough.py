@@ -12,10 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch
 from matplotlib.style import context
 
-from wheretolook.figures.config import Look
-from wheretolook.figures.style import BLUE, INK, PRINT, TWO_COLUMNS_IN, VERMILION, new_figure
+from wheretolook.figures.style import BLUE, INK, PRINT, TWO_COLUMNS_IN, VERMILION, Style, frame, new_figure
 from wheretolook.geometry.poses import Float
-from wheretolook_paper.figures.inputs import BinnedImage, draw_counts, draw_landmarks, frame, n_landmarks
+from wheretolook_paper.figures.inputs import BinnedImage, draw_counts, draw_landmarks, n_landmarks
 
 _COLUMNS = 12  # of a hidden layer's values
 _WIDE = 10  # letters below the score
@@ -66,8 +65,15 @@ def _connect(figure: Figure, before: list[Axes], inputs: list[Axes], after: list
     """Arrows from each panel to the next; the channels, one below the other, count as one panel."""
     middle = inputs[len(inputs) // 2]
     at = 0.5 if len(inputs) % 2 else 1.0  # with an even number, the middle is between two panels
-    arrow: Look = {"arrowstyle": "-|>", "mutation_scale": 7, "color": INK, "shrinkA": 2, "shrinkB": 2, "linewidth": 0.8}
-    ends: Look = {"coordsA": "axes fraction", "coordsB": "axes fraction"}
+    arrow: Style = {
+        "arrowstyle": "-|>",
+        "mutation_scale": 7,
+        "color": INK,
+        "shrinkA": 2,
+        "shrinkB": 2,
+        "linewidth": 0.8,
+    }
+    ends: Style = {"coordsA": "axes fraction", "coordsB": "axes fraction"}
     for left, right in pairwise([*before, middle, *after]):
         start = (1.0, at if left is middle else 0.5)
         end = (-0.45, at) if right is middle else (0.0, 0.5)  # clear of the channel's name
@@ -85,6 +91,6 @@ def _draw_score(axes: Axes, score: float, outcome: str) -> None:
     axes.yaxis.tick_right()
     axes.spines[:].set_visible(True)
     inside = score >= 0.2  # the bar is long enough for its number
-    place: Look = {"va": "top", "color": "white"} if inside else {"va": "bottom", "color": INK}
+    place: Style = {"va": "top", "color": "white"} if inside else {"va": "bottom", "color": INK}
     axes.text(0, score - 0.03 if inside else score + 0.03, f"{score:.2f}", ha="center", fontsize=7, **place)
     axes.set_xlabel("\n".join(textwrap.wrap(outcome, _WIDE)))

@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 
 from wheretolook.dataset.thresholds import ALL
-from wheretolook.figures.config import Look
-from wheretolook.figures.style import INK, RC, new_figure, scene_label
+from wheretolook.figures.style import INK, RC, Style, new_figure, scene_label
 from wheretolook.scorers.styles import method_style
 
 FILLED = {"greedy": "full", "with stops": "left"}
@@ -46,7 +45,7 @@ def paths_figure(summary: pd.DataFrame) -> Figure:
                 axes.hlines(at, low, high, color=style.color, linewidth=1.2)
                 fill = FILLED.get(rule, "bottom" if rule else "full")
                 face = "white" if rule == "greedy" else style.color
-                look: Look = {"markersize": 6, "fillstyle": fill, "markerfacecolor": face}
+                look: Style = {"markersize": 6, "fillstyle": fill, "markerfacecolor": face}
                 look["markerfacecoloralt"] = "white"
                 label = NAMES.get(name, style.label)
                 label += f", {NAMES.get(rule, rule)}" if rule else ""

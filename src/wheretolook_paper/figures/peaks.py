@@ -12,12 +12,10 @@ from matplotlib.patheffects import withStroke
 from matplotlib.style import context
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.figures.config import Look
 from wheretolook.figures.overview import View
-from wheretolook.figures.style import BLUE, INK, PRINT, TWO_COLUMNS_IN, VERMILION, new_figure
+from wheretolook.figures.style import BLUE, INK, PRINT, TWO_COLUMNS_IN, VERMILION, Style, frame, new_figure
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.poses import Float
-from wheretolook_paper.figures.inputs import frame
 
 _WIDE = 27  # letters below a view
 
@@ -64,7 +62,7 @@ def peaks_figure(
                 axes.set_title(f"{mark}  predicted {view.score:.2f}", loc="left")
                 axes.set_xlabel("\n".join(textwrap.wrap(view.outcome, _WIDE)), labelpad=2)
                 azimuth, elevation = map(float, pan_tilt_angles(view.direction))
-                look: Look = {"color": color, "fontsize": 8, "fontweight": "bold", "ha": "center", "va": "center"}
+                look: Style = {"color": color, "fontsize": 8, "fontweight": "bold", "ha": "center", "va": "center"}
                 disc = {"boxstyle": "circle,pad=0.18", "facecolor": "white", "edgecolor": color}
                 sphere.text(azimuth, elevation, mark, zorder=5, bbox=disc, **look)
         return figure
@@ -77,9 +75,9 @@ def _draw_sphere(
     dots = axes.scatter(*pan_tilt_angles(directions), s=size, c=scores, cmap="cividis", vmin=0, vmax=1, linewidths=0)
     if tried is not None:
         looked, good = tried
-        look: Look = {"linewidths": 0.7, "path_effects": [withStroke(linewidth=1.8, foreground="white")]}
-        rings: Look = {"s": 1.1 * size, "facecolors": "none", "edgecolors": INK, "label": "localizes"}
-        crosses: Look = {"s": 0.6 * size, "marker": "x", "color": INK, "label": "does not"}
+        look: Style = {"linewidths": 0.7, "path_effects": [withStroke(linewidth=1.8, foreground="white")]}
+        rings: Style = {"s": 1.1 * size, "facecolors": "none", "edgecolors": INK, "label": "localizes"}
+        crosses: Style = {"s": 0.6 * size, "marker": "x", "color": INK, "label": "does not"}
         x, y = pan_tilt_angles(looked)
         axes.scatter(x[good], y[good], **rings, **look)
         axes.scatter(x[~good], y[~good], **crosses, **look)

@@ -21,11 +21,20 @@ from wheretolook.figures.dollhouse import (
     frustum_corners,
     frustum_segments,
 )
-from wheretolook.figures.style import BLUE, INK, ONE_COLUMN_IN, ORANGE, PRINT, TWO_COLUMNS_IN, VERMILION, new_figure
+from wheretolook.figures.style import (
+    BLUE,
+    INK,
+    ONE_COLUMN_IN,
+    ORANGE,
+    PRINT,
+    TWO_COLUMNS_IN,
+    VERMILION,
+    frame,
+    new_figure,
+)
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float
-from wheretolook_paper.figures.inputs import frame
 
 _GLYPH = 32  # directions drawn of a location
 

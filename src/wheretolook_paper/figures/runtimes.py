@@ -16,8 +16,7 @@ from matplotlib.patches import Patch
 from matplotlib.style import context
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, NullLocator
 
-from wheretolook.figures.config import Look
-from wheretolook.figures.style import BLUE, GREEN, INK, PURPLE, RC, SKY, VERMILION, new_figure
+from wheretolook.figures.style import BLUE, GREEN, INK, PURPLE, RC, SKY, VERMILION, Style, new_figure
 
 COUNTS = "counts alone"
 EVERYTHING = "occlusion, counts, best 100"
@@ -107,7 +106,7 @@ def runtime_table(sizes: pd.DataFrame) -> pd.DataFrame:
 
 
 def _draw_bars(axes: Axes, bars: list[_Bar], start: float) -> None:
-    plate: Look = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
+    plate: Style = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
     for y, bar in enumerate(bars):
         axes.barh(y, bar.seconds - start, 0.68, left=start, **_LOOK[bar.source])
         end = bar.seconds
@@ -195,16 +194,16 @@ def scaling_figure(growth: pd.DataFrame) -> Figure:
     shown = [axis for axis in _GROWING if (growth["axis"] == axis).any()]
     with context(RC):
         figure = new_figure(2.2 * len(shown) + 0.7, 5.2)
-        scales: Look = {"xscale": "log", "yscale": "log"}
+        scales: Style = {"xscale": "log", "yscale": "log"}
         panels = figure.subplots(2, len(shown), sharex="col", sharey="row", squeeze=False, subplot_kw=scales)
         for column, axis in enumerate(shown):
             part = growth[growth["axis"] == axis]
             for (device, name), (color, marker) in zip(machines, cycle(_MACHINES), strict=False):
                 on_machine = part[(part["device"] == device) & (part["name"] == name)]
-                whiskers: Look = {"fmt": "none", "ecolor": color, "elinewidth": 1, "capsize": 2, "zorder": 1.9}
+                whiskers: Style = {"fmt": "none", "ecolor": color, "elinewidth": 1, "capsize": 2, "zorder": 1.9}
                 for what, (dashes, filled) in _WORK.items():
                     rows = on_machine[on_machine["what"] == what].sort_values(axis)
-                    look: Look = {"color": color, "linestyle": dashes, "marker": marker, "markersize": 4.5}
+                    look: Style = {"color": color, "linestyle": dashes, "marker": marker, "markersize": 4.5}
                     look["markerfacecolor"] = color if filled else "white"
                     label = f"{machine_label(name)}, {what}"
                     seconds = rows["median_s"].to_numpy(dtype=float)
@@ -241,6 +240,6 @@ def _draw_proportional(axes: Axes) -> None:
     (left, right) = axes.get_xlim()
     limits = axes.get_ylim()
     slope = np.sqrt(limits[0] * limits[1] / (left * right))
-    look: Look = {"color": "#9a9a9a", "linewidth": 0.8, "linestyle": ":", "zorder": 0.9, "label": "proportional"}
+    look: Style = {"color": "#9a9a9a", "linewidth": 0.8, "linestyle": ":", "zorder": 0.9, "label": "proportional"}
     axes.plot([left, right], [slope * left, slope * right], scalex=False, scaley=False, **look)
     axes.set(xlim=(left, right), ylim=limits)

@@ -14,9 +14,8 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.style import context
 from numpy.typing import NDArray
 
-from wheretolook.figures.config import Look
 from wheretolook.figures.dollhouse import Dollhouse, draw_house, draw_points, draw_segments
-from wheretolook.figures.style import BLUE, INK, ORANGE, PRINT, SKY, TWO_COLUMNS_IN, VERMILION, new_figure
+from wheretolook.figures.style import BLUE, INK, ORANGE, PRINT, SKY, TWO_COLUMNS_IN, VERMILION, Style, new_figure
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float
@@ -62,8 +61,8 @@ def _draw_voxels(axes: Axes, sampling: Sampling) -> None:
     half = sampling.grid.voxel_m / 2
     centers = sampling.grid.centers()[sampling.layer]
     corners = sampling.plan.pixels(np.stack([centers - half, centers + half], axis=1))
-    free_look: Look = {"facecolor": (*to_rgb(SKY), 0.45), "edgecolor": BLUE, "linewidth": 0.5}
-    taken_look: Look = {"edgecolor": "#777777", "linewidth": 0.3, "hatch": "/////"}
+    free_look: Style = {"facecolor": (*to_rgb(SKY), 0.45), "edgecolor": BLUE, "linewidth": 0.5}
+    taken_look: Style = {"edgecolor": "#777777", "linewidth": 0.3, "hatch": "/////"}
     for chosen, look in ((sampling.free, free_look), (~sampling.free, {"facecolor": (1, 1, 1, 0.35), **taken_look})):
         squares = [Rectangle((float(a[0]), float(a[1])), *map(float, b - a)) for a, b in corners[chosen]]
         axes.add_collection(PatchCollection(squares, **look))
@@ -85,7 +84,7 @@ def _draw_directions(figure: Figure, axes: Axes, sampling: Sampling) -> None:
     size = 4500 / len(sampling.directions)
     dropped_at, kept_at = (pan_tilt_angles(sampling.directions[rows]) for rows in (~kept, kept))
     axes.scatter(*dropped_at, s=0.6 * size, facecolors="none", edgecolors="#aaaaaa", linewidths=0.5)
-    colors: Look = {"c": sampling.n_visible[kept], "cmap": "cividis", "vmin": 0, "edgecolors": INK}
+    colors: Style = {"c": sampling.n_visible[kept], "cmap": "cividis", "vmin": 0, "edgecolors": INK}
     dots = axes.scatter(*kept_at, s=size, linewidths=0.3, **colors)
     axes.set(xticklabels=[], yticklabels=[], anchor="N")
     axes.set_title(f"b  Directions: {kept.sum()} of {len(kept)} kept", loc="left")
@@ -107,16 +106,16 @@ def _draw_occlusion(axes: Axes, sampling: Sampling) -> None:
     axes.set_title("c  Occlusion", loc="left")
     handles = []
     for name, color, points in (("in sight", ORANGE, unoccluded), ("hidden", BLUE, hidden)):
-        dot: Look = {"linestyle": "none", "marker": "o", "markersize": 4, "color": color}
+        dot: Style = {"linestyle": "none", "marker": "o", "markersize": 4, "color": color}
         handles.append(Line2D([], [], label=f"{len(points):,} {name}", **dot))
     _legend_below(axes, handles)
 
 
 def _mark_place(axes: Axes, sampling: Sampling) -> None:
-    star: Look = {"s": 75, "marker": "*", "color": VERMILION, "edgecolors": "white", "linewidths": 0.6}
+    star: Style = {"s": 75, "marker": "*", "color": VERMILION, "edgecolors": "white", "linewidths": 0.6}
     draw_points(axes, sampling.plan, sampling.place, zorder=4, **star)
 
 
 def _legend_below(axes: Axes, handles: list[Patch] | list[Line2D]) -> None:
-    padding: Look = {"columnspacing": 1.0, "handletextpad": 0.4, "borderaxespad": 0.2}
+    padding: Style = {"columnspacing": 1.0, "handletextpad": 0.4, "borderaxespad": 0.2}
     axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=2, **padding)

@@ -13,8 +13,7 @@ from matplotlib.style import context
 
 from wheretolook.dataset.thresholds import ALL, threshold_label
 from wheretolook.evaluation.score_table import main_rows, methods_of, threshold_keys
-from wheretolook.figures.config import Look
-from wheretolook.figures.style import GREY, PRINT, TWO_COLUMNS_IN, new_figure
+from wheretolook.figures.style import GREY, PRINT, TWO_COLUMNS_IN, Style, new_figure
 from wheretolook.scorers.registry import all_methods, find
 from wheretolook.scorers.styles import ORACLE, method_style
 from wheretolook_paper.evaluation.paper_tables import PAPER
@@ -53,14 +52,14 @@ def top_n_figure(scores: pd.DataFrame, methods: Sequence[str] = ()) -> Figure:
                 if column == "normalized":
                     axes.set_title(f"within {threshold_label(key)}")
                     for printed_row, (marker, _) in _PAPER_MARKS.items():
-                        mark: Look = {"markersize": 5, "color": GREY, "markerfacecolor": "white"}
+                        mark: Style = {"markersize": 5, "color": GREY, "markerfacecolor": "white"}
                         axes.plot(-0.5, _PRINTED[printed_row][index], marker, **mark)
                 else:
                     _draw_oracle(axes, pooled, top_n, f"{column}_{key}")
             line[0].set_ylabel(name)
         for axes in panels[-1]:
             axes.set_xlabel("N")
-        look: Look = {"linestyle": "none", "color": GREY, "markerfacecolor": "white"}
+        look: Style = {"linestyle": "none", "color": GREY, "markerfacecolor": "white"}
         printed = [Line2D([], [], marker=marker, label=label, **look) for marker, label in _PAPER_MARKS.values()]
         handles = [*panels[1, 0].get_legend_handles_labels()[0], *printed]
         figure.legend(handles=handles, loc="outside upper center", ncols=4, columnspacing=1.6, handlelength=1.4)

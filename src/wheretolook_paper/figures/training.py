@@ -8,8 +8,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
-from wheretolook.figures.config import Look
-from wheretolook.figures.style import RC, new_figure
+from wheretolook.figures.style import RC, Style, new_figure
 from wheretolook.scorers.styles import method_style
 
 
@@ -24,13 +23,13 @@ def training_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:
         panels = figure.subplots(1, 2)
         for method, history in histories.items():
             style = method_style(method)
-            dotted: Look = {"linestyle": ":", "linewidth": 1.1, "label": f"{style.label}: training"}
-            solid: Look = {"linestyle": "-", "label": f"{style.label}: validation"}
+            dotted: Style = {"linestyle": ":", "linewidth": 1.1, "label": f"{style.label}: training"}
+            solid: Style = {"linestyle": "-", "label": f"{style.label}: validation"}
             for panel, name in zip(panels, ("bce", "average_precision"), strict=True):
                 panel.plot(1 + history["epoch"], history[f"train_{name}"], color=style.color, **dotted)
                 panel.plot(1 + history["epoch"], history[f"val_{name}"], color=style.color, **solid)
             best = history.iloc[int(history["val_average_precision"].to_numpy().argmax())]
-            ring: Look = {"marker": "o", "markersize": 8, "markerfacecolor": "none", "color": style.color}
+            ring: Style = {"marker": "o", "markersize": 8, "markerfacecolor": "none", "color": style.color}
             panels[1].plot(1 + best["epoch"], best["val_average_precision"], linestyle="none", **ring)
         panels[0].set(xlabel="epoch (log)", ylabel="weighted cross-entropy")
         panels[1].set(xlabel="epoch (log)", ylabel="average precision")

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.dataset.environment import Scene
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, outcome_in_brief, outcome_in_words, poses
-from wheretolook.figures.overview import View
+from wheretolook.figures.overview import View, rendered_views
 from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
 from wheretolook.inputs.channels import CHANNELS
 from wheretolook.planning.config import PathsConfig, PlanConfig
@@ -165,15 +163,6 @@ def peaks_of(showcase: Showcase, scorer: Scorer, location_id: int, n: int = 3, a
     everywhere = scorer.score(poses_looking_along(center, showcase.directions))
     tried = axes[known], is_good(rows[known])
     return Peaks(showcase.directions, everywhere, views(True), views(False), tried)
-
-
-def rendered_views(
-    scene: Scene, rows: pd.DataFrame, scores: Float, words: Callable[[pd.Series], str]
-) -> tuple[View, ...]:
-    """B labelled viewpoints of a scene with a mesh, with what a camera sees, their scores (B,) and labels in words."""
-    looked = poses(rows)
-    seen = zip(scene.renderer.render(scene.camera, looked).rgb, looked, scores, range(len(rows)), strict=True)
-    return tuple(View(rgb, pose[2, :3], float(score), words(rows.iloc[row])) for rgb, pose, score, row in seen)
 
 
 def planned_views(

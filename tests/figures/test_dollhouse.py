@@ -1,0 +1,48 @@
+"""Views of a scene from outside: projection, visibility of points, errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from box_scenes import CABINET, ROOM, furnished_room
+from wheretolook.figures.dollhouse import dollhouse, frustum_corners, frustum_segments
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import poses_looking_along, transform
+from wheretolook.utils.errors import ConfigError, SceneError
+
+
+def test_a_plan_has_x_to_the_right_and_y_up_and_knows_what_is_visible() -> None:
+    plan = dollhouse(furnished_room(), elevation_deg=90, width_px=300)
+    low, high = plan.pixels([[0, 0, 0], ROOM])
+    assert low[0] < 10 < 290 < high[0] and high[1] < 10 and low[1] > plan.rgb.shape[0] - 10
+    depth = plan.depth_m[plan.depth_m > 0]  # most of it is floor, since the ceiling faces away
+    column, row = plan.pixels([5.0, 1.0, 2.0]).astype(int)
+    assert np.median(depth) - plan.depth_m[row, column] == pytest.approx(CABINET[1][2], abs=0.01)
+    under_cabinet_on_floor_outside = np.array([[5.0, 1.0, 0.05], [2.0, 4.0, 0.0], [20.0, 0.0, 0.0]])
+    assert plan.shows(under_cabinet_on_floor_outside).tolist() == [False, True, False]
+
+
+def test_near_walls_are_removed_unless_two_sided() -> None:
+    floor = np.array([[3.0, 0.5, 0.0]])  # behind the wall at y = 0, the nearest to the eye
+    options = {"azimuth_deg": -90.0, "elevation_deg": 45.0, "width_px": 200}
+    assert dollhouse(furnished_room(ceiling=False), **options).shows(floor).all()
+    assert not dollhouse(furnished_room(ceiling=False), one_sided=False, **options).shows(floor).any()
+
+
+@pytest.mark.parametrize(("options", "error"), [({"elevation_deg": 0}, ConfigError), ({"cut_m": -1.0}, SceneError)])
+def test_invalid_views(options: dict[str, float], error: type[Exception]) -> None:
+    with pytest.raises(error):
+        dollhouse(furnished_room(), **options)
+
+
+def test_frustum_corners_project_to_image_corners() -> None:
+    camera = PinholeCamera(64, 48, 32.0)
+    poses = poses_looking_along([[1.0, 2.0, 3.0]] * 2, [[1.0, 0, 0], [0.3, -1, 0.2]])
+    corners = frustum_corners(camera, poses, 0.5)
+    np.testing.assert_allclose(corners[:, 0], [[1, 2, 3]] * 2)
+    for pose, four in zip(poses, corners[:, 1:], strict=True):
+        in_camera = transform(pose, four)
+        np.testing.assert_allclose(in_camera[:, 2], 0.5)
+        np.testing.assert_allclose(camera.project(in_camera), [[0, 0], [64, 0], [64, 48], [0, 48]], atol=1e-9)
+    assert frustum_segments(camera, poses, 0.5).shape == (2, 8, 2, 3)

@@ -37,7 +37,7 @@ tracking = open_store(release)
 # 30 × 30 bins of the image, each with the mean of the landmarks in it: their pixel, and depth or position.
 
 # %%
-from wheretolook.utils.tracking import newest_run
+from wheretolook.tracking.runs import newest_run
 from wheretolook_paper.release.paper_architecture import paper_architecture_table
 
 run = newest_run(tracking, "train", params={"dataset": release.name, "method": "mlp-2d+3d"})
@@ -83,7 +83,7 @@ display(training_figure(curves) if curves else Markdown(f"No run has a history y
 # %%
 from wheretolook.evaluation.calibration import read_calibration
 from wheretolook.figures.calibration import calibration_figure
-from wheretolook.utils.tracking import newest_artifact
+from wheretolook.tracking.runs import newest_artifact
 
 calibration = read_calibration(newest_artifact(tracking, "evaluate", "calibration.csv", release.name))
 display(calibration_figure(calibration))

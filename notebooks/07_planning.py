@@ -30,7 +30,7 @@ from IPython.display import Markdown, display
 from wheretolook.figures.path_film import methods_figure, still_figure
 from wheretolook.planning.config import PathConfig, PathsConfig, PlanConfig
 from wheretolook.planning.method_paths import path_views, plan_by_methods
-from wheretolook.utils.tracking import newest_artifact
+from wheretolook.tracking.runs import newest_artifact
 from wheretolook_paper.figures.paths import paths_figure
 from wheretolook_paper.paths.path_report import path_markdown
 from wheretolook_paper.release.notebook import open_release, open_store

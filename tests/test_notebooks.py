@@ -20,8 +20,8 @@ from PIL import Image
 
 from synthetic_release import make_release
 from wheretolook.scorers.styles import MethodStyle, method_style
-from wheretolook.utils.tracking import newest_run
-from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import newest_run
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))

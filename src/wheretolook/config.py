@@ -20,10 +20,10 @@ from wheretolook.scorers.adapted.config import AdaptConfig
 from wheretolook.scorers.train_config import MOVED as MOVED_TRAIN_OPTIONS
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
+from wheretolook.tracking.config import TrackingConfig
 from wheretolook.utils.confine import check_folder_name, entry_of
 from wheretolook.utils.devices import check_device_name, usable_device
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.visibility.config import OcclusionConfig
 
 NOT_SCENES = (

@@ -214,8 +214,8 @@ class Workshop:
 
         from mapping.conftest import box_room
         from wheretolook.scenes.loading import save_glb
-        from wheretolook.utils.tracking import client
-        from wheretolook.utils.tracking_config import TrackingConfig
+        from wheretolook.tracking.config import TrackingConfig
+        from wheretolook.tracking.store import client
 
         first = self.state("empty")
         (first / "tiny.yaml").write_text(EXPERIMENT)

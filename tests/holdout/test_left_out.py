@@ -24,11 +24,11 @@ from wheretolook.holdout.photo_map import WORK, open_map
 from wheretolook.scorers.adapted.network import AdaptedNetwork
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.stages.evaluate import evaluate_methods
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import finished_runs
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.weights import read_training
 from wheretolook.utils.shipped import WEIGHTS, shipped
-from wheretolook.utils.tracking import finished_runs
-from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.visibility.occlusion import NoOcclusion
 
 pytestmark = pytest.mark.usefixtures("no_pictures")

@@ -24,9 +24,9 @@ from wheretolook.dataset.viewpoint_table import (
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.localization.report import POSITIVE, label_markdown, label_summary, threshold_sentence
 from wheretolook.stages.label import log_labels
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import artifact, newest_run
 from wheretolook.utils.errors import TableError
-from wheretolook.utils.tracking import artifact, newest_run
-from wheretolook.utils.tracking_config import TrackingConfig
 
 NAN = float("nan")
 

@@ -16,9 +16,10 @@ from wheretolook.geometry.poses import camera_centers
 from wheretolook.planning.config import PathConfig, PathsConfig
 from wheretolook.planning.scene_map import shares_below
 from wheretolook.space.free_space import FreeSpace
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import finished_runs
+from wheretolook.tracking.store import client
 from wheretolook.utils.errors import ConfigError, PlanningError, SceneError
-from wheretolook.utils.tracking import client, finished_runs
-from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook_paper.figures.paths import paths_figure
 from wheretolook_paper.paths.path_comparison import ComparedPaths, Ways, draw_pairs, plan_pairs
 from wheretolook_paper.paths.path_report import log_paths, summarize_paths

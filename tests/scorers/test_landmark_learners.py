@@ -42,13 +42,13 @@ from wheretolook.scorers.set.network import (
 from wheretolook.scorers.set.score import SetScorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
+from wheretolook.tracking.config import TrackingConfig
 from wheretolook.training.data import labelled_rows
 from wheretolook.training.landmark_views import AttributeStatistics, LandmarkLoader, load_landmark_views
 from wheretolook.training.scenes import training_scenes
 from wheretolook.training.trained_network import StoredNetwork, TrainedNetwork
 from wheretolook.training.weights import METADATA_KEY, method_of_weights, read_weights, write_weights
 from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, TableError, WeightsError
-from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.weights.resolve import load_scorer
 
 pytestmark = pytest.mark.usefixtures("no_pictures")

@@ -21,10 +21,10 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scorers import registry
 from wheretolook.scorers.registry import all_methods, make_scorer, methods_named, scorers
 from wheretolook.scorers.visible import METHODS
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.store import client
 from wheretolook.training.weights import read_weights, write_weights
 from wheretolook.utils.errors import ConfigError, WeightsError
-from wheretolook.utils.tracking import client
-from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.weights.resolve import load_scorer, resolve_weights
 
 SOURCE = Path(wheretolook.__file__).parent
@@ -124,8 +124,8 @@ from wheretolook.stages.evaluate import evaluate_methods
 from wheretolook.stages.plan import plan
 from wheretolook.stages.train import train_methods
 from wheretolook.utils.files import write_json
-from wheretolook.utils.tracking import newest_run
-from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.tracking.runs import newest_run
+from wheretolook.tracking.config import TrackingConfig
 
 Figure.savefig = lambda figure, file, **options: file.write(b"")  # figures are built, which is enough here
 folder = Path(sys.argv[1])

@@ -25,12 +25,12 @@ from wheretolook.scorers.mlp.network import ViewpointNetwork
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.store import client
 from wheretolook.training.provenance import TrainedModel
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.weights import METADATA_KEY, method_of_weights, read_training
 from wheretolook.utils.errors import ConfigError, MapError, WeightsError
-from wheretolook.utils.tracking import client
-from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.scorers.sphere.config import SphereConfig

@@ -22,10 +22,10 @@ from wheretolook.scorers.mlp.network import ViewpointNetwork
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
+from wheretolook.tracking.config import TrackingConfig
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.weights import METADATA_KEY, method_of_weights, read_training
 from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, WeightsError
-from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.scorers.trees.config import TreesConfig
 from wheretolook_paper.scorers.trees.learn import BoostedTrees, PooledViews, fit_trees, load_pooled

@@ -17,9 +17,9 @@ from wheretolook.dataset.viewpoint_table import is_good, poses, write_table
 from wheretolook.evaluation.adaptation import compare_log_odds
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scenes.loading import save_glb
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import finished_runs
 from wheretolook.training.weights import read_training
-from wheretolook.utils.tracking import finished_runs
-from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.weights.resolve import load_scorer
 
 

@@ -21,17 +21,10 @@ from wheretolook.evaluation.results import latest_scores
 from wheretolook.scorers.visible import VisibleScorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import artifact, experiment_ids, finished_runs, newest_run, start_run, ui_command
+from wheretolook.tracking.store import client
 from wheretolook.utils.errors import ConfigError, SceneError, TableError, WeightsError
-from wheretolook.utils.tracking import (
-    artifact,
-    client,
-    experiment_ids,
-    finished_runs,
-    newest_run,
-    start_run,
-    ui_command,
-)
-from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.weights.resolve import load_scorer
 
 pytestmark = pytest.mark.usefixtures("no_pictures")

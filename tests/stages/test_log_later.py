@@ -16,11 +16,12 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.stages.evaluate import evaluate_methods, not_logged
 from wheretolook.stages.label import log_labels
 from wheretolook.stages.train import train_methods
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import artifact, finished_runs
+from wheretolook.tracking.store import client
 from wheretolook.training.fit import EpochRecord
 from wheretolook.utils.errors import StorageError, TrackingError, TrackingWarning
 from wheretolook.utils.files import sha256
-from wheretolook.utils.tracking import artifact, client, finished_runs
-from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook_paper.release.training_histories import keep_histories, train_runs
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
@@ -68,7 +69,7 @@ def test_a_training_that_cannot_be_logged_is_kept_and_logged_later(
 ) -> None:
     with monkeypatch.context() as patch:
         breaking(patch, EpochRecord, "on_train_end", tracking)
-        with pytest.warns(TrackingWarning, match=r"the training of mlp-2d.*kept, but not logged.*again"):
+        with pytest.warns(TrackingWarning, match=r"the training of mlp-2d.*saved, but not logged.*again"):
             (model,) = train_methods(dataset, SMALL, tracking, progress=False)
     assert model.run_id == "" and not model.reused
     digest = sha256(model.path)
@@ -121,7 +122,7 @@ def test_an_evaluation_that_cannot_be_logged_is_kept_and_logged_later(
     compare = run.compare_methods
     with monkeypatch.context() as patch:
         patch.setattr(run, "compare_methods", lambda *given: (break_store(tracking), compare(*given))[1])
-        with pytest.warns(TrackingWarning, match=r"the evaluation in .*kept, but not logged"):
+        with pytest.warns(TrackingWarning, match=r"the evaluation in .*saved, but not logged"):
             table = evaluate_methods(dataset, config, tracking, progress=False)
     scores = (dataset.root / "results" / "scores.csv").read_bytes()
     assert len(table) and not_logged(dataset).is_file()
@@ -138,7 +139,7 @@ def test_labels_that_cannot_be_logged_are_summarized_and_logged_later(
     tracking.root.mkdir()
     (tracking.root / "kept").mkdir()
     (tracking.root / "artifacts").write_text("")
-    with pytest.warns(TrackingWarning, match=r"the summary of labels in .*kept, but not logged"):
+    with pytest.warns(TrackingWarning, match=r"the summary of labels in .*saved, but not logged"):
         log_labels(dataset, tracking, {"render": 1.5})
     assert (dataset.root / "results" / "labels.md").is_file()
     note = dataset.root / "labels_not_logged.json"

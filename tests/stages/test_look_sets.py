@@ -17,9 +17,9 @@ from wheretolook.localization.confidence import TOLD, Confidence, told_numbers
 from wheretolook.localization.estimation import PoseEstimator
 from wheretolook.localization.joint_labels import SET_COLUMNS, label_sets
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import newest_run
 from wheretolook.utils.errors import ConfigError, PoseError, TableError, WeightsError
-from wheretolook.utils.tracking import newest_run
-from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.commands.look_sets import LookConfig, compare_looks, evaluate_looks
 from wheretolook_paper.evaluation.looks import look_table, stopping_table

@@ -18,8 +18,8 @@ from wheretolook.cli import main
 from wheretolook.dataset.dataset_lock import changing, reading
 from wheretolook.dataset.layout import Dataset
 from wheretolook.stages.train import train_methods
+from wheretolook.tracking.config import TrackingConfig
 from wheretolook.utils.errors import InUseError
-from wheretolook.utils.tracking_config import TrackingConfig
 
 HOLDER = """
 import sys

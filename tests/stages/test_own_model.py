@@ -29,8 +29,8 @@ from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.loading import save_glb
 from wheretolook.space.config import MappedSpaceConfig
 from wheretolook.stages.preconditions import extractor_of
+from wheretolook.tracking.config import TrackingConfig
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError, WeightsError
-from wheretolook.utils.tracking_config import TrackingConfig
 
 SIZE = (6.0, 5.0, 3.0)
 LOOKS = PinholeCamera(320, 240, 200.0)

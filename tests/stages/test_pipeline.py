@@ -34,11 +34,12 @@ from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.space.tsdf_space import TsdfSpace
 from wheretolook.stages.preconditions import open_scene
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import artifact, finished_runs, newest_run
+from wheretolook.tracking.store import client
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import fingerprint
-from wheretolook.utils.tracking import artifact, client, finished_runs, newest_run
-from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook.weights.resolve import load_scorer

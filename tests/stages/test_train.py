@@ -23,14 +23,14 @@ from wheretolook.inputs.bins import InputStatistics
 from wheretolook.scorers.mlp.network import ViewpointNetwork
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.stages.train import train_methods as train
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.store import client
 from wheretolook.training.data import BatchLoader, ViewpointDataModule, balance_classes, hold_out_locations
 from wheretolook.training.fit import EpochRecord
 from wheretolook.training.provenance import training_fingerprint, was_trained_on
 from wheretolook.training.scenes import with_also
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import ConfigError, TableError
-from wheretolook.utils.tracking import client
-from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.weights.resolve import load_scorer
 
 pytestmark = pytest.mark.usefixtures("no_pictures")

@@ -21,8 +21,8 @@ from wheretolook.scorers.matchability.config import MatchabilityConfig
 from wheretolook.scorers.set.config import SetConfig
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
+from wheretolook.tracking.config import TrackingConfig
 from wheretolook.training.weights import read_weights
-from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook_paper.scorers.trees.config import TreesConfig
 
 pytestmark = pytest.mark.usefixtures("no_pictures")

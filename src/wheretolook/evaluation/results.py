@@ -21,20 +21,25 @@ from wheretolook.evaluation.views import CandidateSet
 from wheretolook.geometry.poses import Float
 from wheretolook.scorers.registry import methods_named, scorers
 from wheretolook.scorers.styles import ORACLE
-from wheretolook.utils.files import atomic_write, fingerprint, temporary_folder
-from wheretolook.utils.tracking import (
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import (
+    ALL_METHODS,
+    AUC,
+    BEST_TAG,
     FINGERPRINT_TAG,
+    REGRET,
+    SHARE,
     NestedRun,
     artifact,
     fingerprint_of,
+    joined,
     log,
     log_nested,
     logged_last,
     newest_run,
     start_run,
 )
-from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.utils.tracking_layout import ALL_METHODS, AUC, BEST_TAG, REGRET, SHARE, joined
+from wheretolook.utils.files import atomic_write, fingerprint, temporary_folder
 from wheretolook.visibility.config import OcclusionConfig
 
 SCORES_CSV = "scores.csv"

@@ -22,11 +22,11 @@ from wheretolook.geometry.poses import Float
 from wheretolook.mapping.config import ExistingModelConfig
 from wheretolook.stages.holdout_photos import check_name, knows_photographs, leave_photographs_out
 from wheretolook.stages.preconditions import Say, Tick, extractor_of, open_scene, refuse_release
+from wheretolook.tracking.store import check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError, MapError, OutOfRangeWarning, SceneError, TableError, WeightsError
 from wheretolook.utils.files import fingerprint, write_text
 from wheretolook.utils.locks import hold
 from wheretolook.utils.reading import read_json_object
-from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
 from wheretolook.weights.resolve import resolve_weights
 
 if TYPE_CHECKING:
@@ -368,7 +368,7 @@ def _save(place: _Place, points: Float, learnt: Adapted, views: LocalizedViews, 
 def _log(
     experiment: Experiment, place: _Place, learnt: Adapted, views: LocalizedViews, gain: Gain, is_better: bool
 ) -> None:
-    from wheretolook.utils.tracking import log, start_run
+    from wheretolook.tracking.runs import log, start_run
 
     params = {"dataset": place.dataset, "scene": place.name, "weights": place.weights, "views": len(views)}
     params |= {"photographs": int((views.photograph >= 0).sum())}

@@ -24,12 +24,12 @@ from wheretolook.geometry.poses import Float, camera_centers, poses_looking_alon
 from wheretolook.scorers.registry import methods_named, scorers
 from wheretolook.stages.evaluate import not_logged
 from wheretolook.stages.preconditions import Say, Tick, dataset_after, open_scene
+from wheretolook.tracking.runs import ui_command
+from wheretolook.tracking.store import check_store
 from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import fingerprint, write_json
 from wheretolook.utils.reading import read_json
-from wheretolook.utils.tracking import ui_command
-from wheretolook.utils.tracking_store import check_store
 from wheretolook.utils.version import VERSION
 from wheretolook.weights.resolve import load_scorer, resolve_weights
 

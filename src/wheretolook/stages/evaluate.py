@@ -15,10 +15,10 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.stages.holdout_photos import check_name, knows_photographs, leave_photographs_out
 from wheretolook.stages.preconditions import Say, Tick, dataset_after, open_scene
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.store import check_store, kept_if_not_logged
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.files import write_text
-from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
 from wheretolook.visibility.config import OcclusionConfig
 from wheretolook_paper.commands.look_sets import evaluate_looks
 

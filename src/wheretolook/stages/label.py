@@ -24,13 +24,13 @@ from wheretolook.localization.report import (
     label_summary,
 )
 from wheretolook.stages.preconditions import Say, Tick, dataset_after, existing, extractor_of, open_scene
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import log, start_run
+from wheretolook.tracking.store import check_store, kept_if_not_logged
 from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.errors import MapError, SceneError, TableError
 from wheretolook.utils.files import write_json, write_text
 from wheretolook.utils.reading import read_json_object
-from wheretolook.utils.tracking import log, start_run
-from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
 
 
 @changes_dataset("label")

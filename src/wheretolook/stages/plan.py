@@ -15,12 +15,11 @@ from wheretolook.dataset.viewpoint_table import pose_columns
 from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.stages.preconditions import Say, Tick, dataset_after, open_scene
+from wheretolook.tracking.runs import joined, log, start_run
+from wheretolook.tracking.store import check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.locks import hold
-from wheretolook.utils.tracking import log, start_run
-from wheretolook.utils.tracking_layout import joined
-from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
 
 if TYPE_CHECKING:
     from wheretolook.planning.routes import PathView, PlannedPath

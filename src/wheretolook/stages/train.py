@@ -14,12 +14,12 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.scorers.method import Method
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.stages.preconditions import Say, Tick, dataset_after
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import log, log_history, start_run
+from wheretolook.tracking.store import check_store, kept_if_not_logged, warn_not_logged
 from wheretolook.utils.confine import entry_of
 from wheretolook.utils.errors import TrackingError
 from wheretolook.utils.files import sha256, temporary_folder, write_json, write_text
-from wheretolook.utils.tracking import log, start_run
-from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.utils.tracking_store import check_store, kept_if_not_logged, warn_not_logged
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -132,13 +132,7 @@ def _train(
 def _log_later(model: TrainedModel, tracking: TrackingConfig) -> TrainedModel:
     """Log a training whose weights and record lie on disk, from the record, as training itself does."""
     from wheretolook.training.weights import read_record
-    from wheretolook_paper.release.training_histories import (
-        NOT_LOGGED,
-        history_not_logged,
-        kept_metrics,
-        log_history,
-        params_of,
-    )
+    from wheretolook_paper.release.training_histories import NOT_LOGGED, history_not_logged, kept_metrics, params_of
 
     record = read_record(model.path)
     kept = record.pop(NOT_LOGGED, {})
@@ -148,7 +142,7 @@ def _log_later(model: TrainedModel, tracking: TrackingConfig) -> TrainedModel:
         with start_run(tracking, model.method, "train", params) as (client, run_id):
             log(client, run_id, metrics=kept_metrics(model.metrics))
             if history is not None:
-                log_history(tracking, run_id, history)
+                log_history(client, run_id, history)
             _log_artifacts(client, run_id, model.path, history, model.method)
         write_json(model.path.with_suffix(".json"), record | {"run_id": run_id})
         return replace(model, run_id=run_id)

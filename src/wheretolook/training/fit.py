@@ -22,12 +22,12 @@ from lightning.pytorch.strategies import DDPStrategy
 from torch.multiprocessing.spawn import ProcessException
 from tqdm.auto import tqdm
 
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.store import client
 from wheretolook.training.classifier import ViewpointClassifier
 from wheretolook.training.config import FittingConfig, SharedConfig
 from wheretolook.utils.errors import ConfigError, TrackingError, WorkerError
 from wheretolook.utils.files import temporary_folder
-from wheretolook.utils.tracking import client
-from wheretolook.utils.tracking_config import TrackingConfig
 
 if TYPE_CHECKING:
     from mlflow.entities import Metric

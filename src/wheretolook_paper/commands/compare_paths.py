@@ -18,13 +18,13 @@ from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_table import SCHEMA, UNLABELLED
 from wheretolook.planning.config import FORWARD, PathsConfig
 from wheretolook.stages.preconditions import Say, Tick, dataset_after, extractor_of, open_scene
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.store import check_store, kept_if_not_logged
 from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.files import atomic_write, fingerprint, write_json, write_text
 from wheretolook.utils.parquet_files import read_parquet
 from wheretolook.utils.reading import read_json, read_json_object
-from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.utils.tracking_store import check_store, kept_if_not_logged
 from wheretolook_paper.commands import joint_paths
 
 if TYPE_CHECKING:

@@ -10,10 +10,10 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.names import RELEASE_FILE
 from wheretolook.figures.config import FiguresConfig
 from wheretolook.stages.preconditions import Say
+from wheretolook.tracking.runs import ui_command
+from wheretolook.tracking.store import check_store
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import temporary_folder
-from wheretolook.utils.tracking import ui_command
-from wheretolook.utils.tracking_store import check_store
 
 _TABLES = ("table_vs_others", "table_input_variants")
 QUICK = ("top_n", *_TABLES, "training", "calibration", "scores", "regret", "paths", "runtimes")

@@ -10,13 +10,13 @@ import pandas as pd
 
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_table import has_matches, is_good, poses, read_table
-from wheretolook.utils.tracking_store import kept_if_not_logged
+from wheretolook.tracking.store import kept_if_not_logged
 from wheretolook_paper.evaluation.looks import LOOKS_CSV, LOOKS_MD, NUMBERS, STRATEGIES, log_looks, write_looks
 
 if TYPE_CHECKING:
     from wheretolook.evaluation.config import EvaluateConfig
     from wheretolook.scorers.base import Scorer
-    from wheretolook.utils.tracking_config import TrackingConfig
+    from wheretolook.tracking.config import TrackingConfig
 
 
 @dataclass(frozen=True)

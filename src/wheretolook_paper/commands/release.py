@@ -11,8 +11,8 @@ from wheretolook.dataset.dataset_lock import changing, reading, reads_dataset
 from wheretolook.dataset.layout import Dataset
 from wheretolook.stages.evaluate import evaluate
 from wheretolook.stages.preconditions import Say, Tick, dataset_after
+from wheretolook.tracking.store import check_store
 from wheretolook.utils.files import copy_file
-from wheretolook.utils.tracking_store import check_store
 
 
 @reads_dataset("release")

@@ -9,10 +9,10 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import BEST_TAG
 from wheretolook.utils.files import write_text
 from wheretolook.utils.markdown import markdown_table
-from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.utils.tracking_layout import BEST_TAG
 
 LOOKS_CSV = "looks.csv"
 LOOKS_MD = "looks.md"
@@ -118,7 +118,7 @@ def log_looks(
 
     The run has the metrics of the best choice of most looks.
     """
-    from wheretolook.utils.tracking import NestedRun, log, log_nested, start_run
+    from wheretolook.tracking.runs import NestedRun, log, log_nested, start_run
 
     numbers = [name for name in _NUMBERS if name in table]
     best = table[table["n_looks"] == table["n_looks"].max()].nlargest(1, "good").iloc[0]

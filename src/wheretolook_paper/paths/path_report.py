@@ -13,19 +13,21 @@ from numpy.typing import NDArray
 from wheretolook.dataset.thresholds import ALL
 from wheretolook.dataset.viewpoint_table import LOCALIZED
 from wheretolook.planning.config import FORWARD, PathsConfig
-from wheretolook.utils.markdown import markdown_table
-from wheretolook.utils.tracking import (
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import (
+    ALL_METHODS,
+    BEST_TAG,
     FINGERPRINT_TAG,
     NestedRun,
     Tags,
     fingerprint_of,
+    joined,
     log,
     log_nested,
     logged_last,
     start_run,
 )
-from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.utils.tracking_layout import ALL_METHODS, BEST_TAG, joined
+from wheretolook.utils.markdown import markdown_table
 
 PATHS_CSV = "paths.csv"
 PATHS_MD = "paths.md"

@@ -26,12 +26,12 @@ from wheretolook.figures.path_film import methods_figure
 from wheretolook.figures.scores import regret_figure, score_figure
 from wheretolook.figures.style import save_figure
 from wheretolook.scorers.registry import learned
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import artifact, finished_runs
+from wheretolook.tracking.store import client, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError, MissingRunError, WhereToLookError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.markdown import markdown_table
-from wheretolook.utils.tracking import artifact, client, finished_runs
-from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.utils.tracking_store import kept_if_not_logged
 from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.evaluation.looks import LOOKS_CSV
 from wheretolook_paper.figures.inputs import inputs_figure

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.names import RELEASE
+from wheretolook.tracking.config import TrackingConfig
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.tracking_config import TrackingConfig
 
 RELEASE_VARIABLE = "WHERETOLOOK_RELEASE"
 STORE_VARIABLE = "WHERETOLOOK_MLRUNS"

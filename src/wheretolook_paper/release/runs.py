@@ -19,12 +19,25 @@ from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good
 from wheretolook.evaluation.results import SCORES_CSV, best_of, evaluation_params, runs_of_rows
 from wheretolook.evaluation.scores import read_scores
 from wheretolook.scorers.registry import learned
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import (
+    ALL_METHODS,
+    AUC,
+    BEST_TAG,
+    REGRET,
+    NestedRun,
+    artifact,
+    experiment_ids,
+    finished_runs,
+    joined,
+    log,
+    log_history,
+    log_nested,
+    start_run,
+)
+from wheretolook.tracking.store import client as client_of
 from wheretolook.utils.files import temporary_folder, write_text
 from wheretolook.utils.locks import hold
-from wheretolook.utils.tracking import NestedRun, artifact, experiment_ids, finished_runs, log, log_nested, start_run
-from wheretolook.utils.tracking import client as client_of
-from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.utils.tracking_layout import ALL_METHODS, AUC, BEST_TAG, REGRET, joined
 from wheretolook_paper.evaluation.looks import LOOKS_CSV, log_looks
 from wheretolook_paper.paths.path_report import PATHS_CSV, log_paths
 from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
@@ -33,7 +46,6 @@ from wheretolook_paper.release.training_histories import (
     HISTORY_CSV,
     TRAINING_CSV,
     kept_metrics,
-    log_history,
     params_of,
     read_histories,
     records,
@@ -202,7 +214,7 @@ def _log_training(
         mlflow.log_artifact(run, str(path))
         if history is not None:
             history = history.drop(columns="method").dropna(axis=1, how="all")
-            log_history(tracking, run, history)
+            log_history(mlflow, run, history)
             write_text(artifact(tracking, run, HISTORY_CSV), history.to_csv(index=False))
     return run
 

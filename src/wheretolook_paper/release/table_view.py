@@ -8,8 +8,8 @@ import pandas as pd
 
 from wheretolook.dataset.thresholds import threshold_label
 from wheretolook.evaluation.scores import RELEASED_DIVISOR
-from wheretolook.utils.tracking import newest_artifact
-from wheretolook.utils.tracking_config import TrackingConfig
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import newest_artifact
 from wheretolook_paper.evaluation.paper_tables import KEYS
 
 if TYPE_CHECKING:

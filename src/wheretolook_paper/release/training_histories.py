@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from wheretolook.dataset.layout import Dataset
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import AUC, artifact, finished_runs
 from wheretolook.training.old_names import name_of_variant, with_name, with_names
 from wheretolook.utils.errors import WeightsError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.reading import read_json_object
-from wheretolook.utils.tracking import artifact, client, finished_runs
-from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook.utils.tracking_layout import AUC
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -28,8 +27,6 @@ TRAINING_CSV = "training.csv"
 
 NOT_LOGGED = "not_logged"
 """In the record of weights whose training is not logged yet: "params" and "history", the text of `HISTORY_CSV`."""
-
-LOG_AT_MOST = 1000  # metrics MLflow takes at a time
 
 
 def params_of(about: Mapping[str, Any]) -> dict[str, Any]:
@@ -92,21 +89,6 @@ def history_not_logged(record: Mapping[str, Any]) -> pd.DataFrame | None:
     kept = record.get(NOT_LOGGED)
     text = kept.get("history") if isinstance(kept, dict) else None
     return pd.read_csv(StringIO(text), float_precision="round_trip") if isinstance(text, str) and text else None
-
-
-def log_history(tracking: TrackingConfig, run_id: str, history: pd.DataFrame) -> None:
-    """Log a history, one row for each `epoch`, as training itself does. What is not finite is left out."""
-    from mlflow.entities import Metric
-
-    start = int(client(tracking).get_run(run_id).info.start_time)
-    metrics = [
-        Metric(str(name), float(value), start + int(row["epoch"]), int(row["epoch"]))
-        for row in history.to_dict("records")
-        for name, value in row.items()
-        if name != "epoch" and pd.notna(value)
-    ]
-    for begin in range(0, len(metrics), LOG_AT_MOST):
-        client(tracking).log_batch(run_id, metrics=metrics[begin : begin + LOG_AT_MOST])
 
 
 def records(folder: Path) -> dict[Path, dict[str, Any]]:

@@ -38,12 +38,12 @@ from wheretolook.scorers.set.config import SetConfig
 from wheretolook.scorers.set.learn import SetData, learn_set
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.stages.train import train_methods as train
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import start_run
 from wheretolook.training.fit import RunLog
 from wheretolook.training.learner import Task
 from wheretolook.training.provenance import weights_path
 from wheretolook.training.scenes import with_also
-from wheretolook.utils.tracking import start_run
-from wheretolook.utils.tracking_config import TrackingConfig
 
 METHODS = ("mlp-2d+z", "mlp-2d+3d+landmark", "conv", "trees", "set", "sphere")
 

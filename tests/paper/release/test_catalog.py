@@ -21,9 +21,9 @@ from wheretolook.figures.style import note_of
 from wheretolook.planning.config import PathConfig, PlanConfig
 from wheretolook.planning.routes import PathView
 from wheretolook.scorers.styles import method_style
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import newest_artifact, newest_run
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.tracking import newest_artifact, newest_run
-from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook_paper.figures.top_n import ROWS, top_n_figure, top_n_table
 from wheretolook_paper.release.catalog import ITEMS, write_items
 from wheretolook_paper.release.paper_architecture import paper_architecture_table

@@ -29,12 +29,12 @@ from wheretolook.scorers.registry import make_scorer
 from wheretolook.scorers.set.config import SetConfig
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
+from wheretolook.tracking.config import TrackingConfig
 from wheretolook.training.data import load_views
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.weights import save_in_half
 from wheretolook.utils.errors import ConfigError, StorageError, TableError, WeightsError
 from wheretolook.utils.files import write_json
-from wheretolook.utils.tracking_config import TrackingConfig
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.commands.release import release_settings

@@ -17,21 +17,11 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.results import latest_scores
 from wheretolook.evaluation.scores import read_scores
-from wheretolook.figures.config import FiguresConfig
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import experiment_ids, experiments, finished_runs, newest_artifact, newest_run
+from wheretolook.tracking.store import client
 from wheretolook.utils.errors import MissingRunError
-from wheretolook.utils.tracking import (
-    artifact,
-    client,
-    experiment_ids,
-    experiments,
-    finished_runs,
-    newest_artifact,
-    newest_run,
-    start_run,
-)
-from wheretolook.utils.tracking_config import TrackingConfig
-from wheretolook_paper.release.catalog import write_items
 from wheretolook_paper.release.notebook import open_store
 from wheretolook_paper.release.runs import ReleaseRuns, log_release
 from wheretolook_paper.release.training_histories import HISTORY_CSV, histories, keep_histories, trained
@@ -152,31 +142,6 @@ def test_parents_carry_the_numbers_of_the_best(logged: tuple[Dataset, TrackingCo
     assert paths.tags["best"] in ("forward", "bins") and paths.metrics["localized"] == 0.5
     (trained_run,) = (client(tracking).get_run(run) for run in runs.train.values())
     assert trained_run.info.run_name == "mlp-2d+3d (train release)" and trained_run.data.metrics["1_auc"] == 0.8
-
-
-def test_a_store_of_an_older_version_serves_on(tmp_path: Path) -> None:
-    """All its runs lie in one experiment, with other names of runs and fewer metrics: read, and left as they are."""
-    release = make_release(tmp_path / "data" / "release")
-    folder = str(tmp_path / "mlruns")
-    old = TrackingConfig(folder, "wheretolook")
-    tracking = TrackingConfig(folder)
-    runs = log_release(release, old)
-    mlflow = client(old)
-    mlflow.update_run(runs.evaluate["release"], name="evaluate release")
-    mlflow.delete_tag(runs.evaluate["release"], "best")
-    assert log_release(release, tracking) == ReleaseRuns(**{**vars(runs), "new": 0})
-    assert [one.name for one in experiments(mlflow, tracking)] == ["wheretolook"]
-    pd.testing.assert_frame_equal(latest_scores(tracking, "release"), latest_scores(old, "release"))
-    config = FiguresConfig(tmp_path / "figures", ("scores", "table_vs_others", "paths", "runtimes"), ("png",))
-    assert write_items(release, tracking, config, lambda text: None) == {}
-    drawn = {path.name for path in (tmp_path / "figures").iterdir()}
-    assert drawn >= {"scores.png", "table_vs_others.md", "paths.png", "runtimes.png"}
-    assert artifact(old, str(runs.paths), "figures/paths.png").is_file()
-    assert mlflow.get_run(runs.evaluate["release"]).info.run_name == "evaluate release"
-    with start_run(tracking, "later", "paths", {"dataset": "release"}) as (_, later):
-        pass
-    assert [run.info.run_id for run in finished_runs(tracking, "paths")] == [later, runs.paths]
-    assert [run.info.run_id for run in finished_runs(old, "paths")] == [runs.paths]  # the option still limits it
 
 
 def test_a_deleted_experiment_does_not_come_back(store: tuple[Dataset, TrackingConfig]) -> None:

@@ -1,4 +1,4 @@
-"""Where MLflow keeps its runs: options only, so that the command line reads them without MLflow."""
+"""Location of the MLflow store. Imports no MLflow, so that the command line can read it quickly."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ class TrackingConfig:
     """Where runs are logged.
 
     Args:
-        folder: folder of the MLflow store. Made when needed; holds `mlflow.db` and `artifacts/`.
-        experiment: name of one MLflow experiment that all runs belong to; if not given, each dataset and purpose has
-            its own, such as `release: evaluation` (`wheretolook.utils.tracking_layout`), and older ones are read, too.
+        folder: folder of the MLflow store. Created when needed; holds `mlflow.db` and `artifacts/`.
+        experiment: name of one MLflow experiment for all runs; by default, each dataset and purpose has its own, such
+            as `release: evaluation`.
     """
 
     folder: str = "mlruns"
@@ -31,5 +31,5 @@ class TrackingConfig:
 
     @property
     def artifacts(self) -> str:
-        """Artifact location of the experiment."""
+        """Artifact location of the experiments."""
         return str(self.root / "artifacts")

@@ -1,12 +1,4 @@
-"""How runs are arranged in MLflow: which experiment a run goes to, what it says there, and how runs are named.
-
-Each dataset and purpose has an experiment, such as `release: evaluation`. A run is named
-
-    <what was run>[, <condition>]... (<stage> <dataset>)
-
-such as "all methods (evaluate release)", "set, mesh, best 100 (evaluate release)" or "set (train release)": what tells
-runs apart comes first, since MLflow cuts long names.
-"""
+"""Descriptions and saved views of MLflow experiments, registered under the entry point `wheretolook.experiment_notes`."""
 
 from __future__ import annotations
 
@@ -14,16 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-REGRET = "1_regret"
-SHARE = "1_share"
-AUC = "1_auc"
-"""Metrics to sort runs by: the first view chosen (N = 1), at the strictest threshold. MLflow orders columns by name,
-digits first."""
-
-
-BEST_TAG = "best"  # tag of a run that compares: the method or learner whose metrics to sort by it carries
-
-ALL_METHODS = "all methods"  # what was run in a comparison of methods
+from wheretolook.tracking.runs import AUC, REGRET, SHARE
 
 
 @dataclass(frozen=True)
@@ -51,9 +34,8 @@ def _column(name: str) -> str:
 
 @dataclass(frozen=True)
 class Purpose:
-    """What the runs of a stage are for: the end of their experiment's name, and what to look at there."""
+    """Description of the experiment of a stage's runs, and its saved views."""
 
-    name: str
     note: str  # MLflow shows it as Markdown
     views: Mapping[str, View] = field(default_factory=dict)  # by their names, which are parts of links
 
@@ -73,7 +55,6 @@ _FIRST = f"""\
 
 PURPOSES = {
     "evaluate": Purpose(
-        "evaluation",
         f"""\
 How well methods choose where to look. One run is one evaluation; its own numbers are those of the best method that has
 to choose (tag `best`). Open it (+) to compare: in it is a run for each `method` × `occlusion` × `candidates`.
@@ -92,17 +73,15 @@ All other numbers lie in the artifact `scores.csv`.""",
         },
     ),
     "looks": Purpose(
-        "looks",
         """\
 Sets of looks from a place, localized together. Open the run (+) to compare: in it is a run for each `strategy` ×
 `n_looks`.
 
 - `good`: share of places where the looks localize together; **sort by it, highest first**
 - `gain`: this less the share where the look that is best alone localizes; `any_good`: where one of the looks does
-- `sure`, `sure_right`: share of poses called sure at 99 %, and of these the share that is right""",
+- `sure`, `sure_right`: share of poses called sure at 99 %, and of these the share that is right"""
     ),
     "train": Purpose(
-        "training",
         """\
 What was trained, a run for each time. Compare the last epoch kept by `kept_val_average_precision`, highest first, with
 `method` beside it; the charts of `val_bce` and `train_bce` by step tell whether a network has learnt too long. Weights
@@ -110,7 +89,6 @@ and `history.csv` are artifacts.""",
         {"trained": View("what was trained, the best first", _KEPT, ("params.method", f"metrics.{AUC}"), "", False)},
     ),
     "learners": Purpose(
-        "learners",
         f"""\
 Everything that can learn, on scenes that it has not learnt from. The run's own numbers are those of the learner with
 the lowest mean regret (tag `best`). Open it (+) to compare: in it is a run for each `learner` × `learnt_from` × `seed`.
@@ -122,13 +100,11 @@ Runs that differ by `seed` alone tell how much of a difference is luck.""",
         {"learners": View("all learners, the best first", REGRET, _LEARNERS, "params.learner LIKE '%'")},
     ),
     "adapt": Purpose(
-        "adapting",
         """\
 Weights adapted to single scenes. Compare `regret`, `auc`, `calibration_error` and `log_loss` with the same names ending
-in `_before`: all of views that were not learnt from. `better` is 1 where the adapted weights were kept.""",
+in `_before`: all of views that were not learnt from. `better` is 1 where the adapted weights were kept."""
     ),
     "paths": Purpose(
-        "paths",
         """\
 Planned paths whose views were rendered and localized. Open the run (+) to compare: in it is a run for each `method` ×
 `task` ("planned": places and views are planned; "given": views along given places).
@@ -138,52 +114,30 @@ Planned paths whose views were rendered and localized. Open the run (+) to compa
         {"methods": View("all methods, the best first", "localized", _PATHS, "params.method LIKE '%'", False)},
     ),
     "plan": Purpose(
-        "plans",
-        "Single paths. Compare `score`, the mean score of the views, and `length_m`; picture and film are artifacts.",
+        "Single paths. Compare `score`, the mean score of the views, and `length_m`; picture and film are artifacts."
     ),
     "label": Purpose(
-        "labels",
         """\
 How the labels came out, a run for each time. `positive_…` are the shares of viewpoints that localize within a limit;
-with `train_` or `test_` in front, of that split. `seconds_…` is the time of each step; `labels.md` is an artifact.""",
+with `train_` or `test_` in front, of that split. `seconds_…` is the time of each step; `labels.md` is an artifact."""
     ),
     "benchmark": Purpose(
-        "benchmarks",
-        "Measurements. `visibility check`: seconds, a metric for each step and device; tables are artifacts.",
+        "Measurements. `visibility check`: seconds, a metric for each step and device; tables are artifacts."
     ),
 }
 
 
-def experiment_name(stage: str, dataset: str) -> str:
-    """The experiment of a stage's runs about a dataset, such as "release: evaluation"; "" for no dataset."""
-    purpose = PURPOSES[stage].name if stage in PURPOSES else stage
-    return ": ".join(filter(None, (dataset, purpose)))
-
-
-def note_of(stage: str, experiment_id: str = "") -> str:
-    """What the description of that experiment says; with its id, it begins with links to the experiment's views."""
+def experiment_tags(stage: str, experiment_id: str) -> dict[str, str]:
+    """Tags in which MLflow keeps the description and the saved views of an experiment of a stage's runs."""
     if stage not in PURPOSES:
-        return ""
+        return {}
+    purpose = PURPOSES[stage]
     address = f"#/experiments/{experiment_id}/runs?{_SHARED_BY}"
-    links = [f"[{view.about}]({address}={name})" for name, view in PURPOSES[stage].views.items() if experiment_id]
-    return "\n\n".join(filter(None, (" · ".join(links), PURPOSES[stage].note)))
+    links = [f"[{view.about}]({address}={name})" for name, view in purpose.views.items()]
+    note = "\n\n".join(filter(None, (" · ".join(links), purpose.note)))
+    views = {f"{_SHARED}{name}": view.state() for name, view in purpose.views.items()}
+    return {"mlflow.note.content": note, **views}
 
 
-def views_of(stage: str) -> dict[str, str]:
-    """Tags of that experiment in which MLflow keeps its views."""
-    views = PURPOSES[stage].views if stage in PURPOSES else {}
-    return {f"{_SHARED}{name}": view.state() for name, view in views.items()}
-
-
-_SHARED = "mlflow.sharedViewState."  # as of MLflow 3
+_SHARED = "mlflow.sharedViewState."  # MLflow 3
 _SHARED_BY = "viewStateShareKey"
-
-
-def run_name(what: str, stage: str, dataset: str) -> str:
-    """A run's name; `what` says what was run, and under which conditions, see `joined`."""
-    return f"{what} ({' '.join(filter(None, (stage, dataset)))})"
-
-
-def joined(what: str, *conditions: str) -> str:
-    """What was run and its conditions, those that are not empty, separated by commas."""
-    return ", ".join(filter(None, (what, *conditions)))

@@ -1,0 +1,323 @@
+"""Logs runs to an MLflow store and finds them again.
+
+A run is named `<what>[, <condition>]... (<stage> <dataset>)`, such as "set, mesh, best 100 (evaluate release)": MLflow
+cuts long names, so what distinguishes runs comes first. MLflow stores absolute artifact paths. If a store was moved,
+its runs are still found here, since the artifacts of a run are in a folder named by its id; MLflow's UI does not show
+the artifacts of earlier runs.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import entry_points
+from itertools import chain, count
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.store import client
+from wheretolook.utils.errors import MissingRunError, TrackingError
+from wheretolook.utils.version import VERSION
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+    from mlflow.entities import Experiment, Metric, Run
+
+Values = Mapping[str, Any] | None
+"""Parameters or metrics by name."""
+
+Tags = Mapping[str, str] | None
+"""Tags by name."""
+
+STAGE_TAG = "stage"
+"""Tag of every run: "label", "train", "evaluate", "plan", "paths", "learners" or "benchmark"."""
+
+PARENT_TAG = "mlflow.parentRunId"
+FINGERPRINT_TAG = "fingerprint"
+"""Tag with the `fingerprint_of` of a run's parameters and results."""
+
+BEST_TAG = "best"
+"""Tag of a run that compares methods or learners: the one whose metrics the run itself has."""
+
+REGRET = "1_regret"
+SHARE = "1_share"
+AUC = "1_auc"
+"""Metrics to sort runs by: the first view chosen (N = 1), at the strictest threshold. MLflow orders columns by name,
+digits first."""
+
+ALL_METHODS = "all methods"
+"""What a comparison of methods runs."""
+
+NOTES_GROUP = "wheretolook.experiment_notes"
+"""Entry points of functions (stage, experiment_id) -> tags that describe a new experiment."""
+
+_LAYOUT_TAGS = {"made_by": "wheretolook"}  # of experiments of a dataset and purpose
+_KIND_TAGS = {"mlflow.experimentKind": "custom_model_development"}  # lets MLflow open the table of runs
+_METRICS_PER_BATCH = 800  # MLflow takes 1000 metrics and parameters together
+_RUNS_PER_PAGE = 50
+_PURPOSES = {
+    "evaluate": "evaluation",
+    "train": "training",
+    "adapt": "adapting",
+    "plan": "plans",
+    "label": "labels",
+    "benchmark": "benchmarks",
+}
+
+
+def experiment_name(stage: str, dataset: str) -> str:
+    """Name of the experiment of a stage's runs on a dataset, such as "release: evaluation"; "" for no dataset."""
+    return ": ".join(filter(None, (dataset, _PURPOSES.get(stage, stage))))
+
+
+def run_name(what: str, stage: str, dataset: str) -> str:
+    """Name of a run; `what` is what was run, with its conditions (see `joined`)."""
+    return f"{what} ({' '.join(filter(None, (stage, dataset)))})"
+
+
+def joined(what: str, *conditions: str) -> str:
+    """Join what was run and its non-empty conditions by commas."""
+    return ", ".join(filter(None, (what, *conditions)))
+
+
+def experiments(mlflow_client: MlflowClient, tracking: TrackingConfig) -> list[Experiment]:
+    """All experiments of this package in the store, also those logged before the store was moved."""
+    name = tracking.experiment
+    tag, value = next(iter(_LAYOUT_TAGS.items()))
+    return [
+        experiment
+        for experiment in mlflow_client.search_experiments()
+        if (name and (experiment.name == name or experiment.name.startswith(f"{name} at ")))
+        or (not name and experiment.tags.get(tag) == value)
+    ]
+
+
+def experiment_ids(mlflow_client: MlflowClient, tracking: TrackingConfig) -> list[str]:
+    """Ids of `experiments`."""
+    return [str(experiment.experiment_id) for experiment in experiments(mlflow_client, tracking)]
+
+
+def experiment_id(mlflow_client: MlflowClient, tracking: TrackingConfig, stage: str, dataset: str = "") -> str:
+    """Id of the experiment for new runs of a stage on a dataset, which is created if missing.
+
+    An experiment keeps the absolute path of its artifacts. In a store that was moved, new runs therefore go to another
+    experiment, named after the new path; likewise if the experiment was deleted, since MLflow keeps its name.
+    """
+    name = tracking.experiment or experiment_name(stage, dataset)
+    moved_name = f"{name} at {tracking.root}"
+    for candidate in chain((name, moved_name), (f"{moved_name} {number}" for number in count(2))):
+        known = mlflow_client.get_experiment_by_name(candidate)  # also a deleted one
+        if known is None:
+            break
+        if known.lifecycle_stage == "active" and known.artifact_location == tracking.artifacts:
+            return str(known.experiment_id)
+    tags = _KIND_TAGS | ({} if tracking.experiment else _LAYOUT_TAGS)
+    created = str(mlflow_client.create_experiment(candidate, artifact_location=tracking.artifacts, tags=tags))
+    if not tracking.experiment:
+        for entry_point in entry_points(group=NOTES_GROUP):
+            for tag, text in entry_point.load()(stage, created).items():
+                mlflow_client.set_experiment_tag(created, tag, text)
+    return created
+
+
+@contextmanager
+def start_run(
+    tracking: TrackingConfig, what: str, stage: str, params: Values = None, tags: Tags = None
+) -> Iterator[tuple[MlflowClient, str]]:
+    """Open a run, and close it as finished, failed (any exception) or killed (Ctrl-C).
+
+    The run's name is made of `what` was run, its stage, such as "train", and the parameter `dataset`, if there is one;
+    the latter two select its experiment. Yields the client and the run's id, for `client.log_metric(run_id, ...)` etc.
+    """
+    mlflow_client = client(tracking)
+    dataset = str((params or {}).get("dataset", ""))
+    all_tags = {STAGE_TAG: stage, **code_version(), **(tags or {})}
+    experiment = experiment_id(mlflow_client, tracking, stage, dataset)
+    with _open_run(mlflow_client, experiment, run_name(what, stage, dataset), all_tags) as run_id:
+        log(mlflow_client, run_id, params)
+        yield mlflow_client, run_id
+
+
+@contextmanager
+def _open_run(mlflow_client: MlflowClient, experiment: str, name: str, tags: Mapping[str, str]) -> Iterator[str]:
+    run_id = str(mlflow_client.create_run(experiment, tags=dict(tags), run_name=name).info.run_id)
+    try:
+        yield run_id
+    except BaseException as error:
+        with suppress(TrackingError):  # the error that ends the run is more informative
+            mlflow_client.set_terminated(run_id, status="KILLED" if isinstance(error, KeyboardInterrupt) else "FAILED")
+        raise
+    mlflow_client.set_terminated(run_id, status="FINISHED")
+
+
+def log(mlflow_client: MlflowClient, run_id: str, params: Values = None, metrics: Values = None) -> None:
+    """Log parameters and metrics of a run. Metrics that are not finite are skipped."""
+    from mlflow.entities import Param
+
+    log_metrics(mlflow_client, run_id, [(0, metrics or {})])
+    if params:
+        texts = [Param(key, str(value)) for key, value in params.items()]
+        mlflow_client.log_batch(run_id, params=texts)
+
+
+def log_history(mlflow_client: MlflowClient, run_id: str, history: pd.DataFrame) -> None:
+    """Log a training history, one row per `epoch`, as training itself logs it."""
+    start_ms = int(mlflow_client.get_run(run_id).info.start_time)
+    rows = history.set_index("epoch").to_dict("index")
+    log_metrics(mlflow_client, run_id, [(int(epoch), metrics) for epoch, metrics in rows.items()], start_ms)
+
+
+def log_metrics(
+    mlflow_client: MlflowClient,
+    run_id: str,
+    steps: Iterable[tuple[int, Mapping[str, Any]]],
+    start_ms: int | None = None,
+) -> None:
+    """Log metrics of steps in batches. Metrics that are not finite are skipped.
+
+    The time of a step is now, or `start_ms` plus the step in milliseconds.
+    """
+    from mlflow.entities import Metric
+
+    now = int(time.time() * 1000)
+    metrics: list[Metric] = [
+        Metric(str(name), float(value), now if start_ms is None else start_ms + step, step)
+        for step, values in steps
+        for name, value in values.items()
+        if math.isfinite(value)
+    ]
+    for begin in range(0, len(metrics), _METRICS_PER_BATCH):
+        mlflow_client.log_batch(run_id, metrics=metrics[begin : begin + _METRICS_PER_BATCH])
+
+
+@dataclass(frozen=True)
+class NestedRun:
+    """A run within another, before it is logged: what was run, parameters, metrics and files."""
+
+    what: str  # with its conditions, see `joined`
+    params: Mapping[str, Any]
+    metrics: Mapping[str, float]
+    files: Sequence[Path] = ()
+
+
+def log_nested(tracking: TrackingConfig, parent: str, stage: str, runs: Iterable[NestedRun], tags: Tags = None) -> None:
+    """Log finished runs of a stage within the run with id `parent`, all with the same tags.
+
+    MLflow needs 25 ms for a run and 0.3 ms for a metric (`tests/benchmarks/bench_tracking.py`): hundreds of runs take
+    half a minute.
+    """
+    mlflow_client = client(tracking)
+    experiment = str(mlflow_client.get_run(parent).info.experiment_id)
+    all_tags = {STAGE_TAG: stage, **code_version(), **(tags or {}), PARENT_TAG: parent}
+    for run in runs:
+        name = run_name(run.what, stage, str(run.params.get("dataset", "")))
+        with _open_run(mlflow_client, experiment, name, all_tags) as run_id:
+            log(mlflow_client, run_id, run.params, run.metrics)
+            for file in run.files:
+                mlflow_client.log_artifact(run_id, str(file))
+
+
+def newest_run(
+    tracking: TrackingConfig, stage: str, tags: Tags = None, params: Tags = None, file: str = ""
+) -> Run | None:
+    """The newest of `finished_runs`, or None."""
+    return next(finished_runs(tracking, stage, tags, params, file), None)
+
+
+def finished_runs(
+    tracking: TrackingConfig, stage: str, tags: Tags = None, params: Tags = None, file: str = ""
+) -> Iterator[Run]:
+    """Yield the finished top-level runs of a stage, newest first; none if there is no store.
+
+    Only runs with these tags and parameters, and with `file` as an artifact ("" for any run).
+    """
+    if not (tracking.root / "mlflow.db").exists():
+        return
+    mlflow_client = client(tracking)
+    searched = experiment_ids(mlflow_client, tracking)
+    query = f"tags.{STAGE_TAG} = '{stage}' AND tags.`{PARENT_TAG}` IS NULL AND attributes.status = 'FINISHED'"
+    order = ["attributes.start_time DESC"]
+    token: str | None = None
+    while searched and token != "":
+        page = mlflow_client.search_runs(searched, query, max_results=_RUNS_PER_PAGE, order_by=order, page_token=token)
+        for run in page:
+            matches = all(run.data.tags.get(key) == str(value) for key, value in (tags or {}).items())
+            matches &= all(run.data.params.get(key) == str(value) for key, value in (params or {}).items())
+            if matches and (not file or artifact(tracking, run.info.run_id, file).is_file()):
+                yield run
+        token = page.token or ""
+
+
+def fingerprint_of(params: Mapping[str, Any], *results: str) -> str:
+    """16 hexadecimal digits that change with any parameter of a run, as MLflow stores it, and any of its results."""
+    texts = {str(name): str(value) for name, value in params.items()}
+    return hashlib.sha256(json.dumps([sorted(texts.items()), *results]).encode()).hexdigest()[:16]
+
+
+def logged_last(tracking: TrackingConfig, stage: str, dataset: str, fingerprint: str, file: str) -> str | None:
+    """Id of the newest finished run of a stage on a dataset if it has this fingerprint and file, or None.
+
+    Then there is nothing new to log. An older run with the fingerprint does not count, since figures read the newest.
+    """
+    run = newest_run(tracking, stage, params={"dataset": dataset})
+    if run is None or run.data.tags.get(FINGERPRINT_TAG) != fingerprint:
+        return None
+    return str(run.info.run_id) if artifact(tracking, run.info.run_id, file).is_file() else None
+
+
+def newest_artifact(tracking: TrackingConfig, stage: str, file: str, dataset: str = "") -> Path:
+    """An artifact of the newest finished top-level run of a stage that has it, on a dataset or on any ("").
+
+    Raises MissingRunError if there is no such run.
+    """
+    run = newest_run(tracking, stage, params={"dataset": dataset} if dataset else None, file=file)
+    if run is None:
+        fix = "`wheretolook figures` lists the command that makes it; `wheretolook log-release` logs the release."
+        raise MissingRunError(f"there is no run of {stage} with {file}", path=tracking.root, fix=fix)
+    return artifact(tracking, run.info.run_id, file)
+
+
+def artifact(tracking: TrackingConfig, run_id: str, path: str) -> Path:
+    """Local path of an artifact of a run, also after the store was moved."""
+    return Path(tracking.artifacts) / run_id / "artifacts" / path
+
+
+def ui_command(tracking: TrackingConfig) -> str:
+    """Shell command that opens MLflow's UI on the store."""
+    program = Path(sys.executable).with_name("mlflow")
+    store = tracking.root / "mlflow.db"
+    if store.is_relative_to(Path.cwd()):
+        store = store.relative_to(Path.cwd())
+    shown = program.relative_to(Path.cwd()) if program.is_relative_to(Path.cwd()) else program
+    return f"{shown} ui --backend-store-uri {shlex.quote(f'sqlite:///{store}')}"
+
+
+@cache
+def code_version() -> dict[str, str]:
+    """Version of this package and, in a checkout, the git commit ("+" appended when files differ from it)."""
+    version = {"code_version": VERSION}
+    here = Path(__file__).resolve().parents[1]
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(here), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout
+
+    with suppress(OSError, subprocess.SubprocessError):
+        top, commit = git("rev-parse", "--show-toplevel", "HEAD").split("\n")[:2]
+        # an installed copy may be inside an unrelated checkout (a virtual environment is)
+        if here == Path(top) / "src" / "wheretolook":
+            changed = git("status", "--porcelain", "--untracked-files=no").strip()
+            version["git_commit"] = commit + ("+" if changed else "")
+    return version

@@ -37,7 +37,7 @@ from wheretolook.figures.dollhouse import dollhouse
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.localization.localizer import Localizer
-from wheretolook.looks.around import best_looks
+from wheretolook.looks.selection import best_views
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.rendered_map import build_map
@@ -94,7 +94,7 @@ directions = fibonacci_sphere(100)
 
 def two_looks(place):
     scores = scorer.score(poses_looking_along(np.tile(place, (len(directions), 1)), directions))
-    looks = sorted(best_looks(scorer, place, directions, scores, 2).looks, key=lambda look: -scores[look])
+    looks = sorted(best_views(scorer, place, directions, scores, 2).rows, key=lambda look: -scores[look])
     return poses_looking_along(np.tile(place, (2, 1)), directions[looks])
 
 

@@ -20,7 +20,7 @@ from wheretolook.dataset.layout import SceneFolder
 from wheretolook.dataset.viewpoint_table import poses, read_table
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import camera_centers
-from wheretolook.looks.around import best_looks
+from wheretolook.looks.selection import best_views
 from wheretolook.utils.shipped import WEIGHTS, shipped
 from wheretolook.weights.resolve import load_scorer
 
@@ -39,11 +39,11 @@ def main() -> None:
     places = np.unique(np.round(camera_centers(poses(read_table(scene.table))), 9), axis=0)[: options.places]
     directions = direction_lattice(options.directions)
     scores = scorer.score_around(places, directions)
-    best_looks(scorer, places[0], directions, scores[0], options.looks)  # warm-up
+    best_views(scorer, places[0], directions, scores[0], options.looks)  # warm-up
     seconds = []
     for place, values in zip(places, scores, strict=True):
         start = time.process_time()
-        best_looks(scorer, place, directions, values, options.looks)
+        best_views(scorer, place, directions, values, options.looks)
         seconds.append(time.process_time() - start)
     low, middle, high = 1e3 * np.quantile(seconds, (0.1, 0.5, 0.9))
     about = f"{options.looks} looks of {options.directions} directions, {len(localization_map.landmarks):,} landmarks"

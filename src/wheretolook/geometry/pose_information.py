@@ -24,6 +24,28 @@ N_NUMBERS = 15  # numbers that a sum of information matrices is kept as
 TRACE = np.zeros(N_NUMBERS)  # weights (15,) whose product with the numbers is the trace
 TRACE[[0, 3, 5, 9, 12, 14]] = 1
 
+PRIOR = 1e-3
+"""Information on each coordinate of a pose without any landmark: keeps the covariance finite (1/m^2 and 1/rad^2 for a
+bearing's noise of one radian)."""
+
+PLACES = np.array([
+    [0, 1, 2, 0, 8, 7],
+    [1, 3, 4, 8, 0, 6],
+    [2, 4, 5, 7, 6, 0],
+    [0, 8, 7, 9, 10, 11],
+    [8, 0, 6, 10, 12, 13],
+    [7, 6, 0, 11, 13, 14],
+])  # fmt: skip
+SIGNS = np.array([
+    [1, 1, 1, 0, 1, -1],
+    [1, 1, 1, -1, 0, 1],
+    [1, 1, 1, 1, -1, 0],
+    [0, -1, 1, 1, 1, 1],
+    [1, 0, -1, 1, 1, 1],
+    [-1, 1, 0, 1, 1, 1],
+])  # fmt: skip
+"""Index of the number at each place of an information matrix, and its sign; 0 where none is."""
+
 _UPPER = np.triu_indices(3)
 
 
@@ -48,22 +70,11 @@ def information_matrices(numbers: ArrayLike, pivots: ArrayLike | None = None) ->
     for the camera centre. The determinant does not depend on it.
     """
     numbers = np.asarray(numbers, dtype=np.float64)
-    matrices = np.empty((*numbers.shape[:-1], 6, 6))
-    matrices[..., :3, :3] = _symmetric(numbers[..., :6])
-    matrices[..., 3:, 3:] = _symmetric(numbers[..., 9:])
-    matrices[..., 3:, :3] = _cross(numbers[..., 6:9])
-    matrices[..., :3, 3:] = -matrices[..., 3:, :3]
+    matrices = numbers[..., PLACES] * SIGNS
     if pivots is not None:  # the centre moves by theta x (centre - pivot)
         turn = np.broadcast_to(np.eye(6), matrices.shape).copy()
         turn[..., :3, 3:] = _cross(np.broadcast_to(np.asarray(pivots, dtype=np.float64), (*matrices.shape[:-2], 3)))
         matrices = np.swapaxes(turn, -1, -2) @ matrices @ turn
-    return matrices
-
-
-def _symmetric(upper: Float) -> Float:
-    matrices = np.empty((*upper.shape[:-1], 3, 3))
-    matrices[..., _UPPER[0], _UPPER[1]] = upper
-    matrices[..., _UPPER[1], _UPPER[0]] = upper
     return matrices
 
 

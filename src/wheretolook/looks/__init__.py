@@ -1,1 +1,1 @@
-"""Several looks from one place: what they see together, and which to take."""
+"""Several views from one location: what they detect jointly, and which to take."""

@@ -1,10 +1,10 @@
-"""Choosing a set of looks from a place: greedily, then by exchange, under a limit on how far the camera turns."""
+"""Select a set of views from one location: greedily, then by exchange, under a limit on camera rotation."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import combinations, permutations
+from itertools import permutations
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,32 +12,35 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.camera_turns import TOLERANCE_DEG
 from wheretolook.geometry.poses import Float, rotation_angle_deg, rotation_looking_along
+from wheretolook.looks.joint_visibility import CandidateViews, candidate_views
+from wheretolook.looks.set_score import SetScoreModel
 from wheretolook.utils.errors import ConfigError, PlanningError
 
 if TYPE_CHECKING:
-    from wheretolook.looks.joint_visibility import SeenAround
+    from wheretolook.scorers.base import Scorer
 
-MOST_LOOKS = 6  # the order of so many is found by trying all
-EXCHANGES = 3  # rounds in which each look may be exchanged for a better one
+MAX_VIEWS = 6  # of a set: its order is found by trying all
+EXCHANGES = 3  # rounds in which each view may be exchanged for a better one
+CANDIDATES = 24  # directions with the best single-view scores that a set is selected from
+SEPARATION_DEG = 15.0  # angle between candidates; nearer ones see the same
 
-Worth = Callable[[Float, Float], Float]
-"""Worths (B,) of sets from their sums (B, N_SUMS) and the chances (B,) that none of their looks localizes alone; higher
-is better."""
+SetScore = Callable[[Float, Float], Float]
+"""Scores (B,) of sets from their sums (B, N_SUMS) and the probability (B,) that no view localizes on its own."""
 
 
 @dataclass(frozen=True)
-class ChosenLooks:
-    """A set of looks in the order that turns least."""
+class ViewSet:
+    """A set of views in the order of least rotation."""
 
-    looks: tuple[int, ...]  # rows of the directions
-    worth: float
+    rows: tuple[int, ...]  # of the directions
+    score: float
     total_turn_deg: float  # from the first to the last, and from the current orientation to the first if there is one
 
 
-class Turns:
-    """Angles by which the camera turns between D directions (D, 3) without roll, and from where it looks now.
+class Rotations:
+    """Angles by which a camera without roll rotates between directions (D, 3), and from its current axis `start` (3,).
 
-    `start` is the axis (3,) that it looks along now; None if any look may be the first.
+    Without a start, any view may be the first.
     """
 
     def __init__(self, directions: Float, start: ArrayLike | None = None) -> None:
@@ -45,150 +48,165 @@ class Turns:
         self.between = rotation_angle_deg(rotations[:, None], rotations[None])
         self.start = None if start is None else rotation_angle_deg(rotations, rotation_looking_along(start))
 
-    def shortest(self, looks: Sequence[int]) -> tuple[float, tuple[int, ...]]:
-        """The least total turn in degrees over all orders of some looks, and the order; of equals the first."""
-        orders = np.array(list(permutations(looks)))
+    def shortest(self, views: Sequence[int]) -> tuple[float, tuple[int, ...]]:
+        """Return the least total rotation in degrees over all orders of some views, and that order."""
+        orders = np.array(list(permutations(views)))
         total = self.between[orders[:, :-1], orders[:, 1:]].sum(1)
         if self.start is not None:
             total = total + self.start[orders[:, 0]]
         best = int(np.argmin(np.round(total, 9)))
-        return float(total[best]), tuple(int(look) for look in orders[best])
+        return float(total[best]), tuple(int(view) for view in orders[best])
 
-    def with_one_more(self, looks: Sequence[int]) -> Float:
-        """The least total turn (D,) of some looks and each direction; `shortest` for all of them at once."""
+    def with_one_more(self, views: Sequence[int]) -> Float:
+        """Return the least total rotation (D,) of some views and each direction."""
         n = len(self.between)
-        if not looks:
-            return np.zeros(n) if self.start is None else self.start
+        start = np.zeros(n) if self.start is None else self.start
+        if not views:
+            return start
         least = np.full(n, np.inf)
-        for order in permutations(looks):
+        for order in permutations(views):
             path = np.asarray(order)
             legs = self.between[path[:-1], path[1:]]
-            first = 0.0 if self.start is None else self.start[path[0]]
-            before = self.between[path[0]] + (0.0 if self.start is None else self.start - first)  # the new one first
-            least = np.minimum(least, first + legs.sum() + np.minimum(before, self.between[path[-1]]))
+            known = start[path[0]] + legs.sum()
+            as_first = self.between[path[0]] + (start - start[path[0]])
+            least = np.minimum(least, known + np.minimum(as_first, self.between[path[-1]]))
             for k, leg in enumerate(legs):
-                extra = self.between[path[k]] + self.between[path[k + 1]] - leg
-                least = np.minimum(least, first + legs.sum() + extra)
+                detour = self.between[path[k]] + self.between[path[k + 1]] - leg
+                least = np.minimum(least, known + detour)
         return least
 
 
-def choose_looks(
-    seen: SeenAround,
-    worth: Worth,
+def best_views(
+    scorer: Scorer,
+    location: Float,
+    directions: Float,
+    scores: Float,
     n: int,
-    turns: Turns,
     max_turn_deg: float | None = None,
-    first: ArrayLike | None = None,
-    exchanges: int | None = None,
-    taken: int | None = None,
-) -> ChosenLooks:
-    """The n looks that are worth most together: greedily one after the other, then by exchange of single ones.
+    start: ArrayLike | None = None,
+) -> ViewSet:
+    """Select the n views from a location (3,) m with the best joint score, of directions (D, 3) with scores (D,).
 
-    `first` are single looks' own scores (D,): by them the first is chosen, the worth of one look unless given. The
-    total turn keeps within `max_turn_deg`. There are `EXCHANGES` rounds of exchange unless told otherwise; a set is
-    never worth less than what greedy choice alone gives. `taken` is a look that is in the set whatever it is worth.
+    The total rotation stays within `max_turn_deg`, counted from the axis `start` (3,) if that is given.
 
-    Raises a ConfigError for a number of looks that is none, or more than there are directions, and a PlanningError if
-    no look can be reached.
+    Raises:
+        ConfigError: a number of views below 1 or above the number of directions, or a negative limit.
+        PlanningError: no such views can be reached.
     """
-    _check(n, len(seen), max_turn_deg)
+    if n > len(directions):
+        raise ConfigError(f"there are only {len(directions)} directions to choose from", value=n)
+    rows = candidates(directions, scores, max(CANDIDATES, n), max_turn_deg, start)
+    axes = directions[rows]
+    views = candidate_views(scorer, location, axes, scores[rows])
+    chosen = select_views(views, SetScoreModel.shipped(), n, Rotations(axes, start), max_turn_deg, scores[rows])
+    return ViewSet(tuple(int(rows[view]) for view in chosen.rows), chosen.score, chosen.total_turn_deg)
+
+
+def candidates(
+    directions: Float, scores: Float, limit: int, max_turn_deg: float | None = None, start: ArrayLike | None = None
+) -> NDArray[np.int64]:
+    """Return rows (C,) of directions to select from: the best separated ones, and near the best one if limited."""
+    order = np.argsort(-np.asarray(scores), kind="stable")
+    if start is not None and max_turn_deg is not None:
+        axis = np.asarray(start, dtype=np.float64)
+        # a camera that does not roll rotates at least by the angle of its axis
+        order = order[directions[order] @ axis / np.linalg.norm(axis) >= _cosine(max_turn_deg)]
+    taken: list[int] = []
+    free = np.ones(len(directions), dtype=bool)
+    near = np.cos(np.radians(SEPARATION_DEG))
+    for row in order:
+        if free[row]:
+            taken.append(int(row))
+            free &= directions @ directions[row] < near
+            if len(taken) == limit:
+                break
+    if max_turn_deg is not None and len(order):
+        close = order[directions[order] @ directions[order[0]] >= _cosine(max_turn_deg)][:limit]
+        taken += [int(row) for row in close]
+    if len(taken) < limit:  # so few directions, or so close to one another
+        taken += order[:limit].tolist()
+    return np.array(list(dict.fromkeys(taken)), dtype=np.int64)
+
+
+def _cosine(limit_deg: float) -> float:
+    return float(np.cos(np.radians(min(180.0, max(0.0, limit_deg) + TOLERANCE_DEG))))
+
+
+def select_views(
+    views: CandidateViews,
+    set_score: SetScore,
+    n: int,
+    rotations: Rotations,
+    max_turn_deg: float | None = None,
+    single: ArrayLike | None = None,
+    exchanges: int = EXCHANGES,
+    required: int | None = None,
+) -> ViewSet:
+    """Select the n views with the best joint score: greedily one after the other, then by exchange of single ones.
+
+    `single` are single-view scores (D,) that decide the first; the score of a set of one unless given. The total
+    rotation stays within `max_turn_deg`. A set never scores less than the greedy one. `required` is a row that is in
+    the set in any case.
+
+    Raises:
+        ConfigError: a number of views below 1 or above the number of directions, or a negative limit.
+        PlanningError: no such views can be reached.
+    """
+    if not 1 <= n <= min(MAX_VIEWS, len(views)):
+        raise ConfigError(f"a set has 1 to {MAX_VIEWS} views, of {len(views)} directions", value=n)
+    if max_turn_deg is not None and not 0 <= max_turn_deg < np.inf:
+        raise ConfigError("a limit on rotation is degrees of at least 0", value=max_turn_deg)
     limit = np.inf if max_turn_deg is None else max_turn_deg + TOLERANCE_DEG
-    single = _added(seen, worth, []) if first is None else np.asarray(first, dtype=np.float64)
-    begun = [] if taken is None else [taken]
-    looks = _greedy(seen, worth, n, turns, np.full(n, limit), single, begun)
-    if looks is None:  # the best look may lie so far off that no turn is left for the others
-        looks = _greedy(seen, worth, n, turns, limit * np.arange(1, n + 1) / n, single, begun)
-    if looks is None:
-        fix = "Raise the limit on turning, or look along more directions."
-        raise PlanningError(f"no {n} looks can be reached", value=max_turn_deg, fix=fix)
-    now = worth_of(seen, worth, looks)
-    rounds = EXCHANGES if exchanges is None else exchanges
-    for _ in range(rounds if n > 1 else 0):
-        before = now
+    first = _with_each(views, set_score, []) if single is None else np.asarray(single, dtype=np.float64)
+    begun = [] if required is None else [required]
+    chosen = _greedy(views, set_score, rotations, np.full(n, limit), first, begun)
+    if chosen is None:  # the best view may be so far off that no rotation is left for the others
+        chosen = _greedy(views, set_score, rotations, limit * np.arange(1, n + 1) / n, first, begun)
+    if chosen is None:
+        fix = "Raise the limit on rotation, or offer more directions."
+        raise PlanningError(f"no {n} views can be reached", value=max_turn_deg, fix=fix)
+    score = score_of_set(views, set_score, chosen)
+    for _ in range(exchanges if n > 1 else 0):
+        before = score
         for k in range(len(begun), n):
-            others = looks[:k] + looks[k + 1 :]
-            value = _added(seen, worth, others)
-            best = _best(value, turns.with_one_more(others) <= limit, others)
-            if best is not None and value[best] > now + 1e-9:
-                looks = [*others[:k], best, *others[k:]]
-                now = float(value[best])
-        if now <= before:
+            others = chosen[:k] + chosen[k + 1 :]
+            values = _with_each(views, set_score, others)
+            best = _best(values, rotations.with_one_more(others) <= limit, others)
+            if best is not None and values[best] > score + 1e-9:
+                chosen = [*others[:k], best, *others[k:]]
+                score = float(values[best])
+        if score <= before:
             break
-    total, order = turns.shortest(looks)
-    return ChosenLooks(order, now, total)
+    total, order = rotations.shortest(chosen)
+    return ViewSet(order, score, total)
 
 
 def _greedy(
-    seen: SeenAround, worth: Worth, n: int, turns: Turns, limits: Float, single: Float, begun: list[int]
+    views: CandidateViews, set_score: SetScore, rotations: Rotations, limits: Float, first: Float, begun: list[int]
 ) -> list[int] | None:
-    """n looks, added one by one to those begun with, the first k within the k-th limit; None if there are no such."""
-    looks = list(begun)
+    """Return views added one by one to those begun with, the first k within the k-th limit; None if there are none."""
+    chosen = list(begun)
     for limit in limits[len(begun) :]:
-        best = _best(_added(seen, worth, looks) if looks else single, turns.with_one_more(looks) <= limit, looks)
+        values = _with_each(views, set_score, chosen) if chosen else first
+        best = _best(values, rotations.with_one_more(chosen) <= limit, chosen)
         if best is None:
             return None
-        looks.append(best)
-    return looks
+        chosen.append(best)
+    return chosen
 
 
-def choose_exhaustively(
-    seen: SeenAround, worth: Worth, n: int, turns: Turns, max_turn_deg: float | None = None
-) -> ChosenLooks:
-    """What `choose_looks` approximates: the best of all sets of n looks; plain, for small numbers of directions."""
-    _check(n, len(seen), max_turn_deg)
-    limit = np.inf if max_turn_deg is None else max_turn_deg + TOLERANCE_DEG
-    best: ChosenLooks | None = None
-    for looks in combinations(range(len(seen)), n):
-        total, order = turns.shortest(looks)
-        value = worth_of(seen, worth, list(looks))
-        if total <= limit and (best is None or value > best.worth):
-            best = ChosenLooks(order, value, total)
-    if best is None:
-        raise PlanningError(f"no {n} looks can be reached", value=max_turn_deg, fix="Raise the limit on turning.")
-    return best
+def score_of_set(views: CandidateViews, set_score: SetScore, rows: list[int]) -> float:
+    """Return the score of a set of views."""
+    return float(set_score(views.joint_sums(rows)[None], np.array([views.p_none(rows)]))[0])
 
 
-def worth_of(seen: SeenAround, worth: Worth, looks: list[int]) -> float:
-    """The worth of a set of looks."""
-    return float(worth(seen.union(looks)[None], np.array([seen.failed(looks)]))[0])
+def _with_each(views: CandidateViews, set_score: SetScore, rows: list[int]) -> Float:
+    """Return the score (D,) of a set with each view added."""
+    p_missed = views.p_missed(rows) if rows else None
+    return set_score(views.sums_with_each(p_missed), views.p_none(rows) * (1 - views.p_single))
 
 
-def best_one_by_one(scores: Float, directions: Float, n: int, apart_deg: float = 40.0) -> list[int]:
-    """The n looks with the highest scores (D,) of their own, at least so far apart if there are so many."""
-    order = np.argsort(-np.asarray(scores), kind="stable").tolist()
-    near = np.cos(np.radians(apart_deg))
-    looks: list[int] = []
-    for look in order:
-        if all(directions[look] @ directions[other] <= near for other in looks):
-            looks.append(look)
-    return (looks + [look for look in order if look not in looks])[:n]
-
-
-def evenly_spread(directions: Float, n: int, first: int) -> list[int]:
-    """n looks as far apart as can be, from a first one on: always the one whose nearest is farthest."""
-    looks = [first]
-    while len(looks) < n:
-        nearest = (directions @ directions[looks].T).max(1)
-        nearest[looks] = np.inf
-        looks.append(int(nearest.argmin()))
-    return looks
-
-
-def _added(seen: SeenAround, worth: Worth, looks: list[int]) -> Float:
-    """The worth (D,) of some looks with each direction added."""
-    return worth(seen.sums(seen.missed(looks) if looks else None), seen.failed(looks) * (1 - seen.alone))
-
-
-def _best(value: Float, allowed: NDArray[np.bool_], looks: list[int]) -> int | None:
+def _best(values: Float, allowed: NDArray[np.bool_], taken: list[int]) -> int | None:
     free = allowed.copy()
-    free[looks] = False
-    return int(np.where(free, value, -np.inf).argmax()) if free.any() else None
-
-
-def _check(n: int, n_directions: int, max_turn_deg: float | None) -> None:
-    if not 1 <= n <= MOST_LOOKS:
-        raise ConfigError(f"a set has 1 to {MOST_LOOKS} looks", value=n)
-    if n > n_directions:
-        raise ConfigError(f"there are only {n_directions} directions to choose from", value=n)
-    if max_turn_deg is not None and not 0 <= max_turn_deg < np.inf:
-        raise ConfigError("a limit on turning is degrees of at least 0", value=max_turn_deg)
+    free[taken] = False
+    return int(np.where(free, values, -np.inf).argmax()) if free.any() else None

@@ -1,9 +1,4 @@
-"""What a set of looks is worth: the probability that they localize together.
-
-It goes by two numbers. The log-odds that one of them localizes alone, each for itself, tells most. That looks which see
-the same do not fail each for itself, it does not know: so the second is the variance of the position that the landmarks
-to be found by all together leave, which falls more with landmarks elsewhere than with more of the same.
-"""
+"""Score a set of views from one location: the probability that they localize jointly."""
 
 from __future__ import annotations
 
@@ -15,34 +10,23 @@ from wheretolook.geometry.poses import Float
 from wheretolook.looks.joint_visibility import log_position_variance
 from wheretolook.utils.shipped_model import LogisticRegression
 
-TOLD = ("log_odds_alone", "log_position_variance")
-
-LEAST_CHANCE = 1e-3  # of localizing alone, or of not
-
-SHIPPED = Path(__file__).with_name("worth.json")
+MIN_PROBABILITY = 1e-3  # that some view localizes on its own, or that none does
 
 
-class SetWorth(LogisticRegression):
-    """One model for sets of any size, single looks among them; it ships fitted to sets of 1 to 5 drawn at random."""
+class SetScoreModel(LogisticRegression):
+    """Logistic regression fitted to random sets of 1 to 5 views; the same for every size.
 
-    names = TOLD
-    about = "what looks are worth"
-    file = SHIPPED
+    The log-odds that some view localizes on its own tell most, but treat views of the same landmarks as independent.
+    The position variance left by all landmarks they detect jointly corrects for that: it falls more with new landmarks
+    than with more detections of the same.
+    """
 
-    def __call__(self, sums: Float, failed: Float) -> Float:
-        """Probabilities (B,) of sets from their sums (B, N_SUMS), and the chances (B,) that no look localizes alone."""
-        chance = np.clip(1 - np.asarray(failed, dtype=np.float64), LEAST_CHANCE, 1 - LEAST_CHANCE)
-        told = np.stack([np.log(chance / (1 - chance)), log_position_variance(np.asarray(sums))], axis=-1)
-        return self.probabilities(told)
+    names = ("log_odds_alone", "log_position_variance")
+    about = "scores of sets of views"
+    file = Path(__file__).with_name("set_score.json")
 
-
-def fisher_worth(sums: Float, failed: Float) -> Float:
-    """For comparison: log det of the information, (B,), as of `fisher.metrics`; with exact chances that of the rig."""
-    from wheretolook_paper.fisher.metrics import metric_of
-
-    return metric_of(np.asarray(sums)[..., 1:], "logdet")
-
-
-def count_worth(sums: Float, failed: Float) -> Float:
-    """For comparison: how many different landmarks are expected to be found, (B,)."""
-    return np.asarray(sums)[..., 0]
+    def __call__(self, sums: Float, p_none: Float) -> Float:
+        """Return the probability (B,) of sets from their sums (B, N_SUMS) and p_none (B,), that no view localizes."""
+        p_some = np.clip(1 - np.asarray(p_none, dtype=np.float64), MIN_PROBABILITY, 1 - MIN_PROBABILITY)
+        log_odds = np.log(p_some / (1 - p_some))
+        return self.probabilities(np.stack([log_odds, log_position_variance(np.asarray(sums))], axis=-1))

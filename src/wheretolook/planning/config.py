@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from wheretolook.geometry.lattices import ViewLattice
-from wheretolook.looks.selection import MOST_LOOKS
+from wheretolook.looks.selection import MAX_VIEWS
 from wheretolook.scorers.forward import ForwardScorer
 from wheretolook.utils.errors import ConfigError
 
@@ -108,8 +108,8 @@ class StopConfig:
     least_score: float = 0.7
 
     def __post_init__(self) -> None:
-        if not 1 <= self.looks <= MOST_LOOKS:
-            raise ConfigError(f"stops.looks is a whole number of 1 to {MOST_LOOKS}", value=self.looks)
+        if not 1 <= self.looks <= MAX_VIEWS:
+            raise ConfigError(f"stops.looks is a whole number of 1 to {MAX_VIEWS}", value=self.looks)
         if not 0 < self.least_score <= 1:
             fix = "Give a probability above 0, such as 0.7."
             raise ConfigError("stops.least_score is a probability", value=self.least_score, fix=fix)

@@ -10,10 +10,9 @@ from scipy.special import expit
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.poses import Float, poses_looking_along
-from wheretolook.looks.around import APART_DEG, CANDIDATES, candidates
-from wheretolook.looks.joint_visibility import seen_around
-from wheretolook.looks.selection import Turns, choose_looks, worth_of
-from wheretolook.looks.set_score import SetWorth
+from wheretolook.looks.joint_visibility import candidate_views
+from wheretolook.looks.selection import CANDIDATES, SEPARATION_DEG, Rotations, candidates, score_of_set, select_views
+from wheretolook.looks.set_score import SetScoreModel
 from wheretolook.planning.config import PathConfig, StopConfig
 from wheretolook.planning.routes import Stop, turning_deg
 from wheretolook.utils.errors import ConfigError, PlanningError
@@ -50,7 +49,7 @@ def stops_along(
     `planner.turn_weight_m` for every radian there and back.
 
     What several looks score is told from the score of the path's view: its odds rise as those of the shipped
-    `SetWorth` do when the further looks are added. Raises a ConfigError if scores are no probabilities
+    `SetScoreModel` do when the further looks are added. Raises a ConfigError if scores are no probabilities
     (`check_stopping`). `progress` is the text of the progress bar; None shows none.
     """
     if config.looks < 2:
@@ -102,7 +101,7 @@ def _stop(
     metres: float,
 ) -> Stop | None:
     """The stop at a place (3,) m whose view along an axis (3,) has a score of its own; None if none is worth it."""
-    apart = directions[directions @ axis < math.cos(math.radians(APART_DEG))]
+    apart = directions[directions @ axis < math.cos(math.radians(SEPARATION_DEG))]
     if len(apart) == 0:
         return None
     scores = scorer.score_around(at[None], apart)[0]
@@ -110,21 +109,21 @@ def _stop(
     rows = np.union1d(candidates(apart, scores, CANDIDATES), near[candidates(apart[near], scores[near], NEAR)])
     looked = np.concatenate([axis[None], apart[rows]])
     alone = np.append(own, scores[rows])
-    seen = seen_around(scorer, at, looked, alone)
-    worth = SetWorth.shipped()
-    turns = Turns(looked, axis)
-    before = worth_of(seen, worth, [0])
+    seen = candidate_views(scorer, at, looked, alone)
+    set_score = SetScoreModel.shipped()
+    rotations = Rotations(looked, axis)
+    before = score_of_set(seen, set_score, [0])
     best = None
     most = 0.0
     for n in range(2, min(config.looks, len(looked)) + 1):
         for limit in TURNS_DEG:
             try:
-                chosen = choose_looks(seen, worth, n, turns, limit, taken=0)
+                chosen = select_views(seen, set_score, n, rotations, limit, required=0)
             except PlanningError:  # nothing lies so near
                 continue
-            further = [look for look in chosen.looks if look != 0]
+            further = [look for look in chosen.rows if look != 0]
             turn = turning_deg(np.concatenate([axis[None], looked[further], axis[None]]))
-            together = _raised(own, before, chosen.worth)
+            together = _raised(own, before, chosen.score)
             stop = Stop(place, looked[further], alone[further], together, turn)
             if together >= config.least_score:
                 return stop

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.geometry.camera_turns import angles_to_axis_deg, check_axis, turns_from_deg, within
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, rotation_looking_along
-from wheretolook.looks.around import best_looks
+from wheretolook.looks.selection import best_views
 from wheretolook.planning.map_file import ARRAYS, DESCRIPTION, REBUILD, read_map, write_map
 from wheretolook.training.old_names import name_of
 from wheretolook.utils.errors import ConfigError, MapFormatError
@@ -229,7 +229,7 @@ class ViewpointMap:
         """The n orientations at a world point (3,) m whose looks are worth most together, in the order to look.
 
         The map's scores tell which orientations are worth considering; what they see together is found out by the
-        `scorer` that the map was built with, at the point itself (`wheretolook.looks.around.best_looks`). The camera
+        `scorer` that the map was built with, at the point itself (`wheretolook.looks.selection.best_views`). The camera
         turns by at most `max_turn_deg` in all, from the axis `start` (3,) on if that is given. None where no voxel is
         free.
 
@@ -244,8 +244,8 @@ class ViewpointMap:
             return None
         at = np.asarray(point, dtype=np.float64)
         scores = np.asarray(self.scores[row])
-        chosen = best_looks(scorer, at, self.directions, scores, n, max_turn_deg, start)
-        return [self._choice(row, look) for look in chosen.looks]
+        chosen = best_views(scorer, at, self.directions, scores, n, max_turn_deg, start)
+        return [self._choice(row, look) for look in chosen.rows]
 
     def best_many(self, points: ArrayLike) -> ViewChoices:
         """The best orientation at each of world points (N, 3) m; raises as `rows`."""

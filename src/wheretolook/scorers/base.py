@@ -17,6 +17,7 @@ from wheretolook.utils.errors import CameraError
 if TYPE_CHECKING:
     from wheretolook.inputs.bins import BinnedViews
     from wheretolook.inputs.localization_map import LocalizationMap
+    from wheretolook.visibility.frustum import LandmarkSets
 
 BLOCK = 4096  # views scored at a time: about 80 MB of bins
 FIELD_OF_VIEW_TOLERANCE = (
@@ -32,6 +33,15 @@ class ViewReport:
     expected_inliers: Float  # (B,) landmarks expected to be found; NaN where the method does not tell
     n_visible: NDArray[np.int64]  # (B,) landmarks in view
     in_range: NDArray[np.bool_]  # (B,) whether the view is like those that the scorer has learnt from
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkProbabilities:
+    """E visible landmarks of some views, one view after the other."""
+
+    rows: NDArray[np.int64]  # (E,) of the landmarks in the map
+    p_detect: Float  # (E,) probability that the localizer detects the landmark: matches it as an inlier
+    precision: Float | None  # (E,) one over the variance of its bearing; None if that is unknown
 
 
 class Scorer(ABC):
@@ -83,10 +93,12 @@ class Scorer(ABC):
         """How many landmarks poses (B, 3, 4) can be expected to find, (B,); NaN where the method does not tell."""
         return np.full(len(cam_from_world), np.nan)
 
-    def found_chances(self, cam_from_world: Float) -> tuple[NDArray[np.int64], Float] | None:
-        """Rows (K,) of the landmarks that one view (3, 4) sees, and each one's chance of being found (K,), in [0, 1].
+    def landmark_probabilities(
+        self, cam_from_world: Float, visible: LandmarkSets | None = None
+    ) -> LandmarkProbabilities | None:
+        """Return how likely each landmark visible from poses (B, 3, 4) is to be detected; None if that is unknown.
 
-        None where the method does not tell.
+        `visible` are the landmarks to consider of each view, in place of all that are visible.
         """
         return None
 

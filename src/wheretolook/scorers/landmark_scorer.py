@@ -1,8 +1,9 @@
-"""Scorers that have learnt from landmarks in view, one by one, and know what views they have learnt from."""
+"""Base of the scorers that learned from single visible landmarks."""
 
 from __future__ import annotations
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -10,16 +11,18 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.inputs.landmark_features import LandmarkDescriber, ViewLandmarks
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.base import LandmarkProbabilities, Scorer
+from wheretolook.scorers.matchability.network import bearing_precision
 from wheretolook.scorers.range_watch import RangeWatch
 from wheretolook.training.training_range import TrainingRange, camera_quantities, view_quantities
+from wheretolook.visibility.frustum import LandmarkSets
 
 
 class LandmarkScorer(Scorer):
-    """Scores a view by the named attributes of the landmarks it sees, of which at most `most` are looked at.
+    """Scores a view by the named attributes of its visible landmarks, of which at most `most` are described.
 
-    Where the file of weights does not say what the training views were like, the range is that of their camera's field
-    of view, if they had but one camera. `score` warns once with an `OutOfRangeWarning`, see `RangeWatch`.
+    Where the weights do not store the range of the training views, it is that of their camera's field of view, if they
+    had one camera. `score` warns once with an `OutOfRangeWarning`, see `RangeWatch`.
     """
 
     most: int | None = None
@@ -40,7 +43,7 @@ class LandmarkScorer(Scorer):
         self._watch = RangeWatch(self.training_range, watching)
 
     def in_range(self, cam_from_world: Float) -> NDArray[np.bool_]:
-        """Which poses (B, 3, 4) see what is like the views learnt from, (B,) bool."""
+        """Return which poses (B, 3, 4) have views like the training views, (B,) bool."""
         cam_from_world = check_poses(cam_from_world)
         inside = np.full(len(cam_from_world), self._serves_camera)
         if self._serves_camera and self.training_range.asks_for_landmarks:
@@ -48,6 +51,26 @@ class LandmarkScorer(Scorer):
                 inside[rows] = self.training_range.contains(view_quantities(described, n_in_view, self._of_camera))
         return inside
 
-    def _look(self, described: ViewLandmarks, n_in_view: Tensor) -> list[Float]:
-        """What the watch wants to know of described views: nothing, if it has warned or has nothing to warn of."""
+    def log_odds_of_detection(self, values: Tensor) -> Tensor | None:
+        """Return the log-odds (E,) that landmarks (E, A) are detected; None if the method does not predict them."""
+        return None
+
+    def landmark_probabilities(
+        self, cam_from_world: Float, visible: LandmarkSets | None = None
+    ) -> LandmarkProbabilities | None:
+        """See `Scorer.landmark_probabilities`."""
+        with torch.inference_mode():
+            described = self.describer.describe(check_poses(cam_from_world), visible)
+            log_odds = self.log_odds_of_detection(described.values)
+            if log_odds is None:
+                return None
+            precision = bearing_precision(described.values, described.attributes)
+        return LandmarkProbabilities(
+            described.rows.cpu().numpy(),
+            log_odds.sigmoid().double().cpu().numpy(),
+            None if precision is None else precision.double().cpu().numpy(),
+        )
+
+    def _quantities(self, described: ViewLandmarks, n_in_view: Tensor) -> list[Float]:
+        """Return the quantities the range watch checks; empty once it has warned, or has nothing to warn of."""
         return [view_quantities(described, n_in_view, self._of_camera)] if self._watch.watching else []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from numbers import Integral
 
-from wheretolook.looks.selection import MOST_LOOKS
+from wheretolook.looks.selection import MAX_VIEWS
 from wheretolook.utils.errors import ConfigError
 
 
@@ -28,8 +28,8 @@ def check_limits(
         if not 0 < least_score <= 1:
             raise ConfigError("a least score is a probability above 0", value=least_score)
     if looks is not None:
-        if not isinstance(looks, Integral) or not 1 <= looks <= MOST_LOOKS:
-            raise ConfigError(f"looks of a waypoint are a whole number of 1 to {MOST_LOOKS}", value=looks)
+        if not isinstance(looks, Integral) or not 1 <= looks <= MAX_VIEWS:
+            raise ConfigError(f"looks of a waypoint are a whole number of 1 to {MAX_VIEWS}", value=looks)
         if n > 1 or (max_turn_deg is not None and least_score is None):
             fix = "Leave out the number of best views, and the limit on turns between waypoints."
             if n == 1:

@@ -15,7 +15,7 @@ from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, check_poses, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.looks.around import best_looks
+from wheretolook.looks.selection import best_views
 from wheretolook.mapping.sanity import warn_of_mesh
 from wheretolook.planning.config import StopConfig
 from wheretolook.planning.routes import PlannedPath
@@ -193,7 +193,7 @@ class WhereToLook:
             skip: leave out points outside the map or inside geometry.
             progress: show a progress bar.
             looks: instead of n, how many looks to choose together, for a camera that turns there and whose looks are
-                localized together (`wheretolook.looks.around.best_looks`). Their rank is the order to look in, and
+                localized together (`wheretolook.looks.selection.best_views`). Their rank is the order to look in, and
                 `set_score` the probability that they localize.
             max_total_turn_deg: how far the camera turns in all from the first look to the last.
             least_score: with `max_turn_deg` and `looks`: where the sequence's view scores less, the waypoint becomes a
@@ -266,10 +266,10 @@ class WhereToLook:
         """The best n looks together at some of the waypoints, (R,) rows, by scores (R, D) of axes (D, 3)."""
         at = waypoints.points[rows]
         pairs = tqdm(zip(at, scores, strict=True), total=len(at), desc="looks", unit="waypoint", disable=not progress)
-        sets = [best_looks(self.scorer, place, axes, values, n, max_turn_deg) for place, values in pairs]
-        looked = axes[[look for found in sets for look in found.looks]]
+        sets = [best_views(self.scorer, place, axes, values, n, max_turn_deg) for place, values in pairs]
+        looked = axes[[look for found in sets for look in found.rows]]
         rank = np.tile(np.arange(1, n + 1), len(rows))
-        worths = np.repeat([found.worth for found in sets], n)
+        worths = np.repeat([found.score for found in sets], n)
         return self._reported(waypoints, np.repeat(rows, n), rank, looked, worths)
 
     def _sequence_with_stops(

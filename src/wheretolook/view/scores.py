@@ -170,15 +170,14 @@ class SeenLandmarks:
 
 def landmarks_seen(scorer: Scorer, pose: Float, teller: Scorer | None = None) -> SeenLandmarks:
     """The landmarks a view (3, 4) sees, with their chances of being found by the scorer, or by another one."""
-    found = scorer.found_chances(pose)
-    if found is None and teller is not None:
-        found = teller.found_chances(pose)
+    known = scorer.landmark_probabilities(pose[None])
+    if known is None and teller is not None:
+        known = teller.landmark_probabilities(pose[None])
     around = scorer.localization_map
-    if found is None:
-        rows = around.landmarks_in_view(pose[None])[0].astype(np.int64)
-        found = rows, np.full(len(rows), np.nan)
-    points = around.landmarks.points[found[0]]
-    return SeenLandmarks(points, around.camera.project(points @ pose[:, :3].T + pose[:, 3]), found[1])
+    rows = around.landmarks_in_view(pose[None])[0].astype(np.int64) if known is None else known.rows
+    points = around.landmarks.points[rows]
+    p_detect = np.full(len(rows), np.nan) if known is None else known.p_detect
+    return SeenLandmarks(points, around.camera.project(points @ pose[:, :3].T + pose[:, 3]), p_detect)
 
 
 @dataclass(frozen=True, eq=False)

@@ -74,38 +74,39 @@ def compare_looks(
 ) -> pd.DataFrame:
     """Sets of looks by every strategy at every labelled location of a scene, and how they were localized.
 
-    Returns `labelling.look_sets.SET_COLUMNS` for each set, with `strategy`, `expected` (the worth it was given before),
+    Returns `labelling.look_sets.SET_COLUMNS` for each set, with `strategy`, `expected` (its score before),
     `single_good` (whether the look that is best alone localizes alone) and `any_good` (whether one of the looks does).
 
     Raises a TableError if the labels do not keep where landmarks were matched.
     """
     from wheretolook.localization.joint_labels import label_sets
-    from wheretolook.looks.joint_visibility import seen_around
-    from wheretolook.looks.selection import worth_of
-    from wheretolook.looks.set_score import SetWorth
+    from wheretolook.looks.joint_visibility import candidate_views
+    from wheretolook.looks.selection import score_of_set
+    from wheretolook.looks.set_score import SetScoreModel
+    from wheretolook_paper.evaluation.look_strategies import choose_set
 
     table = read_table(scene.table, pixels=True)
     cam_from_world = poses(table)
     good = is_good(table)
     scores = scorer.score(cam_from_world)
     rng = np.random.default_rng(config.seed)
-    worth = SetWorth.shipped()
+    set_score = SetScoreModel.shipped()
     sets: list[list[int]] = []
     about: list[dict[str, Any]] = []
     for _, rows in table.groupby("location_id").indices.items():
         axes = cam_from_world[rows, 2, :3]
         values = scores[rows]
         center = -cam_from_world[rows[0], :, :3].T @ cam_from_world[rows[0], :, 3]
-        seen, sure = (seen_around(scorer, center, axes, values, sure) for sure in (False, True))
+        views, certain = (candidate_views(scorer, center, axes, values, certain) for certain in (False, True))
         for strategy in config.strategies:
             for n in config.numbers:
                 if n > len(rows):
                     continue
-                looks = _looks(strategy, n, axes, values, seen, sure, rng)
+                looks = choose_set(strategy, n, axes, values, views, certain, rng)
                 chosen = np.asarray(rows)[looks]
                 sets.append(chosen.tolist())
                 first = bool(good[rows[int(values.argmax())]])
-                expected = worth_of(seen, worth, looks)
+                expected = score_of_set(views, set_score, looks)
                 about.append(
                     {"scene": scene.name, "strategy": strategy, "expected": expected, "single_good": first}
                     | {"any_good": bool(good[chosen].any())}
@@ -118,22 +119,3 @@ def compare_looks(
         table, sets, points, camera, turn_noise_deg=config.turn_noise_deg, seed=config.seed, progress=text
     )
     return pd.concat([pd.DataFrame(about), labelled], axis=1).assign(good=is_good(labelled))
-
-
-def _looks(strategy: str, n: int, axes: Any, scores: Any, seen: Any, sure: Any, rng: np.random.Generator) -> list[int]:
-    from wheretolook.looks.selection import Turns, best_one_by_one, choose_looks, evenly_spread
-    from wheretolook.looks.set_score import SetWorth, count_worth, fisher_worth
-
-    if strategy == "random":
-        return [int(row) for row in rng.choice(len(axes), n, replace=False)]
-    if strategy == "one-by-one":
-        return best_one_by_one(scores, axes, n)
-    if strategy == "even":
-        return evenly_spread(axes, n, int(np.argmax(scores)))
-    turns = Turns(axes)
-    if strategy == "visible":
-        return list(choose_looks(sure, count_worth, n, turns).looks)
-    if strategy == "fisher":
-        return list(choose_looks(sure, fisher_worth, n, turns).looks)
-    exchanges = 0 if strategy == "in-turn" else None
-    return list(choose_looks(seen, SetWorth.shipped(), n, turns, first=scores, exchanges=exchanges).looks)

@@ -8,7 +8,6 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from wheretolook.geometry.poses import Float, check_poses
@@ -66,7 +65,7 @@ class Expectation:
             of_camera = camera_quantities(self.camera)
             for rows, described, n_in_view in describer.in_blocks(cam_from_world):
                 quantities[rows] = view_quantities(described, n_in_view, of_camera)
-                log_odds = self._log_odds(described.values)
+                log_odds = self.log_odds(described.values)
                 parts = expected_parts(described.values, log_odds, described.attributes)[:, :16].double()
                 sums[rows, :16] = torch.segment_reduce(parts, "sum", lengths=described.counts, initial=0.0).cpu()
                 sums[rows, 16] = self._filled(described, log_odds).cpu()
@@ -75,13 +74,7 @@ class Expectation:
             self.quantities = quantities
         return self._sums
 
-    def found_chances(self, describer: LandmarkDescriber, cam_from_world: Float) -> tuple[NDArray[np.int64], Float]:
-        """Rows (K,) of the landmarks that one view (3, 4) sees, and each one's chance of being found (K,)."""
-        described = describer.describe(check_poses(cam_from_world[None]))
-        chances = self._log_odds(described.values).sigmoid().double()
-        return described.rows.cpu().numpy(), np.asarray(chances.cpu().numpy())
-
-    def _log_odds(self, values: Tensor) -> Tensor:
+    def log_odds(self, values: Tensor) -> Tensor:
         """Calibrated log-odds (E,) of being found of landmarks (E, A)."""
         with torch.inference_mode():
             return self.matchability.calibrated(self.matchability.network(values))
@@ -123,9 +116,9 @@ class ExpectedScorer(LandmarkScorer):
         """(B,), the sum of the chances of being found over the landmarks in view."""
         return self._expectation.sums(self.describer, cam_from_world)[:, 0]
 
-    def found_chances(self, cam_from_world: Float) -> tuple[NDArray[np.int64], Float]:
-        """Of all landmarks that a view sees."""
-        return self._expectation.found_chances(self.describer, cam_from_world)
+    def log_odds_of_detection(self, values: Tensor) -> Tensor:
+        """Return the calibrated log-odds (E,) that landmarks (E, A) are detected."""
+        return self._expectation.log_odds(values)
 
 
 class ExpectedFisherScorer(LandmarkScorer):
@@ -150,3 +143,7 @@ class ExpectedFisherScorer(LandmarkScorer):
         numbers = self._expectation.sums(self.describer, cam_from_world)[:, 1:16]
         self._watch.check(self.name, [self._expectation.quantities])
         return metric_of(numbers, self.metric, device=self.localization_map.device)
+
+    def log_odds_of_detection(self, values: Tensor) -> Tensor:
+        """Return the calibrated log-odds (E,) that landmarks (E, A) are detected."""
+        return self._expectation.log_odds(values)

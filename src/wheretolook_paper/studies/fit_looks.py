@@ -5,7 +5,7 @@
 Of validation scenes whose labels keep their pixels (`wheretolook label --label.store_pixels true`), looked at by one
 camera. At each place sets of 1, 2, 3 and 5 looks are drawn at random, the likelier the higher their scores, and joined.
 Two logistic regressions are fitted, and each is judged on scenes it was not fitted to, if there are several. Prints the
-JSON of `labelling/confidence.json` and `looks/worth.json`. The weight of the position's variance is not fitted but
+JSON of `labelling/confidence.json` and `looks/set_score.json`. The weight of the position's variance is not fitted but
 given, as random sets do not tell what it is for: that looks which see the same fail together.
 """
 
@@ -26,7 +26,7 @@ from wheretolook.geometry.poses import camera_centers
 from wheretolook.localization import confidence
 from wheretolook.localization.joint_labels import label_sets
 from wheretolook.looks import set_score as worth
-from wheretolook.looks.joint_visibility import log_position_variance, seen_around
+from wheretolook.looks.joint_visibility import candidate_views, log_position_variance
 from wheretolook.utils.shipped import WEIGHTS, shipped
 from wheretolook.weights.resolve import load_scorer
 
@@ -49,12 +49,12 @@ def drawn_sets(scene: SceneFolder, places: int, draws: int) -> pd.DataFrame:
         rows = of_place[number]
         center = camera_centers(cam_from_world[rows[:1]])[0]
         axes = cam_from_world[rows, 2, :3]
-        seen = seen_around(scorer, center, axes, scores[rows])
+        seen = candidate_views(scorer, center, axes, scores[rows])
         likely = scores[rows] + 0.02
         for n in np.tile((1, 2, 3, 5), draws):
             looks = rng.choice(len(rows), n, replace=False, p=likely / likely.sum())
             sets.append(rows[looks])
-            told.append((seen.failed(looks), log_position_variance(seen.union(looks))))
+            told.append((seen.p_none(looks), log_position_variance(seen.joint_sums(looks))))
     labelled = label_sets(table, sets, around.landmarks.points, scene.camera, progress=scene.name)
     expected = pd.DataFrame(told, columns=["failed", "log_position_variance"])
     return pd.concat([labelled, expected], axis=1).assign(scene=scene.name, good=is_good(labelled))
@@ -87,12 +87,12 @@ def main() -> None:
     fitted = report("confidence", confidence.told_numbers(*(accepted[name] for name in names)), accepted)
     weights = dict(zip(confidence.TOLD, fitted.coef_[0].round(4).tolist(), strict=True))
     print(json.dumps({"weights": weights, "bias": round(float(fitted.intercept_[0]), 4)}, indent=2))
-    chance = np.clip(1 - sets["failed"].to_numpy(), worth.LEAST_CHANCE, 1 - worth.LEAST_CHANCE)
+    chance = np.clip(1 - sets["failed"].to_numpy(), worth.MIN_PROBABILITY, 1 - worth.MIN_PROBABILITY)
     mixed = np.log(chance / (1 - chance)) - VARIANCE * sets["log_position_variance"].to_numpy()
     fitted = report("worth", mixed[:, None], sets)
     scale = float(fitted.coef_[0, 0])
     bias = float(fitted.intercept_[0])
-    weights = dict(zip(worth.TOLD, (round(scale, 4), round(-scale * VARIANCE, 4)), strict=True))
+    weights = dict(zip(worth.SetScoreModel.names, (round(scale, 4), round(-scale * VARIANCE, 4)), strict=True))
     print(json.dumps({"weights": weights, "bias": round(bias, 4)}, indent=2))
 
 

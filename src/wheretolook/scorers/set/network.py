@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import batch_norm, binary_cross_entropy_with_logits, logsigmoid
 
+from wheretolook.geometry.pose_information import PLACES, PRIOR, SIGNS
 from wheretolook.inputs.landmark_features import ATTRIBUTES, ViewLandmarks
 from wheretolook.scorers.matchability.network import (
     N_EXPECTED,
@@ -22,28 +23,6 @@ from wheretolook.scorers.set.config import SetConfig
 from wheretolook.training.attribute_statistics import AttributeStatistics
 from wheretolook.utils.errors import WeightsError
 
-PRIOR = 1e-3
-"""Information on every coordinate of a pose before anything is seen: keeps the covariance finite (1/m^2 and 1/rad^2
-for a bearing's noise of one radian)."""
-
-_PLACES = torch.tensor([
-    [0, 1, 2, 0, 8, 7],
-    [1, 3, 4, 8, 0, 6],
-    [2, 4, 5, 7, 6, 0],
-    [0, 8, 7, 9, 10, 11],
-    [8, 0, 6, 10, 12, 13],
-    [7, 6, 0, 11, 13, 14],
-])  # fmt: skip
-_SIGNS = torch.tensor([
-    [1, 1, 1, 0, 1, -1],
-    [1, 1, 1, -1, 0, 1],
-    [1, 1, 1, 1, -1, 0],
-    [0, -1, 1, 1, 1, 1],
-    [1, 0, -1, 1, 1, 1],
-    [-1, 1, 0, 1, 1, 1],
-])  # fmt: skip
-"""Which of the 15 numbers stands where in an information matrix, and its sign, 0 where none does."""
-
 
 def information_matrices(numbers: Tensor) -> Tensor:
     """`wheretolook.geometry.pose_information.information_matrices` of sums (..., 15), shift first, turn second."""
@@ -54,7 +33,7 @@ def information_matrices(numbers: Tensor) -> Tensor:
 @cache
 def _layout(device: torch.device) -> tuple[Tensor, Tensor]:
     with torch.inference_mode(False):  # what is made in that mode cannot be trained with later
-        return _PLACES.to(device), _SIGNS.to(device)
+        return torch.from_numpy(PLACES).to(device), torch.from_numpy(SIGNS).to(device)
 
 
 EXPECTED = (

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from wheretolook.geometry.poses import Float, check_poses
@@ -44,7 +43,7 @@ class SetScorer(LandmarkScorer):
         scores = np.empty(len(cam_from_world))
         looked_at: list[Float] = []
         for rows, described, n_visible in self.describer.in_blocks(cam_from_world, MOST):
-            looked_at += self._look(described, n_visible)
+            looked_at += self._quantities(described, n_visible)
             scores[rows] = self._chances(cam_from_world[rows], described, n_visible)
         self._watch.check(self.name, looked_at)
         return scores
@@ -65,12 +64,10 @@ class SetScorer(LandmarkScorer):
             told.expected_inliers[rows] = found.cpu().numpy()
         return told
 
-    def found_chances(self, cam_from_world: Float) -> tuple[NDArray[np.int64], Float]:
-        """Of all landmarks that a view sees, by the part of the network that looks at single ones."""
-        described = self.describer.describe(check_poses(cam_from_world[None]))
-        with torch.inference_mode():
-            chances = self.network.matchability(described.values).sigmoid().double()
-        return described.rows.cpu().numpy(), np.asarray(chances.cpu().numpy())
+    def log_odds_of_detection(self, values: Tensor) -> Tensor:
+        """Return the log-odds (E,) that landmarks (E, A) are detected, by the network's part for single landmarks."""
+        log_odds: Tensor = self.network.matchability(values)
+        return log_odds
 
     def _chances(self, cam_from_world: Float, described: ViewLandmarks, n_visible: Tensor) -> Float:
         height = torch.from_numpy(cam_from_world[:, 2, 2]).to(described.values)

@@ -32,7 +32,7 @@ class TreesScorer(LandmarkScorer):
         for begin in range(0, len(scores), BLOCK):
             block = cam_from_world[begin : begin + BLOCK]
             described = self.describer.describe(block)
-            looked_at += self._look(described, described.counts)
+            looked_at += self._quantities(described, described.counts)
             pooled = pool(described, block, self.localization_map.camera)
             scores[begin : begin + BLOCK] = self.trees.logits(pooled).sigmoid().cpu().numpy()
         self._watch.check(self.name, looked_at)

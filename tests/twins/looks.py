@@ -1,0 +1,31 @@
+"""Plain versions of joint sums and of the selection of view sets."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+
+from wheretolook.geometry.poses import Float
+from wheretolook.looks.joint_visibility import N_SUMS, CandidateViews
+from wheretolook.looks.selection import Rotations, SetScore, ViewSet, score_of_set
+
+
+def joint_sums(views: CandidateViews, rows: list[int]) -> Float:
+    """`CandidateViews.joint_sums`, landmark by landmark."""
+    sums = np.zeros(N_SUMS)
+    for landmark, terms in enumerate(views.terms):
+        missed = 1.0
+        for row in rows:
+            missed *= 1.0 - float(views.p_detect[row, landmark])
+        sums += (1 - missed) * terms
+    return sums
+
+
+def best_of_all_sets(views: CandidateViews, set_score: SetScore, n: int, rotations: Rotations) -> ViewSet:
+    """The best of all sets of n views, which `select_views` approximates."""
+    sets = []
+    for rows in combinations(range(len(views)), n):
+        total, order = rotations.shortest(rows)
+        sets.append(ViewSet(order, score_of_set(views, set_score, list(rows)), total))
+    return max(sets, key=lambda one: one.score)

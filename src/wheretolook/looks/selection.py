@@ -153,7 +153,7 @@ def select_views(
         PlanningError: no such views can be reached.
     """
     if not 1 <= n <= min(MAX_VIEWS, len(views)):
-        raise ConfigError(f"a set has 1 to {MAX_VIEWS} views, of {len(views)} directions", value=n)
+        raise ConfigError(f"a set has 1 to {MAX_VIEWS} looks, of {len(views)} directions", value=n)
     if max_turn_deg is not None and not 0 <= max_turn_deg < np.inf:
         raise ConfigError("a limit on rotation is degrees of at least 0", value=max_turn_deg)
     limit = np.inf if max_turn_deg is None else max_turn_deg + TOLERANCE_DEG
@@ -164,7 +164,7 @@ def select_views(
         chosen = _greedy(views, set_score, rotations, limit * np.arange(1, n + 1) / n, first, begun)
     if chosen is None:
         fix = "Raise the limit on rotation, or offer more directions."
-        raise PlanningError(f"no {n} views can be reached", value=max_turn_deg, fix=fix)
+        raise PlanningError(f"no {n} looks can be reached", value=max_turn_deg, fix=fix)
     score = score_of_set(views, set_score, chosen)
     for _ in range(exchanges if n > 1 else 0):
         before = score

@@ -1,4 +1,4 @@
-"""Reads COLMAP models into arrays, with errors that say what is wrong with a file, and stores their images' poses."""
+"""Read and write COLMAP models, and convert them to arrays of points, observations and poses."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import Camera, cameras_by_id, mean_focal_px, only_camera
@@ -15,12 +16,11 @@ from wheretolook.geometry.local_origin import local_origin
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.mapping.colmap_files import (
     REBUILD,
-    blame_binary,
-    blame_text,
     check_binary,
-    check_text,
-    check_text_count,
-    contradicting,
+    check_cameras_and_images,
+    check_text_complete,
+    check_text_counts,
+    file_of_error,
     point_heads,
     point_starts,
     track_elements,
@@ -30,9 +30,10 @@ from wheretolook.utils.errors import MapError, StorageError
 from wheretolook.utils.files import STORAGE_FIX, storage_errors, temporary_folder
 from wheretolook.utils.npz_files import load_npz, save_npz
 
-CAMERAS_FILE = "cameras.npz"  # lies beside the landmarks, small enough to travel without the COLMAP model
+CAMERAS_FILE = "cameras.npz"  # next to the landmarks; small enough to be shipped without the COLMAP model
 MODEL_FILES = ("cameras", "images", "points3D")
-_LARGE_BYTES = 500e6  # of a model that takes so long to read that a bar shows how far it is
+_SUFFIXES = (".bin", ".txt")
+_LARGE_BYTES = 500e6  # of a model from which on reading it shows a progress bar
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,15 +53,16 @@ class ModelArrays:
 
 
 def model_suffix(model_dir: str | Path) -> str:
-    """Whether a folder holds a binary model, ".bin", or one of text, ".txt". MapError if it holds none, or not all."""
+    """Suffix of the model's files in a folder: ".bin" or ".txt". Raises MapError if the model is missing or incomplete."""
     folder = Path(model_dir)
     if not folder.is_dir():
         fix = "Give the folder that holds cameras.bin, images.bin and points3D.bin."
         raise MapError("there is no such folder", path=folder, fix=fix)
-    suffix = next((s for s in (".bin", ".txt") if any((folder / (n + s)).is_file() for n in MODEL_FILES)), None)
+    suffix = next((s for s in _SUFFIXES if any((folder / (n + s)).is_file() for n in MODEL_FILES)), None)
     if suffix is None:
-        inside = [path.parent for path in sorted(folder.glob("**/images.*")) if holds_model(path.parent)][:5]
-        fix = f"Give the folder that holds cameras, images and points3D (.bin or .txt){_listed(inside)}."
+        inside = [str(path.parent) for path in sorted(folder.glob("**/images.*")) if holds_model(path.parent)][:5]
+        examples = f", such as {', '.join(inside)}" if inside else ""
+        fix = f"Give the folder that holds cameras, images and points3D (.bin or .txt){examples}."
         raise MapError("no COLMAP model here", path=folder, fix=fix)
     for name in MODEL_FILES:
         if not (folder / (name + suffix)).is_file():
@@ -71,42 +73,42 @@ def model_suffix(model_dir: str | Path) -> str:
 def read_model(model_dir: str | Path) -> Any:
     """Read a COLMAP model as a `pycolmap.Reconstruction`, binary or text, with or without rigs and frames (3.12).
 
-    Raises MapError if the folder or a file is missing, truncated or corrupt, or holds a camera, pose or point that is
-    not finite or that no model can have; it names the file.
+    Raises MapError, which names the file, if the folder or a file is missing, truncated or corrupt, or holds an
+    impossible camera, pose or point.
     """
     folder = Path(model_dir)
-    suffix = model_suffix(model_dir)
+    suffix = model_suffix(folder)
     import pycolmap
 
     n_bytes = sum((folder / (name + suffix)).stat().st_size for name in MODEL_FILES)
     bar = tqdm(total=2, desc=f"model of {n_bytes / 1e9:.1f} GB: read", unit="step", disable=n_bytes < _LARGE_BYTES)
-    reconstruction = pycolmap.Reconstruction()
+    model = pycolmap.Reconstruction()
     with bar, quiet_colmap():
-        (check_text(folder) if suffix == ".txt" else check_binary(folder, folder))
+        (check_binary(folder, folder) if suffix == ".bin" else check_text_counts(folder))
         bar.update()
         try:
-            (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(str(folder))
-        except (ValueError, IndexError, RuntimeError, MemoryError, KeyError) as error:
-            (blame_text if suffix == ".txt" else blame_binary)(folder)
-            name = contradicting(error)
+            (model.read_binary if suffix == ".bin" else model.read_text)(str(folder))
+            check_cameras_and_images(model, folder, suffix)
+        except (ValueError, LookupError, RuntimeError, MemoryError) as error:
+            name = file_of_error(error)
             path = folder / f"{name}{suffix}" if name else folder
             raise MapError(f"pycolmap cannot read the model: {error}", path=path, fix=REBUILD) from error
         bar.update()
     if suffix == ".txt":
-        found = (reconstruction.num_cameras(), reconstruction.num_images(), reconstruction.num_points3D())
-        for name, number in zip(MODEL_FILES, found, strict=True):
-            check_text_count(folder / f"{name}.txt", number)
+        numbers = (model.num_cameras(), model.num_images(), model.num_points3D())
+        for name, number in zip(MODEL_FILES, numbers, strict=True):
+            check_text_complete(folder / f"{name}.txt", number)
         with temporary_folder() as copy:
-            reconstruction.write_binary(copy)
+            model.write_binary(copy)
             check_binary(copy, folder, suffix)
-    return reconstruction
+    return model
 
 
 def write_model(reconstruction: Any, folder: Path) -> None:
-    """Write a `pycolmap.Reconstruction` as binary files into a folder, made if missing.
+    """Write a `pycolmap.Reconstruction` as binary files into a folder, which is made if missing.
 
-    pycolmap does not notice a full disk, so that what was written is checked. Raises StorageError, which names the file
-    that is not whole.
+    pycolmap does not notice a full disk, so the sizes of the files are checked. Raises StorageError that names the
+    incomplete file.
     """
     with storage_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -115,17 +117,17 @@ def write_model(reconstruction: Any, folder: Path) -> None:
         check_binary(folder, folder)
     except (MapError, RuntimeError, ValueError) as error:
         path = (error.path if isinstance(error, MapError) else None) or folder
-        problem = f"cannot be written whole: is the disk full? ({getattr(error, 'problem', error)})"
+        problem = f"cannot be written completely: is the disk full? ({getattr(error, 'problem', error)})"
         raise StorageError(problem, path=path, fix=STORAGE_FIX) from error
 
 
 def model_arrays(reconstruction: Any) -> ModelArrays:
-    """Arrays of a `pycolmap.Reconstruction`. Errors it does not hold yet are computed from the observations.
+    """Convert a `pycolmap.Reconstruction` to arrays. Unknown reprojection errors are computed from the observations.
 
-    Raises MapError if a track names an image that has no pose.
+    Raises MapError if a track names an image without a pose.
     """
     stored = _stored_points(reconstruction)
-    if not (stored.errors_px[stored.lengths > 0] >= 0).all():  # COLMAP writes -1 for an error that is not known
+    if not (stored.errors_px[stored.lengths > 0] >= 0).all():  # COLMAP writes -1 for an unknown error
         reconstruction.update_point_3d_errors()
         stored = _stored_points(reconstruction)
     image_ids = np.array(sorted(i for i, image in reconstruction.images.items() if image.has_pose), dtype=np.int64)
@@ -146,10 +148,25 @@ def model_arrays(reconstruction: Any) -> ModelArrays:
     )
 
 
-def colmap_poses(model_dir: str | Path, reconstruction: Any = None) -> Float:
-    """Poses cam_from_world (M, 3, 4) float64 of the images of a COLMAP model that have one, in the order of their ids.
+def observation_matrix(model: ModelArrays, group: NDArray[np.integer[Any]] | None = None) -> csr_array:
+    """Which images, or groups (I,) of images, observe which points: a sparse matrix (I or number of groups, P) of ones.
 
-    The model is read from its folder, as by `read_model`, unless it is given. MapError if no image has a pose.
+    Its product with its own transpose counts the points that two images share.
+    """
+    point = np.repeat(np.arange(len(model.points)), np.diff(model.observation_start))
+    rows = model.observation_image if group is None else group[model.observation_image]
+    n_rows = len(model.image_ids) if group is None else int(group.max()) + 1
+    matrix = coo_array(
+        (np.ones(len(point), dtype=np.float32), (rows, point)), shape=(n_rows, len(model.points))
+    ).tocsr()
+    matrix.data[:] = 1  # a point observed twice counts once
+    return matrix
+
+
+def colmap_poses(model_dir: str | Path, reconstruction: Any = None) -> Float:
+    """Poses cam_from_world (M, 3, 4) float64 of a COLMAP model's images with a pose, in the order of their ids.
+
+    Reads the model from its folder unless it is passed. Raises MapError if no image has a pose.
     """
     images = (reconstruction or read_model(model_dir)).images
     posed = [images[number] for number in sorted(images) if images[number].has_pose]
@@ -159,7 +176,7 @@ def colmap_poses(model_dir: str | Path, reconstruction: Any = None) -> Float:
 
 
 def camera_of_model(reconstruction: Any, path: Path, camera_id: int | None = None) -> Camera:
-    """A camera of a pycolmap model: that of a camera_id, or the only one. MapError, naming the model, if none is it."""
+    """The camera of a pycolmap model with an id, or its only camera. Raises MapError, naming the model, if there is none."""
     known = cameras_by_id(reconstruction.cameras, path)
     if camera_id is None:
         return only_camera(known, path)
@@ -182,7 +199,7 @@ def describe_intrinsics(camera: Any) -> dict[str, Any]:
 
 def holds_model(folder: Path) -> bool:
     """Whether a folder holds a COLMAP model, binary or text."""
-    return any(all((folder / (name + suffix)).is_file() for name in MODEL_FILES) for suffix in (".bin", ".txt"))
+    return any(all((folder / (name + suffix)).is_file() for name in MODEL_FILES) for suffix in _SUFFIXES)
 
 
 def save_mapping_poses(cam_from_world: Float, path: str | Path) -> None:
@@ -191,34 +208,27 @@ def save_mapping_poses(cam_from_world: Float, path: str | Path) -> None:
 
 
 def compact_poses(cam_from_world: Float) -> Float:
-    """Poses (M, 3, 4) in single precision; in double where single is too coarse, far from the world's origin."""
+    """Cast poses (M, 3, 4) to single precision, or to double if they are far from the world's origin."""
     near = not local_origin(camera_centers(cam_from_world)).any()
     return np.asarray(cam_from_world, dtype=np.float32 if near else np.float64)
 
 
 def load_mapping_poses(path: str | Path) -> Float:
-    """Read what `save_mapping_poses` wrote, (M, 3, 4). MapError if the file is missing, damaged or another."""
-    path = Path(path)
-    fix = "Run the map stage again, or remove it to read the COLMAP model beside it instead."
-    if not path.is_file():
-        raise MapError("there is no file of the mapping images' poses", path=path, fix="Run the map stage again.")
+    """Read the poses (M, 3, 4) that `save_mapping_poses` wrote. Raises MapError if the file is missing or damaged."""
     try:
-        poses = load_npz(path)["cam_from_world"]
+        poses = load_npz(Path(path))["cam_from_world"]
+        valid = poses.dtype.kind == "f" and poses.ndim == 3 and poses.shape[1:] == (3, 4) and len(poses) > 0
+        if not valid or not np.isfinite(poses).all():
+            raise ValueError(f"an array of {poses.dtype} and shape {poses.shape}")
     except (ValueError, KeyError) as error:
+        fix = "Run the map stage again, or remove the file to use the COLMAP model next to it."
         raise MapError(f"cannot read the mapping images' poses: {error}", path=path, fix=fix) from error
-    shape = poses.shape if poses.dtype.kind == "f" else ()
-    if len(shape) != 3 or shape[1:] != (3, 4) or not len(poses) or not np.isfinite(poses).all():
-        raise MapError("these are no poses of mapping images", path=path, value=poses.shape, fix=fix)
     return np.asarray(poses)
-
-
-def _listed(folders: list[Path]) -> str:
-    return f", such as {', '.join(map(str, folders))}" if folders else ""
 
 
 @dataclass(frozen=True, eq=False)
 class _StoredPoints:
-    """What points3D.bin holds, sorted by id."""
+    """Content of a points3D.bin, sorted by id."""
 
     ids: NDArray[np.int64]  # (P,)
     points: NDArray[np.float64]  # (P, 3)
@@ -228,14 +238,11 @@ class _StoredPoints:
 
 
 def _stored_points(reconstruction: Any) -> _StoredPoints:
-    """Points and tracks of a reconstruction, by way of a file: asked for one by one, 500,000 take a quarter minute."""
+    """Points and tracks of a reconstruction, through a file: reading 500,000 one by one takes 15 seconds."""
     with temporary_folder() as folder:
         reconstruction.write_binary(folder)
         data = np.fromfile(folder / "points3D.bin", dtype=np.uint8)
-    starts = point_starts(data.tobytes())
-    if starts[-1] < 0:  # pycolmap does not notice a full disk
-        path = folder / "points3D.bin"
-        raise StorageError("cannot be written whole: is the disk full?", path=path, fix=STORAGE_FIX)
+        starts = point_starts(folder / "points3D.bin")
     heads = point_heads(data, starts)
     elements = track_elements(data, starts).astype(np.int64)
     lengths = heads["n"].astype(np.int64)

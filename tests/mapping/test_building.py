@@ -15,7 +15,7 @@ from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping import triangulation
 from wheretolook.mapping.colmap_model import load_mapping_poses
-from wheretolook.mapping.config import MapConfig, WalkConfig
+from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG, MapConfig, WalkConfig
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.rendered_map import build_map
 from wheretolook.mapping.walk import plan_walk
@@ -124,7 +124,7 @@ def test_stored_landmarks_are_those_of_the_model_and_its_database(built):
         np.testing.assert_array_equal(value, getattr(read, name))
     assert (stored.track_length >= 2).all()
     # The angle is held by COLMAP before the last adjustment of the points.
-    assert stored.triangulation_angle_deg.min() > 0.9 * CONFIG.min_triangulation_angle_deg
+    assert stored.triangulation_angle_deg.min() > 0.9 * MIN_TRIANGULATION_ANGLE_DEG
 
 
 def test_report_is_on_disk(built):

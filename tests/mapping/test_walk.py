@@ -7,7 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from wheretolook.mapping.config import WalkConfig
+from wheretolook.mapping import walk
+from wheretolook.mapping.config import VISIT_RADIUS_M, WalkConfig
 from wheretolook.mapping.walk import plan_walk
 from wheretolook.utils.errors import ConfigError, SceneError
 
@@ -74,57 +75,57 @@ def walked_distance_m(places: np.ndarray, path: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("coverage", [0.4, 0.7, 1.0])
 def test_walk_is_free_and_covers_what_was_asked(seed, coverage):
     room = Room(door_m=1.2)
-    walk = plan_walk(room, BOUNDS, 150, WalkConfig(coverage=coverage), seed)
-    assert room.segments_are_free(walk.path[:-1], walk.path[1:]).all()
-    assert room.is_free(walk.positions).all()
+    route = plan_walk(room, BOUNDS, 150, WalkConfig(coverage=coverage), seed)
+    assert room.segments_are_free(route.path[:-1], route.path[1:]).all()
+    assert room.is_free(route.positions).all()
     # One more place to visit adds at most the floor within the radius of it, here at most a tenth of all.
-    assert coverage <= walk.coverage < min(coverage + 0.12, 1.0001)
+    assert coverage <= route.coverage < min(coverage + 0.12, 1.0001)
     grid = np.stack(np.meshgrid(np.arange(0.15, 8, 0.3), np.arange(0.15, 6, 0.3), [1.45]), -1).reshape(-1, 3)
     floor = grid[room.is_free(grid)]
-    near = (walked_distance_m(floor, walk.path) <= walk.visit_radius_m).mean()
+    near = (walked_distance_m(floor, route.path) <= route.visit_radius_m).mean()
     # Round the wall's end the way to walk is longer than the straight line.
-    assert walk.coverage - 0.03 <= near <= walk.coverage + 0.15
+    assert route.coverage - 0.03 <= near <= route.coverage + 0.15
 
 
 def test_poses_are_spaced_evenly_along_the_walk_and_look_ahead(monkeypatch):
-    monkeypatch.setattr(WalkConfig, "pitch_variation_deg", 8.0)
-    walk = plan_walk(Room(door_m=1.2), BOUNDS, 120, WalkConfig(swing_deg=30, pitch_deg=-4), 3)
-    assert walk.positions.shape == walk.directions.shape == (120, 3)
-    np.testing.assert_allclose(np.linalg.norm(walk.directions, axis=1), 1, atol=1e-9)
-    steps = np.linalg.norm(np.diff(walk.positions[:, :2], axis=0), axis=1)
-    assert steps.max() <= walk.length_m / 119 + 1e-9  # straight lines are no longer than the walk between
-    assert np.median(steps) > 0.85 * walk.length_m / 119
-    assert walk.length_m / 119 <= 0.6
-    pitch = np.degrees(np.arcsin(walk.directions[:, 2]))
+    monkeypatch.setattr(walk, "PITCH_VARIATION_DEG", 8.0)
+    route = plan_walk(Room(door_m=1.2), BOUNDS, 120, WalkConfig(swing_deg=30, pitch_deg=-4), 3)
+    assert route.positions.shape == route.directions.shape == (120, 3)
+    np.testing.assert_allclose(np.linalg.norm(route.directions, axis=1), 1, atol=1e-9)
+    steps = np.linalg.norm(np.diff(route.positions[:, :2], axis=0), axis=1)
+    assert steps.max() <= route.length_m / 119 + 1e-9  # straight lines are no longer than the walk between
+    assert np.median(steps) > 0.85 * route.length_m / 119
+    assert route.length_m / 119 <= 0.6
+    pitch = np.degrees(np.arcsin(route.directions[:, 2]))
     assert pitch.min() >= -12 - 1e-9 and pitch.max() <= 4 + 1e-9 and np.ptp(pitch) > 8
-    moved = np.diff(walk.positions[:, :2], axis=0) / steps[:, None]
-    ahead = (moved * walk.directions[:-1, :2]).sum(1)
+    moved = np.diff(route.positions[:, :2], axis=0) / steps[:, None]
+    ahead = (moved * route.directions[:-1, :2]).sum(1)
     assert np.median(ahead) > np.cos(np.radians(45))
-    heights = walk.positions[:, 2]
+    heights = route.positions[:, 2]
     assert heights.min() >= 1.25 and heights.max() <= 1.65 and np.ptp(heights) > 0.2
 
 
 def test_few_images_make_a_short_walk():
     config = WalkConfig(image_spacing_m=0.5)
-    walk = plan_walk(Room(door_m=1.2), BOUNDS, 20, config, 0)
-    assert walk.length_m <= 19 * 0.5
-    assert walk.visit_radius_m > config.visit_radius_m
-    assert walk.coverage >= config.coverage
+    route = plan_walk(Room(door_m=1.2), BOUNDS, 20, config, 0)
+    assert route.length_m <= 19 * 0.5
+    assert route.visit_radius_m > VISIT_RADIUS_M
+    assert route.coverage >= config.coverage
 
 
 def test_only_the_largest_reachable_part_is_walked():
-    walk = plan_walk(Room(door_m=0.0), BOUNDS, 60, WalkConfig(coverage=1.0), 0)  # no door
-    assert (walk.positions[:, 0] < 4).all() or (walk.positions[:, 0] > 4).all()
+    route = plan_walk(Room(door_m=0.0), BOUNDS, 60, WalkConfig(coverage=1.0), 0)  # no door
+    assert (route.positions[:, 0] < 4).all() or (route.positions[:, 0] > 4).all()
 
 
 def test_walk_climbs_to_another_storey(monkeypatch):
-    monkeypatch.setattr(WalkConfig, "eye_height_variation_m", 0.1)
+    monkeypatch.setattr(walk, "EYE_HEIGHT_VARIATION_M", 0.1)
     scene = TwoStoreys()
     bounds = np.array([(0, 0, 0), (8, 6, 5.2)])
-    walk = plan_walk(scene, bounds, 300, WalkConfig(coverage=0.95), 1)
-    assert scene.segments_are_free(walk.path[:-1], walk.path[1:]).all()
-    floor = scene.floor_below(walk.positions)
-    height = walk.positions[:, 2] - floor
+    route = plan_walk(scene, bounds, 300, WalkConfig(coverage=0.95), 1)
+    assert scene.segments_are_free(route.path[:-1], route.path[1:]).all()
+    floor = scene.floor_below(route.positions)
+    height = route.positions[:, 2] - floor
     assert height.min() > 1.2
     assert (height < 1.7).mean() > 0.98  # beside the gallery's edge the straight way may hang over it a little
     assert (floor == 0).sum() > 30 and (floor == 2.6).sum() > 30
@@ -145,7 +146,7 @@ def test_scenes_without_a_floor_and_bad_settings(monkeypatch):
         plan_walk(Room(door_m=1.2), BOUNDS, 10, WalkConfig(eye_height_m=5.0))
     with pytest.raises(ConfigError):
         plan_walk(Room(door_m=1.2), BOUNDS, 1)
-    monkeypatch.setattr(WalkConfig, "cell_m", 5.5)
+    monkeypatch.setattr(walk, "CELL_M", 5.5)
     with pytest.raises(SceneError, match="free step"):
         plan_walk(Room(door_m=1.2), BOUNDS, 10)
     bad = ({"coverage": 0.0}, {"coverage": 1.1}, {"pitch_deg": 85.0}, {"eye_height_m": 0.1})

@@ -1,14 +1,31 @@
-"""Settings of the map stage, for rendered images and for photographs."""
+"""Options of the map stage, for rendered images, photographs and existing models."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from math import inf
 from pathlib import Path
+from typing import Any
 
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig
 from wheretolook.utils.errors import ConfigError
+
+# Constants of the walk. The radius only starts there and grows until images are close enough together.
+VISIT_RADIUS_M = 1.0  # floor within this walking distance of the walk counts as visited
+EYE_HEIGHT_VARIATION_M = 0.2  # largest deviation of a hand-held camera's height
+CELL_M = 0.3  # grid spacing of the walk, well below a door's width
+MAX_STEP_HEIGHT_M = 0.4  # largest difference in floor height between neighbouring cells: two steps of stairs
+SWING_PERIOD = 12.0  # images in one swing from left to right and back, so that neighbours overlap
+PITCH_VARIATION_DEG = 10.0  # largest deviation of a hand-held camera's pitch
+
+PARTNERS = 10  # images that each image is matched with; time grows with their number
+MAX_EPIPOLAR_ERROR_PX = 2.0  # matches farther from the epipolar line are dropped; keypoints are accurate to a pixel
+MIN_TRIANGULATION_ANGLE_DEG = 1.5  # COLMAP's own limit
+EXHAUSTIVE_UP_TO = 60  # photographs of which all pairs are matched, in minutes; more are matched by their order
+SCALE_TOLERANCE_PERCENT = (
+    5.0  # of a marker's side, or of the extent of known positions; a wrong size or name is off by more
+)
 
 
 @dataclass(frozen=True)
@@ -21,40 +38,37 @@ class WalkConfig:
         eye_height_m: mean height of the camera above the floor in metres.
         swing_deg: how far the camera swings to either side of the walk.
         pitch_deg: mean pitch, negative is down.
-
-    Attributes:
-        visit_radius_m: floor within this walking distance of the walk counts as visited. Only a start: it grows until
-            the walk is short enough for the images to be `image_spacing_m` apart.
-        eye_height_variation_m: largest deviation of the camera's height, as of one held in a hand.
-        cell_m: distance between neighbouring places of the grid that the walk runs on, well below a door's width.
-        max_step_height_m: largest change of the floor's height from one place to the next: two steps of stairs.
-        swing_period: number of images in one swing from left to right and back, so that neighbours overlap.
-        pitch_variation_deg: largest deviation of the pitch, as of a camera held in a hand.
     """
 
     coverage: float = 0.7
-    visit_radius_m: float = field(default=1.0, init=False)
     image_spacing_m: float = 0.6
     eye_height_m: float = 1.45
-    eye_height_variation_m: float = field(default=0.2, init=False)
-    cell_m: float = field(default=0.3, init=False)
-    max_step_height_m: float = field(default=0.4, init=False)
     swing_deg: float = 40.0
-    swing_period: float = field(default=12.0, init=False)
     pitch_deg: float = -5.0
-    pitch_variation_deg: float = field(default=10.0, init=False)
 
     def __post_init__(self) -> None:
         if not 0 < self.coverage <= 1:
             raise ConfigError("coverage must be in (0, 1]", value=self.coverage)
-        for name in ("image_spacing_m", "eye_height_m"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} must be positive", value=getattr(self, name))
-        variation_m = self.eye_height_variation_m
-        if not 0 <= variation_m < self.eye_height_m:
-            raise ConfigError("eye_height_variation_m must be at least 0 and below eye_height_m", value=variation_m)
-        if not abs(self.pitch_deg) + abs(self.pitch_variation_deg) < 90:
-            raise ConfigError("the pitch must stay within 90 degrees", value=(self.pitch_deg, self.pitch_variation_deg))
+        if not self.image_spacing_m > 0:
+            raise ConfigError("image_spacing_m must be positive", value=self.image_spacing_m)
+        if not self.eye_height_m > EYE_HEIGHT_VARIATION_M:
+            raise ConfigError(f"eye_height_m must be above {EYE_HEIGHT_VARIATION_M}", value=self.eye_height_m)
+        if not abs(self.pitch_deg) + PITCH_VARIATION_DEG < 90:
+            raise ConfigError(
+                f"pitch_deg must stay {PITCH_VARIATION_DEG:g} degrees from vertical", value=self.pitch_deg
+            )
+
+    def record(self) -> dict[str, Any]:
+        """Settings and constants, from which the keys of finished maps are made."""
+        return {
+            **asdict(self),
+            "visit_radius_m": VISIT_RADIUS_M,
+            "eye_height_variation_m": EYE_HEIGHT_VARIATION_M,
+            "cell_m": CELL_M,
+            "max_step_height_m": MAX_STEP_HEIGHT_M,
+            "swing_period": SWING_PERIOD,
+            "pitch_variation_deg": PITCH_VARIATION_DEG,
+        }
 
 
 @dataclass(frozen=True)
@@ -62,8 +76,8 @@ class KnownDistance:
     """A distance measured by hand.
 
     Args:
-        first: name of a photograph, for where it was taken from, or "marker:<id>", for a marker's centre.
-        second: the other end, the same way.
+        first: name of a photograph, which stands for its camera centre, or "marker:<id>" for a marker's centre.
+        second: the other end, in the same form.
         distance_m: between the two, in metres.
     """
 
@@ -74,7 +88,7 @@ class KnownDistance:
     def __post_init__(self) -> None:
         if not 0 < self.distance_m < inf or self.first == self.second:
             value = (self.first, self.second, self.distance_m)
-            raise ConfigError("a known distance is a positive number of metres between two places", value=value)
+            raise ConfigError("a known distance is a positive number of metres between two different ends", value=value)
 
     @property
     def marker_ids(self) -> tuple[int, ...]:
@@ -87,27 +101,22 @@ class KnownDistance:
 
 @dataclass(frozen=True)
 class ScaleConfig:
-    """Where the scale of a map from photographs comes from: markers, a distance, or positions; or nowhere.
+    """Source of the scale of a map from photographs: markers, a distance, positions, or none.
 
     Args:
-        dictionary: dictionary of the markers, by OpenCV's name. DICT_4X4_50, DICT_APRILTAG_36H11, DICT_ARUCO_ORIGINAL
+        dictionary: OpenCV's name of the markers' dictionary. DICT_4X4_50, DICT_APRILTAG_36H11, DICT_ARUCO_ORIGINAL
             and so on.
         marker_size_m: side of the black square of every marker, in metres; 0 for no markers.
         marker_table: CSV file of markers of different sizes, with the columns `id` and `size_m`. Other markers are
-            passed over.
+            ignored.
         distance: one known distance, between photographs or markers.
-        positions: CSV or JSON file of where photographs were taken. CSV with the columns `image`, `x`, `y`, `z`, or
-            JSON `{"image": [x, y, z]}`, in metres, z up. They fix the whole frame, not only its scale.
-
-    Attributes:
-        tolerance_percent: a marker's side that differs by more from its size is refused, and a position that is off by
-            more of the extent of all positions: a wrong size or name is off by more, a good measurement by less.
+        positions: CSV or JSON file of camera positions. CSV with the columns `image`, `x`, `y`, `z`, or
+            JSON `{"image": [x, y, z]}`, in metres, z up. They determine the whole frame, not only its scale.
     """
 
     dictionary: str = "DICT_4X4_50"
     marker_size_m: float = 0.0
     marker_table: Path | None = None
-    tolerance_percent: float = field(default=5.0, init=False)
     distance: KnownDistance | None = None
     positions: Path | None = None
 
@@ -115,17 +124,13 @@ class ScaleConfig:
         if not 0 <= self.marker_size_m < inf:
             raise ConfigError("marker_size_m must not be negative", value=self.marker_size_m)
         if self.marker_size_m > 0 and self.marker_table is not None:
-            sizes = (self.marker_size_m, str(self.marker_table))
-            fix = "Give marker_size_m or marker_table."
-            raise ConfigError("markers have one size, or a table of sizes", value=sizes, fix=fix)
+            raise ConfigError("give marker_size_m or marker_table, not both", value=str(self.marker_table))
         if self.has_marker_sizes + (self.distance is not None) + (self.positions is not None) > 1:
-            value = "markers, a distance, positions: more than one was given"
-            fix = "Give marker sizes, a distance or positions."
-            raise ConfigError("the scale comes from one source", value=value, fix=fix)
+            raise ConfigError("give marker sizes, a distance or positions, not several of them", value=self.dictionary)
 
     @property
     def has_marker_sizes(self) -> bool:
-        """Whether markers of known size give the scale."""
+        """Whether the sizes of markers are known."""
         return self.marker_size_m > 0 or self.marker_table is not None
 
 
@@ -134,26 +139,22 @@ class PhotographsConfig:
     """How a folder of photographs is mapped. Without one, maps are made of rendered images.
 
     Args:
-        images: folder of the photographs, with any folders in it.
-        name: name of the scene; the folder's own if empty.
+        images: folder of the photographs, with any subfolders.
+        name: name of the scene; by default that of the folder.
         max_side_px: photographs are reduced to this many pixels along their longer side; 0 keeps their size. The map's
             cameras and keypoints are those of the reduced photographs.
         camera_model: COLMAP's name of the camera model.
-        camera_params: the camera model's parameters, for a photograph of full size. In COLMAP's order, kept as given.
+        camera_params: the camera model's parameters, for a photograph of full size, in COLMAP's order; they stay fixed.
             Without them, they are refined from the EXIF focal length, or from 1.2 times the longer side where there is
             none.
         shared_camera: whether photographs of one folder, size and EXIF focal length share their intrinsics.
         overlap: how many photographs that follow by name one is matched with; as many more at distances that double.
-        max_reprojection_error_px: landmarks with a larger mean reprojection error are removed. Photographs taken by
-            hand do not reach the 0.5 px of rendered images.
-        up_in_camera: where up is as a camera sees it, if it is the same for all. (x, y, z) with x right, y down, z
+        max_reprojection_error_px: landmarks with a larger mean reprojection error are removed. Hand-held photographs do
+            not reach the 0.5 px of rendered images.
+        up_in_camera: the direction up in the camera frame, if it is the same for all. (x, y, z) with x right, y down, z
             forward: (0, 0, -1) for cameras that look straight down. By default cameras are held level, with any pitch.
-        scale: where the scale comes from.
-        assume_metric: take a map without a scale for one in metres, where metres are needed.
-
-    Attributes:
-        exhaustive_up_to: every pair of photographs is matched up to this number of them, in minutes. Of more, each is
-            matched with those that follow it by name.
+        scale: source of the scale.
+        assume_metric: treat a map without a scale as metric where metres are needed.
     """
 
     images: Path | None = None
@@ -162,7 +163,6 @@ class PhotographsConfig:
     camera_model: str = "SIMPLE_RADIAL"
     camera_params: tuple[float, ...] = ()
     shared_camera: bool = True
-    exhaustive_up_to: int = field(default=60, init=False)
     overlap: int = 10
     max_reprojection_error_px: float = 2.0
     up_in_camera: tuple[float, float, float] | None = None
@@ -178,26 +178,30 @@ class PhotographsConfig:
         if self.up_in_camera is not None and not 0 < sum(abs(value) for value in self.up_in_camera) < inf:
             raise ConfigError("up_in_camera must be a direction", value=self.up_in_camera)
 
+    def record(self) -> dict[str, Any]:
+        """Settings and constants, from which the keys of finished maps are made."""
+        scale = {**asdict(self.scale), "tolerance_percent": SCALE_TOLERANCE_PERCENT}
+        return {**asdict(self), "scale": scale, "exhaustive_up_to": EXHAUSTIVE_UP_TO}
+
 
 @dataclass(frozen=True)
 class ExistingModelConfig:
-    """A COLMAP model of one's own, of known poses, from which a scene is made instead of from a mesh or photographs.
+    """An existing COLMAP model with known poses, from which a scene is made instead of from a mesh or photographs.
 
-    Its world is taken to be in metres, z up; `photographs.scale` and `level` make it so. With `photographs.images`, the
-    folder of its images, its landmarks are triangulated anew at its poses, from keypoints of `extractor`.
+    Its world must be in metres, z up; `photographs.scale` and `level` make it so. With `photographs.images`, the
+    folder of its images, its landmarks are triangulated again at its poses, from keypoints of `extractor`.
 
     Args:
         model: folder of the model.
-        name: name of the scene; the folder's own if empty. For sparse/0 and the like that of the folder above.
-        database: the COLMAP database that the model was built from, or hloc's features in HDF5. Descriptors tell how
-            easily landmarks are mistaken for one another, and queries are matched with them.
+        name: name of the scene; by default that of the folder. For sparse/0 and the like that of the parent folder.
+        database: the COLMAP database that the model was built from, or hloc's features in HDF5. Descriptors give the
+            ambiguity of landmarks, and queries are matched with them.
         mesh: textured mesh of the scene in the model's frame, for free space, occlusion and labels. Without one, free
-            space is where `scenes.mapped_space` says, and hidden-point removal tells what is occluded.
+            space follows `scenes.mapped_space`, and occlusion hidden-point removal.
         mesh_up: which axis of the mesh's file is the model's z: x, y or z, with a minus sign if it points down.
-        camera_id: the camera of the model that will look, where it has several and `camera` names none.
+        camera_id: the query camera, if the model has several and `camera` names none.
         level: turn the model upright by how its cameras were held.
-        max_reprojection_error_px: landmarks with a larger mean reprojection error are removed; 0 for all that the
-            model's own mapper kept.
+        max_reprojection_error_px: landmarks with a larger mean reprojection error are removed; 0 keeps all.
     """
 
     model: Path | None = None
@@ -211,18 +215,17 @@ class ExistingModelConfig:
 
     def __post_init__(self) -> None:
         if not 0 <= self.max_reprojection_error_px < inf:
-            value = self.max_reprojection_error_px
-            raise ConfigError("existing.max_reprojection_error_px must not be negative", value=value)
+            raise ConfigError("max_reprojection_error_px must not be negative", value=self.max_reprojection_error_px)
 
     @property
     def scene_name(self) -> str:
         """Name of the scene's folder."""
         assert self.model is not None
-        parts = [part for part in self.model.resolve().parts[1:] if part not in _NO_NAMES and not part.isdigit()]
+        parts = [part for part in self.model.resolve().parts[1:] if part not in _GENERIC_NAMES and not part.isdigit()]
         return self.name or (parts[-1] if parts else "model")
 
 
-_NO_NAMES = ("sparse", "model", "models", "sfm", "colmap", "map")  # folders of models whose names say nothing
+_GENERIC_NAMES = ("sparse", "model", "models", "sfm", "colmap", "map")  # of folders that hold models
 
 
 @dataclass(frozen=True)
@@ -239,27 +242,17 @@ class MapConfig:
             paper's 0.5 px).
         photographs: a folder of photographs to map instead of a mesh; of the other settings, only `extractor` and
             `keep_database` then count.
-        existing: a model of one's own to take instead; then only `extractor`, `keep_database` and `photographs.images`
-            and `.scale` count besides.
-        camera: the camera that maps, if not the one that looks, such as `{width: 1280, height: 720, fov_deg: 70}`.
-        draw_camera: draw the camera that maps from the scene's seed, as `sample.cameras` draws those that look.
+        existing: an existing model to import instead; then only `extractor`, `keep_database` and `photographs.images`
+            and `.scale` also count.
+        camera: the mapping camera, if not the query camera, such as `{width: 1280, height: 720, fov_deg: 70}`.
+        draw_camera: draw the mapping camera from the scene's seed, as `sample.cameras` draws query cameras.
         keep_images: keep the rendered images, as `images/` in the map's folder.
         keep_database: keep COLMAP's database of keypoints and matches, as `database.db`.
-
-    Attributes:
-        partners: images that each image is matched with, those that share most surface with it; time grows with
-            their number.
-        max_epipolar_error_px: matches farther from the epipolar line of the known poses are dropped. Keypoints are
-            found to within a pixel in each image.
-        min_triangulation_angle_deg: landmarks whose rays meet at less are not made: COLMAP's own limit.
     """
 
     n_images: int = 100
     walk: WalkConfig = field(default_factory=WalkConfig)
     extractor: ExtractorConfig = field(default_factory=ExtractorConfig)
-    partners: int = field(default=10, init=False)
-    max_epipolar_error_px: float = field(default=2.0, init=False)
-    min_triangulation_angle_deg: float = field(default=1.5, init=False)
     two_view_landmarks: bool = True
     max_reprojection_error_px: float = 0.5
     photographs: PhotographsConfig = field(default_factory=PhotographsConfig)
@@ -273,6 +266,18 @@ class MapConfig:
         if self.n_images < 2:
             raise ConfigError("a map needs at least two images", value=self.n_images)
         if self.camera is not None and self.draw_camera:
-            raise ConfigError("the camera that maps is given and to be drawn", value=self.camera, fix="Choose one.")
+            raise ConfigError("give camera or draw_camera, not both", value=self.camera)
         if not self.max_reprojection_error_px > 0:
             raise ConfigError("max_reprojection_error_px must be positive", value=self.max_reprojection_error_px)
+
+    def record(self) -> dict[str, Any]:
+        """Settings and constants, from which the keys of finished maps are made."""
+        return {
+            **asdict(self),
+            "walk": self.walk.record(),
+            "extractor": self.extractor.record(),
+            "photographs": self.photographs.record(),
+            "partners": PARTNERS,
+            "max_epipolar_error_px": MAX_EPIPOLAR_ERROR_PX,
+            "min_triangulation_angle_deg": MIN_TRIANGULATION_ANGLE_DEG,
+        }

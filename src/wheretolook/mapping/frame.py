@@ -53,14 +53,14 @@ def find_scale(
     config = known.config
     centers = {name: model.images[number].projection_center() for number, name in names.items()}
     if known.positions:
-        return scales.scale_from_positions(centers, known.positions, config.tolerance_percent)
+        return scales.scale_from_positions(centers, known.positions)
     scale = MapScale()
     if config.has_marker_sizes:
         views = _marker_views(model, photographs, config.dictionary, turned, progress)
         if not isinstance(known.sizes_m, float | int):
             views = {marker: seen for marker, seen in views.items() if marker in known.sizes_m}
         markers, unused = _place(views)
-        scale = scales.scale_from_markers(markers, known.sizes_m, config.tolerance_percent, unused)
+        scale = scales.scale_from_markers(markers, known.sizes_m, unused=unused)
     elif config.distance is not None:
         wanted = config.distance.marker_ids
         views = _marker_views(model, photographs, config.dictionary, turned, progress) if wanted else {}

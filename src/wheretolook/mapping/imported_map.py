@@ -23,7 +23,7 @@ from wheretolook.mapping.colmap_model import (
     save_mapping_poses,
     write_model,
 )
-from wheretolook.mapping.config import MapConfig
+from wheretolook.mapping.config import EXHAUSTIVE_UP_TO, PARTNERS, MapConfig
 from wheretolook.mapping.feature_files import HDF5_SUFFIXES
 from wheretolook.mapping.frame import KnownScale, find_scale
 from wheretolook.mapping.gravity import estimate_gravity
@@ -186,7 +186,7 @@ def _triangulate(
 ) -> Any:
     """New landmarks at the poses of a model, from keypoints of its images with a pose. Returns a new model."""
     with clock("pairs"):
-        pairs = _pairs(source, config.partners, config.photographs.exhaustive_up_to)
+        pairs = _pairs(source, PARTNERS, EXHAUSTIVE_UP_TO)
     model = _posed_model(source, features)
     steps = (config, clock, seed, processes, progress)
     model = triangulate_model(database, model, features.stored, features.colors, pairs, *steps)

@@ -12,7 +12,7 @@ import numpy as np
 
 from wheretolook.mapping import rendered_map as building
 from wheretolook.mapping.colmap_model import describe_intrinsics, registered_names, write_model
-from wheretolook.mapping.config import MapConfig
+from wheretolook.mapping.config import EXHAUSTIVE_UP_TO, MapConfig
 from wheretolook.mapping.frame import KnownScale, find_scale
 from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.mapping.photographs import photograph_cameras
@@ -89,7 +89,7 @@ def map_photographs(
             features = photograph_features(settings.images, work, side_px, extractor, processes, device, progress)
         with clock("map"):
             cameras = photograph_cameras(settings.images, features.names, features.full_sizes, features.sizes, settings)
-            matched = settings.exhaustive_up_to, settings.overlap
+            matched = EXHAUSTIVE_UP_TO, settings.overlap
             mapped = map_incrementally(work, features, cameras, *matched, seed, processes, progress)
         model = mapped.model
         names = registered_names(mapped.model)

@@ -21,7 +21,7 @@ from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.mapping import triangulation
 from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, save_mapping_poses, write_model
-from wheretolook.mapping.config import MapConfig
+from wheretolook.mapping.config import PARTNERS, MapConfig
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.triangulation import image_name, triangulate_known_poses
 from wheretolook.mapping.walk import FreeSpaceQueries, Walk, plan_walk
@@ -112,7 +112,7 @@ def build_map(
             keypoints, colors = zip(*extracted, strict=True)
         with clock("pairs"):
             overlap = triangulation.surface_overlap(camera, poses, np.stack(depth))
-            pairs = triangulation.choose_pairs(overlap, config.partners)
+            pairs = triangulation.choose_pairs(overlap, PARTNERS)
         database = partial / DATABASE_FILE
         views = camera, poses, keypoints, colors
         model = triangulate_known_poses(database, *views, pairs, config, clock, seed, processes, progress)

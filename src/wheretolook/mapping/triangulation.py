@@ -18,6 +18,7 @@ from wheretolook.features.sift import SIFT
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.local_origin import local_origin
 from wheretolook.geometry.poses import camera_centers, transform
+from wheretolook.mapping.config import MAX_EPIPOLAR_ERROR_PX, MIN_TRIANGULATION_ANGLE_DEG
 from wheretolook.mapping.feature_files import name_kind
 from wheretolook.utils.colmap import quiet_colmap, storing_in_database
 from wheretolook.utils.files import temporary_folder
@@ -100,7 +101,7 @@ def triangulate_model(
             db.write_matches(i + 1, j + 1, matched)
     with storing_in_database(database), clock("verify"):
         verification = pycolmap.TwoViewGeometryOptions()
-        verification.ransac.max_error = config.max_epipolar_error_px
+        verification.ransac.max_error = MAX_EPIPOLAR_ERROR_PX
         verification.ransac.random_seed = seed
         with quiet_colmap():
             pycolmap.guided_geometric_verification(
@@ -111,7 +112,7 @@ def triangulate_model(
         options.load_all_images = True
         options.triangulation.random_seed = options.mapper.random_seed = seed
         options.triangulation.ignore_two_view_tracks = not config.two_view_landmarks
-        options.triangulation.min_angle = options.mapper.filter_min_tri_angle = config.min_triangulation_angle_deg
+        options.triangulation.min_angle = options.mapper.filter_min_tri_angle = MIN_TRIANGULATION_ANGLE_DEG
         with quiet_colmap("ERROR"):  # it warns of every image it cannot read colours from
             model = pycolmap.triangulate_points(model, str(database), str(folder), str(folder), options=options)
         model.transform(back)

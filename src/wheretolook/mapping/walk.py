@@ -10,7 +10,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from wheretolook.mapping.config import WalkConfig
+from wheretolook.mapping.config import (
+    CELL_M,
+    EYE_HEIGHT_VARIATION_M,
+    MAX_STEP_HEIGHT_M,
+    PITCH_VARIATION_DEG,
+    SWING_PERIOD,
+    VISIT_RADIUS_M,
+    WalkConfig,
+)
 from wheretolook.utils.errors import ConfigError, SceneError
 
 Float = NDArray[np.float64]
@@ -88,7 +96,7 @@ def plan_walk(
     rng = np.random.default_rng(seed)
     places = _reachable_places(free_space, np.asarray(bounds, dtype=np.float64), config)
     start = int(rng.integers(len(places.eyes)))
-    radius_m = config.visit_radius_m
+    radius_m = VISIT_RADIUS_M
     while True:
         corners, coverage = _visit(places, start, radius_m, config.coverage)
         path = places.eyes[corners]
@@ -107,11 +115,11 @@ def _length_m(path: Float) -> float:
 def _reachable_places(free_space: FreeSpaceQueries, bounds: Float, config: WalkConfig) -> _Places:
     """The largest connected set of places, found on every storey of the scene."""
     low, high = bounds
-    nx, ny = np.maximum(np.ceil((high - low)[:2] / config.cell_m).astype(int), 1)
+    nx, ny = np.maximum(np.ceil((high - low)[:2] / CELL_M).astype(int), 1)
     heights = np.arange(low[2] + config.eye_height_m, high[2] + config.eye_height_m, 1.0)
     i, j, h = np.meshgrid(np.arange(nx), np.arange(ny), np.arange(len(heights)), indexing="ij")
     cell = np.stack([i.ravel(), j.ravel()], axis=1)
-    probes = np.column_stack([low[:2] + (cell + 0.5) * config.cell_m, heights[h.ravel()]])
+    probes = np.column_stack([low[:2] + (cell + 0.5) * CELL_M, heights[h.ravel()]])
     floor = np.asarray(free_space.floor_below(probes), dtype=np.float64)
     found = np.isfinite(floor)
     # Several probes of a cell may find the same floor: keep one place for each floor of each cell.
@@ -133,7 +141,7 @@ def _reachable_places(free_space: FreeSpaceQueries, bounds: Float, config: WalkC
     middle = (eyes[a] + eyes[b]) / 2
     below = middle[:, 2] - config.eye_height_m - np.asarray(free_space.floor_below(middle), dtype=np.float64)
     drop = np.column_stack([eyes[a, 2] - eyes[b, 2], below])
-    near = (np.abs(drop) <= config.max_step_height_m).all(1)  # False where there is no floor (NaN)
+    near = (np.abs(drop) <= MAX_STEP_HEIGHT_M).all(1)  # False where there is no floor (NaN)
     a = a[near]
     b = b[near]
     if len(a):
@@ -148,7 +156,7 @@ def _reachable_places(free_space: FreeSpaceQueries, bounds: Float, config: WalkC
     if len(members) < 2:
         problem = "no two neighbouring places of the floor are joined by a free step"
         fix = "Lower cell_m or the clearance of free space."
-        raise SceneError(problem, value=f"cell {config.cell_m} m", fix=fix)
+        raise SceneError(problem, value=f"cell {CELL_M} m", fix=fix)
     return _Places(eyes[members], steps[members][:, members])
 
 
@@ -217,15 +225,15 @@ def _along(path: Float, n_images: int, rng: np.random.Generator) -> tuple[Float,
 
 def _vary_height(free_space: FreeSpaceQueries, positions: Float, config: WalkConfig, rng: np.random.Generator) -> Float:
     varied = positions.copy()
-    varied[:, 2] += config.eye_height_variation_m * rng.uniform(-1, 1, len(positions))
+    varied[:, 2] += EYE_HEIGHT_VARIATION_M * rng.uniform(-1, 1, len(positions))
     free = np.asarray(free_space.segments_are_free(positions, varied), dtype=bool)
     return np.where(free[:, None], varied, positions)
 
 
 def _swing(headings: Float, config: WalkConfig, rng: np.random.Generator) -> Float:
     n = len(headings)
-    phase = 2 * np.pi * (np.arange(n) / config.swing_period + rng.uniform())
+    phase = 2 * np.pi * (np.arange(n) / SWING_PERIOD + rng.uniform())
     yaw = np.arctan2(headings[:, 1], headings[:, 0])
     yaw = yaw + np.radians(config.swing_deg * np.sin(phase) + rng.normal(0, 5, n))
-    pitch = np.radians(config.pitch_deg + config.pitch_variation_deg * rng.uniform(-1, 1, n))
+    pitch = np.radians(config.pitch_deg + PITCH_VARIATION_DEG * rng.uniform(-1, 1, n))
     return np.column_stack([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])

@@ -48,7 +48,7 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
         return _map_photographs(experiment, say, tick)
     dataset = dataset_after(experiment, "scenes")
     apart = ("photographs", "existing", "camera", "draw_camera")  # the camera follows by itself
-    settings = {name: value for name, value in _record(experiment.map).items() if name not in apart}
+    settings = {name: value for name, value in experiment.map.record().items() if name not in apart}
     for files in dataset.scenes:
         scene = open_scene(experiment, dataset, files)
         seed = _seed(files)
@@ -79,11 +79,6 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
             say(f"{scene.name}: {found}, {off} -> {files.map}")
         tick(1)
     return dataset
-
-
-def _record(config: MapConfig) -> dict[str, Any]:
-    """Settings as they decide what a map is."""
-    return {**asdict(config), "extractor": config.extractor.record()}
 
 
 def _poses_of_recording(scene: SceneFolder, at_most: int) -> Float | None:
@@ -137,7 +132,7 @@ def _map_photographs(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
     if missing is not None:
         raise ConfigError("there is no such table", path=missing, fix="Check map.photographs.scale.")
     images = [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
-    used = [asdict(replace(settings, assume_metric=False)), experiment.map.extractor.record()]
+    used = [replace(settings, assume_metric=False).record(), experiment.map.extractor.record()]
     made_from = [images, [fingerprint(path) for path in tables]]
     key = cache_key("map", [*used, experiment.map.keep_database, _seed(scene), *made_from])
     if not scene.stage_cache("map", key).is_current(scene.landmarks, scene.mapping_cameras):
@@ -190,7 +185,7 @@ def _map_existing(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
     stats = [(path, path.stat()) for path in files if path.is_file()]
     made_from = [(str(path), stat.st_size, stat.st_mtime_ns) for path, stat in stats]
     mesh = [] if settings.mesh is None else [mesh_fingerprint(settings.mesh)]
-    chosen = {name: value for name, value in _record(experiment.map).items() if name not in ("camera", "draw_camera")}
+    chosen = {name: value for name, value in experiment.map.record().items() if name not in ("camera", "draw_camera")}
     key = cache_key("map", [chosen, _seed(scene), made_from, mesh])
     if scene.stage_cache("map", key).is_current(
         scene.landmarks, scene.mapping_cameras, *([scene.mesh] if mesh else [])

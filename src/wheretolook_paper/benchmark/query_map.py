@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.geometry.camera import PinholeCamera, cameras_by_id
 from wheretolook.mapping.colmap_model import colmap_poses, read_model, write_model
-from wheretolook.mapping.config import MapConfig
+from wheretolook.mapping.config import PARTNERS, MapConfig
 from wheretolook.mapping.rendered_map import (
     LANDMARKS_FILE,
     Clock,
@@ -58,7 +58,7 @@ def build_query_map(
     depth: list[NDArray[np.float32]] = []
     for start in range(0, len(poses), _RENDER_BATCH):
         depth.extend(shrink_depth(renderer.render(DRAWN_CAMERA, poses[start : start + _RENDER_BATCH]).depth_m))
-    pairs = choose_pairs(surface_overlap(DRAWN_CAMERA, poses, np.stack(depth)), config.partners)
+    pairs = choose_pairs(surface_overlap(DRAWN_CAMERA, poses, np.stack(depth)), PARTNERS)
     with WorkerPool(workers) as processes:
         images = _read(files, camera)
         found = extract_with_colors(

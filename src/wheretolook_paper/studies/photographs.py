@@ -47,7 +47,7 @@ from wheretolook.holdout.photo_map import PhotographedMap, open_map, says_metric
 from wheretolook.holdout.report import place_radius
 from wheretolook.holdout.scores import Scoring
 from wheretolook.mapping.colmap_model import colmap_poses, holds_model
-from wheretolook.mapping.config import MapConfig, PhotographsConfig
+from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG, MapConfig, PhotographsConfig
 from wheretolook.mapping.photograph_map import map_photographs
 from wheretolook.mapping.photographs import SUFFIXES
 from wheretolook.mapping.scale import fit_similarity
@@ -87,7 +87,7 @@ def triangulate(model: Any, database: Path) -> Any:
     options.image_names = [image.name for image in model.images.values()]
     options.triangulation.random_seed = options.mapper.random_seed = 0
     options.triangulation.ignore_two_view_tracks = not MAP.two_view_landmarks
-    options.triangulation.min_angle = options.mapper.filter_min_tri_angle = MAP.min_triangulation_angle_deg
+    options.triangulation.min_angle = options.mapper.filter_min_tri_angle = MIN_TRIANGULATION_ANGLE_DEG
     with tempfile.TemporaryDirectory() as folder, quiet_colmap("ERROR"):
         model = pycolmap.triangulate_points(model, str(database), folder, folder, options=options)
     model.update_point_3d_errors()

@@ -24,6 +24,7 @@ SMALL = {
     "queries": "--queries 4000 --processes 2",
     "robot": f"--weights {WEIGHTS} --landmarks 500 --directions 20 --repeats 2",
     "scorers": f"--weights {WEIGHTS} --landmarks 500 --locations 2 --directions 20 --repeats 1 --poses 2",
+    "select": "--landmarks 400 --waypoints 2 --repeats 1",
     "view": "--landmarks 400 --turns 2 --clients 1 --seconds 4",
     "viewpoint_map": "--landmarks 300 --voxels 4 --directions 20 --repeats 1 --builds 1 --queries 100 --waypoints 5",
 }

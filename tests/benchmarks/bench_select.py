@@ -1,7 +1,7 @@
 """Measure `wheretolook select` as a process, start-up and reading of the map included: wall and CPU time.
 
-    python tests/benchmarks/bench_select.py --landmarks 25000 --waypoints 20 --repeats 5
-    python tests/benchmarks/bench_select.py --landmarks 100000 --waypoints 1000 --cold
+python tests/benchmarks/bench_select.py --landmarks 25000 --waypoints 20 --repeats 5
+python tests/benchmarks/bench_select.py --landmarks 100000 --waypoints 1000 --cold
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-
 from common import SIDE_M, write_model
 
 

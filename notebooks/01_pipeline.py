@@ -5,6 +5,8 @@
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -12,12 +14,11 @@
 # ---
 
 # %% [markdown]
-# # Where to look: the whole line in one picture
+# # The pipeline in one figure
 #
-# **Where should a camera point so that it knows where it is?** This notebook draws the answer on one apartment that the
-# network has never seen: the map, the viewpoints sampled in it, the view that is ranked best at each place, and one
-# camera that is turned accordingly. It needs nothing but the release that ships, `data/release`, and runs in about a
-# minute.
+# **Where should a camera point so that it knows where it is?** One apartment that is not part of the training set: its
+# map, the sampled viewpoints, the best view at each location, and one selected camera. Needs only the bundled release,
+# `data/release`; about a minute.
 
 # %%
 # %matplotlib inline
@@ -32,8 +33,8 @@ from wheretolook_paper.release.showcase import open_showcase
 from wheretolook_paper.release.showcase_figures import peaks_of, pipeline_of
 
 # %% [markdown]
-# The release holds landmarks, viewpoints and labels, but no meshes: the apartment is generated anew from its seed. That
-# it is the same one is checked by its lines of sight, which must be those stored with the labels.
+# The release contains landmarks, viewpoints and labels, but no meshes: the apartment is generated again from its seed,
+# and its lines of sight are checked against those stored with the labels.
 
 # %%
 release = open_release()
@@ -41,8 +42,8 @@ showcase = open_showcase(release, "apartment-210")
 Markdown(showcase.summary())
 
 # %% [markdown]
-# The scorer that ships knows the landmarks and the pose, never the image. It has learnt from 32 other scenes:
-# apartments, halls, offices, courts, and buildings whose rooms repeat.
+# The bundled scorer sees landmarks and pose, never the image. It is trained on 32 other scenes: apartments, halls,
+# offices, courts, and buildings with repeated rooms.
 
 # %%
 scorer = load_scorer(release.root / "weights", showcase.localization_map)
@@ -51,31 +52,30 @@ location = showcase.instructive_location()
 # %% [markdown]
 # ## From map to camera
 #
-# Four times the same rooms, seen from above with the ceiling and the near walls taken away.
+# The same rooms four times, seen from above without ceiling and near walls.
 #
-# - **a** The mapping cameras (blue) walked through three rooms and never entered the fourth, the bedroom: no landmark
-#   (orange) is there.
-# - **b** Cameras could stand anywhere in free space and look anywhere. One layer of locations is shown, with 32 of the
-#   500 directions of each.
-# - **c** The best view of each location. In the mapped rooms there is one almost everywhere; in the bedroom there is
-#   hope only beside the door, and the network knows it.
-# - **d** The camera at a place where half of all views fail, turned to its best view, what it sees from there, and
-#   what came of localizing that image.
+# - **a** The mapping cameras (blue) visited three rooms and not the fourth, the bedroom, which has no landmarks
+#   (orange).
+# - **b** Viewpoints: one layer of locations in free space, with 32 of the 500 directions of each.
+# - **c** The best view at each location. In the mapped rooms nearly every location has one; in the bedroom only near
+#   the door, and the predicted probability is low elsewhere.
+# - **d** The camera at a location where half of all views fail, turned to its best view; its image; and the result of
+#   localizing it.
 
 # %%
 display(pipeline_figure(pipeline_of(showcase, scorer, location)))
 
 # %% [markdown]
-# ## One place, every direction
+# ## All directions at one location
 #
-# The same place in detail: each dot is a direction, light where the network expects the camera to be localized. Rings
-# and crosses tell what really came of views that were rendered and localized; the network was not told.
+# Each dot is a direction, light where the predicted probability is high. Rings and crosses mark rendered views that
+# localized or failed; the network has not seen them.
 
 # %%
 display(peaks_figure(*peaks_of(showcase, scorer, location)))
 
 # %% [markdown]
-# ## Turn it yourself
+# ## Interactive
 #
 # On a machine with a display, this opens the scene, its landmarks and the mapping cameras in Open3D's viewer:
 #

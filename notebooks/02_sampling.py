@@ -5,6 +5,8 @@
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -14,9 +16,8 @@
 # %% [markdown]
 # # Sampling viewpoints
 #
-# **Which viewpoints are worth asking about?** Locations are the centres of free voxels, directions a lattice on the
-# sphere, and of these the ones are kept that see most landmarks. This notebook shows all three steps (paper, Sec. 3.1
-# and 3.2) on a test apartment of the release.
+# Locations are the centres of free voxels, directions a lattice on the sphere, of which those with the most visible
+# landmarks are kept (paper, Sec. 3.1 and 3.2). Shown on a test apartment of the release.
 
 # %%
 # %matplotlib inline
@@ -30,7 +31,7 @@ from wheretolook_paper.release.showcase import open_showcase
 from wheretolook_paper.release.showcase_figures import sampling_of
 
 # %% [markdown]
-# An apartment of the release, generated anew from its seed; a place in it where half of all views fail.
+# An apartment of the release, generated again from its seed, and a location where half of all views fail.
 
 # %%
 showcase = open_showcase(open_release(), "apartment-210")
@@ -39,34 +40,33 @@ location = showcase.instructive_location()
 # %% [markdown]
 # ## Voxels, directions, occlusion
 #
-# - **a** A layer of voxels at the height of eyes. Shaded ones are free: clear of walls and furniture, above a floor,
-#   inside the building. The star is the location that b and c are about.
-# - **b** Its 500 directions on the sphere: +x in the middle, +y halfway to the right, up above. The 100 that see most
-#   landmarks are kept, coloured by how many they see: towards the kitchen, and down at the floor in the doorway. The
-#   ceiling and the wall to the bedroom are dropped.
-# - **c** What decides it: landmarks with a free line of sight (orange) and hidden ones (blue). Through the doorway one
-#   sees a wedge of the kitchen; the bathroom is full of landmarks of which none can be seen.
+# - **a** A layer of voxels at eye height. Shaded voxels are free: clear of walls and furniture, above a floor, inside
+#   the building. The star is the location of b and c.
+# - **b** Its 500 directions on the sphere: +x in the middle, +y halfway to the right, up above. The 100 with the most
+#   visible landmarks are kept, coloured by their number: towards the kitchen, and down at the floor in the doorway.
+#   Ceiling and bedroom wall are dropped.
+# - **c** Unoccluded (orange) and occluded (blue) landmarks. A wedge of the kitchen is visible through the doorway; none
+#   of the bathroom's many landmarks is.
 
 # %%
 display(sampling_figure(sampling_of(showcase, location)))
 
 # %% [markdown]
-# ## Another place, another answer
+# ## Another location
 #
-# In the bathroom it is the other way round: its own landmarks are in sight now, those of the living room are hidden.
-# The directions that see most look at the wall with the door, and through it into the kitchen.
+# In the bathroom its own landmarks are unoccluded and those of the living room are not. The directions with the most
+# visible landmarks face the wall with the door and, through it, the kitchen.
 
 # %%
 bathroom = showcase.nearest_location([-2.5, 2.0, 1.5])
 display(sampling_figure(sampling_of(showcase, bathroom)))
 
 # %% [markdown]
-# ## Lattices of directions
+# ## Direction lattices
 #
-# Five hundred directions, three ways. The spherical Fibonacci lattice covers the sphere evenly. Equal steps of azimuth
-# and elevation crowd at the poles. The paper's printed formula is undefined for half of its indices, and its released
-# code uses the two angles on the wrong axes: directions crowd at two poles and leave holes, so that some direction lies
-# 20° from the nearest sampled one.
+# Three lattices of five hundred directions. The spherical Fibonacci lattice covers the sphere evenly. Equal steps of
+# azimuth and elevation crowd at the poles. The paper's printed formula is undefined for half of its indices, and its
+# released code puts the two angles on the wrong axes: directions crowd at two poles and leave gaps of up to 20°.
 
 # %%
 display(fibonacci_figure(500))

@@ -5,6 +5,8 @@
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -12,11 +14,11 @@
 # ---
 
 # %% [markdown]
-# # What the network is told
+# # Input features of the network
 #
-# **How does a view become an input?** Not as an image: a network that chooses views must answer before the camera has
-# turned. It is told where the landmarks of the map would appear. This notebook follows one view from the pose to the
-# 4,500 numbers of the paper's largest input (Sec. 3.3), and on through the network to its score.
+# The network selects views before the camera turns, so its input is not an image but the projected landmarks of the
+# map. This notebook follows one view from the pose to the 4,500 features of the paper's largest variant (Sec. 3.3) and
+# through the network to its score.
 
 # %%
 # %matplotlib inline
@@ -32,7 +34,7 @@ from wheretolook_paper.release.showcase import open_showcase
 from wheretolook_paper.release.showcase_figures import learning_of
 
 # %% [markdown]
-# An apartment of the release, generated anew from its seed, and the paper's network that ships.
+# An apartment of the release, generated again from its seed, and the bundled version of the paper's network.
 
 # %%
 release = open_release()
@@ -42,10 +44,9 @@ location = showcase.instructive_location()
 # %% [markdown]
 # ## Landmarks, bins, channels
 #
-# Left, the view that the paper's network likes best at this place, as the camera would see it, with the landmarks in
-# view; below, how many fall into each of 30 × 30 bins, dark for one, light for many. Right, what the three variants of
-# the network are told of each bin: the mean pixel (*u*, *v*), the depth *z* as well, or all three coordinates in the
-# camera's frame. The kitchen, far away, stands out in *z*.
+# Left, the highest-scored view at this location with its visible landmarks; below, their number in each of 30 × 30
+# bins, light for many. Right, the three input variants: the mean pixel (*u*, *v*) of each bin, with depth *z*, or all
+# three coordinates in the camera frame. The distant kitchen stands out in *z*.
 
 # %%
 mlp = load_scorer(release.root / "weights" / "mlp-2d+z.safetensors", showcase.localization_map)
@@ -53,9 +54,9 @@ learning = learning_of(showcase, mlp, location)
 display(inputs_figure(learning.image))
 
 # %% [markdown]
-# ## A view with little to go by
+# ## A view with few landmarks
 #
-# From the same place, towards the ceiling: next to nothing is left of the input.
+# From the same location towards the ceiling: the input is nearly empty.
 
 # %%
 worst = learning_of(showcase, mlp, location, best=False)
@@ -64,23 +65,22 @@ display(inputs_figure(worst.image))
 # %% [markdown]
 # ## Through the network
 #
-# The input is standardized by channel and goes through two hidden layers of 300 units. Nothing here is a cartoon: these
-# are the values that the shipped network computes for the two views above. Below the score stands how far off the pose
-# was when the image was localized.
+# The input is standardized by channel and passes two hidden layers of 300 units. Shown are the bundled network's actual
+# activations for the two views above, with the pose error of the localized image below the score.
 
 # %%
 display(learning_figure(*learning))
 
 # %% [markdown]
-# The view at the same place that it likes least:
+# The lowest-scored view at the same location:
 
 # %%
 display(learning_figure(*worst))
 
 # %% [markdown]
-# ## Its architecture
+# ## Architecture
 #
-# The paper's table of layers, read off the module itself.
+# The paper's table of layers, read from the module.
 
 # %%
 architecture_table(mlp.network).style.format(thousands=",").hide(axis="index")

@@ -16,9 +16,8 @@
 # %% [markdown]
 # # Training
 #
-# Does the network learn what it should, is there overfitting, do its probabilities mean what they say, and what does
-# it look at? What is shown comes from train runs in the tracking store: those of the release, logged now if they are
-# not there yet, and whatever you have trained yourself.
+# Learning curves, calibration, and what the network responds to, from training runs in the tracking store: those of the
+# release, logged now if they are missing, and your own.
 
 # %%
 # %matplotlib inline
@@ -33,8 +32,8 @@ tracking = open_store(release)
 # %% [markdown]
 # ## The network
 #
-# The paper's table 1 beside the layers trained here: three fully connected layers, with dropout between. The input is
-# 30 × 30 bins of the image, each with the mean of the landmarks in it: their pixel, and depth or position.
+# The paper's table 1 and the layers trained here: three fully connected layers with dropout. The input is 30 × 30 bins
+# of the image, each with the mean pixel of its landmarks, and depth or position.
 
 # %%
 from wheretolook.tracking.runs import newest_run
@@ -44,12 +43,11 @@ run = newest_run(tracking, "train", params={"dataset": release.name, "method": "
 paper_architecture_table(run.data.params).style.hide()
 
 # %% [markdown]
-# ## What was trained
+# ## Training runs
 #
-# The newest run of each method, on viewpoints of scenes that it has not learnt from: `set` on eight of all kinds,
-# looked at by many cameras, the others on one apartment. `set` looks at landmarks one by one and knows what they are
-# like; `mlp-2d`, `mlp-2d+z` and `mlp-2d+3d` are the paper's network, `mlp-released` is it as the paper's released code
-# trains it.
+# The newest run of each method, validated on scenes not used for training: `set` on eight scenes of all kinds with many
+# cameras, the others on one apartment. `set` processes individual landmarks with their attributes; `mlp-2d`, `mlp-2d+z`
+# and `mlp-2d+3d` are the paper's network, `mlp-released` is trained like the paper's released code.
 
 # %%
 from wheretolook_paper.release.training_histories import trained
@@ -59,9 +57,8 @@ trained(tracking, release.name).style.hide().format(precision=3, na_rep="–")
 # %% [markdown]
 # ## Learning curves
 #
-# Loss and average precision over the epochs, thin and dotted in training, thick in validation; a ring marks the epoch
-# whose weights were kept. Where the thick lines turn while the dotted ones go on, the network learns its scenes by
-# heart.
+# Loss and average precision by epoch, thin and dotted in training, thick in validation; a ring marks the selected
+# checkpoint. Diverging lines indicate overfitting.
 
 # %%
 from wheretolook_paper.figures.training import training_figure
@@ -74,11 +71,10 @@ display(training_figure(curves) if curves else Markdown(f"No run has a history y
 # %% [markdown]
 # ## Calibration
 #
-# Of all test viewpoints with about the same predicted probability, how many localize? On the dashed line as many as
-# predicted. The paper's network promises too much here, the set of landmarks a little too little. The reason is not
-# that either is too sure in general: the temperature T that divides its logits is fitted on the validation scene, and
-# comes out near 1. What is off is the difference between that scene and these two, which no single number mends; on a
-# map of one's own, `wheretolook adapt` learns it from the map's photographs. Below, how many viewpoints there are.
+# Of all test viewpoints with about the same predicted probability, the fraction that localizes; the dashed line is
+# perfect calibration. The paper's network is overconfident here, the set network slightly underconfident. Temperature
+# scaling, fitted on the validation scene, gives T near 1: the offset is between scenes, which one parameter cannot fix;
+# on your map `wheretolook adapt` calibrates with its photographs. Below, the number of viewpoints.
 
 # %%
 from wheretolook.evaluation.calibration import read_calibration
@@ -89,10 +85,10 @@ calibration = read_calibration(newest_artifact(tracking, "evaluate", "calibratio
 display(calibration_figure(calibration))
 
 # %% [markdown]
-# ## What the network looks at
+# ## What the network responds to
 #
-# **Does the network look where a person would?** Its score over the whole sphere of directions at one place, and the
-# rendered views behind the peaks and the pits. The network has seen none of these images: it knows landmarks and poses.
+# The score over the whole sphere of directions at one location, and rendered views at maxima and minima. The network
+# has seen none of these images.
 
 # %%
 from wheretolook import load_scorer
@@ -101,8 +97,8 @@ from wheretolook_paper.release.showcase import open_showcase
 from wheretolook_paper.release.showcase_figures import mistaken_location, peaks_of
 
 # %% [markdown]
-# The place is one of an apartment that none of them has learnt from, where half of all views fail. Its mesh is
-# generated anew from its seed to render what the camera sees.
+# A location in an apartment not used for training, where half of all views fail. Its mesh is generated again from its
+# seed to render the images.
 
 # %%
 showcase = open_showcase(release, "apartment-210")
@@ -111,10 +107,9 @@ location = showcase.instructive_location()
 # %% [markdown]
 # ### The paper's network
 #
-# Numbers mark the highest scores among views that were labelled, letters the lowest, none within 40° of another of its
-# kind. Rings localized within 5 cm and 0.4°, crosses did not. The peaks turn out to show shelves, chairs and a
-# patterned carpet, the pits a bare ceiling or a dim corner. Below each view stands how far off the pose was that was
-# found, if one was.
+# Numbers mark the highest scores among labelled views, letters the lowest, at least 40° apart. Rings localized within 5
+# cm and 0.4°, crosses did not. The maxima show shelves, chairs and a patterned carpet, the minima a bare ceiling or a
+# dim corner. Below each view is its pose error, if a pose was estimated.
 
 # %%
 mlp = load_scorer(release.root / "weights" / "mlp-2d+z.safetensors", showcase.localization_map)
@@ -123,9 +118,9 @@ display(peaks_figure(*peaks_of(showcase, mlp, location)))
 # %% [markdown]
 # ### The set network
 #
-# The scorer that ships also knows what each landmark is like: from where it was mapped, how often, how exactly. At the
-# same place it tells better what fails: on the left of the sphere there are landmarks enough to please the paper's
-# network, which only knows where they are, yet views do not localize.
+# The bundled scorer also uses landmark attributes: mapping directions and distances, track length, accuracy. At the
+# same location it predicts failures better: on the left of the sphere many landmarks are visible, which the paper's
+# network scores highly, yet the views do not localize.
 
 # %%
 scorer = load_scorer(release.root / "weights", showcase.localization_map)
@@ -134,15 +129,15 @@ display(peaks_figure(*peaks_of(showcase, scorer, location)))
 # %% [markdown]
 # ### Where they err
 #
-# The place where the probabilities of the paper's network are farthest from what happened, of all at the height of
-# eyes. Half of the sphere looks fine to it and fails.
+# The location at eye height with the largest error of the paper's predicted probabilities. Half of the sphere scores
+# well and fails.
 
 # %%
 mistaken = mistaken_location(showcase, mlp)
 display(peaks_figure(*peaks_of(showcase, mlp, mistaken)))
 
 # %% [markdown]
-# The set network at that place:
+# The set network at that location:
 
 # %%
 display(peaks_figure(*peaks_of(showcase, scorer, mistaken)))

@@ -16,9 +16,9 @@
 # %% [markdown]
 # # The paper's tables
 #
-# How well does each method choose where to look, and how sure is that? Both tables of the paper's experiments, with
-# intervals, beside the numbers it prints; then all methods at once, what each loses, and what occlusion has to do with
-# it. All from the newest evaluation in the tracking store; on a fresh clone that of the release is logged first.
+# Both tables of the paper's experiments with intervals and the published numbers; then all methods, their regret, and
+# the effect of occlusion. From the newest evaluation in the tracking store; on a fresh clone that of the release is
+# logged first.
 
 # %%
 # %matplotlib inline
@@ -35,18 +35,19 @@ tracking = open_store(release)
 # %% [markdown]
 # ## Table 2: all methods
 #
-# The best view of each location, at four limits of the error. *Ours* is the share of views that localize, in % of what
-# an oracle reaches, with its 95 % interval over locations; */0.527* the same share divided as the paper's released code
-# divides. Read down a column: the order of the methods is what can be compared, not the size of the numbers.
+# The best view of each location at four thresholds. *Ours* is the share of views that localize, in % of the oracle,
+# with its 95 % interval; */0.527* the same share divided as in the paper's released code. Compare the order of methods
+# within a column, not absolute numbers.
 
 # %%
 display(Markdown(NOTE))
 paper_styler(latest_paper_table(tracking, "vs_others", release.name))
 
 # %% [markdown]
-# ## Table 3: inputs of the network
+# ## Table 3: input variants
 #
-# In the paper depth brings four points at the finest limit. Here the three variants are within each other's intervals.
+# In the paper depth gains four points at the strictest threshold. Here the three variants are within each other's
+# intervals.
 
 # %%
 paper_styler(latest_paper_table(tracking, "input_variants", release.name))
@@ -54,9 +55,9 @@ paper_styler(latest_paper_table(tracking, "input_variants", release.name))
 # %% [markdown]
 # ## All methods
 #
-# The best view of each location at the finest and at the coarsest limit, the best method on top; arrows point to
-# methods beyond the axis. Those that know what landmarks are like lead at the finest limit; at the coarsest most are
-# alike. Of the rows of Fisher information the best three are shown; all numbers stand in the table at the end.
+# The best view of each location at the strictest and the loosest threshold, best method on top; arrows point to methods
+# beyond the axis. Methods with landmark attributes lead at the strictest threshold; at the loosest most are alike. The
+# best three Fisher information rows are shown; the final table has all.
 
 # %%
 from wheretolook.evaluation.results import latest_scores
@@ -66,27 +67,27 @@ scores = latest_scores(tracking, release.name)
 display(score_figure(scores))
 
 # %% [markdown]
-# ## What each method loses
+# ## Regret
 #
-# Left, how far a method stays behind the oracle; right, the difference to the set of landmarks on the same locations:
-# where the whisker crosses the dashed line, the two cannot be told apart.
+# Left, the distance to the oracle; right, the paired difference to the set network: methods whose whisker crosses the
+# dashed line do not differ significantly.
 
 # %%
 display(regret_figure(scores))
 
 # %% [markdown]
-# The same on six interiors made by others, never trained on: differences are larger, and the paper's network is ahead
-# of the bins.
+# Six interiors by other authors, not used for training: differences are larger, and the paper's network is ahead of the
+# bins.
 
 # %%
 display(regret_figure(latest_scores(tracking, "interiors")))
 
 # %% [markdown]
-# ## Seeing through walls
+# ## Without occlusion
 #
-# Discs with true occlusion, squares as if every method saw through walls, as the paper's released code does.
-# With the walls gone bins and the networks are above all rows of Fisher information, as in the paper, but bins above
-# the paper's network. What suffers most is what counts landmarks or sums up their information.
+# Discs with true occlusion, squares as if every method saw through walls, as in the paper's released code. Without
+# occlusion bins and networks are above all Fisher information rows, as in the paper, but bins above the paper's
+# network. Counting methods and summed information lose most.
 
 # %%
 from wheretolook_paper.figures.occlusion import occlusion_figure
@@ -94,9 +95,9 @@ from wheretolook_paper.figures.occlusion import occlusion_figure
 display(occlusion_figure(scores))
 
 # %% [markdown]
-# ## Everything in numbers
+# ## All numbers
 #
-# All that the evaluation tells; `results/scores.md` of the dataset holds the same.
+# The complete evaluation, also in `results/scores.md` of the dataset.
 
 # %%
 from wheretolook.evaluation.report import score_markdown

@@ -5,6 +5,8 @@
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -12,11 +14,11 @@
 # ---
 
 # %% [markdown]
-# # Several viewpoints of a location
+# # Several viewpoints per location
 #
-# **Is the fifth or tenth best view of a place still good?** A planner may not be able to take the best one. This is the
-# paper's figure "Multiple viewpoints results", from the newest evaluation in the tracking store; on a fresh clone that
-# of the release is logged first.
+# A planner may not be able to take the best view. Is the fifth or tenth still good? The paper's figure "Multiple
+# viewpoints results", from the newest evaluation in the tracking store; on a fresh clone that of the release is logged
+# first.
 
 # %%
 # %matplotlib inline
@@ -31,13 +33,12 @@ release = open_release()
 scores = latest_scores(open_store(release), release.name)
 
 # %% [markdown]
-# ## Two meanings of a score
+# ## Two measures
 #
-# Above, how many of the best N views are good, in % of what an oracle reaches: from left to right in a panel it changes
-# by a point or two, so a planner may nearly as well take the tenth best. Below, at how many locations one of N is good:
-# with ten tries the methods shown are within two points of the oracle's line, since most locations have many good
-# views, and random is within five.
-# The paper prints numbers for N = 1 alone, on other scenes: open grey marks.
+# Above, the fraction of positive views among the best N, in % of the oracle: it changes by one or two points, so the
+# tenth best is nearly as good. Below, the fraction of locations with a positive view among N: with ten views the
+# methods are within two points of the oracle and random within five, because most locations have many positive views.
+# The paper prints numbers for N = 1 only, on other scenes: open grey marks.
 
 # %%
 display(top_n_figure(scores))
@@ -45,16 +46,16 @@ display(top_n_figure(scores))
 # %% [markdown]
 # ## Other methods
 #
-# Any methods of the table can be drawn so: here those that weight landmarks by their chance of being found.
+# The same for methods that weight landmarks by detection probability.
 
 # %%
 expected = ["expected-inliers", "expected-bins", "fisher-trace-expected", "set", "random"]
 display(top_n_figure(scores, expected))
 
 # %% [markdown]
-# ## In numbers
+# ## Numbers
 #
-# Within 5 cm and 0.4°, in %: the share of good ones among the best N, and of locations with a good one among N.
+# Within 5 cm and 0.4°, in %: positive views among the best N, and locations with a positive view among N.
 
 # %%
 from wheretolook_paper.figures.top_n import top_n_table

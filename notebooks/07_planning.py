@@ -14,12 +14,11 @@
 # ---
 
 # %% [markdown]
-# # Planning: the same way, looked at differently
+# # Planning: the same path with other views
 #
-# **Does a robot that looks where its map is good know better where it is?** This notebook plans a path between two
-# places of an apartment three times, looking ahead, by Fisher information and by the set network (the paper's planning
-# figure); then it tells what came of twenty such pairs in each of eight scenes, where every view was rendered and
-# localized.
+# Does selecting views along a path improve localization? Three plans between two places of an apartment, looking ahead,
+# by Fisher information and by the set network (the paper's planning figure); then the results of twenty such pairs in
+# each of eight scenes, with every view rendered and localized.
 
 # %%
 # %matplotlib inline
@@ -37,10 +36,10 @@ from wheretolook_paper.release.notebook import open_release, open_store
 from wheretolook_paper.release.showcase import open_showcase
 
 # %% [markdown]
-# ## Three ways to look
+# ## Three methods
 #
-# A start and a goal in an apartment that the network has never seen. A path costs its length, its turns and, for every
-# metre, what its views lack in score.
+# Start and goal in an apartment not used for training. The cost of a path is its length, its rotation and, per metre,
+# the score its views lack.
 
 # %%
 release = open_release()
@@ -50,9 +49,8 @@ goal = [2.24, -2.12, 1.53]
 config = PlanConfig(grid=(8, 8, 4), directions=200, planner=PathConfig(time_s=6.0))
 
 # %% [markdown]
-# Each method has its own map of scores, eight by eight by four voxels with 200 directions each; the network's takes
-# half a minute on two cores. RRT* looks for a short path, and for places and views together; what costs least is
-# improved until time is up.
+# Each method has its own viewpoint map of 8 × 8 × 4 voxels with 200 directions; the network's takes half a minute on
+# two cores. RRT* searches a short path, and places and views jointly, and improves the cheapest within the time budget.
 
 # %%
 localization_map = showcase.localization_map
@@ -60,8 +58,8 @@ methods = ["forward", "fisher-trace-gp", "set"]
 paths = plan_by_methods(showcase, release, methods, start, goal, config)
 
 # %% [markdown]
-# From above, with an arrow for where the camera looks. All three go nearly the same way. Looking ahead, the camera ends
-# facing a corner that was hardly mapped; the other two keep turning to where the landmarks are.
+# From above, with arrows for the viewing directions. All three take nearly the same path. Looking ahead, the camera
+# ends facing a hardly mapped corner; the other two keep facing landmarks.
 
 # %%
 renderers = {"set": showcase.renderer}
@@ -69,20 +67,19 @@ views = {name: path_views(path, localization_map, renderers.get(name)) for name,
 display(methods_figure(views, localization_map.landmarks.points))
 
 # %% [markdown]
-# ## What the camera sees on its way
+# ## Images along the path
 #
-# Five views along the last path, with the landmarks in them, and the score all along it. The same as a film:
-# `wheretolook plan --film gif`.
+# Five views along the last path with their landmarks, and the score along it. As a film: `wheretolook plan --film gif`.
 
 # %%
 display(still_figure(views["set"], localization_map.landmarks.points, "apartment 210, set of landmarks"))
 
 # %% [markdown]
-# ## Does it help?
+# ## Results
 #
-# Views that localize within 0.25 m and 2°, with 95 % intervals over pairs of starts and goals. Left, each method chose
-# places and views; right, it chose the views along a path that was given, under the limit of 30° between waypoints,
-# exactly (filled) and by the greedy rule of the Active Localization Benchmark (open); looking ahead keeps to no limit.
+# Views that localize within 0.25 m and 2°, with 95 % intervals over pairs of start and goal. Left, places and views
+# planned; right, views along given paths with at most 30° between waypoints, exact (filled) and by the greedy rule of
+# the Active Localization Benchmark (open); looking ahead has no limit.
 
 # %%
 summary = pd.read_csv(newest_artifact(open_store(release), "paths", "paths.csv", release.name))

@@ -16,9 +16,9 @@
 # %% [markdown]
 # # Runtimes
 #
-# How long does it take to find out which of 24,919 landmarks every one of 500 directions at 648 locations sees? The
-# paper's figure of runtimes with this project's times beside it, from the newest benchmark in the tracking store; on a
-# fresh clone that of the release is logged first.
+# How long does it take to determine which of 24,919 landmarks are visible in each of 500 directions at 648 locations?
+# The paper's runtime figure with this project's times, from the newest benchmark in the tracking store; on a fresh
+# clone that of the release is logged first.
 
 # %%
 # %matplotlib inline
@@ -32,11 +32,11 @@ from wheretolook_paper.release.notebook import open_release, open_store
 tracking = open_store(open_release())
 
 # %% [markdown]
-# ## Against the paper
+# ## Compared with the paper
 #
-# The axis is logarithmic: each line is ten times the one before. Hatched bars are the paper's, on its machines; the
-# dotted one is the authors' released kernel on an H200. The NumPy twin does the same work in the plainest way, so that
-# the gain can be told from the machine's. Below, the whole check with occlusion, which the paper's times leave out.
+# Logarithmic axis. Hatched bars are the paper's, on its machines; the dotted one is the authors' released kernel on an
+# H200. The NumPy twin does the same work plainly, which separates the algorithm's gain from the machine's. Below, the
+# complete check with occlusion, which the paper's times exclude.
 
 # %%
 from wheretolook_paper.figures.runtimes import runtime_figure
@@ -45,9 +45,9 @@ times = pd.read_csv(newest_artifact(tracking, "benchmark", "runtimes.csv"))
 display(runtime_figure(times))
 
 # %% [markdown]
-# ## In numbers
+# ## Numbers
 #
-# Median, least and most seconds of repeated runs, and billions of projections a second that the counting stands for.
+# Median, minimum and maximum seconds of repeated runs, and the equivalent billions of projections per second.
 
 # %%
 from wheretolook_paper.figures.runtimes import runtime_table
@@ -55,11 +55,11 @@ from wheretolook_paper.figures.runtimes import runtime_table
 runtime_table(times).style.hide().format(precision=3)
 
 # %% [markdown]
-# ## On your machine
+# ## Your machine
 #
-# `python tests/benchmarks/bench_visibility.py --out mine.json` measures (add `--device cuda` for a GPU), and
-# `python tests/benchmarks/bench_visibility.py --draw mine.json --log` logs it: this notebook then shows that run.
-# With `--scaling` it measures how time and memory grow, too, which is drawn here if the store knows it.
+# `python tests/benchmarks/bench_visibility.py --out mine.json` measures (add `--device cuda` for a GPU), and `python
+# tests/benchmarks/bench_visibility.py --draw mine.json --log` logs the run shown here. `--scaling` also measures the
+# growth of time and memory, drawn here if logged.
 
 # %%
 from wheretolook.utils.errors import MissingRunError

@@ -5,6 +5,8 @@
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -14,9 +16,9 @@
 # %% [markdown]
 # # Your own map
 #
-# **How do I get from a COLMAP model to a camera that knows where to look?** In ten cells: read the model, load the
-# scorer that ships, build a viewpoint map, ask it, refine its answer, keep it. To have a model to try it on, three
-# small rooms are generated and mapped first; put the path of your own model in their place. It must be in metres, z up.
+# From a COLMAP model to camera views in ten cells: read the model, load the bundled scorer, build a viewpoint map,
+# query, refine and save it. Three small rooms are generated and mapped as an example; replace them by the path of your
+# model. It must be in metres, z up.
 
 # %%
 # %matplotlib inline
@@ -44,7 +46,7 @@ from wheretolook_paper.release.notebook import open_release
 # %% [markdown]
 # ## A map
 #
-# Put your own folder here. This one is made on the spot: a small apartment, photographed and mapped.
+# Use your own folder here. This example is generated: a small apartment, rendered and mapped.
 
 # %%
 folder = Path(mkdtemp())
@@ -54,8 +56,8 @@ print(*sorted(path.name for path in example.model.iterdir()), sep="\n")
 # %% [markdown]
 # ## Read the model
 #
-# A COLMAP folder, binary or text. With a mesh of the same rooms, landmarks behind walls are known to be hidden; without
-# one, `occlusion=HiddenPointRemoval()` guesses it from the landmarks alone.
+# A COLMAP folder, binary or text. With a mesh of the rooms occlusion is exact; without,
+# `occlusion=HiddenPointRemoval()` estimates it from the landmarks.
 
 # %%
 localization_map = LocalizationMap.from_colmap(example.model, mesh=example.scan)
@@ -64,7 +66,7 @@ print(f"{len(localization_map.landmarks):,} landmarks, {len(localization_map.map
 # %% [markdown]
 # ## Score any pose
 #
-# The best of the weights that ship. A score is the probability that a camera there localizes within 5 cm and 0.4°.
+# With the bundled weights. A score is the probability that the camera localizes within 5 cm and 0.4°.
 
 # %%
 scorer = load_scorer(open_release().root / "weights", localization_map)
@@ -73,8 +75,7 @@ scorer.score(poses_looking_along([[1.0, 0.5, 1.5]] * 2, [[0.0, 1.0, 0.0], [0.0, 
 # %% [markdown]
 # ## Build the viewpoint map
 #
-# Voxels of about half a metre, those that a camera can be in, 200 directions at each: every one is scored once and for
-# all.
+# Free voxels of about half a metre with 200 directions each, every one scored once.
 
 # %%
 mesh = load_mesh(example.scan)
@@ -83,8 +84,8 @@ grid = VoxelGrid.over(space.bounds, (10, 8, 4))
 views = build_viewpoint_map(scorer, grid, free_locations(grid, space), fibonacci_sphere(200), "fibonacci")
 
 # %% [markdown]
-# The best view of every free voxel of a layer, seen from above. Light ones will localize. Where all are dark, no turn
-# of the camera helps: the walk of the mapping camera has never been there.
+# The best view of every free voxel of a layer, seen from above. Light views are likely to localize. Where all are dark,
+# no direction helps: the mapping camera has not been there.
 
 # %%
 layer = views.locations[abs(views.locations[:, 2] - 1.5) < 0.33]
@@ -92,10 +93,10 @@ best = views.best_many(layer)
 display(ranked_figure(dollhouse(mesh, cut_m=1.5), layer, views.directions[best.direction_id], best.score))
 
 # %% [markdown]
-# ## Ask it
+# ## Query
 #
-# What a planner asks: the best view at a point, in microseconds; `best_n`, `best_in_cone` and `best_reachable` ask for
-# more. The place here is the one where the scorer is least sure of its best view.
+# The best view at a point, in microseconds; `best_n`, `best_in_cone` and `best_reachable` return more. The location
+# shown is the one with the lowest best score.
 
 # %%
 place = layer[abs(best.score - 0.5).argmin()]
@@ -105,23 +106,23 @@ print(choice)
 # %% [markdown]
 # ## Refine
 #
-# Between the directions of the lattice there may be a better one: a local search over the sphere, with the same scorer.
+# A local search over the sphere improves directions between those of the lattice, with the same scorer.
 
 # %%
 refined = refine_directions(scorer, [place], [choice.axis])
 print(f"{refined.start_scores[0]:.4f} on the lattice, {refined.scores[0]:.4f} after {refined.n_scored} more views")
 
 # %% [markdown]
-# And this is what the camera sees then:
+# The image of that view:
 
 # %%
 pose = poses_looking_along([place], refined.axes)
 Image.fromarray(WarpRenderer(mesh).render(localization_map.camera, pose).rgb[0])
 
 # %% [markdown]
-# ## Keep it
+# ## Save
 #
-# A folder of plain `.npy` files with a written layout, for planners in any language.
+# A folder of plain `.npy` files with a documented layout, for planners in any language.
 
 # %%
 views.save(folder / "viewpoint-map")

@@ -14,12 +14,12 @@
 # ---
 
 # %% [markdown]
-# # Several looks
+# # Several views from one location
 #
-# **Does it help a lost robot to look twice?** What one camera view finds may be wrong, with a hundred inliers, where a
-# map resembles itself. But a robot knows how far it turned between two looks, so their matches must agree on one pose.
-# This notebook maps a generated apartment, asks at twenty places for two looks, localizes each alone and both together,
-# and shows a place where it made the difference; then it shows what was measured on sixteen scenes.
+# In a map with repeated structure one view may localize at a wrong pose with a hundred inliers. A robot knows the
+# rotation between two views, so their matches must agree on one pose. This notebook maps a generated apartment, selects
+# two views at twenty locations, localizes each alone and both jointly, and shows a location where it matters; then the
+# results on sixteen scenes.
 
 # %%
 # %matplotlib inline
@@ -74,9 +74,9 @@ localization_map = LocalizationMap.from_colmap(folder / "map", mesh=folder / "sc
 localizer = Localizer(Landmarks.load(folder / "map" / "landmarks.npz"), camera)
 
 # %% [markdown]
-# ## Two looks at twenty places
+# ## Two views at twenty locations
 #
-# The places are drawn of all free ones about as high as a robot's camera.
+# Locations are drawn from free space at the height of a robot's camera.
 
 # %%
 grid = VoxelGrid.over(space.bounds, (14, 14, 8))
@@ -84,8 +84,8 @@ free = grid.centers()[free_locations(grid, space)]
 places = np.random.default_rng(3).choice(free[abs(free[:, 2] - 1.3) < 0.5], 20, replace=False)
 
 # %% [markdown]
-# At each, 100 directions are scored; two of them are chosen that are expected to localize best together. The one that
-# is best alone comes first.
+# At each, 100 directions are scored, and the two views with the highest joint probability are selected. The best single
+# view comes first.
 
 # %%
 scorer = load_scorer(open_release().root / "weights", localization_map)
@@ -99,7 +99,7 @@ def two_looks(place):
 
 
 # %% [markdown]
-# Each look is rendered and localized, alone and together with the other. How many places are right within 5 cm and
+# Each view is rendered and localized, alone and jointly. At how many locations is the pose correct within 5 cm and
 # 0.4°?
 
 # %%
@@ -110,17 +110,17 @@ right["both together"] = sum(story.together.right for story in stories)
 display(pd.Series(right, name=f"of {len(stories)} places").to_frame())
 
 # %% [markdown]
-# How sure the pose of both looks is, where it is right and where it is wrong.
+# Confidence of the joint pose, where it is correct and where it is not.
 
 # %%
 sure = pd.DataFrame([(story.together.right, story.together.chance) for story in stories], columns=["right", "sure"])
 display(sure.groupby("right").describe().round(2))
 
 # %% [markdown]
-# ## Where it makes the difference
+# ## Where it matters
 #
-# The place where the first look is most wrong and both together are right. Blue is where the camera is, dashed where it
-# believes to be; points in the images are the matches that agree with that.
+# The location where the first view is most wrong and the joint pose is correct. Solid: true pose; dashed: estimated
+# pose; points in the images: the matches that agree with it.
 
 # %%
 helped = [story for story in stories if story.together.right] or stories
@@ -128,10 +128,10 @@ shown = max(helped, key=lambda story: story.alone[0].error_m if np.isfinite(stor
 display(still_figure(shown, dollhouse(mesh, elevation_deg=62, cut_m=1.6)))
 
 # %% [markdown]
-# ## What was measured
+# ## Results
 #
-# Eight generated scenes on which choices were made, and eight on which none was, six of them by others. A second look
-# brings most; which of the good ones is taken hardly matters, that their poses are joined does. How: docs/looks.md.
+# Eight generated validation scenes and eight test scenes, six of them by other authors. A second view helps most; joint
+# localization matters more than which views are selected. Details: docs/looks.md.
 
 # %%
 display(looks_figure(pd.read_csv(open_release().root / "results" / "looks.csv")))

@@ -12,7 +12,6 @@ from scipy.optimize import minimize_scalar
 from scipy.special import expit
 
 from wheretolook.geometry.poses import Float
-from wheretolook.training.old_names import with_names
 from wheretolook.utils.probability import finite_log_odds
 
 Good = NDArray[np.bool_]  # whether each view localizes, (B,)
@@ -102,5 +101,5 @@ def _mean_loss(logits: Float, good: Good) -> float:
 
 
 def read_calibration(path: Path) -> pd.DataFrame:
-    """Reliability curves from the CSV file that the evaluate stage writes, in this version or an older one."""
-    return with_names(pd.read_csv(path, keep_default_na=False, na_values=[""]))
+    """Reliability curves from the CSV file that the evaluate command writes."""
+    return pd.read_csv(path, keep_default_na=False, na_values=[""])

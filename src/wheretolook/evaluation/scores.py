@@ -17,7 +17,6 @@ from wheretolook.evaluation.ranking import TestViews, TopN, choose_at_random, ch
 from wheretolook.geometry.poses import Float
 from wheretolook.scorers.registry import find
 from wheretolook.scorers.styles import ORACLE
-from wheretolook.training.old_names import with_names
 from wheretolook.utils.errors import ConfigError
 
 RELEASED_DIVISOR = 0.527
@@ -31,8 +30,8 @@ Choices = Mapping[tuple[str, int], TopN]  # what each method, the oracle too, ch
 
 
 def read_scores(path: Path) -> pd.DataFrame:
-    """A score table from its CSV file, of this version or an older one; see `score_table`."""
-    table = with_names(pd.read_csv(path, keep_default_na=False, na_values=[""]))
+    """A score table from its CSV file, see `score_table`."""
+    table = pd.read_csv(path, keep_default_na=False, na_values=[""])
     return table.assign(reference=table["reference"].fillna("")) if "reference" in table else table
 
 

@@ -20,7 +20,6 @@ from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.looks.selection import best_views
 from wheretolook.planning.map_file import ARRAYS, DESCRIPTION, REBUILD, read_map, write_map
-from wheretolook.training.old_names import name_of
 from wheretolook.utils.errors import ConfigError, MapFormatError
 
 if TYPE_CHECKING:
@@ -128,9 +127,6 @@ class ViewpointMap:
         Raises MapFormatError if there is no map, or it is damaged or of another version.
         """
         grid, origin, arrays = read_map(folder, mmap)
-        if "inputs" in origin:  # of a map built before methods had one name each
-            origin = {**origin, "scorer": name_of(origin["scorer"], origin["inputs"])}
-            del origin["inputs"]
         try:
             return cls(grid=grid, origin=MapOrigin(**origin), **arrays)
         except (TypeError, ValueError) as error:

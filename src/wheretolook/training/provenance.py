@@ -12,7 +12,6 @@ from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.names import RELEASE_FILE
 from wheretolook.features.sift import SIFT
 from wheretolook.training.config import DECIDING, SharedConfig
-from wheretolook.training.old_names import with_name
 from wheretolook.training.scenes import with_also
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.files import fingerprint, sha256
@@ -22,44 +21,42 @@ from wheretolook.utils.version import VERSION
 
 @dataclass(frozen=True)
 class TrainedModel:
-    """What training one method left."""
+    """The weights that training one method wrote."""
 
-    method: str  # its name
-    path: Path  # its weights
-    run_id: str  # its MLflow run, at the time of training; "" if it is not logged yet
-    # metrics of the epoch whose weights were kept, and that epoch's number (from 0) as "epoch"
-    metrics: dict[str, float]
-    reused: bool = False  # whether it was trained before and only found again
+    method: str
+    path: Path  # of the weights
+    run_id: str  # of its MLflow run; "" if it is not logged yet
+    metrics: dict[str, float]  # of the epoch whose weights are stored, numbered from 0 as "epoch"
+    reused: bool = False  # whether it was trained by an earlier run of the command
 
 
 def weights_path(dataset: Dataset, method: str) -> Path:
-    """Where the weights of a method lie in a dataset's folder; beside them `.json`, the record of their training."""
+    """Return the path of a method's weights in a dataset's folder; the record of training is `.json` beside it."""
     return dataset.root / "weights" / f"{method}.safetensors"
 
 
 def about_training(dataset: Dataset, method: str, config: SharedConfig, options: Any) -> dict[str, Any]:
-    """What decides which weights come out, as JSON values.
+    """Return all that decides which weights training gives, as JSON values.
 
-    The dataset comes with the scenes of others that are learnt from, see `with_also`; the options are the method's own,
-    a dataclass. What training starts from (`FittingConfig.starts_from`) decides, too.
+    The dataset includes the scenes of `train.also`, see `with_also`; `options` are the method's own, a dataclass.
     """
     shared = {name: value for name, value in asdict(config).items() if name in DECIDING}
-    seen = [scene for scene in dataset.scenes if scene.split != "test"]
+    scenes = [scene for scene in dataset.scenes if scene.split != "test"]
     cameras = dataset.cameras
     about: dict[str, Any] = {
         "dataset": dataset.name,
         "dataset_fingerprint": training_fingerprint(dataset),
-        "landmarks": {_name(scene, dataset): fingerprint(scene.landmarks) for scene in seen},
+        "landmarks": {_name(scene, dataset): fingerprint(scene.landmarks) for scene in scenes},
         "code_version": VERSION,
         "method": method,
-        # there may be thousands: the dataset's fingerprint tells which
+        # there may be thousands: the dataset's fingerprint covers them
         "camera": cameras[0].record() if len(cameras) == 1 else f"{len(cameras)} cameras",
         "config": {**asdict(options), **shared},
     }
     from wheretolook.mapping.landmarks import features_of
 
-    features = sorted({features_of(scene.landmarks) for scene in seen if scene.landmarks.is_file()})
-    if features not in ([], [SIFT.name]):  # weights that say nothing are for SIFT, as are all older ones
+    features = sorted({features_of(scene.landmarks) for scene in scenes if scene.landmarks.is_file()})
+    if features not in ([], [SIFT.name]):  # SIFT is the default and not recorded
         about["features"] = features
     if config.also:
         about["also"] = list(config.also)
@@ -72,32 +69,32 @@ def about_training(dataset: Dataset, method: str, config: SharedConfig, options:
 
 
 def _name(scene: SceneFolder, dataset: Dataset) -> str:
-    """Name of a scene, with that of its dataset if it is of another one."""
+    """Return the name of a scene, preceded by its dataset's if that is another one."""
     folder = scene.folder.parent
     return scene.name if folder == dataset.root else f"{folder.name}/{scene.name}"
 
 
 def trained_before(path: Path, about: Mapping[str, Any]) -> TrainedModel | None:
-    """The model at `path` if it was trained as `about` says and has not been changed since."""
+    """Return the model at `path` if its record equals `about` and its weights are unchanged; else None."""
     try:
         record = read_json_object(path.with_suffix(".json"))
-        if with_name(record["about"]) == about and record["weights_sha256"] == sha256(path):
+        if record["about"] == about and record["weights_sha256"] == sha256(path):
             return TrainedModel(about["method"], path, record["run_id"], record["metrics"], reused=True)
     except (OSError, ValueError, KeyError, TypeError):
-        pass  # no record, or a damaged one: train
+        pass
     return None
 
 
 def training_fingerprint(dataset: Dataset) -> str:
-    """16 hexadecimal digits that change with anything a network learns from: the train and val scenes."""
+    """Return 16 hexadecimal digits that change with the train and val scenes."""
     return Dataset(dataset.root, (*dataset.split("train"), *dataset.split("val"))).fingerprint()
 
 
 def was_trained_on(dataset: Dataset, training: Mapping[str, Any]) -> bool:
-    """Whether weights with a record of training were trained on what a dataset, and others beside it, now hold.
+    """Return whether weights with a record of training were trained on what a dataset now holds.
 
-    Where another dataset that they learnt from is not at hand, the dataset's own scenes tell. A release may also ship
-    weights that have learnt from other datasets alone: of these there is nothing to compare.
+    If a dataset of `train.also` is not available, only the dataset's own scenes are compared. A release may ship
+    weights trained on other datasets alone, which count as trained on it.
     """
     if (dataset.root / RELEASE_FILE).is_file() and training.get("dataset", dataset.name) != dataset.name:
         return True
@@ -105,7 +102,7 @@ def was_trained_on(dataset: Dataset, training: Mapping[str, Any]) -> bool:
     if also and not all((dataset.root.parent / name / "dataset.json").is_file() for name in also):
         return bool(training.get("own_fingerprint") == training_fingerprint(dataset))
     try:
-        together = with_also(dataset, also)
+        complete = with_also(dataset, also)
     except (TableError, ConfigError):
-        return False  # what lies there now cannot have been learnt from
-    return bool(training.get("dataset_fingerprint") == training_fingerprint(together))
+        return False
+    return bool(training.get("dataset_fingerprint") == training_fingerprint(complete))

@@ -1,4 +1,4 @@
-"""A trained network with all that is needed to use it again, on disk and back."""
+"""A trained network with what is needed to score with it, saved to a weights file and loaded."""
 
 from __future__ import annotations
 
@@ -12,27 +12,26 @@ import torch
 from torch import Tensor, nn
 
 from wheretolook.geometry.camera import Camera, camera_of_record
-from wheretolook.training.old_names import name_of_header
 from wheretolook.training.training_range import TrainingRange
-from wheretolook.training.weights import check_serves, read_weights, write_weights
+from wheretolook.training.weights import check_method_of_weights, read_weights, write_weights
 from wheretolook.utils.errors import ConfigError, WeightsError
 
 
 class StoredNetwork(nn.Module, ABC):
-    """A network that can be built anew from what it tells of itself."""
+    """A network that is rebuilt from its description and its state."""
 
     @abstractmethod
     def description(self) -> dict[str, Any]:
-        """All that defines the network but its weights, as JSON values."""
+        """Return all that defines the network but its weights, as JSON values."""
 
     @classmethod
     @abstractmethod
     def of_description(cls, stored: Mapping[str, Any]) -> Self:
-        """The untrained network with this description; a WeightsError if it asks for what is not known here."""
+        """Build the untrained network of a description; a WeightsError if it names unknown inputs."""
 
     @property
     def stored(self) -> nn.Module:
-        """The part whose weights are stored."""
+        """The module whose state is stored."""
         return self
 
 
@@ -40,9 +39,9 @@ NetworkT = TypeVar("NetworkT", bound=StoredNetwork)
 
 
 class TrainedNetwork(Generic[NetworkT]):
-    """A network, the camera of its training views, and what calibrates its logits: scale * logit + offset.
+    """A network, the camera of its training views (None for several), and the calibration scale * logit + offset.
 
-    `training_range` says what the training views were like, if the file of weights tells.
+    `training_range` describes the training views; None if the weights do not store it.
     """
 
     def __init__(
@@ -62,11 +61,11 @@ class TrainedNetwork(Generic[NetworkT]):
         self.training_range = training_range
 
     def calibrated(self, logits: Tensor) -> Tensor:
-        """Calibrated log-odds of the network's logits, in the same shape and precision."""
+        """Return calibrated log-odds of the network's logits, in the same shape and precision."""
         return self.scale * logits + self.offset
 
     def save(self, path: Path, training: Mapping[str, Any] | None = None) -> None:
-        """Write one safetensors file, atomically, with JSON values on the training. Equal networks, equal bytes."""
+        """Write one safetensors file, atomically, with JSON values about the training in its header."""
         header = {
             **self.network.description(),
             "camera": None if self.camera is None else self.camera.record(),
@@ -81,15 +80,14 @@ class TrainedNetwork(Generic[NetworkT]):
     def load(
         cls, path: str | Path, network_class: type[NetworkT], *methods: str, device: str = "cpu"
     ) -> TrainedNetwork[NetworkT]:
-        """Read what `save` wrote for one of these methods, ready to score on a device (dropout off, no gradients).
+        """Load weights of one of these methods, ready to score on a device.
 
-        Raises a WeightsError if the file is missing, damaged, foreign, of another method, or unlike its description.
+        Raises a WeightsError if the file is missing, damaged, of another method, or does not fit its header.
         """
         tensors, header = read_weights(Path(path))
-        check_serves(path, header, *methods)
-        fix = f"Train again, or give other weights of {methods[0]}."
+        check_method_of_weights(path, header, *methods)
         try:
-            with torch.device("meta"):  # so that what is described is only made if it is as large as what is stored
+            with torch.device("meta"):  # build only a network as large as what is stored
                 expected = network_class.of_description(header).stored.state_dict()
             _check_sizes(expected, tensors)
             network = network_class.of_description(header)
@@ -98,23 +96,18 @@ class TrainedNetwork(Generic[NetworkT]):
             offset = float(header.get("offset", 0.0))
             if not (isfinite(scale) and isfinite(offset)):
                 raise ValueError(f"scale {scale} and offset {offset} are not finite")
-            known = TrainingRange.of_record(header["range"]) if "range" in header else None
-        except WeightsError as error:
-            raise WeightsError(error.problem, path=path, value=error.value, fix=error.fix or fix) from error
-        except (KeyError, TypeError, ValueError, IndexError, AttributeError, RuntimeError, ConfigError) as error:
-            raise WeightsError(f"damaged description in the header: {error}", path=path, fix=fix) from error
-        try:
+            training_range = TrainingRange.of_record(header["range"]) if "range" in header else None
             network.stored.load_state_dict(tensors)
-        except RuntimeError as error:
-            problem = f"the weights do not fit the network they describe: {error}"
-            raise WeightsError(problem, path=path, fix=fix) from error
-        found = network.to(device).requires_grad_(False)
-        return TrainedNetwork(name_of_header(header), found, camera, scale, offset, known)
+        except WeightsError as error:
+            raise WeightsError(error.problem, path=path, value=error.value, fix=error.fix) from error
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError, RuntimeError, ConfigError) as error:
+            raise WeightsError(f"damaged header: {error}", path=path, fix="Train again.") from error
+        network.to(device).requires_grad_(False)
+        return TrainedNetwork(header["method"], network, camera, scale, offset, training_range)
 
 
-def _check_sizes(expected: Mapping[str, Tensor], found: Mapping[str, Tensor]) -> None:
-    for name in sorted({*expected, *found}):
-        sizes = [tuple(tensors[name].shape) if name in tensors else None for tensors in (expected, found)]
+def _check_sizes(expected: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> None:
+    for name in sorted({*expected, *tensors}):
+        sizes = [tuple(side[name].shape) if name in side else None for side in (expected, tensors)]
         if sizes[0] != sizes[1]:
-            problem = f"the weights do not fit the network they describe: {name} is of size {sizes[1]}, not {sizes[0]}"
-            raise WeightsError(problem)
+            raise WeightsError(f"the weights do not fit their header: {name} is of size {sizes[1]}, not {sizes[0]}")

@@ -1,15 +1,15 @@
-"""Trained weights on disk: one safetensors file that also holds what the input must look like."""
+"""Read and write trained weights: one safetensors file with a JSON header, and a JSON record of the training beside."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from safetensors import SafetensorError, safe_open
 
-from wheretolook.training.old_names import name_of_header, with_name
 from wheretolook.utils.errors import WeightsError
 from wheretolook.utils.files import write_bytes
 from wheretolook.utils.reading import parse_json_object, read_json_object
@@ -17,18 +17,13 @@ from wheretolook.utils.reading import parse_json_object, read_json_object
 if TYPE_CHECKING:
     from torch import Tensor
 
-FORMAT_VERSION = 1  # version of the layout of the metadata
-MOST = 1e12
-"""What no finite weight exceeds in size. Places that adapted weights know have coordinates of a planet at most."""
-
-METADATA_KEY = "wheretolook"  # key of the JSON text in the header of the file
+FORMAT_VERSION = 1  # of the header
+METADATA_KEY = "wheretolook"  # of the header's JSON text in the safetensors metadata
+MAX_MAGNITUDE = 1e12  # of a finite weight; the coordinates that scene-adapted weights store are far below
 
 
 def write_weights(path: str | Path, method: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
-    """Write tensors and a description (JSON values) as one safetensors file, atomically. The same give the same bytes.
-
-    Of the description "camera" is that of the training views, "training" what is known of the training.
-    """
+    """Write tensors and a header of JSON values as one safetensors file, atomically; equal content, equal bytes."""
     from safetensors.torch import save
 
     text = json.dumps({"format_version": FORMAT_VERSION, **header, "method": method})
@@ -37,110 +32,97 @@ def write_weights(path: str | Path, method: str, tensors: Mapping[str, Tensor], 
     write_bytes(Path(path), save(content, metadata={METADATA_KEY: text}))
 
 
-def check_serves(path: str | Path, header: Mapping[str, Any], *methods: str) -> None:
-    """Raise a WeightsError unless the description of weights says that they serve one of these methods."""
-    found = name_of_header(header)
-    if found not in methods:
-        fix = f"Give weights of {methods[0]}, or train them."
-        raise WeightsError(f"these weights are not of {' or '.join(methods)}", path=path, value=found, fix=fix)
+def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the tensors of a weights file by name, and its header.
+
+    Raises a WeightsError if the file is missing, damaged, of another program or of another version.
+    """
+    header = read_header(path)
+    with _opened(path, "pt") as file:
+        names = file.keys()  # the file is no dict, whatever it looks like
+        tensors = {name: file.get_tensor(name) for name in names}
+    for name, tensor in tensors.items():
+        if not tensor.is_floating_point():
+            continue
+        if tensor.isnan().any():
+            raise WeightsError("these weights are not numbers (NaN)", path=path, value=name, fix="Train again.")
+        if (tensor[tensor.isfinite()].abs() > MAX_MAGNITUDE).any():
+            raise WeightsError("these weights are too large: they are damaged", path=path, value=name)
+    return tensors, header
+
+
+def read_header(path: Path) -> dict[str, Any]:
+    """Return the header of a weights file, without loading its tensors or torch; raises as `read_weights`."""
+    if not path.is_file():
+        raise WeightsError("there are no weights", path=path, fix="Run the train command first, or correct the path.")
+    with _opened(path, "np") as file:
+        metadata = file.metadata() or {}
+    if METADATA_KEY not in metadata:
+        fix = "Give weights that the train command wrote."
+        raise WeightsError("these weights were not written by wheretolook", path=path, fix=fix)
+    try:
+        header = parse_json_object(metadata[METADATA_KEY])
+    except ValueError as error:
+        raise WeightsError(f"damaged header: {error}", path=path, fix="Train again.") from error
+    if (version := header.get("format_version")) != FORMAT_VERSION:
+        problem = f"this version of wheretolook reads weights of format {FORMAT_VERSION}"
+        raise WeightsError(problem, path=path, value=version, fix="Install the version that wrote them.")
+    if not isinstance(header.get("training", {}), dict) or not isinstance(header.get("method"), str):
+        raise WeightsError("damaged header: no method, or training is no object", path=path, fix="Train again.")
+    return header
+
+
+@contextmanager
+def _opened(path: Path, framework: str) -> Iterator[Any]:
+    try:
+        with safe_open(path, framework=framework) as file:
+            yield file
+    except (SafetensorError, OSError) as error:
+        raise WeightsError(f"not a readable safetensors file: {error}", path=path, fix="Train again.") from error
+
+
+def check_method_of_weights(path: str | Path, header: Mapping[str, Any], *methods: str) -> None:
+    """Raise a WeightsError unless the header names one of these methods."""
+    if header["method"] not in methods:
+        problem = f"these weights are not of {' or '.join(methods)}"
+        raise WeightsError(problem, path=path, value=header["method"], fix=f"Give weights of {methods[0]}.")
+
+
+def method_of_weights(path: str | Path) -> str:
+    """Return the name of the method that weights are of, such as "mlp-2d+z" or "set"."""
+    return str(read_header(Path(path))["method"])
 
 
 def read_training(path: str | Path) -> dict[str, Any]:
-    """What the train stage has written into the header of weights about their training; see `read_weights`."""
-    return with_name(read_weights(Path(path))[1].get("training", {}))
+    """Return what the header of weights stores about their training."""
+    return dict(read_header(Path(path)).get("training", {}))
 
 
 def features_of_weights(path: str | Path) -> list[str]:
-    """Names of the features of the maps that weights have learnt from; see `read_weights`."""
+    """Return the names of the local features of the maps that weights were trained on."""
     return list(read_training(path).get("features", ["sift"]))
 
 
 def read_record(path: str | Path) -> dict[str, Any]:
-    """The record beside weights: "about", "weights_sha256", "run_id", "metrics". WeightsError if missing or damaged."""
+    """Return the JSON record beside weights: "about", "weights_sha256", "run_id", "metrics".
+
+    Raises a WeightsError if it is missing or damaged.
+    """
     beside = Path(path).with_suffix(".json")
     try:
         record = read_json_object(beside)
         float(record["metrics"]["val_average_precision"])
-        return record | {"about": with_name(record["about"])}
+        return record | {"about": dict(record["about"])}
     except (OSError, ValueError, TypeError, KeyError) as error:
         problem = f"the record of training is missing or damaged: {error}"
         raise WeightsError(problem, path=beside, fix="Train again.") from error
 
 
-def method_of_weights(path: str | Path) -> str:
-    """The name of the method that weights serve, such as "mlp-2d+z" or "set"; see `read_header`."""
-    return name_of_header(read_header(Path(path)))
-
-
 def preference(path: str | Path) -> tuple[bool, float]:
-    """What the best of several weights has most of: many cameras learnt with, then validation average precision.
+    """Return a key that sorts weights: trained with many cameras first, then by validation average precision.
 
-    Those that have learnt with many cameras come before all that know one: their precision is that on harder views.
-    Raises a WeightsError if the file or its record cannot be read.
+    The precision of those trained with many cameras is on harder views. Raises a WeightsError if the file or its record
+    cannot be read.
     """
     many = read_header(Path(path)).get("camera", "") is None
     return many, float(read_record(path)["metrics"]["val_average_precision"])
-
-
-def save_in_half(path: Path) -> None:
-    """Store weights in half precision, atomically, with the same description. Done again, nothing changes."""
-    tensors, header = read_weights(path)
-    if any(tensor.is_floating_point() and tensor.element_size() > 2 for tensor in tensors.values()):
-        halved = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in tensors.items()}
-        header.pop("format_version")
-        write_weights(path, name_of_header(header), halved, header)
-
-
-def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Tensors of a weights file by name, and the description in its header.
-
-    Raises a WeightsError if the file is missing, damaged, foreign or of another version.
-    """
-    header = read_header(path)
-    try:
-        with safe_open(path, framework="pt") as file:
-            names = file.keys()  # the file is no dict, whatever it looks like
-            tensors = {name: file.get_tensor(name) for name in names}
-    except (SafetensorError, OSError) as error:
-        raise _unreadable(path, error) from error
-    unknown = next((name for name, x in tensors.items() if x.is_floating_point() and bool(x.isnan().any())), None)
-    if unknown is not None:
-        raise WeightsError("these weights are not numbers (NaN)", path=path, value=unknown, fix="Train again.")
-    finite = {name: x[x.isfinite()] for name, x in tensors.items() if x.is_floating_point()}
-    large = next((name for name, x in finite.items() if bool((x.abs() > MOST).any())), None)
-    if large is not None:
-        raise WeightsError("these weights are too large: they are damaged", path=path, value=large, fix="Train again.")
-    return tensors, header
-
-
-def _unreadable(path: Path, error: Exception) -> WeightsError:
-    return WeightsError(f"not a readable safetensors file: {error}", path=path, fix="Train again.")
-
-
-def read_header(path: Path) -> dict[str, Any]:
-    """The description in the header of a weights file. Its tensors are not read, nor torch loaded.
-
-    Raises a WeightsError if the file is missing, damaged, foreign or of another version.
-    """
-    if not path.is_file():
-        raise WeightsError("there are no weights", path=path, fix="Run the train stage first, or correct the path.")
-    try:
-        with safe_open(path, framework="np") as file:
-            metadata = file.metadata() or {}
-    except (SafetensorError, OSError) as error:
-        raise _unreadable(path, error) from error
-    if METADATA_KEY not in metadata:
-        fix = "Give weights that the train stage wrote."
-        raise WeightsError("these weights were not written by wheretolook", path=path, fix=fix)
-    try:
-        header = parse_json_object(metadata[METADATA_KEY])
-    except ValueError as error:
-        raise WeightsError(f"damaged description in the header: {error}", path=path, fix="Train again.") from error
-    if (found := header.get("format_version")) != FORMAT_VERSION:
-        problem = f"this version of wheretolook reads weights of format {FORMAT_VERSION}"
-        fix = "Train again, or install the version that wrote them."
-        raise WeightsError(problem, path=path, value=found, fix=fix)
-    if not isinstance(header.get("training", {}), dict):
-        problem = "damaged description in the header: what is known of the training is no JSON object"
-        raise WeightsError(problem, path=path, value=header["training"], fix="Train again.")
-    return header

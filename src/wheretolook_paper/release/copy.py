@@ -139,7 +139,7 @@ def ship_weights(release: Dataset) -> Choice:
     The shelf is `weights/others/`, where no evaluation finds them. A matchability model stays where it is: methods that
     weight landmarks need it. Done again, nothing changes. Raises as `choose_weights_to_ship`.
     """
-    from wheretolook.training.weights import read_record, save_in_half
+    from wheretolook.training.weights import read_record
 
     choice = choose_weights_to_ship(release)
     folder = release.root / "weights"
@@ -148,9 +148,20 @@ def ship_weights(release: Dataset) -> Choice:
         for file in (path, path.with_suffix(".json")):
             os.replace(file, folder / SHELF / file.name)
     record = read_record(choice.network)
-    save_in_half(choice.network)
+    convert_to_float16(choice.network)
     write_json(choice.network.with_suffix(".json"), {**record, "weights_sha256": sha256(choice.network)})
     return choice
+
+
+def convert_to_float16(path: Path) -> None:
+    """Rewrite a weights file in half precision, with the same header; one in half precision stays as it is."""
+    from wheretolook.training.weights import read_weights, write_weights
+
+    tensors, header = read_weights(path)
+    if any(tensor.is_floating_point() and tensor.element_size() > 2 for tensor in tensors.values()):
+        halved = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in tensors.items()}
+        header.pop("format_version")
+        write_weights(path, header["method"], halved, header)
 
 
 def sizes(root: Path, weights: bool = True) -> dict[str, int]:

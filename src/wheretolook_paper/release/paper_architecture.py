@@ -9,7 +9,6 @@ from itertools import pairwise
 import pandas as pd
 
 from wheretolook.inputs.channels import PAPER_VARIANTS
-from wheretolook.training.old_names import name_of_variant
 
 
 def paper_architecture_table(params: Mapping[str, str]) -> pd.DataFrame:
@@ -17,8 +16,7 @@ def paper_architecture_table(params: Mapping[str, str]) -> pd.DataFrame:
 
     A row for each layer: `layer` (its number in the paper's table), `paper` and `here`.
     """
-    method = params.get("method") or name_of_variant(params["variant"])
-    channels = PAPER_VARIANTS[method.removeprefix("mlp-")]
+    channels = PAPER_VARIANTS[params["method"].removeprefix("mlp-")]
     bins = int(params["bins"])
     widths = [len(channels) * bins**2, *map(int, ast.literal_eval(params["hidden"]))]
     here = []

@@ -12,7 +12,6 @@ import pandas as pd
 from wheretolook.dataset.layout import Dataset
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import AUC, artifact, finished_runs
-from wheretolook.training.old_names import name_of_variant, with_name, with_names
 from wheretolook.utils.errors import WeightsError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.reading import read_json_object
@@ -42,8 +41,7 @@ def kept_metrics(metrics: Mapping[str, float]) -> dict[str, float]:
 
 def method_of_run(run: Run) -> str:
     """The name of the method that a train run has trained."""
-    params = run.data.params
-    return str(params["method"]) if "method" in params else name_of_variant(params.get("variant", ""))
+    return str(run.data.params.get("method", ""))
 
 
 def train_runs(
@@ -97,7 +95,7 @@ def records(folder: Path) -> dict[Path, dict[str, Any]]:
     for path in sorted(folder.rglob("*.json")):
         try:
             record = read_json_object(path)
-            found[path] = record | {"about": with_name(record["about"])}
+            found[path] = record | {"about": dict(record["about"])}
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise WeightsError(f"not a record of training: {error}", path=path, fix="Train again.") from error
     return found
@@ -105,7 +103,7 @@ def records(folder: Path) -> dict[Path, dict[str, Any]]:
 
 def read_histories(path: Path) -> pd.DataFrame:
     """`TRAINING_CSV`; empty if there is none."""
-    return with_names(pd.read_csv(path)) if path.is_file() else pd.DataFrame({"method": []})
+    return pd.read_csv(path) if path.is_file() else pd.DataFrame({"method": []})
 
 
 def keep_histories(release: Dataset, tracking: TrackingConfig) -> pd.DataFrame:

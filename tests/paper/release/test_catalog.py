@@ -191,6 +191,6 @@ def test_layers_are_those_that_were_trained() -> None:
                                           "Sigmoid"]  # fmt: skip
     assert small["layer"].tolist() == ["1", "1.1", "1.2", "2", "2.1", "2.2", "3", "3.1"]
     assert small["here"].tolist()[5:] == ["", "", ""]
-    same = paper_architecture_table({"variant": "2d+3d", "bins": "30", "hidden": "(300, 300)", "dropout": "0.5"})
+    same = paper_architecture_table({"method": "mlp-2d+3d", "bins": "30", "hidden": "(300, 300)", "dropout": "0.5"})
     different = pd.Series(same["paper"] != same["here"])
     assert same.loc[different, "here"].tolist() == ["fully connected 4500 × 300"]

@@ -32,7 +32,6 @@ from wheretolook.stages.train import train_methods as train
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.training.data import load_views
 from wheretolook.training.trained_network import TrainedNetwork
-from wheretolook.training.weights import save_in_half
 from wheretolook.utils.errors import ConfigError, StorageError, TableError, WeightsError
 from wheretolook.utils.files import write_json
 from wheretolook.visibility.occlusion import StoredOcclusion
@@ -40,6 +39,7 @@ from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.commands.release import release_settings
 from wheretolook_paper.release import copy as releases
 from wheretolook_paper.release.card import release_card
+from wheretolook_paper.release.copy import convert_to_float16
 from wheretolook_paper.scorers.trees.config import TreesConfig
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
@@ -167,7 +167,7 @@ def test_a_release_scores_as_the_original(finished: Path, tmp_path: Path) -> Non
 
     halved = weights.with_name("half.safetensors")
     shutil.copyfile(weights, halved)
-    save_in_half(halved)
+    convert_to_float16(halved)
     assert halved.stat().st_size < 0.55 * weights.stat().st_size
     for name, value in load(halved).state_dict().items():
         np.testing.assert_allclose(value, load(weights).state_dict()[name], rtol=5e-4, atol=1e-7)

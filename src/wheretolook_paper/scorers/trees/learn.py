@@ -24,7 +24,7 @@ from wheretolook.training.fit import home_device
 from wheretolook.training.learner import Learnt, Task, class_counts, fit_platt
 from wheretolook.training.scenes import training_scenes
 from wheretolook.training.training_range import QUANTITIES, TrainingRange, camera_quantities, view_quantities
-from wheretolook.training.weights import check_serves, read_weights, write_weights
+from wheretolook.training.weights import check_method_of_weights, read_weights, write_weights
 from wheretolook.utils.errors import ConfigError, WeightsError
 from wheretolook_paper.scorers.trees.config import TreesConfig
 
@@ -112,7 +112,7 @@ class BoostedTrees:
     def load(cls, path: str | Path) -> BoostedTrees:
         """Read what `save` wrote; a WeightsError if it is missing, damaged, foreign or of another kind."""
         tensors, header = read_weights(Path(path))
-        check_serves(path, header, "trees")
+        check_method_of_weights(path, header, "trees")
         fix = "Train again, or give weights of trees."
         try:
             features = torch.tensor([POOLED.index(name) for name in header["features"]])

@@ -17,7 +17,7 @@
 # # Sampling viewpoints
 #
 # Locations are the centres of free voxels, directions a lattice on the sphere, of which those with the most visible
-# landmarks are kept (paper, Sec. 3.1 and 3.2). Shown on a test apartment of the release.
+# landmarks are kept. Sections 3.1 and 3.2 of the paper, shown on a test apartment of the release.
 
 # %%
 # %matplotlib inline

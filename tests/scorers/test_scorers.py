@@ -14,7 +14,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.bins import BinnedViews, InputStatistics
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
-from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber, pool
+from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scorers.adapted.network import AdaptedNetwork
 from wheretolook.scorers.base import Scorer
@@ -28,6 +28,7 @@ from wheretolook.training.landmark_views import AttributeStatistics
 from wheretolook.utils.errors import ConfigError, PoseError, WeightsError
 from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.scorers.conv.network import ConvNetwork, ConvSpec
+from wheretolook_paper.scorers.pooled_features import pool
 from wheretolook_paper.scorers.sphere.config import SphereConfig
 from wheretolook_paper.scorers.sphere.network import SphereNetwork
 from wheretolook_paper.scorers.trees.config import TreesConfig

@@ -17,7 +17,6 @@ from synthetic_dataset import CAMERA, make_dataset
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import is_good, poses
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.inputs.landmark_features import POOLED
 from wheretolook.scorers.mlp.network import ViewpointNetwork
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.stages.evaluate import evaluate_methods as evaluate
@@ -27,6 +26,7 @@ from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.weights import METADATA_KEY, method_of_weights, read_training
 from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, WeightsError
 from wheretolook.weights.resolve import load_scorer
+from wheretolook_paper.scorers.pooled_features import POOLED
 from wheretolook_paper.scorers.trees.config import TreesConfig
 from wheretolook_paper.scorers.trees.learn import BoostedTrees, PooledViews, fit_trees, load_pooled
 from wheretolook_paper.scorers.trees.score import TreesScorer

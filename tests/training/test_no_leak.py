@@ -14,7 +14,7 @@ from synthetic_dataset import make_dataset
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good, read_table, write_table
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.inputs.landmark_features import ATTRIBUTES, POOLED, LandmarkDescriber
+from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.matchability.config import MatchabilityConfig
@@ -23,6 +23,7 @@ from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.stages.train import train_methods as train
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.training.weights import read_weights
+from wheretolook_paper.scorers.pooled_features import POOLED
 from wheretolook_paper.scorers.trees.config import TreesConfig
 
 pytestmark = pytest.mark.usefixtures("no_pictures")

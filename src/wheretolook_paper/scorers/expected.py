@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from wheretolook.geometry.poses import Float, check_poses
-from wheretolook.inputs.landmark_features import LandmarkDescriber, ViewLandmarks, image_cells
+from wheretolook.inputs.landmark_features import LandmarkDescriber, ViewLandmarks
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scorers.landmark_scorer import LandmarkScorer
 from wheretolook.scorers.matchability.network import MatchabilityNetwork, expected_parts
@@ -19,6 +19,7 @@ from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.training_range import QUANTITIES, camera_quantities, view_quantities
 from wheretolook.utils.errors import ConfigError
 from wheretolook_paper.fisher.metrics import METRICS, metric_of
+from wheretolook_paper.scorers.pooled_features import image_cells
 
 BINS = 30  # bins along each side of the image, of which those expected to hold a found landmark are counted
 

@@ -16,7 +16,6 @@ from synthetic_dataset import CAMERA, make_landmarks, make_scene
 from wheretolook.dataset.layout import STAGES, Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_table import has_matches, read_table, write_table
 from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.inputs.landmark_features import POOLED
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.stages.preconditions import extractor_of
 from wheretolook.training.provenance import trained_before
@@ -24,6 +23,7 @@ from wheretolook.training.weights import METADATA_KEY, preference, read_training
 from wheretolook.visibility.occlusion import NoOcclusion, StoredOcclusion
 from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.release.copy import _manifest, read_about
+from wheretolook_paper.scorers.pooled_features import POOLED
 from wheretolook_paper.scorers.trees.learn import BoostedTrees
 
 _WEIGHTS = Path(__file__).parents[3] / "data" / "release" / "weights"

@@ -18,7 +18,7 @@ from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
 from wheretolook.dataset.viewpoint_table import is_good, poses
 from wheretolook.geometry.camera import Camera, camera_of_record
 from wheretolook.geometry.poses import Float
-from wheretolook.inputs.landmark_features import POOLED, LandmarkDescriber, pool
+from wheretolook.inputs.landmark_features import LandmarkDescriber
 from wheretolook.training.data import check_classes, labelled_rows, validation_views
 from wheretolook.training.fit import home_device
 from wheretolook.training.learner import Learnt, Task, class_counts, fit_platt
@@ -26,6 +26,7 @@ from wheretolook.training.scenes import training_scenes
 from wheretolook.training.training_range import QUANTITIES, TrainingRange, camera_quantities, view_quantities
 from wheretolook.training.weights import check_method_of_weights, read_weights, write_weights
 from wheretolook.utils.errors import ConfigError, WeightsError
+from wheretolook_paper.scorers.pooled_features import POOLED, pool
 from wheretolook_paper.scorers.trees.config import TreesConfig
 
 if TYPE_CHECKING:

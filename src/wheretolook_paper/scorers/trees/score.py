@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from wheretolook.geometry.poses import Float, check_poses
-from wheretolook.inputs.landmark_features import ATTRIBUTES, pool
+from wheretolook.inputs.channels import ATTRIBUTES
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scorers.base import BLOCK
 from wheretolook.scorers.landmark_scorer import LandmarkScorer
+from wheretolook_paper.scorers.pooled_features import pool
 from wheretolook_paper.scorers.trees.learn import BoostedTrees
 
 

@@ -1,4 +1,4 @@
-"""How a camera moved from view to view, as odometry tells it: with it, views along a way are parts of one rig."""
+"""Noisy odometry between consecutive views, which makes them parts of one camera rig."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import numpy as np
 from wheretolook.geometry.poses import Float, invert_poses, rotation_angle_deg
 
 
-def told_steps(cam_from_world: Float, m_per_m: float, deg_per_deg: float, rng: np.random.Generator) -> Float:
-    """Steps (W - 1, 3, 4) between consecutive views (W, 3, 4) along a way: each view's camera from that of the next.
+def noisy_steps(cam_from_world: Float, m_per_m: float, deg_per_deg: float, rng: np.random.Generator) -> Float:
+    """Return steps (W - 1, 3, 4) between views (W, 3, 4) along a path: each camera from the next, with noise.
 
-    Each is off by noise of its own: one standard deviation of the translation is `m_per_m` metres along each axis for
-    every metre of the step, of the rotation `deg_per_deg` degrees about each axis for every degree.
+    The standard deviation of the translation is `m_per_m` metres along each axis per metre of the step, that of the
+    rotation `deg_per_deg` degrees about each axis per degree.
     """
     from scipy.spatial.transform import Rotation
 
@@ -19,22 +19,22 @@ def told_steps(cam_from_world: Float, m_per_m: float, deg_per_deg: float, rng: n
     metres = np.linalg.norm(steps[:, :, 3], axis=1, keepdims=True)
     radians = np.radians(rotation_angle_deg(steps[:, :, :3], np.eye(3)))[:, None]
     shift = m_per_m * metres * rng.normal(size=(len(steps), 3))
-    turn = Rotation.from_rotvec(deg_per_deg * radians * rng.normal(size=(len(steps), 3))).as_matrix()
-    return np.concatenate([turn @ steps[:, :, :3], (steps[:, :, 3] + shift)[..., None]], axis=2)
+    rotation = Rotation.from_rotvec(deg_per_deg * radians * rng.normal(size=(len(steps), 3))).as_matrix()
+    return np.concatenate([rotation @ steps[:, :, :3], (steps[:, :, 3] + shift)[..., None]], axis=2)
 
 
 def rig_of_last(steps: Float, view: int, n: int) -> Float:
-    """cam_from_rig (N, 3, 4) of a view along a way and up to n - 1 before it, the last first, by `told_steps`.
+    """Return cam_from_rig (N, 3, 4) of a view and up to n - 1 views before it, newest first, given `noisy_steps`.
 
-    The rig's frame is the view's own camera.
+    The rig's frame is the camera of the view.
     """
-    mounts: list[Float] = [np.eye(3, 4)]
+    cam_from_rig: list[Float] = [np.eye(3, 4)]
     for step in steps[max(0, view - n + 1) : view][::-1]:
-        mounts.append(chained(step, mounts[-1]))
-    return np.stack(mounts)
+        cam_from_rig.append(chained(step, cam_from_rig[-1]))
+    return np.stack(cam_from_rig)
 
 
 def chained(a: Float, b: Float) -> Float:
-    """Rigid transforms (..., 3, 4): first b, then a."""
+    """Compose rigid transforms (..., 3, 4): first b, then a."""
     rotation = a[..., :3] @ b[..., :3]
     return np.concatenate([rotation, a[..., :3] @ b[..., 3:] + a[..., 3:]], axis=-1)

@@ -1,4 +1,4 @@
-"""Results of a comparison of planned paths: the share of their views that localize, their lengths and turns."""
+"""Summary of compared paths: the share of views that localize, lengths and rotations; as a table and MLflow runs."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from wheretolook.dataset.thresholds import ALL
 from wheretolook.dataset.viewpoint_table import LOCALIZED
+from wheretolook.evaluation.bootstrap import ClusterBootstrap, divide
 from wheretolook.planning.config import FORWARD, PathsConfig
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import (
@@ -36,16 +36,18 @@ PATHS_PNG = "paths.png"
 
 
 def summarize_paths(paths: pd.DataFrame, views: pd.DataFrame, config: PathsConfig) -> pd.DataFrame:
-    """A row for each scene (and all of them), task and method, NaN where there is no data.
+    """Summarize paths and labelled views of all scenes: a row for each scene (and all of them), task and method.
 
-    `paths` and `views` are those of `wheretolook_paper.paths.path_comparison.ComparedPaths` of all scenes, with a column
-    `scene`, the views also with `status`, `error_m` and `error_deg`.
+    Args:
+        paths: those of `ComparedPaths` of all scenes, with a column `scene`.
+        views: likewise, with `status`, `error_m` and `error_deg`.
+        config: limits of the errors, and the resamples.
 
     Returns:
         `localized`, the share of all views that localize; `times_forward` and `times_forward_length`, the ratios of
-        this share and of the length to those of "forward", over the pairs that both could plan; 95 % intervals of the
+        this share and of the length to those of "forward", over the pairs planned by both; 95 % intervals of the
         first two by resampling pairs within scenes; `failures` to plan, `turn_deg_per_m`, and `promised`, the mean
-        score. Where `paths` tell `n_looks`, also `looks`, how many are taken at a place on average.
+        score. If `paths` have `n_looks`, also `looks`, the mean number of views at a waypoint. NaN without data.
     """
     near = (views["error_m"] < config.max_error_m) & (views["error_deg"] < config.max_error_deg)
     good = near & (views["status"] == LOCALIZED)
@@ -57,92 +59,69 @@ def summarize_paths(paths: pd.DataFrame, views: pd.DataFrame, config: PathsConfi
     rows = []
     for scene in [*scenes, *([ALL] if len(scenes) > 1 else [])]:
         here = table if scene == ALL else table[table["scene"] == scene]
-        draws = _draws(here, config)
         for task, of_task in here.groupby("task", sort=False):
-            forward = of_task[of_task["method"] == FORWARD]
+            forward = of_task[of_task["method"] == FORWARD].set_index(["scene", "pair"])
+            strata = forward.index.get_level_values("scene").map(scenes.index).to_numpy(np.int64)
+            pairs = forward.index.get_level_values("pair").to_numpy(np.int64)
+            bootstrap = ClusterBootstrap(pairs, config.resamples, config.seed, strata)
             for method, of_method in of_task.groupby("method", sort=False):
-                rows.append({"scene": scene, "task": task, "method": method, **_row(of_method, forward, draws)})
+                row = _row(of_method, forward, bootstrap)
+                rows.append({"scene": scene, "task": task, "method": method, **row})
     return pd.DataFrame(rows)
 
 
-def _draws(table: pd.DataFrame, config: PathsConfig) -> NDArray[np.int64]:
-    """How often each pair of `_pairs_of` is drawn, (resamples, P), with replacement within its scene."""
-    scene = _pairs_of(table).get_level_values("scene")
-    rng = np.random.default_rng(config.seed)
-    times = np.zeros((config.resamples, len(scene)), dtype=np.int64)
-    for name in dict.fromkeys(scene):
-        columns = np.flatnonzero(scene == name)
-        drawn = rng.integers(0, len(columns), (config.resamples, len(columns)))
-        for row, picks in enumerate(drawn):
-            np.add.at(times[row], columns[picks], 1)
-    return times
-
-
-def _pairs_of(table: pd.DataFrame) -> pd.MultiIndex:
-    return pd.MultiIndex.from_frame(table[["scene", "pair"]].drop_duplicates())
-
-
-def _row(of_method: pd.DataFrame, forward: pd.DataFrame, draws: NDArray[np.int64]) -> dict[str, Any]:
-    index = _pairs_of(forward)
-    method, base = (table.set_index(["scene", "pair"]).reindex(index) for table in (of_method, forward))
-    both = (method["planned"] & base["planned"]).fillna(False).to_numpy(bool)
-    counts, base_counts = (table[["good", "n"]].fillna(0).to_numpy() for table in (method, base))
-
-    def quotient(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
-        return np.divide(a, b, out=np.full(len(a), np.nan), where=b > 0)
-
-    def ratio(weights: NDArray[Any]) -> NDArray[Any]:
-        return quotient(*(quotient(*((weights * both) @ table).T) for table in (counts, base_counts)))
-
-    whole = np.ones((1, len(index)))
+def _row(of_method: pd.DataFrame, forward: pd.DataFrame, bootstrap: ClusterBootstrap) -> dict[str, Any]:
+    """Return the numbers of a method, given the rows of "forward" by scene and pair, and a bootstrap of these."""
+    method = of_method.set_index(["scene", "pair"]).reindex(forward.index)
+    both = (method["planned"] & forward["planned"]).fillna(False).to_numpy(bool)
+    good, n = method[["good", "n"]].fillna(0).to_numpy().T
+    base_good, base_n = forward[["good", "n"]].to_numpy().T
+    localized = bootstrap.ratios(good, n)
+    times = divide(bootstrap.ratios(good * both, n * both), bootstrap.ratios(base_good * both, base_n * both))
+    low, high = bootstrap.interval(np.stack([localized, times], axis=1))
     metres = float(of_method["length_m"].sum())
-    lengths = [table["length_m"].to_numpy()[both].sum() for table in (method, base)]
-    return {
+    lengths = [float(table["length_m"].to_numpy()[both].sum()) for table in (method, forward)]
+    row = {
         "pairs": len(of_method),
         "failures": int((~of_method["planned"]).sum()),
-        "views": int(counts[:, 1].sum()),
-        "localized": float(quotient(*(whole @ counts).T)[0]),
-        **_interval("localized", quotient(*(draws @ counts).T)),
-        "times_forward": float(ratio(whole)[0]),
-        **_interval("times_forward", ratio(draws)),
-        "times_forward_length": float(lengths[0] / lengths[1]) if lengths[1] else float("nan"),
+        "views": int(n.sum()),
+        "localized": float(localized[0]),
+        "localized_low": float(low[0]),
+        "localized_high": float(high[0]),
+        "times_forward": float(times[0]),
+        "times_forward_low": float(low[1]),
+        "times_forward_high": float(high[1]),
+        "times_forward_length": lengths[0] / lengths[1] if lengths[1] else float("nan"),
         "length_m": float(of_method["length_m"].mean()),
         "turn_deg_per_m": float(of_method["turn_deg"].sum() / metres) if metres else float("nan"),
         "promised": float(of_method["promised"].mean()),
-        **_looks(of_method),
     }
-
-
-def _looks(of_method: pd.DataFrame) -> dict[str, float]:
-    if "n_looks" not in of_method:
-        return {}
-    places = float(of_method["n_views"].sum())
-    return {"looks": float(of_method["n_looks"].sum()) / places if places else float("nan")}
-
-
-def _interval(name: str, draws: NDArray[Any]) -> dict[str, float]:
-    """Ends of the 95 % interval of the draws that are finite, by the names of their columns."""
-    known = draws[np.isfinite(draws)]
-    low, high = np.percentile(known, (2.5, 97.5)) if len(known) else (np.nan, np.nan)
-    return {f"{name}_low": float(low), f"{name}_high": float(high)}
+    if "n_looks" in of_method:
+        waypoints = float(of_method["n_views"].sum())
+        row["looks"] = float(of_method["n_looks"].sum()) / waypoints if waypoints else float("nan")
+    return row
 
 
 def path_markdown(summary: pd.DataFrame, config: PathsConfig) -> str:
-    """The summary as Markdown, a table for each task."""
+    """Format the summary of `summarize_paths` as Markdown, a table for each task."""
     limits = f"{config.max_error_m:g} m and {config.max_error_deg:g}°"
     text = [f"Share of the views along paths that localize within {limits}, in % [95 % interval over pairs]."]
     titles = {"planned": "Places and views planned", "given": "Views along a given path"}
     for task, rows in summary.groupby("task", sort=False):
         header = ["scene", "method", "localized", "times forward", "length / forward's", "turn, °/m", "not found"]
-        told = "looks" in rows
-        header += ["looks a place"] if told else []
+        with_looks = "looks" in rows
+        header += ["looks a place"] if with_looks else []
         lines = []
         for _, row in rows.iterrows():
             localized, low, high = (f"{100 * row[f'localized{end}']:.1f}" for end in ("", "_low", "_high"))
-            times, least, most = (f"{row[f'times_forward{end}']:.2f}" for end in ("", "_low", "_high"))
-            cells = [f"{localized} [{low}, {high}]", f"{times} [{least}, {most}]", f"{row['times_forward_length']:.2f}"]
+            times, times_low, times_high = (f"{row[f'times_forward{end}']:.2f}" for end in ("", "_low", "_high"))
+            cells = [
+                f"{localized} [{low}, {high}]",
+                f"{times} [{times_low}, {times_high}]",
+                f"{row['times_forward_length']:.2f}",
+            ]
             cells += [f"{row['turn_deg_per_m']:.0f}", f"{row['failures']}"]
-            cells += [f"{row['looks']:.2f}"] if told else []
+            cells += [f"{row['looks']:.2f}"] if with_looks else []
             lines.append([str(row["scene"]), str(row["method"]), *cells])
         text += [f"{titles[str(task)]}:", markdown_table(header, lines)]
     return "\n\n".join(text) + "\n"
@@ -151,12 +130,11 @@ def path_markdown(summary: pd.DataFrame, config: PathsConfig) -> str:
 def log_paths(
     params: Mapping[str, Any], summary: pd.DataFrame, results: Path, tracking: TrackingConfig, tags: Tags = None
 ) -> str:
-    """Log a comparison: a run with its files, and in it one for each task and method over all scenes.
+    """Log a comparison as a run with its files and a nested run for each task and method; return the run's id.
 
-    `params` describe the comparison, `summary` is of `summarize_paths`, `results` the folder of the files, of which
-    missing ones are left out. Returns the id of the run, which has the numbers of the method of whose planned paths the
-    largest share localizes. If the newest comparison of the dataset was of the same and found the same, nothing is
-    logged, and the id is that of its run.
+    `params` describe the comparison, `summary` is that of `summarize_paths`; files missing in the folder `results` are
+    skipped. The run has the numbers of the method with the largest share of localized views on its own paths. If the
+    newest comparison of the dataset has the same parameters and results, its id is returned and nothing is logged.
     """
     mark = fingerprint_of(params, summary.to_csv(index=False))
     if (known := logged_last(tracking, "paths", params["dataset"], mark, PATHS_CSV)) is not None:

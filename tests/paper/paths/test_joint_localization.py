@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from planning.rooms import CAMERA, room_landmarks
-from wheretolook.dataset.environment import Scene
-from wheretolook.dataset.layout import SceneFolder
 from wheretolook.dataset.viewpoint_table import pose_columns, poses
 from wheretolook.geometry.poses import pose_error, poses_looking_along, rotation_angle_deg
-from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator
+from wheretolook.localization.joint_labels import label_sets
 from wheretolook.planning.config import PathsConfig, StopConfig
 from wheretolook.utils.errors import ConfigError
-from wheretolook_paper.commands.joint_paths import KEY, OUTCOME, check_joint, localize_together
 from wheretolook_paper.figures.paths import paths_figure
-from wheretolook_paper.paths.odometry import chained, rig_of_last, told_steps
+from wheretolook_paper.paths.joint_localization import (
+    KEY,
+    OUTCOME,
+    check_joint,
+    joint_paths,
+    localize_last_views,
+    localize_stops,
+)
+from wheretolook_paper.paths.odometry import chained, noisy_steps, rig_of_last
 from wheretolook_paper.paths.path_comparison import ComparedPaths
 from wheretolook_paper.paths.path_report import path_markdown, summarize_paths
 
@@ -56,14 +61,6 @@ def seen(cam_from_world: np.ndarray, blind: np.ndarray, seed: int = 0) -> pd.Dat
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    files = SceneFolder(tmp_path_factory.mktemp("data") / "rooms" / "room", "test", CAMERA)
-    files.map.mkdir(parents=True)
-    LANDMARKS.save(files.landmarks)
-    return Scene(files, device="cpu")
-
-
-@pytest.fixture(scope="module")
 def compared() -> tuple[ComparedPaths, pd.DataFrame, pd.DataFrame, pd.DataFrame]:
     """The same way by two methods, with a stop at the blind place of one; paths, further looks, and labels of both."""
     pose = poses_looking_along(POSITIONS, AXES)
@@ -81,67 +78,37 @@ def compared() -> tuple[ComparedPaths, pd.DataFrame, pd.DataFrame, pd.DataFrame]
     return ComparedPaths(paths, views), further, labels, seen(aside, np.array([False]))
 
 
-def test_looks_of_a_stop_and_the_last_views_localize_where_one_view_does_not(
-    scene: Scene, compared: tuple, tmp_path: Path
-) -> None:
+def test_joint_views_localize_where_a_single_view_does_not(compared: tuple) -> None:
     single, further, labels, further_labels = compared
     near = (single.views["status"] == "localized") & (single.views["error_m"] < 0.25)
     assert near.tolist() == [number % 6 != BLIND for number in range(18)]
-    given = (scene, CONFIG, LocalizerConfig(), tmp_path)
-    found = localize_together(single, further, labels, further_labels, *given, ["a"])
-    assert list(dict.fromkeys(found.paths["method"])) == [
-        "set with stops",
-        "forward last 3 together",
-        "set last 3 together",
-    ]
-    assert found.views.groupby("method").size().to_dict() == dict.fromkeys(found.paths["method"], 6)
-    both = ComparedPaths(
-        pd.concat([single.paths.assign(n_looks=6), found.paths], ignore_index=True).assign(scene="room"),
-        pd.concat([single.views, found.views], ignore_index=True).assign(scene="room"),
-    )
-    table = summarize_paths(both.paths, both.views, CONFIG).set_index("method")
+    localize = partial(label_sets, points=LANDMARKS.points, cameras=CAMERA)
+    stops = localize_stops(single.views, further, pd.concat([labels, further_labels], ignore_index=True), localize)
+    last = localize_last_views(single.views, labels, CONFIG, localize)
+    names = ["set with stops", "forward last 3 together", "set last 3 together"]
+    paths = [joint_paths(single.paths, stops, further), joint_paths(single.paths, last, further.iloc[:0])]
+    assert pd.concat(paths)["method"].tolist() == names
+    all_paths = pd.concat([single.paths.assign(n_looks=6), *paths], ignore_index=True).assign(scene="room")
+    all_views = pd.concat([single.views, stops, last], ignore_index=True).assign(scene="room")
+    table = summarize_paths(all_paths, all_views, CONFIG).set_index("method")
     for name in ("forward", "set"):
         assert table.loc[name, "localized"] == pytest.approx(5 / 6) and table.loc[name, "looks"] == 1
         assert table.loc[f"{name} last 3 together", "localized"] == 1
     stopped = table.loc["set with stops"]
     assert stopped["localized"] == 1 and stopped["looks"] == pytest.approx(7 / 6)
     assert stopped["turn_deg_per_m"] == pytest.approx(175) and stopped["promised"] == pytest.approx((5 * 0.5 + 0.8) / 6)
-    stop = found.views[found.views["method"] == "set with stops"].set_index("waypoint")
+    stop = stops.set_index("waypoint")
     own = single.views[single.views["method"] == "set"].set_index("waypoint")
     pd.testing.assert_frame_equal(stop[OUTCOME].drop(BLIND), own[OUTCOME].drop(BLIND))
     assert stop.loc[BLIND, "error_m"] < 0.05 and stop.loc[BLIND, "score"] == 0.8
-    text = path_markdown(table.reset_index(), CONFIG)
-    assert "| looks a place |" in text and "| set with stops " in text
-    (axes,) = paths_figure(table.reset_index()).axes
-    assert "landmarks, with stops" in " ".join(axes.get_legend_handles_labels()[1]).lower()
-
-
-def test_what_was_localized_together_is_used_again(scene: Scene, compared: tuple, tmp_path: Path) -> None:
-    single, further, labels, further_labels = compared
-    config = replace(CONFIG, last_views=2)
-
-    def views(config: PathsConfig, made_from: str) -> tuple[pd.DataFrame, float]:
-        found = localize_together(
-            single, further, labels, further_labels, scene, config, LocalizerConfig(), tmp_path, [made_from]
-        )
-        return found.views, (tmp_path / "last-together.parquet").stat().st_mtime_ns
-
-    first = views(config, "a")
-    again = views(config, "a")
-    pd.testing.assert_frame_equal(first[0], again[0])
-    assert first[1] == again[1]
-    other = views(config, "b")
-    noisy = views(replace(config, odometry_m_per_m=0.2), "b")
-    assert again[1] < other[1] < noisy[1]
-    last = other[0]["method"].str.contains("last")
-    np.testing.assert_allclose(other[0][last]["error_m"], first[0][last]["error_m"], rtol=1e-6)
-    assert noisy[0][last]["error_m"].median() > other[0][last]["error_m"].median()
+    assert "| set with stops " in path_markdown(table.reset_index(), CONFIG)
+    assert paths_figure(table.reset_index()).axes
 
 
 def test_odometry_without_noise_is_the_way_itself() -> None:
     rng = np.random.default_rng(0)
     way = poses_looking_along(rng.uniform(-2, 2, (6, 3)), rng.normal(size=(6, 3)))
-    steps = told_steps(way, 0.0, 0.0, rng)
+    steps = noisy_steps(way, 0.0, 0.0, rng)
     for view, n in ((0, 3), (1, 3), (4, 3), (5, 6)):
         rig = rig_of_last(steps, view, n)
         assert len(rig) == min(n, view + 1)
@@ -152,8 +119,8 @@ def test_odometry_without_noise_is_the_way_itself() -> None:
 def test_odometry_is_off_by_a_share_of_each_step() -> None:
     way = poses_looking_along([(0, 0, 0), (2.0, 0, 0)], [(1, 0, 0), (np.cos(0.5), np.sin(0.5), 0)])
     rng = np.random.default_rng(1)
-    true = told_steps(way, 0, 0, rng)[0]
-    told = np.array([told_steps(way, 0.01, 0.02, rng)[0] for _ in range(1500)])
+    true = noisy_steps(way, 0, 0, rng)[0]
+    told = np.array([noisy_steps(way, 0.01, 0.02, rng)[0] for _ in range(1500)])
     np.testing.assert_allclose((told[:, :, 3] - true[:, 3]).std(0), 0.02, rtol=0.1)
     angle = rotation_angle_deg(told[:, :, :3], true[:, :3])
     assert np.sqrt((angle**2).mean()) == pytest.approx(np.sqrt(3) * 0.02 * np.degrees(0.5), rel=0.1)
@@ -168,13 +135,12 @@ def test_stops_are_refused_where_no_method_can(compared: tuple) -> None:
     assert len(poses(compared[1])) == 1
 
 
-def test_where_no_place_is_a_stop_nothing_changes(scene: Scene, compared: tuple, tmp_path: Path) -> None:
+def test_without_stops_nothing_changes(compared: tuple) -> None:
     single, further, labels, _ = compared
-    config = replace(CONFIG, last_views=1)
     nothing = pd.DataFrame(columns=further.columns[:8])
-    found = localize_together(
-        single, nothing, labels, pd.DataFrame(), scene, config, LocalizerConfig(), tmp_path, ["a"]
-    )
-    own = single.views[single.views["method"] == "set"].reset_index(drop=True)
-    pd.testing.assert_frame_equal(found.views.drop(columns="method"), own.drop(columns="method"))
-    assert found.paths[["method", "turn_deg", "n_looks"]].to_numpy().tolist() == [["set with stops", 0.0, 6]]
+    localize = partial(label_sets, points=LANDMARKS.points, cameras=CAMERA)
+    views = localize_stops(single.views, nothing, labels, localize)
+    own = single.views[single.views["method"] == "set"]
+    pd.testing.assert_frame_equal(views.drop(columns="method"), own.drop(columns="method"))
+    paths = joint_paths(single.paths, views, nothing)
+    assert paths[["method", "turn_deg", "n_looks"]].to_numpy().tolist() == [["set with stops", 0.0, 6]]

@@ -22,7 +22,7 @@ from wheretolook.utils.shipped import WEIGHTS, shipped
 from wheretolook.weights.resolve import resolve_weights
 
 LANDMARKS = room_landmarks(200)
-SHIPPED = Path(__file__).parents[2] / "data" / "release" / "weights"
+ACTLOC = Path(__file__).parents[2] / "data" / "release" / "weights"
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def test_the_papers_network_scores_for_its_field_of_view_alone(dataset: Path) ->
     weights = dataset / "data" / "release" / "weights"
     weights.mkdir(parents=True)
     for suffix in ("safetensors", "json"):
-        shutil.copy(SHIPPED / f"mlp-2d+z.{suffix}", weights)
+        shutil.copy(ACTLOC / f"mlp-2d+z.{suffix}", weights)
     rooms = Dataset.load(dataset / "data" / "rooms")
     assert resolve_weights(dataset=rooms) == weights / "mlp-2d+z.safetensors"
     narrow = tuple(replace(scene, camera=replace(CAMERA, focal_px=70.0)) for scene in rooms.scenes)
@@ -93,7 +93,7 @@ def test_the_best_weights_there_are_score(dataset: Path, capsys: pytest.CaptureF
     weights = dataset / "data" / "release" / "weights"
     weights.mkdir(parents=True)
     for suffix in ("safetensors", "json"):
-        shutil.copy(SHIPPED / f"set.{suffix}", weights)
+        shutil.copy(ACTLOC / f"set.{suffix}", weights)
     assert run(dataset, "--scene", "a") == 0
     assert "release/weights/set.safetensors" in capsys.readouterr().out
     folder = dataset / "data" / "rooms" / "a" / "viewpoint-map"

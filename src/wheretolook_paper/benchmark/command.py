@@ -43,7 +43,7 @@ METHODS (--methods)
   max-visibility             the same mended: angles in their order, elevation from level, upright
   any other                  `wheretolook evaluate --list-methods`
 
-AS SHIPPED AND MENDED
+AS ACTLOC AND ACTLOC_FIXED
   evaluate_plan.py joins errors to poses by row, though errors stand in the order of file names (1, 10, 2) and poses in
   that of waypoints; as shipped is what it computes on these files. Mended joins by id.
 
@@ -154,14 +154,14 @@ def _of_files(options: argparse.Namespace) -> list[Result]:
 def _of_scenes(options: argparse.Namespace) -> tuple[list[Result], list[str]]:
     from wheretolook.scorers.registry import check_method
     from wheretolook.utils.devices import usable_device
-    from wheretolook_paper.benchmark.actloc_baseline import SHIPPED
+    from wheretolook_paper.benchmark.actloc_baseline import ACTLOC
     from wheretolook_paper.benchmark.folder import BenchmarkScene
     from wheretolook_paper.benchmark.report import Result
     from wheretolook_paper.benchmark.round import BEST, RoundConfig, SceneRound
 
     methods = list(dict.fromkeys(options.methods))
     for method in methods:
-        if method not in (BEST, SHIPPED):
+        if method not in (BEST, ACTLOC):
             check_method(method)
     scenes = [BenchmarkScene.of(folder, options.mesh, options.waypoints) for folder in options.scenes]
     config = RoundConfig(
@@ -182,5 +182,5 @@ def _of_scenes(options: argparse.Namespace) -> tuple[list[Result], list[str]]:
             scores = one.run(method)
             if scores is not None:
                 results.append(Result(one.scene.name, one.folder_name(method), scores))
-        told += [f"{one.scene.name}: {line}" for line in one.told]
+        told += [f"{one.scene.name}: {line}" for line in one.messages]
     return results, told

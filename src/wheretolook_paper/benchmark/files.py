@@ -1,4 +1,4 @@
-"""The benchmark's text files: poses, "id qw qx qy qz tx ty tz" (world-to-camera), and errors, "id metres degrees"."""
+"""Read and write the benchmark's text files: poses "id qw qx qy qz tx ty tz" and errors "id metres degrees"."""
 
 from __future__ import annotations
 
@@ -14,18 +14,16 @@ from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import write_text
 
 IMAGE_ENDING = ".png"
-_UNIT = (
-    1e-5  # that the length of a quaternion may be off 1, relatively; numpy.isclose's, by which evaluate_plan.py stops
-)
+_UNIT_TOLERANCE = 1e-5  # of a quaternion's length, as numpy.isclose's in evaluate_plan.py
 
 
 @dataclass(frozen=True, eq=False)
 class PoseFile:
-    """N poses, in the order of the file."""
+    """N poses in the order of the file."""
 
     ids: tuple[str, ...]
-    quaternions: Float  # (N, 4) wxyz, world-to-camera, as they stand in the file
-    translations: Float  # (N, 3) metres, world-to-camera
+    quaternions: Float  # (N, 4) wxyz, cam_from_world, as in the file
+    translations: Float  # (N, 3) metres, cam_from_world
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -38,10 +36,10 @@ class PoseFile:
 
 @dataclass(frozen=True, eq=False)
 class ErrorFile:
-    """N errors of estimated poses, in the order of the file."""
+    """N errors of estimated poses in the order of the file."""
 
-    ids: tuple[str, ...]  # without the image's ending
-    metres: Float  # (N,) distance between camera centres; NaN where no pose was found
+    ids: tuple[str, ...]  # without the image's suffix
+    metres: Float  # (N,) distance between camera centres; NaN without a pose
     degrees: Float  # (N,) angle between orientations
 
     def __len__(self) -> int:
@@ -49,7 +47,7 @@ class ErrorFile:
 
 
 def write_poses(path: Path, ids: Sequence[str], cam_from_world: ArrayLike) -> None:
-    """Write poses (N, 3, 4), atomically; the folder is made if missing."""
+    """Write poses (N, 3, 4) atomically, creating the folder if missing."""
     poses = np.asarray(cam_from_world, dtype=np.float64).reshape(-1, 3, 4)
     values = np.concatenate([quaternion_from_rotation(poses[:, :, :3]), poses[:, :, 3]], axis=1).tolist()
     lines = [" ".join([name, *map(repr, row)]) for name, row in zip(ids, values, strict=True)]
@@ -57,39 +55,29 @@ def write_poses(path: Path, ids: Sequence[str], cam_from_world: ArrayLike) -> No
 
 
 def read_poses(path: Path) -> PoseFile:
-    """Read a file of poses. Raises a TableError, with the line, if it is missing, a line is no pose, or ids repeat."""
+    """Read a file of poses. Raises a TableError if it is missing, a line is not a pose, or ids repeat."""
     ids, values = _read(path, 8, "a pose is id qw qx qy qz tx ty tz")
     table = np.array(values, dtype=np.float64).reshape(-1, 7)
-    off = ~(np.abs(np.linalg.norm(table[:, :4], axis=1) - 1) <= _UNIT)  # nor NaN
-    lost = ~np.isfinite(table).all(axis=1)
-    if lost.any():
-        row = int(np.flatnonzero(lost)[0])
-        value = f"{ids[row]}: {table[row]}"
-        fix = "Leave such a pose out."
-        raise TableError("a pose is NaN or infinite", path=path, value=value, fix=fix)
-    if off.any():
-        row = int(np.flatnonzero(off)[0])
-        fix = "Write qw qx qy qz, of length 1."
-        raise TableError(
-            "a quaternion is not of unit length", path=path, value=f"{ids[row]}: {table[row, :4]}", fix=fix
-        )
+    is_unit = np.abs(np.linalg.norm(table[:, :4], axis=1) - 1) <= _UNIT_TOLERANCE
+    invalid = np.flatnonzero(~(is_unit & np.isfinite(table).all(axis=1)))
+    if len(invalid):
+        fix = "Write finite numbers and quaternions qw qx qy qz of length 1, or omit the pose."
+        value = f"{ids[invalid[0]]}: {table[invalid[0]]}"
+        raise TableError("this is not a pose", path=path, value=value, fix=fix)
     return PoseFile(ids, table[:, :4], table[:, 4:])
 
 
 def write_errors(path: Path, ids: Sequence[str], metres: ArrayLike, degrees: ArrayLike) -> None:
-    """Write errors (N,) in metres and degrees, NaN where there is no pose, in the order of the images' file names.
-
-    That is the order in which the benchmark's own script writes them: 1, 10, 2.
-    """
+    """Write errors (N,) in metres and degrees, NaN without a pose, in the order of the images' file names (1, 10, 2)."""
     rows = zip(ids, np.asarray(metres).tolist(), np.asarray(degrees).tolist(), strict=True)
     ordered = sorted(rows, key=lambda row: row[0] + IMAGE_ENDING)
     write_text(path, "".join(f"{name} {m!r} {deg!r}\n" for name, m, deg in ordered))
 
 
 def read_errors(path: Path) -> ErrorFile:
-    """Read a file of errors, of ours or of match_and_localize.py, which writes the image's name where it found no pose.
+    """Read a file of errors, from `write_errors` or match_and_localize.py, which keeps the suffix of failed images.
 
-    Raises a TableError, with the line, if it is missing, empty, a line is none, or ids repeat.
+    Raises a TableError if it is missing or empty, a line is not an error, or ids repeat.
     """
     ids, values = _read(path, 3, "an error is id, metres and degrees")
     table = np.array(values, dtype=np.float64).reshape(-1, 2)
@@ -117,5 +105,5 @@ def _read(path: Path, n_cells: int, what: str) -> tuple[tuple[str, ...], list[li
         raise TableError("the file is empty", path=path, fix=f"In this file, {what}.")
     if len({*ids}) < len(ids):
         twice = next(name for row, name in enumerate(ids) if name in ids[:row])
-        raise TableError("an id stands there twice", path=path, value=twice, fix="Each id needs one line.")
+        raise TableError("an id appears twice", path=path, value=twice, fix="Keep one line per id.")
     return tuple(ids), values

@@ -1,4 +1,4 @@
-"""A scene folder of the Active Localization Benchmark: what lies where."""
+"""The files of a scene folder of the Active Localization Benchmark."""
 
 from __future__ import annotations
 
@@ -12,15 +12,14 @@ from wheretolook.utils.confine import path_within
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WhereToLookError
 
 CAMERA = PinholeCamera(320, 320, 277.0, center_px=(159.5, 159.5))
-"""The benchmark's camera, 60 degrees across: what its maps say, and what it localizes with (its camera.py)."""
+"""The benchmark's camera (its camera.py), of 60 degrees: that of its maps, and the one it localizes with."""
 
 DRAWN_CAMERA = PinholeCamera(320, 320, 277.0)
-"""The camera that its images are drawn with.
+"""The camera that its images are rendered with.
 
-The viewer that draws them looks through the middle of the image, (160, 160) where the centre of the first pixel is
-(0.5, 0.5), as in COLMAP; its own principal point (159.5, 159.5) means the same with pixels centred on whole numbers.
-The scripts shift keypoints to COLMAP's pixels, the principal point not: maps and queries are off by the same half pixel
-(0.1 degrees), which cancels as long as both are drawn alike.
+The viewer's principal point is the image centre, (160, 160) in COLMAP's pixels, whose first centre is (0.5, 0.5); the
+benchmark's (159.5, 159.5) is the same point with pixel centres at integers. Its scripts shift keypoints to COLMAP's
+pixels but not the principal point, so maps and queries share an offset of half a pixel (0.1 degrees), which cancels.
 """
 
 LAYOUT = """\
@@ -32,7 +31,7 @@ SCENE_DIR, such as 00010-DBjEcHFg4oq
 
 _WAYPOINTS = ("waypoints.txt", "sampled_waypoints.txt", "sampled_viewpoints.txt")
 _MODELS = ("scene_reconstruction", "scene_reconstruction/reference_sfm")
-_SEE = "`wheretolook benchmark --help` tells what a scene folder holds."
+_SEE = "`wheretolook benchmark --help` lists the files of a scene folder."
 
 
 @dataclass(frozen=True)
@@ -47,10 +46,9 @@ class BenchmarkScene:
 
     @classmethod
     def of(cls, folder: Path, mesh: Path | None = None, waypoints: Path | None = None) -> BenchmarkScene:
-        """Find the files of a scene folder, but for those given.
+        """Find the files of a scene folder, except those given.
 
-        Raises a SceneError without folder or mesh, a MapError without model, a TableError without waypoints; each names
-        the file that was looked for.
+        Raises a SceneError without folder or mesh, a MapError without model, a TableError without waypoints.
         """
         folder = folder.resolve()
         if not folder.is_dir():
@@ -69,14 +67,13 @@ class BenchmarkScene:
         )
 
     def image_file(self, name: str) -> Path:
-        """The file of the map's image of a name. Raises a MapError if there is none.
+        """Return the file of a map image. Raises a MapError if there is none.
 
-        Names in the benchmark's models are paths as its scripts were given them, such as
-        "scene_reconstruction/images/0.png".
+        Names in the benchmark's models are paths as passed to its scripts, such as "scene_reconstruction/images/0.png".
         """
         self.check_images()
         places = [self.images / Path(name).name]
-        with suppress(ConfigError):  # a path from elsewhere: there is only its last part to go by
+        with suppress(ConfigError):  # of a path outside the scene only the last part is used
             above = self.images.parent.parent
             places = [*(path_within(folder, name, "an image's name") for folder in (self.images, above)), *places]
         found = next((path for path in places if path.is_file()), None)
@@ -102,16 +99,16 @@ def _mesh(folder: Path) -> Path:
     named = [folder / f"{name}.glb" for name in (folder.name.partition("-")[2], folder.name) if name]
     found = [path for path in named if path.is_file()] or sorted(folder.glob("*.glb"))
     if not found:
-        raise SceneError("the scene lacks its mesh", path=named[0], fix="Put it there, or name another: --mesh FILE.")
+        raise SceneError("the scene lacks its mesh", path=named[0], fix="Put it there, or give --mesh FILE.")
     if len(found) > 1 and found[0] not in named:
         names = ", ".join(path.name for path in found)
-        raise SceneError("there are several meshes", path=folder, value=names, fix="Name one: --mesh FILE.")
+        raise SceneError("there are several meshes", path=folder, value=names, fix="Choose one: --mesh FILE.")
     return found[0]
 
 
 def _waypoints(folder: Path) -> Path:
     found = next((folder / name for name in _WAYPOINTS if (folder / name).is_file()), None)
     if found is None:
-        fix = f"Put them there (or {', '.join(_WAYPOINTS[1:])}), or name another file: --waypoints FILE."
+        fix = f"Put them there (or {', '.join(_WAYPOINTS[1:])}), or give --waypoints FILE."
         raise TableError("the scene lacks its waypoints", path=folder / _WAYPOINTS[0], fix=fix)
     return found

@@ -1,4 +1,4 @@
-"""Landmarks that drawn images are localized against: SIFT, triangulated from the map's own images at its poses."""
+"""Build the map that rendered images are localized against: SIFT triangulated from the map's images at its poses."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ _RENDER_BATCH = 16
 def build_query_map(
     scene: BenchmarkScene, renderer: Renderer, folder: Path, workers: int, device: str, progress: bool
 ) -> Path:
-    """Triangulate landmarks anew and save them with descriptors in a folder that is there; returns their file.
+    """Triangulate SIFT landmarks and save them with descriptors in an existing folder; return their file.
 
-    The released maps are of SuperPoint keypoints, whose descriptors only SuperPoint's network makes; here SIFT is found
-    in the same images, and poses stay as they are. The mesh tells which images see the same surface.
+    The released maps have SuperPoint keypoints, whose descriptors need SuperPoint's network; here SIFT is extracted
+    from the same images, and the poses are kept. Image pairs are chosen by the overlap of their surface in the mesh.
 
     Raises a MapError if the images are missing or of another size than the map's camera, the map has several cameras or
-    one with distortion, or nothing can be triangulated.
+    a camera with distortion, or nothing can be triangulated.
     """
     config = MapConfig()
     model = read_model(scene.model)
@@ -51,7 +51,7 @@ def build_query_map(
         raise MapError("the benchmark's maps have one camera", path=scene.model, value=len(cameras), fix=_FIX)
     camera = cameras.pop()
     if not isinstance(camera, PinholeCamera):
-        raise MapError("the camera of the map is no pinhole", path=scene.model, value=camera.model, fix=_FIX)
+        raise MapError("the map's camera is not a pinhole", path=scene.model, value=camera.model, fix=_FIX)
     poses = colmap_poses(scene.model, model)
     names = [model.images[number].name for number in sorted(model.images) if model.images[number].has_pose]
     files = [scene.image_file(name) for name in names]
@@ -76,18 +76,18 @@ def build_query_map(
 
 
 def _read(files: list[Path], camera: PinholeCamera) -> Iterator[NDArray[np.uint8]]:
-    """Images (H, W, 3), RGB."""
+    """Yield images (H, W, 3), RGB."""
     for path in files:
         image = read_image(path)
         if image is None or image.shape[:2] != (camera.height, camera.width):
             size = None if image is None else f"{image.shape[1]}x{image.shape[0]}"
-            problem = f"this is no image of {camera.width}x{camera.height} px, as the map's camera has"
-            raise MapError(problem, path=path, value=size, fix="Copy it anew.")
+            problem = f"not an image of {camera.width}x{camera.height} px, the size of the map's camera"
+            raise MapError(problem, path=path, value=size, fix="Copy the original file.")
         yield image
 
 
 def read_image(path: Path) -> NDArray[np.uint8] | None:
-    """An image (H, W, 3) uint8, RGB; None if it is missing or cannot be read."""
+    """Return an image (H, W, 3) uint8, RGB; None if it is missing or unreadable."""
     import cv2
 
     try:

@@ -1,4 +1,4 @@
-"""Tables of a round: one line a view, and the summary, as shipped beside mended."""
+"""Tables of a round: a row per view, and the summary of both versions of the measures."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ SUMMARY_MD = "summary.md"
 NOTES = """\
 As shipped: the benchmark's scripts on these files. `evaluate_plan.py` takes the n-th line of the errors for the n-th
 pose, though errors stand in the order of file names (1, 10, 2) and poses in that of waypoints, and stops where their
-numbers differ. Mended: joined by id; a pose without an error has failed. Shares are of views, over scenes too: the
-views of all scenes in one, not a mean of scenes. No oracle: some waypoints may have no view that localizes."""
+numbers differ. Mended: joined by id; a pose without an error has failed. Shares over all scenes are of all views, not
+means of scenes. No oracle: some waypoints may have no view that localizes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What a method reached in a scene."""
+    """The scores of a method in a scene."""
 
     scene: str
     method: str
@@ -47,10 +47,10 @@ class Result:
 
 
 def views_table(results: Sequence[Result]) -> pd.DataFrame:
-    """One row a view: where it looks, its error, its turn, and in which measures it counts.
+    """Return a row per view: direction, error, rotation, and the measures in which it counts.
 
-    `as_shipped_error_of` is the id whose error evaluate_plan.py takes for the view, `as_shipped_plan` what comes of it;
-    both are empty where the script stops.
+    `as_shipped_error_of` is the id whose error evaluate_plan.py takes for the view, `as_shipped_plan` the result; both
+    are empty where the script stops.
     """
     return pd.concat([_views(result) for result in results], ignore_index=True)
 
@@ -77,9 +77,9 @@ def _views(result: Result) -> pd.DataFrame:
 
 
 def summary_table(results: Sequence[Result]) -> pd.DataFrame:
-    """One row a scene, method and measure, with hits, total and percent, as shipped and mended; `ALL` scenes last.
+    """Return a row per scene, method and measure with hits, total and percent of both versions; `ALL` scenes last.
 
-    Over all scenes, a script that stops in one of them has no result.
+    A script that stops in one scene has no result over all scenes.
     """
     groups: dict[tuple[str, str], list[Scores]] = {}
     for result in results:
@@ -114,7 +114,7 @@ def _cells(prefix: str, share: Share | None) -> dict[str, Any]:
 
 
 def summary_text(summary: pd.DataFrame) -> str:
-    """The summary for people, as Markdown that also reads as text."""
+    """Format the summary as Markdown."""
     rows = []
     for _, row in summary.iterrows():
         shares = [_text(row, "as_shipped"), _text(row, "mended")]
@@ -129,14 +129,14 @@ def _text(row: pd.Series[Any], prefix: str) -> str:
 
 
 def measure_label(measure: str) -> str:
-    """A measure for people."""
+    """Return the label of a measure."""
     if measure == PLAN:
         return f"plan: {threshold_label(threshold_key(PLAN_THRESHOLD))}, turn {PLAN_TURN_DEG:g}°"
     return threshold_label(measure)
 
 
 def write_report(results: Sequence[Result], folder: Path) -> str:
-    """Write the tables into a folder; returns the summary's text."""
+    """Write the tables into a folder; return the summary's text."""
     summary = summary_table(results)
     text = summary_text(summary)
     write_text(folder / VIEWS_CSV, views_table(results).to_csv(index=False, float_format="%.6g", lineterminator="\n"))

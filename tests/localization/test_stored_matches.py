@@ -177,6 +177,6 @@ def test_pixels_are_kept_in_the_order_of_the_landmarks(
         inlier = np.isin(back["matched_rows"][row], back["inlier_rows"][row])
         at = CAMERA.project(transform(pose, landmarks.points[back["matched_rows"][row][inlier]]))
         assert np.linalg.norm(at - pixels[inlier], axis=1).max() < 10
-    with pytest.raises(TableError, match=r"matched_pixels.*--label\.store_pixels true"):
+    with pytest.raises(TableError):
         write_table(matched, tmp_path / "matches.parquet")
         read_table(tmp_path / "matches.parquet", pixels=True)

@@ -22,7 +22,7 @@ from wheretolook_paper.evaluation.look_strategies import count_score, informatio
 from wheretolook_paper.fisher.exact import exact_information
 
 AXES = direction_lattice(24)
-MODEL = SetScoreModel.shipped()
+MODEL = SetScoreModel.bundled()
 
 
 @pytest.fixture(scope="module")

@@ -226,7 +226,7 @@ def test_lists_of_tum_do_not_lead_out_of_the_folder(tum, tmp_path):
     (tmp_path / "some").mkdir()
     for name in ("rgb.txt", "depth.txt", "groundtruth.txt"):
         (tmp_path / "some" / name).write_text((tum / name).read_text().replace("rgb/", "../rgb/"))
-    with pytest.raises(ConfigError, match="lead out of its folder"):
+    with pytest.raises(ConfigError):
         scan(tmp_path / "some")
     (tmp_path / "some" / "rgb.txt").write_text("1.0 a.png b.png\n")
     with pytest.raises(SceneError, match="not a time and 1 value"):

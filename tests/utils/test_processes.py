@@ -25,7 +25,7 @@ def die(item: int) -> int:
 
 
 def test_a_killed_process_is_a_typed_error() -> None:
-    with WorkerPool(2) as processes, pytest.raises(WorkerError, match="killed"):
+    with WorkerPool(2) as processes, pytest.raises(WorkerError):
         list(processes.map(die, range(6)))
 
 

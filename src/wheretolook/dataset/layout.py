@@ -20,7 +20,7 @@ from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, compact_poses, holds_model, load_mapping_poses
 from wheretolook.mapping.scale import read_scale
 from wheretolook.utils.artifact_cache import ArtifactCache
-from wheretolook.utils.confine import check_links, entry_of
+from wheretolook.utils.confine import safe_child
 from wheretolook.utils.errors import ConfigError, SceneError, TableError
 from wheretolook.utils.files import fingerprint, write_json
 from wheretolook.utils.reading import read_json_object
@@ -301,7 +301,7 @@ class Dataset:
             for entry in content["scenes"]:
                 camera = camera_of_record(entry["camera"] if "camera" in entry else content["camera"])
                 own = bool(entry.get("own_camera", False))
-                folder = entry_of(root, entry["name"], "a scene's name")
+                folder = safe_child(root, entry["name"], "a scene's name")
                 if entry["split"] not in get_args(Split):
                     raise ValueError(f"a scene's split is {', '.join(get_args(Split))}, not {entry['split']!r}")
                 scenes.append(SceneFolder(folder, entry["split"], camera, own))
@@ -311,5 +311,4 @@ class Dataset:
             problem = f"damaged dataset description: {error}"
             fix = "Run the scenes stage again."
             raise TableError(problem, path=path, fix=fix) from error
-        check_links(root, depth=3)
         return cls(root, tuple(scenes))

@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
 
-from wheretolook.utils.confine import entry_of
+from wheretolook.utils.confine import safe_child
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.reading import read_json_object
 
@@ -23,12 +23,12 @@ def check_scene_name(data: Path, name: str, dataset: str = "") -> None:
     Also if a name would lead out of its folder; TableError if the dataset named is none.
     """
     if dataset:
-        roots = [entry_of(data, dataset, "a dataset's name")]
+        roots = [safe_child(data, dataset, "a dataset's name")]
         if not (roots[0] / "dataset.json").is_file():
             raise TableError("this folder is no dataset", path=roots[0] / "dataset.json", fix=NO_DATASET)
     else:
         roots = [path.parent for path in sorted(data.glob("*/dataset.json"))]
-    if not any(entry_of(root, name, "a scene's name").is_dir() for root in roots):
+    if not any(safe_child(root, name, "a scene's name").is_dir() for root in roots):
         no_such_scene(roots[0] if dataset else data, name, roots)
 
 

@@ -99,7 +99,6 @@ def run(arguments: Sequence[str]) -> int:
     scoring = Scoring(options.method, options.weights, tuple(options.also), options.anywhere)
     scoring.check()  # now, not after the work
     out = options.out or sources.folder_of_check(options.data, _name(options))
-    sources.check_links_of(out)
     scene = None if options.scene is None else sources.find_scene(options.data, options.scene, options.name)
     try:
         with _reading(scene), hold(out / ".lock", "check"):

@@ -28,7 +28,7 @@ from wheretolook.mapping.rendered_map import DATABASE_FILE
 from wheretolook.mapping.sanity import axes_doubt
 from wheretolook.mapping.scale import Similarity, read_scale
 from wheretolook.mapping.sources import features_beside, photographs_of
-from wheretolook.utils.confine import check_links, entry_of
+from wheretolook.utils.confine import safe_child
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning
 from wheretolook.utils.files import fingerprint, write_text
 from wheretolook.utils.reading import read_json_object
@@ -161,13 +161,7 @@ def folder_of_check(data: Path, name: str) -> Path:
 
     Raises ConfigError if it would lie elsewhere, by its name or by a link.
     """
-    return entry_of(entry_of(data, CHECKS, "the folder of all checks"), name, "the name of a check")
-
-
-def check_links_of(out: Path) -> None:
-    """Raise ConfigError if a link in a folder of results, or in the folders of its blocks, leads out of it."""
-    if out.is_dir():
-        check_links(out, 4)
+    return safe_child(safe_child(data, CHECKS, "the folder of all checks"), name, "the name of a check")
 
 
 def find_scene(data: Path, name: str, dataset: str = "") -> SceneFolder:

@@ -1,7 +1,7 @@
-"""How sure it is that a joint pose is right: what a robot knows of it without knowing where it is.
+"""Predicts whether a joint pose is right, from what a robot knows without ground truth.
 
-A wrong pose can have a hundred inliers where the map resembles itself. But then another place has nearly as many, or
-has fewer that no likeness explains; and the pose that is right explains all looks much better than any pose elsewhere.
+Where a map resembles itself, a wrong pose can have a hundred inliers. But then a competing pose has nearly as many, or
+has fewer that the ambiguity does not explain; the right pose explains all views much better than any competing pose.
 """
 
 from __future__ import annotations
@@ -19,47 +19,48 @@ from wheretolook.utils.shipped_model import LogisticRegression
 if TYPE_CHECKING:
     from wheretolook.localization.rig_localization import JointLocalization
 
-SHIPPED = Path(__file__).with_name("confidence.json")
+FEATURE_NAMES = ("log_elsewhere", "log_share", "log_own", "log_deviation_deg")
+"""log(1 + support of the best competing pose), log of the inlier ratio of the matches, log of the ratio of this pose's
+unique support to that of its strongest rival (`pose_ambiguity.log_ratio`), log of one standard deviation of the
+orientation (degrees)."""
 
-TOLD = ("log_elsewhere", "log_share", "log_own", "log_deviation_deg")
-"""What the confidence goes by: log(1 + support of the best pose elsewhere), log of the share of matches that are
-inliers, log of the ratio of what only this pose explains to what only its strongest rival does
-(`likeness.log_ratio`), log of one standard deviation of the orientation (degrees)."""
-
-MIN_INLIERS = 10  # with fewer the localizer itself refuses a pose
-
-LEAST_DEVIATION = 1e-4  # degrees, beyond which it makes no difference
-MOST_DEVIATION = 10.0
+MIN_INLIERS = 10  # with fewer, the localizer itself rejects a pose
+MIN_DEVIATION_DEG = 1e-4
+MAX_DEVIATION_DEG = 10.0
 
 
-def told_numbers(
-    n_inliers: ArrayLike, n_matches: ArrayLike, elsewhere: ArrayLike, own: ArrayLike, rival_own: ArrayLike,
+def confidence_features(
+    n_inliers: ArrayLike,
+    n_matches: ArrayLike,
+    rival_support: ArrayLike,
+    unique_support: ArrayLike,
+    rival_unique_support: ArrayLike,
     deviation_deg: ArrayLike,
-) -> Float:  # fmt: skip
-    """`TOLD` (B, 4) of B joint poses."""
-    inliers, matches, rival, off = (
-        np.asarray(x, dtype=np.float64) for x in (n_inliers, n_matches, elsewhere, deviation_deg)
-    )
-    share = (inliers + 0.5) / (matches + 1)
-    off = np.clip(off, LEAST_DEVIATION, MOST_DEVIATION)
-    return np.stack([np.log1p(rival), np.log(share), log_ratio(own, rival_own), np.log(off)], axis=-1)
+) -> Float:
+    """`FEATURE_NAMES` (B, 4) of B joint poses."""
+    inlier_ratio = (np.asarray(n_inliers, dtype=np.float64) + 0.5) / (np.asarray(n_matches, dtype=np.float64) + 1)
+    deviation = np.clip(np.asarray(deviation_deg, dtype=np.float64), MIN_DEVIATION_DEG, MAX_DEVIATION_DEG)
+    support_ratio = log_ratio(unique_support, rival_unique_support)
+    rival = np.log1p(np.asarray(rival_support, dtype=np.float64))
+    return np.stack([rival, np.log(inlier_ratio), support_ratio, np.log(deviation)], axis=-1)
 
 
-class Confidence(LogisticRegression):
-    """The probability that a pose is within 5 cm and 0.4 degrees; 0 with fewer inliers than `MIN_INLIERS`."""
+class ConfidenceModel(LogisticRegression):
+    """Probability that a pose is within 5 cm and 0.4 degrees; 0 with fewer inliers than `MIN_INLIERS`."""
 
-    names = TOLD
+    names = FEATURE_NAMES
     about = "confidence"
-    file = SHIPPED
+    file = Path(__file__).with_name("confidence.json")
 
-    def of(self, found: JointLocalization) -> float:
-        """The confidence in a joint pose, 0 where there is none."""
-        return float(self.of_numbers(found.n_inliers, found.n_matches, found.elsewhere, *found.own, found.deviation[1]))
-
-    def of_numbers(
-        self, n_inliers: ArrayLike, n_matches: ArrayLike, elsewhere: ArrayLike, own: ArrayLike, rival_own: ArrayLike,
-        deviation_deg: ArrayLike,
-    ) -> Float:  # fmt: skip
-        """Confidences (B,) from the numbers of `told_numbers`."""
-        sure = self.probabilities(told_numbers(n_inliers, n_matches, elsewhere, own, rival_own, deviation_deg))
-        return np.where(np.asarray(n_inliers) >= MIN_INLIERS, sure, 0.0)
+    def of(self, localization: JointLocalization) -> float:
+        """Confidence in a joint pose, 0 if there is none."""
+        if localization.n_inliers < MIN_INLIERS:
+            return 0.0
+        features = confidence_features(
+            localization.n_inliers,
+            localization.n_matches,
+            localization.rival_support,
+            *localization.unique_support,
+            localization.deviation[1],
+        )
+        return float(self.predict_proba(features))

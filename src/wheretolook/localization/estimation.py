@@ -44,17 +44,17 @@ class PoseEstimator:
 
         The matches are pixels (M, 2) of the camera's image, and rows (M,) of the points; at least four.
         """
-        found = self.estimate_here(pixels, self.points[rows], camera)
+        found = self.estimate_local(pixels, self.points[rows], camera)
         return None if found is None else (poses_from(found[0], -self.origin), found[1])
 
-    def estimate_here(
+    def estimate_local(
         self, pixels: Float, points: Float, camera: Camera, trials: int | None = None
     ) -> tuple[Float, NDArray[np.bool_]] | None:
         """As `estimate`, of points (M, 3) in metres from `origin`; the pose is of the world with that origin.
 
         RANSAC makes so many trials at most, as many as the settings say unless given.
         """
-        taken_with, seen = known_to_poselib(camera.colmap, np.asarray(pixels, dtype=np.float64))
+        taken_with, seen = poselib_camera(camera.colmap, np.asarray(pixels, dtype=np.float64))
         options = {**self.ransac, "max_iterations": trials or self.config.max_trials}
         pose, found = poselib.estimate_absolute_pose(seen, points, taken_with, options, REFINEMENT)
         if found["num_inliers"] < 3 or not np.isfinite(pose.Rt).all():  # no three matches determine a pose
@@ -65,7 +65,7 @@ class PoseEstimator:
 POSELIBS_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
 
 
-def known_to_poselib(camera: ColmapCamera, pixels: Float) -> tuple[dict[str, Any], Float]:
+def poselib_camera(camera: ColmapCamera, pixels: Float) -> tuple[dict[str, Any], Float]:
     """A camera as PoseLib takes it, and pixels (M, 2) of its image.
 
     Of a model that PoseLib does not know, pixels become those of a pinhole with the same focal length, by their rays.

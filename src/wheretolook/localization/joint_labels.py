@@ -1,6 +1,6 @@
-"""Labels of sets of looks: whether they localize together. They cost no rendering beyond that of single views.
+"""Labels sets of views that are localized jointly, from the stored matches of single views, without rendering.
 
-Each view is rendered and matched once (`--label.store_pixels true`); sets of views of a location are joined from that.
+Each view is rendered and matched once (`--label.store_pixels true`).
 """
 
 from __future__ import annotations
@@ -16,19 +16,32 @@ from tqdm.auto import tqdm
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, MATCH_FIELDS, PIXELS, poses
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, pose_error
-from wheretolook.localization.confidence import Confidence
+from wheretolook.localization.confidence import ConfidenceModel
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator
 from wheretolook.localization.rig import Look, rig_of
-from wheretolook.localization.rig_localization import Alone, JointLocalizer
+from wheretolook.localization.rig_localization import JointLocalization, JointLocalizer, SingleViewPoses
 from wheretolook.utils.errors import TableError
 
 SET_COLUMNS = (
-    "n_looks", "location_id", "status", "error_m", "error_deg", "n_matches", "n_inliers", "support", "elsewhere", "own",
-    "rival_own", "deviation_m", "deviation_deg", "confidence", "seconds",
-)  # fmt: skip
-"""What `label_sets` tells of each set; `status`, `error_m` and `error_deg` as of single viewpoints, so that
-`viewpoints.table.is_good` serves sets, too."""
+    "n_looks",
+    "location_id",
+    "status",
+    "error_m",
+    "error_deg",
+    "n_matches",
+    "n_inliers",
+    "support",
+    "elsewhere",
+    "own",
+    "rival_own",
+    "deviation_m",
+    "deviation_deg",
+    "confidence",
+    "seconds",
+)
+"""Columns of `label_sets`. `status`, `error_m` and `error_deg` are as for single viewpoints, so `is_good` applies to sets,
+too; `elsewhere` is the rival support, `own` and `rival_own` are the unique support of pose and rival."""
 
 
 def label_sets(
@@ -39,86 +52,93 @@ def label_sets(
     config: LocalizerConfig | None = None,
     turn_noise_deg: float = 0.0,
     seed: int = 0,
-    confidence: Confidence | None = None,
+    confidence: ConfidenceModel | None = None,
     progress: str | None = None,
     rigs: Sequence[Float] | None = None,
 ) -> pd.DataFrame:
-    """Localize sets of a table's views together, and measure the errors. Each set has rows of the table, of one place.
-    Or of several, if `rigs` tell for each set where its views are to one another: cam_from_rig (N, 3, 4), metres. The
-    error is then that of the first view of a set.
+    """Localize sets of a table's views jointly and measure the errors.
 
-    Of a set of one the label is that of a single image, but for the order of its matches, which are stored by landmark.
-    Turns between looks are those of the table's poses; with `turn_noise_deg` they are told wrong by as much, drawn from
-    the seed. The error is that of the look that is worst. `points` (N, 3) m are the landmarks', `confidence` is the one
-    that ships unless given. The progress bar has a text; None shows none. Returns a row for each set, `SET_COLUMNS`.
+    A set has rows of the table with views of one location, whose relative rotations are those of the table, with
+    `turn_noise_deg` of noise about each axis drawn from the seed; its error is that of the worst view. With `rigs`,
+    cam_from_rig (N, 3, 4) in metres for each set, its views may be of several locations; its error is that of its
+    first view. `points` (N, 3) m are the landmarks. A set of one view gets the label of a single image, up to the order
+    of its matches. `progress` is the title of a progress bar. Returns a row per set, with `SET_COLUMNS`.
 
-    Raises a TableError if the table does not hold where landmarks were matched, a row is none of its own or of the
-    points'; a PoseError if looks of a set are not of one place; a ConfigError for noise below zero.
+    Raises TableError if the table has no stored pixels or a row is invalid, PoseError if views of a set are not from
+    one location, ConfigError for negative noise.
     """
     missing = [name for name in (*MATCH_FIELDS.names[:1], PIXELS) if name not in table]
     if missing:
         fix = "Label with `--label.store_pixels true`, and read the table with `pixels=True`."
-        raise TableError("it is not stored where landmarks were matched", value=missing, fix=fix)
+        raise TableError("the table has no pixels of matches", value=missing, fix=fix)
     localizer = JointLocalizer(PoseEstimator(points, config), turn_noise_deg)
-    told = confidence or Confidence.shipped()
+    model = confidence or ConfidenceModel.bundled()
     rng = np.random.default_rng(seed)
-    true = poses(table)
-    places = table["location_id"].to_numpy()
-    numbers = table[CAMERA_ID].to_numpy() if CAMERA_ID in table and isinstance(cameras, Mapping) else None
+    true_poses = poses(table)
+    single_view: dict[int, SingleViewPoses] = {}
+    known: dict[tuple[int, ...], tuple[object, ...]] = {}  # repeated sets, if nothing is drawn for each
     rows: list[tuple[object, ...]] = []
-    alone: dict[int, Alone] = {}  # what each view finds alone, which many sets ask for
-    known: dict[tuple[int, ...], tuple[object, ...]] = {}  # sets that come again, where nothing is drawn for each
-    for number, taken in enumerate(tqdm(sets, desc=progress, unit="set", disable=progress is None)):
-        chosen = np.asarray(taken, dtype=np.int64)
+    for number, members in enumerate(tqdm(sets, desc=progress, unit="set", disable=progress is None)):
+        chosen = np.asarray(members, dtype=np.int64)
         if len(chosen) == 0 or chosen.min() < 0 or chosen.max() >= len(table):
-            raise TableError(f"a set of looks names no rows of the table's {len(table)}", value=chosen.tolist())
+            raise TableError(f"a set of views has none or wrong rows of {len(table)}", value=chosen.tolist())
         key = tuple(chosen.tolist())
-        if key in known:
-            rows.append(known[key])
-            continue
-        mounts = _told_turns(rig_of(true[chosen]), turn_noise_deg, rng) if rigs is None else rigs[number]
-        looks = [
-            _look(table, row, mount, cameras if numbers is None else cameras[int(numbers[row])], len(points))  # type: ignore[index, arg-type]
-            for row, mount in zip(chosen, mounts, strict=True)
-        ]
-        start = time.perf_counter()
-        for row, look in zip(key, looks, strict=True):
-            if row not in alone:
-                alone[row] = localizer.alone(look)
-        found = localizer.localize(looks, [alone[row] for row in key])
-        seconds = time.perf_counter() - start
-        if found.cams_from_world is None:
-            error_m = error_deg = np.array([np.nan])
-        else:
-            judged = slice(None) if rigs is None else slice(1)
-            error_m, error_deg = pose_error(found.cams_from_world[judged], true[chosen][judged])
-        numbers_of = (found.n_matches, found.n_inliers, found.support, found.elsewhere, *found.own, *found.deviation)
-        values = (len(chosen), int(places[chosen[0]]), found.status, error_m.max(), error_deg.max(), *numbers_of)
-        rows.append((*values, told.of(found), seconds))
-        if turn_noise_deg == 0 and rigs is None:
-            known[key] = rows[-1]
+        if key not in known or turn_noise_deg or rigs is not None:
+            rig = _noisy(rig_of(true_poses[chosen]), turn_noise_deg, rng) if rigs is None else rigs[number]
+            looks = [_look(table, row, pose, cameras, len(points)) for row, pose in zip(key, rig, strict=True)]
+            start = time.perf_counter()
+            for row, look in zip(key, looks, strict=True):
+                if row not in single_view:
+                    single_view[row] = localizer.single_view_poses(look)
+            result = localizer.localize(looks, [single_view[row] for row in key])
+            seconds = time.perf_counter() - start
+            error = _worst_error(result, true_poses[chosen] if rigs is None else true_poses[chosen[:1]])
+            location = int(table["location_id"].iloc[chosen[0]])
+            known[key] = (*_values(len(chosen), location, result, error), model.of(result), seconds)
+        rows.append(known[key])
     return pd.DataFrame(rows, columns=list(SET_COLUMNS))
 
 
-def _look(table: pd.DataFrame, row: int, mount: Float, camera: Camera, n_points: int) -> Look:
+def _worst_error(result: JointLocalization, true_poses: Float) -> tuple[float, float]:
+    """Largest errors (m, degrees) of the first poses; NaN if there is no pose."""
+    if result.cams_from_world is None:
+        return np.nan, np.nan
+    error_m, error_deg = pose_error(result.cams_from_world[: len(true_poses)], true_poses)
+    return error_m.max(), error_deg.max()
+
+
+def _values(
+    n_views: int, location_id: int, result: JointLocalization, error: tuple[float, float]
+) -> tuple[object, ...]:
+    counts = (result.n_matches, result.n_inliers, result.support, result.rival_support)
+    return (n_views, location_id, result.status, *error, *counts, *result.unique_support, *result.deviation)
+
+
+def _look(
+    table: pd.DataFrame, row: int, cam_from_rig: Float, cameras: Camera | Mapping[int, Camera], n_points: int
+) -> Look:
+    if isinstance(cameras, Mapping):
+        camera = cameras[int(table[CAMERA_ID].iat[row])] if CAMERA_ID in table else next(iter(cameras.values()))
+    else:
+        camera = cameras
     landmarks = np.asarray(table["matched_rows"].iat[row], dtype=np.int64)
     pixels = np.asarray(table[PIXELS].iat[row], dtype=np.float64)
-    fix = "Label the scene again, with its map of now."
+    fix = "Label the scene again with its present map."
     if len(pixels) != 2 * len(landmarks) or not np.isfinite(pixels).all():
-        raise TableError("a view's pixels do not fit its matches", value=(len(pixels), len(landmarks)), fix=fix)
+        raise TableError("a view's pixels do not match its landmarks", value=(len(pixels), len(landmarks)), fix=fix)
     if len(landmarks) and (landmarks.min() < 0 or landmarks.max() >= n_points):
         raise TableError(
             f"a view matched a landmark that the map of {n_points} lacks", value=int(landmarks.max()), fix=fix
         )
-    return Look(mount, pixels.reshape(-1, 2), landmarks, camera)
+    return Look(cam_from_rig, pixels.reshape(-1, 2), landmarks, camera)
 
 
-def _told_turns(mounts: Float, turn_noise_deg: float, rng: np.random.Generator) -> Float:
-    """Turns as a head that is off by as much would tell them; the first look's is the rig's, and exact."""
+def _noisy(cam_from_rig: Float, turn_noise_deg: float, rng: np.random.Generator) -> Float:
+    """Perturb the rotations of all views but the first, which defines the rig."""
     if turn_noise_deg == 0:
-        return mounts
+        return cam_from_rig
     from scipy.spatial.transform import Rotation
 
-    noise = Rotation.from_rotvec(np.radians(rng.normal(0, turn_noise_deg, (len(mounts), 3)))).as_matrix()
+    noise = Rotation.from_rotvec(np.radians(rng.normal(0, turn_noise_deg, (len(cam_from_rig), 3)))).as_matrix()
     noise[0] = np.eye(3)
-    return np.concatenate([noise @ mounts[:, :, :3], mounts[:, :, 3:]], axis=2)
+    return np.concatenate([noise @ cam_from_rig[:, :, :3], cam_from_rig[:, :, 3:]], axis=2)

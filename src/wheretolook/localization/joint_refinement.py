@@ -1,4 +1,4 @@
-"""Refines the pose of a rig whose views' poses to one another are known to some accuracy only."""
+"""Refines the pose of a rig together with the rotations of its views, which are known up to noise."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.rig import Look
 
-STEPS = 20
-SMALL = 1e-9  # a step of the parameters, in metres and radians, below which the pose is found
+MAX_STEPS = 20
+MIN_STEP = 1e-9  # change of the parameters, in metres and radians, at which the iteration stops
 
 
-def refine_with_turns(
+def refine_rotations(
     looks: Sequence[Look],
     points: Sequence[Float],
     inliers: Sequence[NDArray[np.bool_]],
@@ -22,55 +22,66 @@ def refine_with_turns(
     cams_from_world: Float,
     noise_rad: float,
 ) -> tuple[Float, Float]:
-    """The rig's pose (3, 4) and its looks' poses (N, 3, 4) that explain the inliers best.
+    """Refine the rig's pose (3, 4) and its views' poses (N, 3, 4) on the inliers.
 
-    Each look may have turned otherwise than told, about its centre: by a small rotation of which one standard deviation
-    about each axis is `noise_rad`, a prior that is worth as much as a keypoint's error of one pixel. Gauss-Newton on
-    the rig's pose and the looks' turns, with Cauchy's weights (one pixel) on the keypoints. Turns of the looks are as
-    left by an earlier call, in `cams_from_world`; points (M, 3) m and masks (M,) are of each look.
+    Gauss-Newton on the rig's pose and one small rotation of each view about its centre, with Cauchy weights (one pixel)
+    on the keypoints and a quadratic prior on the rotations, whose standard deviation about each axis is `noise_rad`.
+    Rotations start as in `cams_from_world`; points (M, 3) m and masks (M,) are given for each view.
     """
     from scipy.spatial.transform import Rotation
 
-    mounts = [np.asarray(look.cam_from_rig, dtype=np.float64) for look in looks]
-    n = len(looks)
+    cam_from_rig = np.stack([np.asarray(look.cam_from_rig, dtype=np.float64) for look in looks])
     rig = np.array(rig_from_world)
-    turns = np.stack([cams_from_world[k, :, :3] @ rig[:, :3].T @ mounts[k][:, :3].T for k in range(n)])
-    for _ in range(STEPS):
-        normal = np.zeros((6 + 3 * n, 6 + 3 * n))
-        right = np.zeros(6 + 3 * n)
-        for k, look in enumerate(looks):
-            own = slice(6 + 3 * k, 9 + 3 * k)
-            normal[own, own] += np.eye(3) / noise_rad**2
-            right[own] -= Rotation.from_matrix(turns[k]).as_rotvec() / noise_rad**2
-            if not inliers[k].any():
-                continue
-            in_rig = points[k][inliers[k]] @ rig[:, :3].T + rig[:, 3]
-            mounted = in_rig @ mounts[k][:, :3].T + mounts[k][:, 3]
-            there = mounted @ turns[k].T
-            error = look.camera.project(there) - look.pixels[inliers[k]]
-            by_point = _derivative(look, there)
-            # world to rig is perturbed on the left, (turn, shift); a look's turn on the left, too
-            by_rig = by_point @ turns[k] @ mounts[k][:, :3]
-            jacobian = np.concatenate([by_rig @ -_skew(in_rig), by_rig, by_point @ -_skew(there)], axis=2)
-            weight = 1 / (1 + (error**2).sum(1))
-            columns = np.r_[0:6, own]
-            normal[np.ix_(columns, columns)] += np.einsum("m,mij,mik->jk", weight, jacobian, jacobian)
-            right[columns] -= np.einsum("m,mij,mi->j", weight, jacobian, error)
-        step = np.linalg.lstsq(normal, right, rcond=None)[0]
+    turns = np.stack([cams_from_world[k, :, :3] @ rig[:, :3].T @ pose[:, :3].T for k, pose in enumerate(cam_from_rig)])
+    for _ in range(MAX_STEPS):
+        step = _solve(looks, points, inliers, cam_from_rig, rig, turns, noise_rad)
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         rig = np.concatenate([turn @ rig[:, :3], (turn @ rig[:, 3] + step[3:6])[:, None]], axis=1)
-        turns = np.stack([Rotation.from_rotvec(step[6 + 3 * k : 9 + 3 * k]).as_matrix() @ turns[k] for k in range(n)])
-        if np.abs(step).max() < SMALL:
+        turns = Rotation.from_rotvec(step[6:].reshape(-1, 3)).as_matrix() @ turns
+        if np.abs(step).max() < MIN_STEP:
             break
     cams = [
-        np.concatenate([turn @ m[:, :3] @ rig[:, :3], (turn @ (m[:, :3] @ rig[:, 3] + m[:, 3]))[:, None]], axis=1)
-        for turn, m in zip(turns, mounts, strict=True)
+        np.concatenate([turn @ pose[:, :3] @ rig[:, :3], (turn @ (pose[:, :3] @ rig[:, 3] + pose[:, 3]))[:, None]], 1)
+        for turn, pose in zip(turns, cam_from_rig, strict=True)
     ]
     return rig, np.stack(cams)
 
 
-def _derivative(look: Look, points_cam: Float) -> Float:
-    """Of pixels by points (M, 3) in the camera's frame, (M, 2, 3): central differences, so that any camera will do."""
+def _solve(
+    looks: Sequence[Look],
+    points: Sequence[Float],
+    inliers: Sequence[NDArray[np.bool_]],
+    cam_from_rig: Float,
+    rig: Float,
+    turns: Float,
+    noise_rad: float,
+) -> Float:
+    """Gauss-Newton step (6 + 3 N,): left perturbations of rig_from_world (rotation, translation), then of rotations."""
+    from scipy.spatial.transform import Rotation
+
+    normal = np.zeros((6 + 3 * len(looks), 6 + 3 * len(looks)))
+    right = np.zeros(len(normal))
+    for k, look in enumerate(looks):
+        columns_of_turn = slice(6 + 3 * k, 9 + 3 * k)
+        normal[columns_of_turn, columns_of_turn] += np.eye(3) / noise_rad**2
+        right[columns_of_turn] -= Rotation.from_matrix(turns[k]).as_rotvec() / noise_rad**2
+        if not inliers[k].any():
+            continue
+        in_rig = points[k][inliers[k]] @ rig[:, :3].T + rig[:, 3]
+        in_camera = (in_rig @ cam_from_rig[k][:, :3].T + cam_from_rig[k][:, 3]) @ turns[k].T
+        error = look.camera.project(in_camera) - look.pixels[inliers[k]]
+        by_point = _projection_jacobian(look, in_camera)
+        by_rig = by_point @ turns[k] @ cam_from_rig[k][:, :3]
+        jacobian = np.concatenate([by_rig @ -_skew(in_rig), by_rig, by_point @ -_skew(in_camera)], axis=2)
+        weight = 1 / (1 + (error**2).sum(1))
+        columns = np.r_[0:6, columns_of_turn]
+        normal[np.ix_(columns, columns)] += np.einsum("m,mij,mik->jk", weight, jacobian, jacobian)
+        right[columns] -= np.einsum("m,mij,mi->j", weight, jacobian, error)
+    return np.linalg.lstsq(normal, right, rcond=None)[0]
+
+
+def _projection_jacobian(look: Look, points_cam: Float) -> Float:
+    """Derivative (M, 2, 3) of pixels by points (M, 3) in the camera's frame: central differences, for any camera."""
     size = 1e-6 * np.maximum(1.0, np.linalg.norm(points_cam, axis=1))[:, None]
     columns = []
     for axis in np.eye(3):

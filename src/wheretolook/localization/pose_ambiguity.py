@@ -1,10 +1,9 @@
-"""Which of two poses is right, where a map resembles itself: the one with evidence that the other cannot explain.
+"""Decides between pose hypotheses where a map resembles itself, by the inliers that only one of them explains.
 
-Two rooms have the same chairs. Seen in one, these are matched with the landmarks of either, so a wrong pose may have
-more inliers than the right one. But inliers on a chair speak for both rooms: whoever stands in the other sees a chair
-at the same place of the image, too. What tells is what only one of the rooms has. So landmarks that agree with a pose
-are carried to where they would be seen from if the other were right. Where the map has something there, they are
-evidence for both; where it has nothing, for the first alone.
+Two rooms have the same chairs. Seen in one, these match landmarks of either, so a wrong pose may have more inliers than
+the right one. But inliers on a chair support both rooms: from the other room, too, a chair is seen at the same place in
+the image. So landmarks that agree with a pose are moved to where they would appear if the other pose were right. Where
+the map has a landmark there, they support both; where it has none, only the first.
 """
 
 from __future__ import annotations
@@ -17,75 +16,78 @@ from scipy.spatial import cKDTree
 
 from wheretolook.geometry.poses import Float
 
-ALIKE_M = 0.4
-"""A landmark this close to where one is carried is its counterpart. On validation scenes 0.25 to 0.6 m do as well: a
-copy of a thing is a copy, but not the same points of it were mapped."""
+COUNTERPART_DISTANCE_M = 0.4
+"""A landmark this close to a moved one is its counterpart. On validation scenes 0.25 to 0.6 m do as well: of two copies
+of a thing, different points were mapped."""
 
-PLACE_M = 0.25
+LOCATION_SIZE_M = 0.25
 """Landmarks in one cube of this edge count once: those of one thing are matched together, and wrongly together."""
 
 PSEUDOCOUNT = 10.0
-"""Places added to both poses' own before they are compared, so that one against none is no proof."""
+"""Locations added to both sides of a comparison, so that one against none is no proof."""
 
 SUPPORT_POWER = 0.2
-"""Power of the ratio of two poses' support that counts beside that of their own places."""
+"""Power of the ratio of two poses' support that counts in addition to that of their unique support."""
 
-LEAST_OF_RIVAL = 0.1
-"""Support of a rival at least, as a share of the best supported pose's."""
+MIN_SUPPORT_RATIO = 0.1
+"""Minimum support of a candidate, relative to the best supported pose."""
 
 
-class Likeness:
-    """Of a map's landmarks (N, 3) m: what is alike as seen from two poses."""
+class PoseAmbiguity:
+    """Compares pose hypotheses in a map with landmarks (N, 3) m, by the inliers that only one of them explains."""
 
     def __init__(self, points: Float) -> None:
         self.points = points
         self._tree = cKDTree(points[np.isfinite(points).all(axis=1)])
 
-    def own_places(self, rows: NDArray[np.int64], pose: Float, other: Float) -> int:
-        """How many places hold landmarks, of those that agree with a pose, that the other pose cannot explain.
+    def unique_support(self, rows: NDArray[np.int64], pose: Float, other: Float) -> int:
+        """Count locations with landmarks, rows (M,), that agree with a pose and that the other pose cannot explain.
 
-        The landmarks are rows (M,), both poses (3, 4) from the world into the same frame of camera or rig.
+        Both poses (3, 4) are from the world into the same frame of camera or rig.
         """
-        seen = self.points[rows] @ pose[:, :3].T + pose[:, 3]
-        carried = (seen - other[:, 3]) @ other[:, :3]
-        distance, _ = self._tree.query(carried, distance_upper_bound=ALIKE_M)
-        return self.places(rows[~np.isfinite(distance)])
+        in_camera = self.points[rows] @ pose[:, :3].T + pose[:, 3]
+        moved = (in_camera - other[:, 3]) @ other[:, :3]
+        distance, _ = self._tree.query(moved, distance_upper_bound=COUNTERPART_DISTANCE_M)
+        return self.count_locations(rows[~np.isfinite(distance)])
 
-    def places(self, rows: NDArray[np.int64]) -> int:
-        """How many places hold some landmarks, rows (M,)."""
-        return len(np.unique(np.floor(self.points[rows] / PLACE_M), axis=0))
+    def count_locations(self, rows: NDArray[np.int64]) -> int:
+        """Count locations (cubes of `LOCATION_SIZE_M`) with landmarks, rows (M,)."""
+        return len(np.unique(np.floor(self.points[rows] / LOCATION_SIZE_M), axis=0))
 
 
-def log_ratio(own: ArrayLike, others: ArrayLike) -> Float:
-    """Of places that only one pose explains and that only the other does, (...,) each: log of their ratio, damped."""
+def log_ratio(unique: ArrayLike, rival_unique: ArrayLike) -> Float:
+    """Damped log ratio of the unique support (...,) of two poses."""
     return np.log(
-        (np.asarray(own, dtype=np.float64) + PSEUDOCOUNT) / (np.asarray(others, dtype=np.float64) + PSEUDOCOUNT)
+        (np.asarray(unique, dtype=np.float64) + PSEUDOCOUNT)
+        / (np.asarray(rival_unique, dtype=np.float64) + PSEUDOCOUNT)
     )
 
 
-def preference(own: tuple[int, int], support: tuple[float, float]) -> float:
-    """By how much the first of two poses is to be preferred, by the places of their own and their support."""
-    return float(log_ratio(*own) + SUPPORT_POWER * np.log((support[0] + 1) / (support[1] + 1)))
+def preference(unique: tuple[int, int], support: tuple[float, float]) -> float:
+    """Log odds for the first of two poses, from the unique support and the support of both."""
+    return float(log_ratio(*unique) + SUPPORT_POWER * np.log((support[0] + 1) / (support[1] + 1)))
 
 
 def strongest_rival(
-    own: NDArray[np.int64], support: Sequence[float], k: int, among: Sequence[int] | None = None
+    unique: NDArray[np.int64], support: Sequence[float], k: int, among: Sequence[int] | None = None
 ) -> int:
-    """Which of K poses, two or more, speaks most against one of them; (K, K) places of each that another lacks."""
+    """Index of the pose that is the strongest evidence against pose `k`; `unique` (K, K) as by `unique_support`."""
     others = [n for n in (range(len(support)) if among is None else among) if n != k]
-    return min(others, key=lambda n: _against(own, support, k, n))
+    return min(others, key=lambda n: _preference_over(unique, support, k, n))
 
 
-def most_likely(own: NDArray[np.int64], support: Sequence[float]) -> int:
-    """Of K poses, by falling support, the one for which most speaks even against its strongest rival.
+def most_likely(unique: NDArray[np.int64], support: Sequence[float]) -> int:
+    """Index of the pose with the strongest evidence against its strongest rival; poses by decreasing support.
 
-    Not by one duel after the other: these may go round in a circle.
+    Pairwise preferences may be cyclic, so poses are not eliminated one after the other.
     """
-    able = [k for k, of in enumerate(support) if of > LEAST_OF_RIVAL * support[0]]
-    if len(able) < 2:
+    candidates = [k for k, value in enumerate(support) if value > MIN_SUPPORT_RATIO * support[0]]
+    if len(candidates) < 2:
         return 0
-    return max(able, key=lambda k: _against(own, support, k, strongest_rival(own, support, k, able)))
+    return max(
+        candidates, key=lambda k: _preference_over(unique, support, k, strongest_rival(unique, support, k, candidates))
+    )
 
 
-def _against(own: NDArray[np.int64], support: Sequence[float], k: int, n: int) -> float:
-    return preference((int(own[k, n]), int(own[n, k])), (support[k], support[n]))
+def _preference_over(unique: NDArray[np.int64], support: Sequence[float], k: int, n: int) -> float:
+    return preference((int(unique[k, n]), int(unique[n, k])), (support[k], support[n]))

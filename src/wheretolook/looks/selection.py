@@ -98,7 +98,7 @@ def best_views(
     rows = candidates(directions, scores, max(CANDIDATES, n), max_turn_deg, start)
     axes = directions[rows]
     views = candidate_views(scorer, location, axes, scores[rows])
-    chosen = select_views(views, SetScoreModel.shipped(), n, Rotations(axes, start), max_turn_deg, scores[rows])
+    chosen = select_views(views, SetScoreModel.bundled(), n, Rotations(axes, start), max_turn_deg, scores[rows])
     return ViewSet(tuple(int(rows[view]) for view in chosen.rows), chosen.score, chosen.total_turn_deg)
 
 

@@ -29,4 +29,4 @@ class SetScoreModel(LogisticRegression):
         """Return the probability (B,) of sets from their sums (B, N_SUMS) and p_none (B,), that no view localizes."""
         p_some = np.clip(1 - np.asarray(p_none, dtype=np.float64), MIN_PROBABILITY, 1 - MIN_PROBABILITY)
         log_odds = np.log(p_some / (1 - p_some))
-        return self.probabilities(np.stack([log_odds, log_position_variance(np.asarray(sums))], axis=-1))
+        return self.predict_proba(np.stack([log_odds, log_position_variance(np.asarray(sums))], axis=-1))

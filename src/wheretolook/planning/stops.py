@@ -110,7 +110,7 @@ def _stop(
     looked = np.concatenate([axis[None], apart[rows]])
     alone = np.append(own, scores[rows])
     seen = candidate_views(scorer, at, looked, alone)
-    set_score = SetScoreModel.shipped()
+    set_score = SetScoreModel.bundled()
     rotations = Rotations(looked, axis)
     before = score_of_set(seen, set_score, [0])
     best = None

@@ -54,12 +54,11 @@ def leave_photographs_out(
     model's cameras seem to lie on their side.
     """
     from wheretolook.holdout.holdout import left_out_blocks
-    from wheretolook.holdout.photo_map import WORK, check_links_of, features_of, folder_of_check, open_map
+    from wheretolook.holdout.photo_map import WORK, features_of, folder_of_check, open_map
 
     out = folder_of_check(experiment.data, name)
     workers = experiment.n_workers
     device = experiment.warp_device
-    check_links_of(out)
     try:
         with hold(out / ".lock", stage):
             folder, features = features_of(model, images, database, out / WORK, workers, device)

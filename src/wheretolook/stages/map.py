@@ -26,7 +26,7 @@ from wheretolook.stages.preconditions import (
     refuse_release,
 )
 from wheretolook.utils.artifact_cache import cache_key
-from wheretolook.utils.confine import check_folder_name, entry_of, path_within
+from wheretolook.utils.confine import check_folder_name, path_within, safe_child
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.utils.files import fingerprint
 
@@ -124,7 +124,7 @@ def _map_photographs(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
     assert settings.images is not None
     name = settings.name or settings.images.resolve().name
     check_folder_name("a scene's name, map.photographs.name,", name, NOT_SCENES)
-    scene = SceneFolder(entry_of(root, name, "a scene's name"), "test", experiment.camera.camera)
+    scene = SceneFolder(safe_child(root, name, "a scene's name"), "test", experiment.camera.camera)
     dataset = _with_photographs(scene, experiment)
     files = [settings.images / name for name in list_photographs(settings.images)]
     tables = [path for path in (settings.scale.marker_table, settings.scale.positions) if path is not None]
@@ -174,7 +174,7 @@ def _map_existing(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
         fix = "Give a model and a mesh that are both in metres with z up."
         raise ConfigError("a model that is turned or scaled leaves its mesh", value=str(settings.mesh), fix=fix)
     model = read_model(settings.model)
-    scene = SceneFolder(entry_of(root, name, "a scene's name"), "test", experiment.camera.camera)
+    scene = SceneFolder(safe_child(root, name, "a scene's name"), "test", experiment.camera.camera)
     scene = _with_own_camera(scene, model, experiment)
     dataset = _with_photographs(scene, experiment)
     tables = [photographs.scale.marker_table, photographs.scale.positions, settings.database]

@@ -12,7 +12,7 @@ from wheretolook.geometry.camera import CameraConfig, camera_of_record, describe
 from wheretolook.scans.config import RgbdConfig
 from wheretolook.stages.preconditions import Say, Tick
 from wheretolook.utils.artifact_cache import cache_key
-from wheretolook.utils.confine import check_folder_name, entry_of
+from wheretolook.utils.confine import check_folder_name, safe_child
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.files import write_json
 from wheretolook.utils.reading import read_json_object
@@ -29,7 +29,9 @@ def scan_scene(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
     settings = experiment.scenes.rgbd
     root = experiment.root
     check_folder_name("a scene's name, scenes.rgbd.name,", settings.scene_name, NOT_SCENES)
-    scene = SceneFolder(entry_of(root, settings.scene_name, "a scene's name"), settings.split, experiment.camera.camera)
+    scene = SceneFolder(
+        safe_child(root, settings.scene_name, "a scene's name"), settings.split, experiment.camera.camera
+    )
     others = _others(root, scene)
     key = cache_key("scenes", ["rgbd", *_made_from(settings)])
     if scene.stage_cache("scenes", key).is_current(scene.mesh, scene.folder / REPORT, scene.frames):

@@ -15,7 +15,7 @@ from wheretolook.dataset.sampling_config import Split
 from wheretolook.scenes.config import SceneKind
 from wheretolook.stages.preconditions import Say, Tick, mesh_fingerprint, refuse_release
 from wheretolook.utils.artifact_cache import cache_key
-from wheretolook.utils.confine import entry_of
+from wheretolook.utils.confine import safe_child
 from wheretolook.utils.errors import ConfigError, SceneError
 
 if TYPE_CHECKING:
@@ -44,11 +44,11 @@ def make_scenes(experiment: Experiment, say: Say = print, tick: Tick = lambda wo
     keys: dict[SceneFolder, list[Any]] = {}
     for seed, split in enumerate(splits, config.seed):
         kind = config.kind_of(seed)
-        scene = SceneFolder(entry_of(root, f"{kind}-{seed:03d}", "a scene's name"), split, camera)
+        scene = SceneFolder(safe_child(root, f"{kind}-{seed:03d}", "a scene's name"), split, camera)
         sources[scene] = partial(_generate, experiment, kind, seed)
         keys[scene] = [config.apartment.key(), seed, *([] if kind == "apartment" else [kind])]
     for source in config.meshes:
-        scene = SceneFolder(entry_of(root, source.scene_name, "a scene's name"), source.split, camera)
+        scene = SceneFolder(safe_child(root, source.scene_name, "a scene's name"), source.split, camera)
         if scene.name in {other.name for other in sources}:
             raise SceneError("two scenes have the same name", path=source.path, value=scene.name, fix="Give it a name.")
         sources[scene] = partial(_load, source)

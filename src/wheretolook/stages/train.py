@@ -17,7 +17,7 @@ from wheretolook.stages.preconditions import Say, Tick, dataset_after
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import log, log_history, start_run
 from wheretolook.tracking.store import check_store, kept_if_not_logged, warn_not_logged
-from wheretolook.utils.confine import entry_of
+from wheretolook.utils.confine import safe_child
 from wheretolook.utils.errors import TrackingError
 from wheretolook.utils.files import sha256, temporary_folder, write_json, write_text
 
@@ -69,7 +69,10 @@ def train_methods(
     shared: dict[str, Any] = {"progress": progress, "kept": {}}
     models = []
     with ExitStack() as stack:
-        for root in (dataset.root, *(entry_of(dataset.root.parent, name, "a dataset's name") for name in config.also)):
+        for root in (
+            dataset.root,
+            *(safe_child(dataset.root.parent, name, "a dataset's name") for name in config.also),
+        ):
             stack.enter_context(reading(root, "train"))
         dataset = with_also(dataset, config.also)
         for method in config.chosen():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.utils.confine import entry_of
+from wheretolook.utils.confine import safe_child
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.files import fingerprint
 
@@ -21,7 +21,7 @@ def with_also(dataset: Dataset, names: Sequence[str]) -> Dataset:
         raise ConfigError("a dataset would be learnt from twice", value=list(names), fix=fix)
     scenes = list(dataset.scenes)
     for name in names:
-        other = Dataset.load(entry_of(dataset.root.parent, name, "a dataset's name"))
+        other = Dataset.load(safe_child(dataset.root.parent, name, "a dataset's name"))
         scenes += training_scenes(Dataset(other.root, other.split("train")))
     if names:
         seen: dict[str, SceneFolder] = {}

@@ -1,4 +1,4 @@
-"""Logistic regressions that ship as a JSON file of weights by name: a few numbers in, a probability out."""
+"""Logistic regressions bundled as JSON files of weights by feature name."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from wheretolook.utils.reading import read_json_object
 
 @dataclass(frozen=True)
 class LogisticRegression:
-    """Each kind names the numbers it goes by, and says what it tells and in which file it ships."""
+    """Base class: a subclass names its features, what it predicts (`about`) and its bundled file."""
 
     names: ClassVar[tuple[str, ...]]
     about: ClassVar[str]
@@ -27,8 +27,8 @@ class LogisticRegression:
 
     @classmethod
     @cache
-    def shipped(cls) -> Self:
-        """That which ships, fitted on validation scenes."""
+    def bundled(cls) -> Self:
+        """The bundled model, fitted on validation scenes."""
         return cls.load(cls.file)
 
     @classmethod
@@ -36,14 +36,13 @@ class LogisticRegression:
         """Read a JSON file of weights by name and a bias. Raises a WeightsError if it is damaged."""
         try:
             stored = read_json_object(path)
-            made = cls(tuple(float(stored["weights"][name]) for name in cls.names), float(stored["bias"]))
-            if not np.isfinite([*made.weights, made.bias]).all():
+            model = cls(tuple(float(stored["weights"][name]) for name in cls.names), float(stored["bias"]))
+            if not np.isfinite([*model.weights, model.bias]).all():
                 raise ValueError("a weight is not finite")
         except (OSError, ValueError, KeyError, TypeError) as error:
-            fix = "Install the package again, or fit it anew."
-            raise WeightsError(f"a damaged file of {cls.about}: {error}", path=path, fix=fix) from error
-        return made
+            raise WeightsError(f"a damaged file of {cls.about}: {error}", path=path, fix="Fit it again.") from error
+        return model
 
-    def probabilities(self, told: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-        """(...,) of the numbers it goes by, (..., K) in the order of their names."""
-        return np.asarray(1 / (1 + np.exp(-np.clip(told @ np.asarray(self.weights) + self.bias, -60, 60))))
+    def predict_proba(self, features: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+        """Probabilities (...,) for feature vectors (..., K) in the order of `names`."""
+        return np.asarray(1 / (1 + np.exp(-np.clip(features @ np.asarray(self.weights) + self.bias, -60, 60))))

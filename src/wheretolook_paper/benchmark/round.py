@@ -18,7 +18,7 @@ from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.select.waypoints import Waypoints, read_waypoints
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
-from wheretolook.utils.confine import entry_of
+from wheretolook.utils.confine import safe_child
 from wheretolook.utils.errors import SceneError, StorageError, TableError
 from wheretolook.utils.files import atomic_folder, fingerprint, write_bytes
 from wheretolook.utils.version import VERSION
@@ -293,7 +293,7 @@ class SceneRound:
 
 
 def _image_file(folder: Path, name: str) -> Path:
-    return entry_of(folder / IMAGES, f"{name}{IMAGE_ENDING}", "a view's id")
+    return safe_child(folder / IMAGES, f"{name}{IMAGE_ENDING}", "a view's id")
 
 
 def _checked(waypoints: Waypoints) -> Waypoints:

@@ -90,7 +90,7 @@ def compare_looks(
     good = is_good(table)
     scores = scorer.score(cam_from_world)
     rng = np.random.default_rng(config.seed)
-    set_score = SetScoreModel.shipped()
+    set_score = SetScoreModel.bundled()
     sets: list[list[int]] = []
     about: list[dict[str, Any]] = []
     for _, rows in table.groupby("location_id").indices.items():

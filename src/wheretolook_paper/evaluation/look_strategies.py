@@ -63,5 +63,5 @@ def choose_set(
         objective = count_score if strategy == "visible" else information_score
         return list(select_views(certain, objective, n, rotations).rows)
     options = {"exchanges": 0} if strategy == "in-turn" else {}
-    chosen = select_views(views, SetScoreModel.shipped(), n, rotations, single=scores, **options)
+    chosen = select_views(views, SetScoreModel.bundled(), n, rotations, single=scores, **options)
     return list(chosen.rows)

@@ -17,7 +17,7 @@ from wheretolook.figures.dollhouse import Dollhouse, draw_house, draw_segments, 
 from wheretolook.figures.style import BLUE, GREEN, INK, RC, VERMILION, Style, new_figure
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, camera_centers, pose_error
-from wheretolook.localization.confidence import Confidence
+from wheretolook.localization.confidence import ConfidenceModel
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.rig import Look, rig_of
 from wheretolook.localization.rig_localization import JointLocalization, JointLocalizer
@@ -94,7 +94,7 @@ def tell_looks(
     camera: Camera,
     cam_from_world: ArrayLike,
     images: Pixels,
-    confidence: Confidence | None = None,
+    confidence: ConfidenceModel | None = None,
 ) -> LookStory:
     """Localize images (N, H, W, 3) of looks (N, 3, 4) from one place, each alone and all together.
 
@@ -103,7 +103,7 @@ def tell_looks(
     true = np.asarray(cam_from_world, dtype=np.float64)
     if len(true) < 2:
         raise PoseError("a story of looks needs two of them", value=len(true))
-    sure = confidence or Confidence.shipped()
+    sure = confidence or ConfidenceModel.bundled()
     joint = JointLocalizer(localizer.estimator)
     found = [localizer.localize(image) for image in images]
     looks = [
@@ -116,7 +116,7 @@ def tell_looks(
     return LookStory(camera, true, images, alone, _found(joint.localize_together(looks), looks, true, sure))
 
 
-def _found(pose: JointLocalization, looks: Sequence[Look], true: Float, confidence: Confidence) -> Found:
+def _found(pose: JointLocalization, looks: Sequence[Look], true: Float, confidence: ConfidenceModel) -> Found:
     pixels = tuple(look.pixels[kept] for look, kept in zip(looks, pose.inliers, strict=True))
     if pose.cams_from_world is None:
         return Found(None, pixels, 0.0, np.inf, np.inf)

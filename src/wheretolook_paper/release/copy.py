@@ -20,7 +20,7 @@ from wheretolook.mapping.colmap_model import CAMERAS_FILE, save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.method import Method
 from wheretolook.scorers.registry import learned, scorers
-from wheretolook.utils.confine import entry_of
+from wheretolook.utils.confine import safe_child
 from wheretolook.utils.errors import ConfigError, StorageError, TableError, WeightsError
 from wheretolook.utils.files import sha256, write_json
 from wheretolook.utils.reading import read_json_object
@@ -57,7 +57,7 @@ def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> D
     for scene in before.scenes if before is not None else ():
         scene.stage_cache("label").clear()  # until all is copied, nothing may learn from what is there
     copied = [
-        (scene, SceneFolder(entry_of(root, scene.name, "a scene's name"), scene.split, scene.camera))
+        (scene, SceneFolder(safe_child(root, scene.name, "a scene's name"), scene.split, scene.camera))
         for scene in dataset.scenes
     ]
     for scene, copy in copied:

@@ -84,8 +84,8 @@ def main() -> None:
     sets = pd.concat([drawn_sets(scene, options.places, options.sets) for scene in scenes], ignore_index=True)
     accepted = sets[sets["n_inliers"] >= 10]
     names = ("n_inliers", "n_matches", "elsewhere", "own", "rival_own", "deviation_deg")
-    fitted = report("confidence", confidence.told_numbers(*(accepted[name] for name in names)), accepted)
-    weights = dict(zip(confidence.TOLD, fitted.coef_[0].round(4).tolist(), strict=True))
+    fitted = report("confidence", confidence.confidence_features(*(accepted[name] for name in names)), accepted)
+    weights = dict(zip(confidence.FEATURE_NAMES, fitted.coef_[0].round(4).tolist(), strict=True))
     print(json.dumps({"weights": weights, "bias": round(float(fitted.intercept_[0]), 4)}, indent=2))
     chance = np.clip(1 - sets["failed"].to_numpy(), worth.MIN_PROBABILITY, 1 - worth.MIN_PROBABILITY)
     mixed = np.log(chance / (1 - chance)) - VARIANCE * sets["log_position_variance"].to_numpy()

@@ -129,7 +129,7 @@ def test_odometry_is_off_by_a_share_of_each_step() -> None:
 def test_stops_are_refused_where_no_method_can(compared: tuple) -> None:
     check_joint(CONFIG)
     check_joint(replace(CONFIG, methods=("forward", "visible"), stops=StopConfig()))
-    with pytest.raises(ConfigError, match="probabilities"):
+    with pytest.raises(ConfigError):
         check_joint(replace(CONFIG, methods=("forward", "visible")))
     assert {*KEY} <= {*compared[0].views}
     assert len(poses(compared[1])) == 1

@@ -100,7 +100,7 @@ def test_from_a_model_to_a_planned_path(tmp_path, with_mesh):
     said: list[str] = []
     stages.make_maps(experiment, said.append)
     n_points = model.num_points3D()
-    assert f"flat: {n_points} landmarks from 36 images" in said[0] and "taken for a metre" in said[1]
+    assert f"flat: {n_points} landmarks from 36 images" in said[0] and "metre" in said[1]
     (scene,) = Dataset.load(tmp_path / "data" / "mine").scenes
     assert scene.name == "flat" and scene.camera == LOOKS and scene.own_camera
     assert scene.is_photographed is not with_mesh and len(scene.read_landmarks()) == n_points
@@ -222,7 +222,7 @@ def test_a_turned_and_scaled_model_is_doubted_and_mended(tmp_path):
     table.write_text("image,x,y,z\n" + "".join(f"{i:03d}.jpg,{x},{y},{z}\n" for i, (x, y, z) in enumerate(centers)))
     by_positions, report = mended(ScaleConfig(positions=table))
     np.testing.assert_allclose(by_positions, centers, atol=1e-6)
-    with pytest.raises(ConfigError, match=r"markers are found in photographs.*--images"):
+    with pytest.raises(ConfigError, match=r"markers are detected in photographs.*--images"):
         mended(ScaleConfig(marker_size_m=0.4))
 
 
@@ -241,7 +241,7 @@ def test_a_mesh_of_another_frame_is_doubted(tmp_path):
     (["--model", "nowhere"], "no such folder"),
     (["--model", "flat", "--mesh", "nowhere.glb"], "nowhere.glb"),
     (["--model", "flat", "--database", "nowhere.db"], "no such database"),
-    (["--model", "flat", "--images", "nowhere"], "an image of the model is missing"),
+    (["--model", "flat", "--images", "nowhere"], "cannot read an image of the model"),
     (["--model", "flat", "--images", ".", "--database", "x.db"], "Leave --database out"),
 ])  # fmt: skip
 def test_the_command_line_names_what_is_missing(tmp_path, monkeypatch, capsys, arguments, said):

@@ -15,7 +15,7 @@ from wheretolook.dataset.layout import SceneFolder
 from wheretolook.geometry.camera import Camera, cameras_by_id, only_camera
 from wheretolook.geometry.lattices import ViewLattice, VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.mapping.scale import read_scale
+from wheretolook.mapping.georeference import read_scale
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import MapError, SceneError

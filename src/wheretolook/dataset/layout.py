@@ -18,7 +18,7 @@ from wheretolook.dataset.viewpoint_table import CAMERA_ID, read_table
 from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of_record, read_cameras
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, compact_poses, holds_model, load_mapping_poses
-from wheretolook.mapping.scale import read_scale
+from wheretolook.mapping.georeference import read_scale
 from wheretolook.utils.artifact_cache import ArtifactCache
 from wheretolook.utils.confine import safe_child
 from wheretolook.utils.errors import ConfigError, SceneError, TableError

@@ -23,10 +23,10 @@ from wheretolook.localization.labeller import versions
 from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_arrays, read_model, registered_names
 from wheretolook.mapping.config import ExistingModelConfig, MapConfig, PhotographsConfig
 from wheretolook.mapping.feature_files import read_descriptors
+from wheretolook.mapping.georeference import Similarity, read_scale
 from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.mapping.rendered_map import DATABASE_FILE
 from wheretolook.mapping.sanity import axes_doubt
-from wheretolook.mapping.scale import Similarity, read_scale
 from wheretolook.mapping.sources import features_beside, photographs_of
 from wheretolook.utils.confine import safe_child
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning

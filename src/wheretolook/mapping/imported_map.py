@@ -1,67 +1,59 @@
-"""A map from a COLMAP model of one's own: as it is, turned and scaled, or triangulated anew at its poses."""
+"""Make a map from an existing COLMAP model: as it is, rotated and scaled, or triangulated again at its poses."""
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
 
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.mapping import rendered_map as building
 from wheretolook.mapping.colmap_model import (
-    CAMERAS_FILE,
     colmap_poses,
     describe_intrinsics,
     model_arrays,
+    observation_matrix,
     read_model,
     registered_names,
-    save_mapping_poses,
-    write_model,
 )
 from wheretolook.mapping.config import EXHAUSTIVE_UP_TO, PARTNERS, MapConfig
-from wheretolook.mapping.feature_files import HDF5_SUFFIXES
-from wheretolook.mapping.frame import KnownScale, find_scale
+from wheretolook.mapping.georeference import KnownScale, MapScale, Similarity, find_scale
 from wheretolook.mapping.gravity import estimate_gravity
-from wheretolook.mapping.landmarks import load_colmap_landmarks
-from wheretolook.mapping.rendered_map import DATABASE_FILE, LANDMARKS_FILE, REPORT_FILE, Clock
+from wheretolook.mapping.map_folder import (
+    DATABASE_FILE,
+    MapDraft,
+    MapReport,
+    MapRun,
+    check_replaceable,
+    finish_map,
+    total_seconds,
+)
 from wheretolook.mapping.sanity import warn_of_frame
-from wheretolook.mapping.scale import MapScale, Similarity
 from wheretolook.mapping.sfm import PhotographFeatures, photograph_features
-from wheretolook.mapping.triangulation import choose_pairs, color_points, triangulate_model
+from wheretolook.mapping.triangulation import choose_pairs, triangulate_model
 from wheretolook.utils.confine import path_within
 from wheretolook.utils.errors import ConfigError, MapError
-from wheretolook.utils.files import atomic_folder, copy_file, write_text
+from wheretolook.utils.files import atomic_folder
 from wheretolook.utils.images import image_size
 from wheretolook.utils.processes import WorkerPool
 
-_PROPORTIONS = 0.01  # by which a photograph's proportions may differ from those of its camera
-_ORIENTATION = 274  # number of EXIF's entry, and its values for photographs that lie on a side
-_ASIDE = (5, 6, 7, 8)
-_FACING_DEG = 60.0  # cameras that look in directions farther apart are not matched where no points say what they share
+_PROPORTION_TOLERANCE = 0.01  # between the proportions of a photograph and of its camera
+_EXIF_ORIENTATION = 274
+_SIDEWAYS = (5, 6, 7, 8)  # values of EXIF's orientation for photographs that are stored on a side
+_FACING_DEG = 60.0  # without points, cameras whose axes differ by more are not matched
 
 
 @dataclass(frozen=True)
-class ExistingMapReport:
-    """What came of a model of one's own; `report.json`."""
+class ExistingMapReport(MapReport):
+    """Properties of a map from an existing model; `report.json`."""
 
-    n_images: int  # images with a pose
-    n_points: int  # points of the model given
-    triangulated_anew: bool  # whether the landmarks are new ones, from the images
-    n_landmarks: int  # landmarks after the filter
-    n_landmarks_removed: int  # points the filter removed
+    n_points: int  # points of the existing model
+    triangulated_anew: bool  # whether the landmarks were triangulated again, from the images
     has_descriptors: bool  # without them, ambiguity is unknown and nothing can be localized
-    median_track_length: float  # observations of a landmark
-    mean_reprojection_error_px: float  # mean over the landmarks
     cameras: list[dict[str, Any]]  # COLMAP's intrinsics
     scale: MapScale
-    seed: int  # seed of COLMAP
-    config: dict[str, Any]  # the configuration, as a dictionary
-    seconds: dict[str, float]  # wall-clock time of each step
 
 
 def map_existing(
@@ -74,12 +66,12 @@ def map_existing(
     progress: bool = True,
     reconstruction: Any = None,
 ) -> ExistingMapReport:
-    """Make a map of the COLMAP model in `config.existing.model`, which may have been read already.
+    """Make a map of the COLMAP model in `config.existing.model`; `reconstruction` is that model, if read already.
 
-    The result is what `build_map` makes: a COLMAP model with `landmarks.npz`, `cameras.npz` and `report.json`, which is
-    also returned, beside it. Without images it is the model itself, rigs and all. With `config.photographs.images`, its
-    images have the same poses and names, but ids from 1 and, as for a map of photographs, the reduced size; their
-    keypoints are kept in `work`. A `MapWarning` says what is left out, and if metres or z up are doubtful.
+    Writes what `build_map` writes: a COLMAP model with `landmarks.npz`, `cameras.npz` and `report.json`, which is also
+    returned. Without images it is the model itself, with its rigs. With `config.photographs.images`, its images have
+    the same poses and names, but ids from 1 and, as in a map of photographs, the reduced size; their keypoints are
+    cached in `work`. A `MapWarning` reports points that are left out, and doubts about metres or z up.
 
     Raises MapError if the model, the database or an image cannot be used, nothing gives the scale asked for, or
     `out_dir` holds something that is not a map; ConfigError for settings that exclude one another.
@@ -88,23 +80,23 @@ def map_existing(
     photographs = config.photographs
     out_dir = Path(out_dir)
     work = Path(work)
-    clock = Clock()
     if settings.model is None:
         raise ConfigError("no model was named", fix="Set map.existing.model.")
-    anew = photographs.images is not None
-    if anew and settings.database is not None:
-        fix = "Leave --database out to triangulate anew, or --images to keep the model's landmarks."
-        raise ConfigError("images give new keypoints, so a database is of no use", value=settings.database, fix=fix)
-    building.refuse_foreign_folder(out_dir)
+    if photographs.images is not None and settings.database is not None:
+        fix = "Leave --database out to triangulate again, or --images to keep the model's landmarks."
+        raise ConfigError("images give new keypoints, which a database does not describe", fix=fix)
+    check_replaceable(out_dir)
     known = KnownScale.read(photographs.scale)
-    with clock("read"):
-        model = reconstruction or read_model(settings.model)
-        colmap_poses(settings.model, model)  # raises if there is no image with a pose
-        n_points = model.num_points3D()
+    with atomic_folder(out_dir) as folder, WorkerPool(workers) as processes:
+        run = MapRun(config, processes, seed, device, progress)
+        clock = run.clock
+        with clock("read"):
+            model = reconstruction or read_model(settings.model)
+            colmap_poses(settings.model, model)  # raises if there is no image with a pose
+            n_points = model.num_points3D()
         database = settings.database
+        limit_px = settings.max_reprojection_error_px
         turned = True
-    with atomic_folder(out_dir) as partial, WorkerPool(workers) as processes:
-        worst_px = settings.max_reprojection_error_px
         if photographs.images is not None:
             with clock("extract"):
                 work.mkdir(parents=True, exist_ok=True)
@@ -112,51 +104,31 @@ def map_existing(
                 for name in names:
                     path_within(photographs.images, name, "the name of an image of the model")
                 turned = _are_turned(model, photographs.images)
-                how = (photographs.max_side_px, config.extractor, processes, device, progress, names, turned)
-                features = photograph_features(photographs.images, work, *how)
-            database = partial / DATABASE_FILE
-            model = _triangulate(model, features, database, config, clock, seed, processes, progress)
-            worst_px = worst_px or photographs.max_reprojection_error_px
+                features = photograph_features(photographs.images, work, run, names, turned)
+            database = folder / DATABASE_FILE
+            model = _triangulate(model, features, database, run)
+            limit_px = limit_px or photographs.max_reprojection_error_px
         with clock("frame"):
             scale, to_world = _world(model, known, settings.level, photographs.images, turned, progress)
             if to_world is not None:
                 to_world.transform_model(model)
-        with clock("filter_and_write"):
-            n_removed = 0
-            if worst_px:
-                if not all(point.has_error() for point in model.points3D.values()):
-                    model.update_point_3d_errors()
-                fix = "Raise map.existing.max_reprojection_error_px, or check the model's poses and intrinsics."
-                n_removed = building.remove_inaccurate(model, worst_px, settings.model, fix)
-            if anew:
-                color_points(model, features.colors)
-            write_model(model, partial)
-        with clock("landmarks"):
-            landmarks = load_colmap_landmarks(settings.model, database, device=device, reconstruction=model)
-            landmarks.save(partial / LANDMARKS_FILE)
-            poses = colmap_poses(settings.model, model)
-            save_mapping_poses(poses, partial / CAMERAS_FILE)
-        if anew and not config.keep_database:
-            (partial / DATABASE_FILE).unlink()
-        elif config.keep_database and settings.database is not None:
-            is_features = settings.database.suffix.lower() in HDF5_SUFFIXES
-            copy_file(settings.database, partial / (settings.database.name if is_features else DATABASE_FILE))
+            if limit_px and not all(point.has_error() for point in model.points3D.values()):
+                model.update_point_3d_errors()
+        fix = "Raise map.existing.max_reprojection_error_px, or check the model's poses and intrinsics."
+        draft = MapDraft(model, settings.model, limit_px, fix, database, search_device=device)
+        landmarks, fields = finish_map(draft, folder, run)
+        poses = colmap_poses(settings.model, model)
         report = ExistingMapReport(
             n_images=len(poses),
+            **fields,
+            seconds=total_seconds(clock),
             n_points=n_points,
-            triangulated_anew=anew,
-            n_landmarks=len(landmarks),
-            n_landmarks_removed=n_removed,
+            triangulated_anew=photographs.images is not None,
             has_descriptors=landmarks.descriptors is not None,
-            median_track_length=float(np.median(landmarks.track_length)),
-            mean_reprojection_error_px=float(landmarks.reprojection_error_px.mean()),
             cameras=[describe_intrinsics(camera) for _, camera in sorted(model.cameras.items())],
             scale=scale,
-            seed=seed,
-            config=asdict(config),
-            seconds={**clock.seconds, "total": sum(clock.seconds.values())},
         )
-        write_text(partial / REPORT_FILE, json.dumps(asdict(report), indent=2, default=str) + "\n")
+        report.save(folder)
     warn_of_frame(settings.model, landmarks.mapping_distance_m, poses)
     return report
 
@@ -164,7 +136,7 @@ def map_existing(
 def _world(
     model: Any, known: KnownScale, level: bool, images: Path | None, turned: bool, progress: bool
 ) -> tuple[MapScale, Similarity | None]:
-    """The scale of a model, and the similarity to the world; None if it is to stay as it is."""
+    """The scale of a model, and the similarity to the world; None if the model stays as it is."""
     rotation: Float = np.eye(3)
     if level:
         rotation = estimate_gravity(colmap_poses("", model)).rotation
@@ -174,30 +146,20 @@ def _world(
     return MapScale("model"), to_world if level else None
 
 
-def _triangulate(
-    source: Any,
-    features: PhotographFeatures,
-    database: Path,
-    config: MapConfig,
-    clock: Clock,
-    seed: int,
-    processes: WorkerPool,
-    progress: bool,
-) -> Any:
-    """New landmarks at the poses of a model, from keypoints of its images with a pose. Returns a new model."""
-    with clock("pairs"):
-        pairs = _pairs(source, PARTNERS, EXHAUSTIVE_UP_TO)
-    model = _posed_model(source, features)
-    steps = (config, clock, seed, processes, progress)
-    model = triangulate_model(database, model, features.stored, features.colors, pairs, *steps)
+def _triangulate(source: Any, features: PhotographFeatures, database: Path, run: MapRun) -> Any:
+    """Triangulate new landmarks at the poses of a model, from keypoints of its images. Returns a new model."""
+    with run.clock("pairs"):
+        pairs = _pairs(source)
+    model = triangulate_model(database, _posed_model(source, features), features.stored, features.colors, pairs, run)
     if not model.num_points3D():
         fix = "Check that these are the model's images, and that they overlap."
-        raise MapError("the images give no landmark at the model's poses", path=config.photographs.images, fix=fix)
+        images = run.config.photographs.images
+        raise MapError("the images give no landmark at the model's poses", path=images, fix=fix)
     return model
 
 
 def _posed_model(source: Any, features: PhotographFeatures) -> Any:
-    """A reconstruction of the same cameras, names and poses, of the size of the features; image i has the id i + 1."""
+    """A reconstruction with the same cameras, names and poses, at the size of the features; image i has the id i + 1."""
     import pycolmap
 
     model = pycolmap.Reconstruction()
@@ -218,64 +180,66 @@ def _posed_model(source: Any, features: PhotographFeatures) -> Any:
     return model
 
 
-def _pairs(source: Any, partners: int, exhaustive_up_to: int) -> NDArray[np.int64]:
-    """Pairs (P, 2) of images with a pose to match, i < j, in the order of their ids: all of a few images.
+def _pairs(source: Any) -> NDArray[np.int64]:
+    """Pairs (P, 2) of images with a pose to match, i < j, in the order of their ids: all pairs of a few images.
 
     Of more, each with those that share most points of the model, or without points with the nearest that face much the
     same way.
     """
     poses = colmap_poses("", source)
     n = len(poses)
-    if n <= exhaustive_up_to:
+    if n <= EXHAUSTIVE_UP_TO:
         return np.column_stack(np.triu_indices(n, 1)).astype(np.int64)
     if source.num_points3D():
-        model = model_arrays(source)
-        point = np.repeat(np.arange(len(model.points)), np.diff(model.observation_start))
-        ones = np.ones(len(point), dtype=np.int32)
-        sees = coo_array((ones, (model.observation_image, point)), shape=(n, len(model.points))).tocsr()
-        sees.data[:] = 1  # a point observed twice in an image counts once
-        shared = np.asarray((sees @ sees.T).toarray(), dtype=np.float64)
+        observed = observation_matrix(model_arrays(source))
+        shared = np.asarray((observed @ observed.T).toarray(), dtype=np.float64)
         np.fill_diagonal(shared, 0)
-        return choose_pairs(shared, partners, 1.0)
+        return choose_pairs(shared, PARTNERS, 1.0)
     centers = camera_centers(poses)
     distance = np.linalg.norm(centers[:, None] - centers, axis=-1)
     nearness = 1 / (1 + distance) * (poses[:, 2, :3] @ poses[:, 2, :3].T > np.cos(np.radians(_FACING_DEG)))
     np.fill_diagonal(nearness, 0)
-    return choose_pairs(nearness, 2 * partners, 0.0)
+    return choose_pairs(nearness, 2 * PARTNERS, 0.0)
 
 
 def _are_turned(model: Any, folder: Path) -> bool:
     """Whether the model's images are its photographs turned upright by EXIF; else they are as stored.
 
-    COLMAP's versions differ in this. Raises MapError if one is missing, unreadable, or has neither proportions.
+    COLMAP's versions differ in this. Raises MapError if a photograph is missing or unreadable, or fits its camera in
+    neither way.
     """
-    images = [model.images[number] for number in registered_names(model)]
-    misfits: list[tuple[str, tuple[int, int], tuple[int, int]]] = []
+    misfits = []
     for turned in (True, False):
-        for image in images:
-            camera = model.cameras[image.camera_id]
-            (width, height) = _size(folder / image.name, turned)
-            if abs(width * camera.height / (height * camera.width) - 1) > _PROPORTIONS:
-                misfits.append((image.name, (width, height), (camera.width, camera.height)))
-                break
-        else:
+        misfit = next(
+            filter(None, (_misfit(model, number, folder, turned) for number in registered_names(model))), None
+        )
+        if misfit is None:
             return turned
+        misfits.append(misfit)
     name, size, expected = misfits[0]
-    problem = f"this photograph has other proportions than its camera in the model, {expected[0]} x {expected[1]}"
+    problem = f"the photograph's proportions differ from those of its camera in the model, {expected}"
     raise MapError(problem, path=folder / name, value=size, fix="Give the photographs that the model was made from.")
 
 
+def _misfit(model: Any, number: int, folder: Path, turned: bool) -> tuple[str, str, str] | None:
+    """Name, size and expected size of a model's image, if the photograph has other proportions than its camera."""
+    image = model.images[number]
+    camera = model.cameras[image.camera_id]
+    width, height = _size(folder / image.name, turned)
+    if abs(width * camera.height / (height * camera.width) - 1) <= _PROPORTION_TOLERANCE:
+        return None
+    return image.name, f"{width} x {height}", f"{camera.width} x {camera.height}"
+
+
 def _size(path: Path, turned: bool) -> tuple[int, int]:
-    """Width and height of a photograph, turned upright as the EXIF orientation says, or as stored."""
+    """Width and height of a photograph, turned upright by its EXIF orientation, or as stored."""
     from PIL import Image
 
     try:
         width, height = image_size(path)
         with Image.open(path) as photograph:
-            is_aside = turned and photograph.getexif().get(_ORIENTATION, 1) in _ASIDE
-    except FileNotFoundError as error:
-        fix = "Give the folder that the names of the model's images are relative to."
-        raise MapError("an image of the model is missing", path=path, fix=fix) from error
+            swapped = turned and photograph.getexif().get(_EXIF_ORIENTATION, 1) in _SIDEWAYS
     except (OSError, ValueError) as error:
-        raise MapError(f"cannot read this photograph: {error}", path=path, fix="Copy it again.") from error
-    return (height, width) if is_aside else (width, height)
+        fix = "Give the folder that the names of the model's images are relative to."
+        raise MapError(f"cannot read an image of the model: {error}", path=path, fix=fix) from error
+    return (height, width) if swapped else (width, height)

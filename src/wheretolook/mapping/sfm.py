@@ -1,9 +1,7 @@
-"""Poses and points of photographs by COLMAP's incremental mapping. Finished steps are kept and not done again."""
+"""Poses and points of photographs by COLMAP's incremental mapping, with a cache of finished steps."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import shutil
 from collections.abc import Iterator
@@ -15,24 +13,26 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.descriptors import DescriptorKind, Stored
-from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.registry import kind_of
-from wheretolook.mapping import photographs
 from wheretolook.mapping.colmap_model import read_model, write_model
-from wheretolook.mapping.photographs import PhotographCameras, list_photographs, photograph_pairs
-from wheretolook.mapping.rendered_map import extract_with_colors
-from wheretolook.mapping.triangulation import fill_database, match_pairs, stored_keypoints
+from wheretolook.mapping.config import EXHAUSTIVE_UP_TO
+from wheretolook.mapping.map_folder import MapRun
+from wheretolook.mapping.photographs import (
+    PhotographCameras,
+    list_photographs,
+    photograph_pairs,
+    read_photograph,
+    reduce_photograph,
+)
+from wheretolook.mapping.triangulation import extract_with_colors, fill_database, match_pairs, stored_keypoints
+from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.colmap import quiet_colmap, storing_in_database
 from wheretolook.utils.errors import MapError
-from wheretolook.utils.files import write_json
-from wheretolook.utils.npz_files import load_npz, save_npz
-from wheretolook.utils.processes import WorkerPool
-from wheretolook.utils.reading import read_json_object
 
-_LEAST_IMAGES = 3  # of a model: two photographs alone do not determine a camera
-_VERSION = 1  # of the format in which finished steps are kept
+_MIN_IMAGES = 3  # of a model: two photographs do not determine a camera
+_MANIFEST = "steps.json"
+_VERSION = 2  # of the format of finished steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class PhotographFeatures:
     sizes: NDArray[np.int64]  # (I, 2) width and height as mapped
     stored: list[Stored]  # pixels and descriptors of each photograph's keypoints
     colors: list[NDArray[np.uint8]]  # (N_i, 3) uint8 of each photograph's keypoints
-    key: str  # changes whenever something changes that the keypoints depend on
+    key: str  # hash of everything that determines the keypoints
     kind: DescriptorKind  # of the descriptors
 
 
@@ -58,104 +58,90 @@ class MappedPhotographs:
 
 
 def photograph_features(
-    folder: Path,
-    work: Path,
-    max_side_px: int,
-    extractor: ExtractorConfig,
-    processes: WorkerPool,
-    device: str = "cpu",
-    progress: bool = True,
-    names: list[str] | None = None,
-    turned: bool = True,
+    folder: Path, work: Path, run: MapRun, names: list[str] | None = None, turned: bool = True
 ) -> PhotographFeatures:
-    """Keypoints of photographs in a folder, by the project's extractor: a later localization uses the same.
+    """Extract keypoints of photographs in a folder, at most `max_side_px` large; those of a finished run are reused.
 
-    Of all photographs in it, unless names are given; read as `read_photograph` does. Raises MapError if one cannot be
-    read, or the folder holds fewer than two.
+    Takes all photographs unless names are given; `turned` is that of `read_photograph`. Raises MapError if one cannot
+    be read, or the folder holds fewer than two.
     """
     names = list_photographs(folder) if names is None else names
+    max_side_px = run.config.photographs.max_side_px
     files = [(name, (folder / name).stat().st_size, (folder / name).stat().st_mtime_ns) for name in names]
-    how = [] if turned else ["as stored"]
-    key = _key([files, max_side_px, extractor.record(), *how])
-    path = work / "features.npz"
-    kept = _load(path, key)
-    if kept is None:
-        kept = _extract(folder, names, max_side_px, KeypointExtractor(extractor, device), processes, progress, turned)
-        save_npz(path, {"key": np.array(key), **kept})
-    ends = np.cumsum(kept["counts"])[:-1]
-    pixels, descriptors, colors = (np.split(kept[name], ends) for name in ("pixels", "descriptors", "colors"))
+    extractor = run.config.extractor
+    key = cache_key(_VERSION, files, max_side_px, extractor.record(), turned)
+    cache = ArtifactCache(work, key, "features", _MANIFEST)
+    results = cache.load("features.npz")
+    if results is None:
+        results = cache.store({"features.npz": _extract(folder, names, turned, run)})
+    arrays = results["features.npz"]
+    ends = np.cumsum(arrays["counts"])[:-1]
+    pixels, descriptors, colors = (np.split(arrays[name], ends) for name in ("pixels", "descriptors", "colors"))
     stored = list(zip(pixels, descriptors, strict=True))
-    return PhotographFeatures(names, kept["full_sizes"], kept["sizes"], stored, colors, key, kind_of(extractor.method))
+    kind = kind_of(extractor.method)
+    return PhotographFeatures(names, arrays["full_sizes"], arrays["sizes"], stored, colors, key, kind)
 
 
 def map_incrementally(
-    work: Path,
-    features: PhotographFeatures,
-    cameras: PhotographCameras,
-    exhaustive_up_to: int,
-    overlap: int,
-    seed: int,
-    processes: WorkerPool,
-    progress: bool = True,
+    work: Path, features: PhotographFeatures, cameras: PhotographCameras, run: MapRun
 ) -> MappedPhotographs:
     """Match photographs, verify the matches, and map incrementally (Schonberger and Frahm, CVPR 2016).
 
-    Finished steps are kept in `work`. For `exhaustive_up_to` and `overlap` see `photograph_pairs`. The processes match;
-    COLMAP's bundle adjustment takes as many threads. MapError if the photographs do not overlap enough for any map.
+    Finished steps are cached in `work`. The worker processes match; COLMAP's bundle adjustment takes as many threads.
+    Raises MapError if the photographs do not overlap enough for a map.
     """
-    seed %= 2**31  # COLMAP keeps it in an int
-    pairs = photograph_pairs(len(features.names), exhaustive_up_to, overlap)
-    key = _key([features.key, pairs.tolist()])
+    seed = run.seed % 2**31  # COLMAP keeps it in an int
+    pairs = photograph_pairs(len(features.names), EXHAUSTIVE_UP_TO, run.config.photographs.overlap)
+    key = cache_key(features.key, pairs.tolist())
     database = work / "database.db"
-    kept = _load(work / "matches.npz", key)
-    if kept is None:
+    cache = ArtifactCache(work, key, "matches", _MANIFEST)
+    results = cache.load("matches.npz")
+    if results is None:
         with storing_in_database(database):
-            matches = list(match_pairs(features.stored, pairs, work, processes, progress, features.kind))
-        kept = {"matches": np.concatenate(matches), "counts": np.array([len(found) for found in matches])}
-        save_npz(work / "matches.npz", {"key": np.array(key), **kept})
+            found = list(match_pairs(features.stored, pairs, work, run.processes, run.progress, features.kind))
+        arrays = {"matches": np.concatenate(found), "counts": np.array([len(matches) for matches in found])}
+        results = cache.store({"matches.npz": arrays})
+    matches = np.split(results["matches.npz"]["matches"], np.cumsum(results["matches.npz"]["counts"])[:-1])
     intrinsics = [camera.todict() for camera in cameras.cameras]
-    key = _key([key, intrinsics, cameras.camera_of.tolist(), cameras.given, seed])
+    key = cache_key(key, intrinsics, cameras.camera_of.tolist(), cameras.given, seed)
     folder = work / "sparse"
-    note = work / "sparse.json"
-    if not (database.is_file() and folder.is_dir() and _note(note).get("key") == key):
-        for leftover in (database, note):
-            leftover.unlink(missing_ok=True)
+    cache = ArtifactCache(work, key, "sparse", _MANIFEST)
+    results = cache.load("sparse.json") if cache.is_current(database, folder) else None
+    if results is None:
+        cache.clear()
+        database.unlink(missing_ok=True)
         shutil.rmtree(folder, ignore_errors=True)
-        matches = np.split(kept["matches"], np.cumsum(kept["counts"])[:-1])
         _fill(database, features, cameras, pairs, matches)
-        model_sizes = _reconstruct(database, folder, len(features.names), cameras.given, seed, processes, progress)
-        write_json(note, {"key": key, "model_sizes": model_sizes})
-    return MappedPhotographs(read_model(folder), database, _note(note)["model_sizes"])
+        model_sizes = _reconstruct(database, folder, len(features.names), cameras.given, seed, run)
+        results = cache.store({"sparse.json": {"model_sizes": model_sizes}})
+    return MappedPhotographs(read_model(folder), database, results["sparse.json"]["model_sizes"])
 
 
-def _extract(
-    folder: Path,
-    names: list[str],
-    max_side_px: int,
-    extractor: KeypointExtractor,
-    processes: WorkerPool,
-    progress: bool,
-    turned: bool = True,
-) -> dict[str, NDArray[Any]]:
+def _extract(folder: Path, names: list[str], turned: bool, run: MapRun) -> dict[str, NDArray[Any]]:
+    """Sizes, keypoints, descriptors and colours of photographs, as the arrays of `features.npz`."""
     full_sizes = []
     sizes = []
 
     def images() -> Iterator[NDArray[np.uint8]]:
         for name in names:
-            rgb = photographs.read_photograph(folder / name, turned)
-            reduced = photographs.reduce_photograph(rgb, max_side_px)
+            rgb = read_photograph(folder / name, turned)
+            reduced = reduce_photograph(rgb, run.config.photographs.max_side_px)
             full_sizes.append(rgb.shape[1::-1])
             sizes.append(reduced.shape[1::-1])
             yield reduced
 
-    n = len(names)
-    extracted = extract_with_colors(extractor, images(), n, processes, "map: extract", progress, same_size=False)
-    kind = kind_of(extractor.config.method)
-    found = [(*stored_keypoints(keypoints, kind), color) for keypoints, color in extracted]
-    counts = np.array([len(color) for *_, color in found])
-    parts = zip(("pixels", "descriptors", "colors"), zip(*found, strict=True), strict=True)
-    joined = {name: np.concatenate(values) for name, values in parts}
-    return {"full_sizes": np.array(full_sizes), "sizes": np.array(sizes), "counts": counts, **joined}
+    kind = kind_of(run.config.extractor.method)
+    extracted = extract_with_colors(images(), len(names), "map: extract", run, same_size=False)
+    stored = [(*stored_keypoints(keypoints, kind), color) for keypoints, color in extracted]
+    pixels, descriptors, colors = (np.concatenate(values) for values in zip(*stored, strict=True))
+    return {
+        "full_sizes": np.array(full_sizes),
+        "sizes": np.array(sizes),
+        "counts": np.array([len(color) for *_, color in stored]),
+        "pixels": pixels,
+        "descriptors": descriptors,
+        "colors": colors,
+    }
 
 
 def _fill(
@@ -181,17 +167,15 @@ def _fill(
                 db.write_matches(i + 1, j + 1, found)
 
 
-def _reconstruct(
-    database: Path, folder: Path, n_images: int, given: bool, seed: int, processes: WorkerPool, progress: bool
-) -> list[int]:
+def _reconstruct(database: Path, folder: Path, n_images: int, given: bool, seed: int, run: MapRun) -> list[int]:
     """Verify matches, map, and write the largest model. Returns the number of photographs in each, largest first."""
     import pycolmap
 
-    threads = processes.workers
+    threads = run.processes.workers
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     options = pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=threads, extract_colors=False)
-    options.min_model_size = _LEAST_IMAGES
+    options.min_model_size = _MIN_IMAGES
     options.ba_refine_focal_length = options.ba_refine_extra_params = not given
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = not given
     options.triangulation.random_seed = options.mapper.random_seed = seed
@@ -200,7 +184,7 @@ def _reconstruct(
     models = folder.with_name("models.partial")
     shutil.rmtree(models, ignore_errors=True)
     models.mkdir()
-    bar = tqdm(total=n_images, desc="map: register", disable=not progress, unit="image")
+    bar = tqdm(total=n_images, desc="map: register", disable=not run.progress, unit="image")
     steps: Any = {"initial_image_pair_callback": lambda: bar.update(2), "next_image_callback": lambda: bar.update(1)}
     with storing_in_database(database), quiet_colmap("ERROR"), bar:
         verifier = pycolmap.GeometricVerifierOptions(num_threads=threads)
@@ -209,31 +193,11 @@ def _reconstruct(
     ordered = sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     shutil.rmtree(models)
     if not ordered:
-        enough = f"at least {_LEAST_IMAGES} sharp photographs that share most of what they show with the next"
-        fix = f"Give {enough}, from different places; a focal length (map.photographs.camera_params) helps."
-        value = f"{n_images} photographs, none placed"
-        raise MapError("the photographs do not overlap enough for a map", value=value, fix=fix)
+        fix = (
+            f"Give at least {_MIN_IMAGES} sharp photographs from different places, each of which overlaps most of the "
+        )
+        fix += "next; a focal length (map.photographs.camera_params) helps."
+        raise MapError("the photographs do not overlap enough for a map", value=f"{n_images} photographs", fix=fix)
     write_model(ordered[0], models)
     os.replace(models, folder)
     return [model.num_reg_images() for model in ordered]
-
-
-def _key(parts: list[Any]) -> str:
-    text = json.dumps([_VERSION, parts], sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def _note(path: Path) -> dict[str, Any]:
-    try:
-        return read_json_object(path)
-    except (OSError, ValueError):
-        return {}
-
-
-def _load(path: Path, key: str) -> dict[str, NDArray[Any]] | None:
-    """Arrays of a finished step; None if it was not finished, or from other inputs."""
-    try:
-        kept = load_npz(path)
-    except ValueError:
-        return None
-    return kept if str(kept.pop("key", "")) == key else None

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from wheretolook.mapping.feature_files import HDF5_SUFFIXES
-from wheretolook.mapping.rendered_map import DATABASE_FILE
-from wheretolook.mapping.scale import REPORT_FILE
+from wheretolook.mapping.georeference import REPORT_FILE
+from wheretolook.mapping.map_folder import DATABASE_FILE
 from wheretolook.utils.reading import read_json_object
 
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Sequence
-from contextlib import AbstractContextManager
+from collections import deque
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.features.descriptors import DescriptorKind, Stored
+from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.registry import kind_of
 from wheretolook.features.sift import SIFT
@@ -20,12 +22,10 @@ from wheretolook.geometry.local_origin import local_origin
 from wheretolook.geometry.poses import camera_centers, transform
 from wheretolook.mapping.config import MAX_EPIPOLAR_ERROR_PX, MIN_TRIANGULATION_ANGLE_DEG
 from wheretolook.mapping.feature_files import name_kind
+from wheretolook.mapping.map_folder import MapRun, color_points
 from wheretolook.utils.colmap import quiet_colmap, storing_in_database
 from wheretolook.utils.files import temporary_folder
 from wheretolook.utils.processes import WorkerPool
-
-if TYPE_CHECKING:
-    from wheretolook.mapping.config import MapConfig
 
 _SAMPLES_ACROSS = 16  # surface points taken from an image, in x
 DEPTH_STRIDE = 4  # depth images are kept at every fourth pixel, the centre of each 4 x 4 block being the one at index 2
@@ -41,6 +41,32 @@ def image_name(index: int) -> str:
     return f"{index:05d}.png"
 
 
+def extract_with_colors(
+    images: Iterable[NDArray[np.uint8]], n_images: int, title: str, run: MapRun, same_size: bool = True
+) -> Iterator[tuple[Keypoints, NDArray[np.uint8]]]:
+    """Extract keypoints of images (H, W, 3) uint8, in their order, and the colours (N, 3) uint8 at them.
+
+    The images are made while others are processed. A GPU processes batches if all images are of the same size.
+    """
+    extractor = KeypointExtractor(run.config.extractor, run.device)
+    waiting: deque[NDArray[np.uint8]] = deque()
+
+    def remembered() -> Iterator[NDArray[np.uint8]]:
+        for rgb in images:
+            waiting.append(rgb)
+            yield rgb
+
+    if extractor.on_gpu and not same_size:
+        extracted: Generator[Keypoints, None, None] = (extractor.extract(rgb) for rgb in remembered())
+    else:
+        extracted = extractor.extract_many(remembered(), run.processes)
+    with closing(extracted):
+        for keypoints in tqdm(extracted, title, total=n_images, disable=not run.progress, unit="image"):
+            rgb = waiting.popleft()
+            column, row = keypoints.pixels.astype(np.int64).T
+            yield keypoints, rgb[np.clip(row, 0, rgb.shape[0] - 1), np.clip(column, 0, rgb.shape[1] - 1)]
+
+
 def triangulate_known_poses(
     database: Path,
     camera: PinholeCamera,
@@ -48,17 +74,12 @@ def triangulate_known_poses(
     keypoints: Sequence[Keypoints],
     colors: Sequence[NDArray[np.uint8]],
     pairs: NDArray[np.int64],
-    config: MapConfig,
-    clock: Callable[[str], AbstractContextManager[None]],
-    seed: int,
-    processes: WorkerPool,
-    progress: bool,
+    run: MapRun,
 ) -> Any:
-    """Triangulate what images (I) of one camera see from known poses (I, 3, 4); see `triangulate_model`."""
-    kind = kind_of(config.extractor.method)
-    model = _posed_model(camera, cam_from_world)
-    stored = [stored_keypoints(found, kind) for found in keypoints]
-    return triangulate_model(database, model, stored, colors, pairs, config, clock, seed, processes, progress)
+    """Triangulate landmarks from images (I) of one camera at known poses (I, 3, 4); see `triangulate_model`."""
+    kind = kind_of(run.config.extractor.method)
+    stored = [stored_keypoints(extracted, kind) for extracted in keypoints]
+    return triangulate_model(database, _posed_model(camera, cam_from_world), stored, colors, pairs, run)
 
 
 def triangulate_model(
@@ -67,28 +88,24 @@ def triangulate_model(
     stored: Sequence[Stored],
     colors: Sequence[NDArray[np.uint8]],
     pairs: NDArray[np.int64],
-    config: MapConfig,
-    clock: Callable[[str], AbstractContextManager[None]],
-    seed: int,
-    processes: WorkerPool,
-    progress: bool,
+    run: MapRun,
 ) -> Any:
     """Match pairs of images, verify the matches against the known poses, and triangulate.
 
     Makes a COLMAP database of keypoints, descriptors, matches and verified matches. Takes a `pycolmap.Reconstruction`
     of images with poses, which stay as they are, and no points, image i with the id i + 1; keypoints and their colours
-    (N_i, 3) uint8 of each image, and pairs (P, 2) of images to match, i < j. The processes match, as many threads
-    verify; `clock` times a step.
+    (N_i, 3) uint8 of each image, and pairs (P, 2) of images to match, i < j.
 
     Returns a `pycolmap.Reconstruction`, not yet filtered by reprojection error.
     """
     import pycolmap
 
+    clock = run.clock
     folder = database.parent
-    kind = kind_of(config.extractor.method)
+    kind = kind_of(run.config.extractor.method)
     to_local, back = _local_frame(model)
     model.transform(to_local)  # rays that meet far from the origin are ill-conditioned
-    seed %= 2**31  # COLMAP keeps it in an int
+    seed = run.seed % 2**31  # COLMAP keeps it in an int
     pycolmap.set_random_seed(seed)
     with storing_in_database(database), clock("database"):
         for index, (pixels, _) in enumerate(stored):
@@ -96,7 +113,7 @@ def triangulate_model(
             model.images[index + 1].points2D = pycolmap.Point2DList(points)
         fill_database(database, model, stored, kind)
     with storing_in_database(database), clock("match"), pycolmap.Database.open(str(database)) as db:
-        matches = match_pairs(stored, pairs, folder, processes, progress, kind)
+        matches = match_pairs(stored, pairs, folder, run.processes, run.progress, kind)
         for (i, j), matched in zip(pairs.tolist(), matches, strict=True):
             db.write_matches(i + 1, j + 1, matched)
     with storing_in_database(database), clock("verify"):
@@ -105,13 +122,13 @@ def triangulate_model(
         verification.ransac.random_seed = seed
         with quiet_colmap():
             pycolmap.guided_geometric_verification(
-                model, str(database), two_view_geometry_options=verification, num_threads=processes.workers
+                model, str(database), two_view_geometry_options=verification, num_threads=run.processes.workers
             )
     with clock("triangulate"):
         options = pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=1, extract_colors=False)
         options.load_all_images = True
         options.triangulation.random_seed = options.mapper.random_seed = seed
-        options.triangulation.ignore_two_view_tracks = not config.two_view_landmarks
+        options.triangulation.ignore_two_view_tracks = not run.config.two_view_landmarks
         options.triangulation.min_angle = options.mapper.filter_min_tri_angle = MIN_TRIANGULATION_ANGLE_DEG
         with quiet_colmap("ERROR"):  # it warns of every image it cannot read colours from
             model = pycolmap.triangulate_points(model, str(database), str(folder), str(folder), options=options)
@@ -130,13 +147,6 @@ def _local_frame(model: Any) -> tuple[Any, Any]:
     origin = local_origin(posed)
     straight = pycolmap.Rotation3d(np.eye(3))
     return pycolmap.Sim3d(1.0, straight, -origin), pycolmap.Sim3d(1.0, straight, origin)
-
-
-def color_points(model: Any, colors: Sequence[NDArray[np.uint8]]) -> None:
-    """Give each point of a reconstruction the mean colour of its keypoints, (N_i, 3) uint8; image i has id i + 1."""
-    for point in model.points3D.values():
-        observed = [colors[element.image_id - 1][element.point2D_idx] for element in point.track.elements]
-        point.color = np.rint(np.mean(observed, axis=0)).astype(np.uint8)
 
 
 def match_pairs(

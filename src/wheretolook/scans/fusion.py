@@ -18,8 +18,8 @@ from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float
 from wheretolook.geometry.tsdf import DepthImage, TsdfConfig, TsdfVolume
 from wheretolook.mapping.colmap_model import write_model
+from wheretolook.mapping.georeference import Similarity
 from wheretolook.mapping.gravity import estimate_gravity, rotation_to_z
-from wheretolook.mapping.scale import Similarity
 from wheretolook.scans.checks import check_depth_unit, landmark_readings
 from wheretolook.scans.config import RgbdConfig
 from wheretolook.scans.depth_correction import DepthCorrection, fit_depth_correction

@@ -112,7 +112,7 @@ def _adapt_map(experiment: Experiment, model: Path, weights: Path, say: Say, tic
     """Adapt to a COLMAP map by its photographs alone."""
     from wheretolook.holdout.photo_map import folder_of_check
     from wheretolook.mapping.colmap_model import model_arrays, read_model
-    from wheretolook.mapping.scale import read_scale
+    from wheretolook.mapping.georeference import read_scale
     from wheretolook.select.surroundings import surroundings
 
     name = ExistingModelConfig(model=model).scene_name

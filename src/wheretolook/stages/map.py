@@ -14,7 +14,7 @@ from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, describe_camera, draw_camera
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.config import MapConfig, ScaleConfig
-from wheretolook.mapping.scale import read_scale
+from wheretolook.mapping.georeference import read_scale
 from wheretolook.stages.preconditions import (
     Say,
     Tick,
@@ -72,7 +72,7 @@ def make_maps(experiment: Experiment, say: Say = print, tick: Tick = lambda work
                 device = scene.device
                 how = (scene.raycaster, workers, device)
                 forget = files.stage_cache("map").clear
-                report = build_map(*shown, experiment.map, seed, files.map, *how, replacing=forget, poses=taken)
+                report = build_map(*shown, experiment.map, seed, files.map, *how, before_replace=forget, poses=taken)
             files.stage_cache("map", key).store()
             found = f"{report.n_landmarks:,} landmarks from {report.n_registered} images"
             off = f"median {report.median_distance_to_mesh_cm:.2f} cm from the mesh"
@@ -140,7 +140,7 @@ def _map_photographs(experiment: Experiment, say: Say, tick: Tick) -> Dataset:
 
         how = (scene.folder / "photographs", _seed(scene), experiment.n_workers, experiment.warp_device)
         forget = scene.stage_cache("map").clear
-        report = map_photographs(experiment.map, scene.map, *how, replacing=forget)
+        report = map_photographs(experiment.map, scene.map, *how, before_replace=forget)
         scene.stage_cache("map", key).store()
         used_images = f"{report.n_registered} of {report.n_images} photographs"
         say(f"{scene.name}: {report.n_landmarks:,} landmarks from {used_images} -> {scene.map}")

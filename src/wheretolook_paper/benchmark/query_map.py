@@ -9,18 +9,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.geometry.camera import PinholeCamera, cameras_by_id
-from wheretolook.mapping.colmap_model import colmap_poses, read_model, write_model
+from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.config import PARTNERS, MapConfig
-from wheretolook.mapping.rendered_map import (
-    LANDMARKS_FILE,
-    Clock,
+from wheretolook.mapping.map_folder import DATABASE_FILE, LANDMARKS_FILE, MapDraft, MapRun, finish_map
+from wheretolook.mapping.triangulation import (
+    choose_pairs,
     extract_with_colors,
-    remove_inaccurate,
-    save_landmarks,
+    shrink_depth,
+    surface_overlap,
+    triangulate_known_poses,
 )
-from wheretolook.mapping.triangulation import choose_pairs, shrink_depth, surface_overlap, triangulate_known_poses
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.images import read_image as read_file
 from wheretolook.utils.processes import WorkerPool
@@ -61,17 +60,11 @@ def build_query_map(
     pairs = choose_pairs(surface_overlap(DRAWN_CAMERA, poses, np.stack(depth)), PARTNERS)
     with WorkerPool(workers) as processes:
         images = _read(files, camera)
-        found = extract_with_colors(
-            KeypointExtractor(config.extractor, device), images, len(files), processes, "map: extract", progress
-        )
-        keypoints, colors = zip(*found, strict=True)
-        database = folder / "database.db"
-        views = camera, poses, keypoints, colors, pairs
-        built = triangulate_known_poses(database, *views, config, Clock(), 0, processes, progress)
-    remove_inaccurate(built, config.max_reprojection_error_px, scene.images, _FIX)
-    write_model(built, folder)
-    save_landmarks(folder, database, config.max_reprojection_error_px)
-    database.unlink()
+        run = MapRun(config, processes, device=device, progress=progress)
+        keypoints, colors = zip(*extract_with_colors(images, len(files), "map: extract", run), strict=True)
+        database = folder / DATABASE_FILE
+        built = triangulate_known_poses(database, camera, poses, keypoints, colors, pairs, run)
+        finish_map(MapDraft(built, scene.images, config.max_reprojection_error_px, _FIX, database), folder, run)
     return folder / LANDMARKS_FILE
 
 

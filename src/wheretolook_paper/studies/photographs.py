@@ -48,9 +48,10 @@ from wheretolook.holdout.report import place_radius
 from wheretolook.holdout.scores import Scoring
 from wheretolook.mapping.colmap_model import colmap_poses, holds_model
 from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG, MapConfig, PhotographsConfig
+from wheretolook.mapping.georeference import fit_similarity
+from wheretolook.mapping.map_folder import MapRun
 from wheretolook.mapping.photograph_map import map_photographs
 from wheretolook.mapping.photographs import SUFFIXES
-from wheretolook.mapping.scale import fit_similarity
 from wheretolook.mapping.sfm import photograph_features
 from wheretolook.mapping.triangulation import (
     Stored,
@@ -111,7 +112,9 @@ def map_known_poses(
         [np.where(one < 65535, one * np.float32(1e-3), np.float32(0)) for one in map(shrink_depth, depth)]
     )
     with WorkerPool(workers) as processes:
-        features = photograph_features(work / "images", work / "photographs", 0, extractor, processes, device)
+        config = MapConfig(extractor=extractor, photographs=PhotographsConfig(max_side_px=0))
+        run = MapRun(config, processes, device=device)
+        features = photograph_features(work / "images", work / "photographs", run)
         names = features.names
         stored = features.stored
         pinhole = PinholeCamera(*features.sizes[0].tolist(), focal_px)

@@ -25,8 +25,8 @@ from wheretolook.mapping.colmap_model import (
     save_mapping_poses,
 )
 from wheretolook.mapping.feature_files import read_descriptors
+from wheretolook.mapping.georeference import read_positions, read_scale
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
-from wheretolook.mapping.scale import read_positions, read_scale
 from wheretolook.planning.viewpoint_map import ViewpointMap
 
 _FILES = ("cameras", "images", "points3D", "rigs", "frames")

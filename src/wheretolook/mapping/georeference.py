@@ -1,0 +1,336 @@
+"""Scale and frame of a map in metres, from markers, a known distance, or known camera positions."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+from tqdm.auto import tqdm
+
+from wheretolook.geometry.poses import Float
+from wheretolook.mapping.config import SCALE_TOLERANCE_PERCENT, ScaleConfig
+from wheretolook.mapping.markers import Marker, MarkerView, detect_markers, marker_detector, place_marker
+from wheretolook.mapping.photographs import read_photograph
+from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.reading import read_json_object
+
+Source = Literal["markers", "distance", "positions", "model", "unknown"]
+REPORT_FILE = "report.json"
+_FLAT = 1e-6  # points whose second largest spread is below this share of the largest are on a line
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """x -> scale * rotation x + translation."""
+
+    scale: float  # positive
+    rotation: Float  # (3, 3)
+    translation: Float  # (3,), in units of the target
+
+    def apply(self, points: ArrayLike) -> Float:
+        """Transform points (..., 3)."""
+        return np.asarray(self.scale * np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation)
+
+    def transform_model(self, model: Any) -> None:
+        """Transform a `pycolmap.Reconstruction` in place."""
+        import pycolmap
+
+        model.transform(pycolmap.Sim3d(self.scale, pycolmap.Rotation3d(self.rotation), self.translation))
+
+
+@dataclass(frozen=True)
+class MapScale:
+    """The scale of a map; `scale` in its `report.json`."""
+
+    source: Source = "unknown"  # "model": that of an existing model; "unknown": the map is not in metres
+    factor: float = 1.0  # metres in a unit of COLMAP's frame; 1 if unknown
+    # Error of each marker's side (in percent) or photograph's position (in metres); empty for a single distance.
+    residuals: dict[str, float] = field(default_factory=dict)
+    unit: Literal["percent", "m", ""] = ""  # of the residuals
+    unused: dict[str, str] = field(default_factory=dict)  # markers and photographs that were not used, and why
+    marker_error_px: dict[str, float] = field(default_factory=dict)  # root mean square over each marker's corners
+    # Number of photographs that see each marker. Two cannot show that the marker was moved between them.
+    marker_views: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether the map is in metres."""
+        return self.source != "unknown"
+
+    def describe(self) -> str:
+        """One clause for a log."""
+        if not self.is_metric:
+            return "scale UNKNOWN: no markers, distance or positions were given, so lengths are not in metres"
+        if self.source == "model":
+            return "scale as in the model, whose unit is assumed to be the metre"
+        text = f"scale from {self.source}"
+        if self.residuals:
+            errors = np.abs(list(self.residuals.values()))
+            text += f", errors {np.median(errors):.3g} {self.unit} (median), {errors.max():.3g} {self.unit} (maximum)"
+        if self.marker_error_px:
+            text += f", corners within {max(self.marker_error_px.values()):.2g} px"
+        if self.marker_views and max(self.marker_views.values()) <= 2:
+            text += "; NOT CHECKED: no marker is seen in more than two photographs"
+        return text + (f"; not used: {', '.join(self.unused)}" if self.unused else "")
+
+
+@dataclass(frozen=True, eq=False)
+class KnownScale:
+    """Settings of the scale, with the content of the tables that they name."""
+
+    config: ScaleConfig
+    sizes_m: Mapping[int, float] | float
+    positions: Mapping[str, Float]
+
+    @staticmethod
+    def read(config: ScaleConfig) -> KnownScale:
+        """Read the tables. Raises ConfigError if one is not valid, or OpenCV lacks the markers' dictionary."""
+        if config.has_marker_sizes or (config.distance is not None and config.distance.marker_ids):
+            marker_detector(config.dictionary)
+        sizes = config.marker_size_m if config.marker_table is None else read_marker_table(config.marker_table)
+        return KnownScale(config, sizes, {} if config.positions is None else read_positions(config.positions))
+
+
+def find_scale(
+    model: Any,
+    known: KnownScale,
+    upright: Similarity,
+    photographs: Path | None = None,
+    turned: bool = True,
+    progress: bool = True,
+) -> tuple[MapScale, Similarity]:
+    """The scale of a `pycolmap.Reconstruction`, and the similarity from its frame to the world.
+
+    `upright` is that similarity without the scale; known positions overrule it. Markers are detected in the folder of
+    photographs, which are read by `read_photograph`. Raises MapError or ConfigError if there is no scale of the source
+    that was requested.
+    """
+    centers = {image.name: image.projection_center() for image in _posed_images(model)}
+    config = known.config
+    if known.positions:
+        return scale_from_positions(centers, known.positions)
+    scale = MapScale()
+    views: dict[int, list[MarkerView]] = {}
+    if config.has_marker_sizes or (config.distance is not None and config.distance.marker_ids):
+        views = _marker_views(model, photographs, config.dictionary, turned, progress)
+    if config.has_marker_sizes:
+        if not isinstance(known.sizes_m, float | int):
+            views = {marker: seen for marker, seen in views.items() if marker in known.sizes_m}
+        markers, unused = _place_markers(views)
+        scale = scale_from_markers(markers, known.sizes_m, unused)
+    elif config.distance is not None:
+        ends = (config.distance.first, config.distance.second)
+        first, second = (_end_point(end, centers, views, photographs) for end in ends)
+        scale = scale_from_distance(first, second, config.distance.distance_m)
+    return scale, replace(upright, scale=scale.factor, translation=scale.factor * upright.translation)
+
+
+def fit_similarity(source: ArrayLike, target: ArrayLike) -> Similarity:
+    """The similarity that maps points (N, 3) to points (N, 3) with the least sum of squared errors.
+
+    Umeyama, "Least-Squares Estimation of Transformation Parameters Between Two Point Patterns", TPAMI 1991. Raises
+    MapError for fewer than three points, or points on a line.
+    """
+    import pycolmap
+
+    a = np.asarray(source, dtype=np.float64)
+    b = np.asarray(target, dtype=np.float64)
+    if len(a) < 3 or _are_on_a_line(a) or _are_on_a_line(b):
+        fix = "Give the positions of three photographs or more, not on a line."
+        raise MapError("these positions do not determine a frame", value=len(a), fix=fix)
+    sim3d = pycolmap.estimate_sim3d(a, b)
+    return Similarity(float(sim3d.scale), np.asarray(sim3d.rotation.matrix()), np.asarray(sim3d.translation))
+
+
+def scale_from_markers(
+    markers: Sequence[Marker], size_m: Mapping[int, float] | float, unused: Mapping[str, str] | None = None
+) -> MapScale:
+    """The median of true size over length in the map, over the sides of all markers.
+
+    `size_m` is the side of all markers, or of each by its id; `unused` are markers that could not be placed, and why.
+    Raises MapError if there is no marker, or the error of a side exceeds the tolerance.
+    """
+    if not markers:
+        reasons = "; ".join((unused or {}).values()) or "no marker of a known size was detected"
+        fix = "Check scale.dictionary and the sizes; at least two photographs must show a whole marker."
+        raise MapError("no marker gives the map its scale", value=reasons, fix=fix)
+    sizes = np.array([size_m if isinstance(size_m, float | int) else size_m[marker.marker_id] for marker in markers])
+    lengths = np.stack([marker.sides for marker in markers])
+    factor = float(np.median(sizes[:, None] / lengths))
+    errors = 100 * (factor * lengths / sizes[:, None] - 1)
+    names = [f"marker {marker.marker_id}" for marker in markers]
+    wrong = np.flatnonzero(np.abs(errors).max(1) > SCALE_TOLERANCE_PERCENT)
+    if len(wrong):
+        values = [f"{names[row]}: {' '.join(f'{value:+.1f}' for value in errors[row])} %" for row in wrong]
+        problem = f"the markers do not agree on a scale: sides are wrong by more than {SCALE_TOLERANCE_PERCENT:g} %"
+        fix = "Measure the black squares; give markers of different sizes in a marker_table."
+        raise MapError(problem, value=", ".join(values), fix=fix)
+    sides = [f"{name} side {side}" for name in names for side in range(4)]
+    residuals = dict(zip(sides, errors.ravel().tolist(), strict=True))
+    errors_px = dict(zip(names, (marker.error_px for marker in markers), strict=True))
+    n_views = dict(zip(names, (len(set(marker.images)) for marker in markers), strict=True))
+    return MapScale("markers", factor, residuals, "percent", dict(unused or {}), errors_px, n_views)
+
+
+def scale_from_distance(first: ArrayLike, second: ArrayLike, distance_m: float) -> MapScale:
+    """The scale at which two points (3,) of the map are `distance_m` apart. Raises MapError if they coincide."""
+    length = float(np.linalg.norm(np.asarray(first) - np.asarray(second)))
+    if not length > 0:
+        raise MapError("the two ends of the known distance coincide", value=length, fix="Name two different ends.")
+    return MapScale("distance", distance_m / length)
+
+
+def scale_from_positions(centers: Mapping[str, Float], positions: Mapping[str, Float]) -> tuple[MapScale, Similarity]:
+    """The scale, and the similarity from camera centres in the map to known positions in metres, by photograph.
+
+    The tolerance is a share of the diagonal of the box around the positions used. Raises MapError if fewer than three
+    photographs are in the map, all are on a line, or the error of one exceeds the tolerance.
+    """
+    names = [name for name in positions if name in centers]
+    source = np.array([centers[name] for name in names]).reshape(-1, 3)
+    target = np.array([positions[name] for name in names]).reshape(-1, 3)
+    similarity = fit_similarity(source, target)
+    errors_m = np.linalg.norm(similarity.apply(source) - target, axis=1).tolist()
+    residuals = dict(zip(names, errors_m, strict=True))
+    limit_m = SCALE_TOLERANCE_PERCENT / 100 * float(np.linalg.norm(np.ptp(target, axis=0)))
+    wrong = sorted((name for name in names if residuals[name] > limit_m), key=lambda name: -residuals[name])
+    if wrong:
+        limit = f"{limit_m:.3g} m, {SCALE_TOLERANCE_PERCENT:g} % of their extent"
+        value = ", ".join(f"{name}: {residuals[name]:.3g} m" for name in wrong[:5])
+        fix = "Check the first one's position, and the units and names of all."
+        raise MapError(f"the positions do not fit the map: errors exceed {limit}", value=value, fix=fix)
+    unused = {name: "not in the map" for name in positions if name not in centers}
+    return MapScale("positions", similarity.scale, residuals, "m", unused), similarity
+
+
+def read_marker_table(path: Path) -> dict[int, float]:
+    """Read the side in metres of each marker by its id, from a CSV file with the columns `id` and `size_m`.
+
+    Raises ConfigError if the file is missing or not such a table, or a marker has two sizes.
+    """
+    sizes: dict[int, float] = {}
+    for row in _read_rows(path, ("id", "size_m")):
+        try:
+            marker = int(row["id"])
+            size = float(row["size_m"])
+        except ValueError as error:
+            raise ConfigError("not a marker's id and size", path=path, value=row, fix="Write 7,0.15.") from error
+        if not 0 < size < np.inf:
+            raise ConfigError("a marker's size must be positive", path=path, value=row)
+        if sizes.setdefault(marker, size) != size:
+            raise ConfigError(f"marker {marker} has two sizes", path=path, value=(sizes[marker], size))
+    return sizes
+
+
+def read_positions(path: Path) -> dict[str, Float]:
+    """Read positions (3,) in metres by photograph, from CSV (`image`, `x`, `y`, `z`) or JSON (`{image: [x, y, z]}`).
+
+    Raises ConfigError if the file is missing or not such a table, or a photograph has two positions.
+    """
+    if path.suffix.lower() == ".json":
+        try:
+            rows = list(read_json_object(path).items())
+        except (OSError, ValueError) as error:
+            raise ConfigError(
+                f"not a file of positions: {error}", path=path, fix="Write {image: [x, y, z]}."
+            ) from error
+    else:
+        table = _read_rows(path, ("image", "x", "y", "z"))
+        rows = [(row["image"], [row["x"], row["y"], row["z"]]) for row in table]
+    positions: dict[str, Float] = {}
+    for name, values in rows:
+        try:
+            position = np.array(values, dtype=np.float64)
+        except (TypeError, ValueError):
+            position = np.zeros(0)
+        if position.shape != (3,) or not np.isfinite(position).all():
+            raise ConfigError("not a position", path=path, value=(name, values), fix="Give x, y, z in metres.")
+        if not np.array_equal(positions.setdefault(name, position), position):
+            raise ConfigError("a photograph has two positions", path=path, value=name)
+    return positions
+
+
+def read_scale(map_dir: Path) -> MapScale | None:
+    """Read the scale in a map's report; None for maps of known poses, which are metric. Raises MapError if damaged."""
+    path = map_dir / REPORT_FILE
+    try:
+        record = read_json_object(path).get("scale")
+        scale = None if record is None else MapScale(**record)
+        if scale is not None and (scale.source not in get_args(Source) or not 0 < scale.factor < np.inf):
+            raise ValueError(f"a scale of {scale.factor} from {scale.source}")
+        return scale
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, TypeError) as error:
+        raise MapError(f"the map's report is damaged: {error}", path=path, fix="Run the map stage again.") from error
+
+
+def _posed_images(model: Any) -> list[Any]:
+    return [image for _, image in sorted(model.images.items()) if image.has_pose]
+
+
+def _are_on_a_line(points: Float) -> bool:
+    spread = np.linalg.svd(points - points.mean(0), compute_uv=False)
+    return bool(spread[1] <= _FLAT * max(spread[0], 1e-12))
+
+
+def _marker_views(
+    model: Any, folder: Path | None, dictionary: str, turned: bool, progress: bool
+) -> dict[int, list[MarkerView]]:
+    """Views of markers in photographs with a pose, by marker: detected at full size, in pixels of the map."""
+    if folder is None:
+        fix = "Give the folder of the model's images, --images, or a distance between photographs, or positions."
+        raise ConfigError("markers are detected in photographs, and none were given", value=dictionary, fix=fix)
+    views: dict[int, list[MarkerView]] = {}
+    for image in tqdm(_posed_images(model), "map: markers", disable=not progress, unit="image"):
+        camera = model.cameras[image.camera_id]
+        rgb = read_photograph(folder / image.name, turned)
+        reduction = np.array([camera.width, camera.height]) / rgb.shape[1::-1]
+        for marker, corners in detect_markers(rgb, dictionary, folder / image.name).items():
+            view = MarkerView(image.name, camera, image.cam_from_world().matrix(), corners * reduction)
+            views.setdefault(marker, []).append(view)
+    return dict(sorted(views.items()))
+
+
+def _place_markers(views: Mapping[int, list[MarkerView]]) -> tuple[list[Marker], dict[str, str]]:
+    """Markers placed in the map, and why others were not: one false detection must not stop the map."""
+    markers = []
+    unused = {}
+    for marker, seen in views.items():
+        try:
+            markers.append(place_marker(marker, seen))
+        except MapError as error:
+            unused[f"marker {marker}"] = f"{error.problem}: {error.value}"
+    return markers, unused
+
+
+def _end_point(
+    end: str, centers: Mapping[str, Float], views: Mapping[int, list[MarkerView]], folder: Path | None
+) -> Float:
+    """Position (3,) of an end of a known distance, in COLMAP's frame."""
+    if end.startswith("marker:"):
+        number = int(end.removeprefix("marker:"))
+        if number not in views:
+            raise MapError(f"no photograph with a pose sees marker {number}", path=folder, fix="Name another one.")
+        return place_marker(number, views[number]).center
+    if end not in centers:
+        fix = "Name one that has a pose, relative to its folder; markers are written marker:7."
+        raise MapError("the map has no such photograph", path=folder, value=end, fix=fix)
+    return centers[end]
+
+
+def _read_rows(path: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
+    try:
+        with path.open(newline="") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            rows = [{name: (row[name] or "").strip() for name in columns} for row in reader]
+        if not rows:
+            raise ValueError("it is empty")
+    except (OSError, ValueError, KeyError, csv.Error) as error:
+        raise ConfigError(f"not a CSV file with the columns {', '.join(columns)}: {error}", path=path) from error
+    return rows

@@ -1,0 +1,142 @@
+"""Georeferencing: closed forms, tables and invalid inputs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wheretolook.mapping.config import KnownDistance, ScaleConfig
+from wheretolook.mapping.georeference import (
+    MapScale,
+    fit_similarity,
+    read_marker_table,
+    read_positions,
+    scale_from_distance,
+    scale_from_markers,
+    scale_from_positions,
+)
+from wheretolook.mapping.markers import Marker
+from wheretolook.utils.errors import ConfigError, MapError
+
+SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float64)
+
+
+def square(marker_id: int, side: float) -> Marker:
+    return Marker(marker_id, SQUARE * side + marker_id, ("a.jpg", "b.jpg"), 0.1)
+
+
+def by_photograph(n: int) -> dict[str, np.ndarray]:
+    points = np.random.default_rng(3).normal(size=(n, 3))
+    return {f"{index}.jpg": point for index, point in enumerate(points)}
+
+
+def test_similarity_is_recovered_and_never_mirrors() -> None:
+    points = np.random.default_rng(0).normal(size=(10, 3))
+    rotation = Rotation.random(random_state=1).as_matrix()
+    similarity = fit_similarity(points, 3.7 * points @ rotation.T + (1, -2, 5))
+    assert similarity.scale == pytest.approx(3.7)
+    np.testing.assert_allclose(similarity.rotation, rotation, atol=1e-12)
+    np.testing.assert_allclose(similarity.translation, (1, -2, 5), atol=1e-12)
+    assert np.linalg.det(fit_similarity(points, points * (1, 1, -1)).rotation) == pytest.approx(1)
+    line = np.arange(5.0)[:, None] * (1, 2, 3)
+    for few in (np.eye(3)[:2], line):
+        with pytest.raises(MapError):
+            fit_similarity(few, few)
+
+
+def test_scale_is_the_median_over_the_sides_of_markers() -> None:
+    often = Marker(3, SQUARE * 0.49, ("a.jpg", "b.jpg", "c.jpg"), 0.3)
+    scale = scale_from_markers([square(1, 0.5), square(2, 0.51), often], 0.2)
+    assert scale.source == "markers" and scale.is_metric and scale.unit == "percent"
+    assert scale.factor == pytest.approx(0.4)
+    assert scale.residuals["marker 2 side 0"] == pytest.approx(2.0) and len(scale.residuals) == 12
+    assert scale.marker_error_px == {"marker 1": 0.1, "marker 2": 0.1, "marker 3": 0.3}
+    assert scale.marker_views == {"marker 1": 2, "marker 2": 2, "marker 3": 3}
+    assert "NOT CHECKED" not in scale.describe()
+    assert "NOT CHECKED" in scale_from_markers([square(1, 1.0)], 0.2).describe()
+    markers = [square(1, 0.5), square(2, 0.5), square(3, 1.0)]
+    assert scale_from_markers(markers, {1: 0.2, 2: 0.2, 3: 0.4}).factor == pytest.approx(0.4)
+    stretched = Marker(4, SQUARE * (1.0, 1.2, 1.0), ("a.jpg", "b.jpg"), 0.1)
+    for wrong in (markers, [stretched], []):
+        with pytest.raises(MapError):
+            scale_from_markers(wrong, 0.2)
+
+
+def test_scale_from_a_distance() -> None:
+    assert scale_from_distance((0, 0, 0), (0, 3, 4), 2.5) == MapScale("distance", 0.5)
+    with pytest.raises(MapError):
+        scale_from_distance((1, 1, 1), (1, 1, 1), 2.5)
+
+
+def test_positions_determine_the_frame_and_leave_residuals() -> None:
+    centers = by_photograph(6)
+    rotation = Rotation.random(random_state=4).as_matrix()
+    positions = {name: 2 * rotation @ center + (5, 0, 1) for name, center in centers.items()}
+    scale, similarity = scale_from_positions(centers, {**positions, "lost.jpg": np.zeros(3)})
+    assert scale.factor == pytest.approx(2) and scale.unit == "m" and list(scale.unused) == ["lost.jpg"]
+    assert max(scale.residuals.values()) < 1e-12 and set(scale.residuals) == set(centers)
+    np.testing.assert_allclose(similarity.apply(centers["3.jpg"]), positions["3.jpg"])
+    positions["2.jpg"] = positions["2.jpg"] + (0, 0, 0.3)
+    worst = scale_from_positions(centers, positions)[0].residuals
+    assert max(worst, key=lambda name: worst[name]) == "2.jpg"
+
+
+def test_positions_that_do_not_fit_are_rejected_worst_first() -> None:
+    centers = by_photograph(14)
+    for off_m in (2.0, 100.0):
+        positions = {name: 2 * center for name, center in centers.items()}
+        positions["2.jpg"] = positions["2.jpg"] + (0, off_m, 0)
+        with pytest.raises(MapError) as caught:
+            scale_from_positions(centers, positions)
+        assert str(caught.value.value).startswith("2.jpg: ")
+    with pytest.raises(MapError):
+        scale_from_positions(centers, dict(zip(centers, reversed(centers.values()), strict=True)))
+
+
+def test_tables_of_markers_and_positions_are_read(tmp_path: Path) -> None:
+    table = tmp_path / "markers.csv"
+    table.write_text("id, size_m\n3, 0.4\n7, 0.2\n7, 0.2\n")
+    assert read_marker_table(table) == {3: 0.4, 7: 0.2}
+    for name, text in (("p.csv", "image,x,y,z\na.jpg,1,2,3\n"), ("p.json", '{"a.jpg": [1, 2, 3]}')):
+        (tmp_path / name).write_text(text)
+        np.testing.assert_array_equal(read_positions(tmp_path / name)["a.jpg"], (1, 2, 3))
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        *[("m.csv", f"id,size_m\n{rows}") for rows in ("3,0.4\n3,0.2\n", "", "x,0.4\n", "3,-1\n", "3\n")],
+        ("m.csv", "id,width\n3,0.4\n"),
+        ("p.csv", "image,x,y,z\na.jpg,1,2,3\na.jpg,1,2,4\n"),
+        *[("p.json", text) for text in ('{"a.jpg": [1, 2]}', '{"a.jpg": "x"}', "[1]", "{")],
+        ("p.csv", None),
+    ],
+)
+def test_invalid_tables_are_rejected(tmp_path: Path, name: str, text: str | None) -> None:
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    with pytest.raises(ConfigError):
+        (read_marker_table if name[0] == "m" else read_positions)(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"marker_size_m": 0.2, "marker_table": Path("markers.csv")},
+        {"marker_size_m": 0.2, "distance": KnownDistance("a.jpg", "marker:7", 1.5)},
+        {"positions": Path("positions.csv"), "distance": KnownDistance("a.jpg", "marker:7", 1.5)},
+        {"marker_size_m": -1.0},
+    ],
+)
+def test_invalid_settings_are_rejected(settings) -> None:
+    with pytest.raises(ConfigError):
+        ScaleConfig(**settings)
+
+
+def test_ends_of_a_known_distance() -> None:
+    assert KnownDistance("a.jpg", "marker:7", 1.5).marker_ids == (7,)
+    with pytest.raises(ConfigError):
+        KnownDistance("a.jpg", "a.jpg", 1.0)

@@ -28,10 +28,10 @@ import msgspec
 import numpy as np
 from common import write_model
 
-from wheretolook.view.opened import open_map
 from wheretolook.view.server import Viewer
 from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
+from wheretolook.view.viewed_map import open_map
 
 COMMAND = [sys.executable, "-c", "import sys; from wheretolook.cli import main; sys.exit(main(sys.argv[1:]))"]
 
@@ -155,15 +155,15 @@ def memory_mb() -> float:
 def print_turns(session: Any, n: int) -> None:
     """Print how long the score of a view turned by hand takes while the floor fills."""
     session.go_to(np.array([9.0, 9.0, 1.5]))
-    while session.place is None:
+    while session.place.location is None:
         time.sleep(0.02)
     time.sleep(2)
     times = []
-    for axis in session.place.directions[:: len(session.place.directions) // n][:n]:
+    for axis in session.place.location.directions[:: len(session.place.location.directions) // n][:n]:
         start = time.monotonic()
-        session.controls.picture_told.content = ""
-        session.turn_to(axis)
-        while not session.controls.picture_told.content and time.monotonic() - start < 10:
+        session.controls.picture_caption.content = ""
+        session.place.turn_to(axis)
+        while not session.controls.picture_caption.content and time.monotonic() - start < 10:
             time.sleep(0.001)
         times.append(time.monotonic() - start)
         time.sleep(0.3)

@@ -18,7 +18,7 @@ from wheretolook.scans.frames import _size
 from wheretolook.select.surroundings import _read_depth
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.utils.images import image_size, read_image
-from wheretolook.view.photographs import MOST_PROPORTION, Photographs
+from wheretolook.view.photographs import MAX_ASPECT, Photographs
 
 
 def png(path: Path, width: int, height: int, written: int | None = None, bits: int = 8) -> Path:
@@ -49,7 +49,7 @@ def test_a_bomb_is_refused_by_its_size(side: int, tmp_path: Path) -> None:
 
 def test_a_thin_photograph_is_not_shown_as_wide(tmp_path: Path) -> None:
     png(tmp_path / "a.png", 1, 60_000)
-    assert Photographs(tmp_path, ("a.png",), np.eye(3, 4)[None]).read(0, 360).shape == (360 * MOST_PROPORTION, 360, 3)
+    assert Photographs(tmp_path, ("a.png",), np.eye(3, 4)[None]).read(0, 360).shape == (360 * MAX_ASPECT, 360, 3)
 
 
 def test_images_are_read_as_they_are(tmp_path: Path) -> None:

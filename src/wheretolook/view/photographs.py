@@ -1,4 +1,4 @@
-"""The photographs that a map was made from, and which of them is nearest to a view."""
+"""The photographs that a map was built from, and the one nearest to a view."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from wheretolook.utils.confine import path_within
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.images import image_size
 
-AT_AN_ANGLE_M = 2.0  # metres that a right angle between two views counts for
-MOST_PROPORTION = 8  # of height to width, as which narrower photographs are shown
+METRES_PER_RIGHT_ANGLE = 2.0  # weight of rotation against translation
+MAX_ASPECT = 8  # height over width of a displayed photograph
 
 
 @dataclass(frozen=True, eq=False)
 class Photographs:
-    """Files of a map's images and where each was taken."""
+    """Image files of a map with their poses."""
 
     folder: Path
     names: tuple[str, ...]
@@ -28,44 +28,44 @@ class Photographs:
 
     @classmethod
     def of_model(cls, model: Path, folder: Path) -> Self | None:
-        """Those of a COLMAP model's images that lie in a folder; None if none does."""
+        """Collect the registered images of a COLMAP model that exist in a folder; None if none does."""
         from wheretolook.mapping.colmap_model import read_model
 
-        names = []
-        poses = []
-        for image in read_model(model).images.values():
-            if image.has_pose and _file(folder, image.name) is not None:
-                names.append(image.name)
-                poses.append(image.cam_from_world().matrix())
-        return cls(folder, tuple(names), np.array(poses)) if names else None
+        images = [
+            image
+            for image in read_model(model).images.values()
+            if image.has_pose and _existing_file(folder, image.name) is not None
+        ]
+        poses = [image.cam_from_world().matrix() for image in images]
+        return cls(folder, tuple(image.name for image in images), np.array(poses)) if images else None
 
     def nearest(self, pose: Float) -> int:
-        """The photograph that shows most nearly what a view (3, 4) does: by metres, an angle counting as some."""
-        away = np.linalg.norm(camera_centers(self.cam_from_world) - camera_centers(pose), axis=1)
+        """Return the number of the photograph nearest to a view (3, 4), by distance plus weighted rotation."""
+        distance = np.linalg.norm(camera_centers(self.cam_from_world) - camera_centers(pose), axis=1)
         cosine = self.cam_from_world[:, 2, :3] @ pose[2, :3]
-        return int(np.argmin(away + AT_AN_ANGLE_M * (1 - cosine)))
+        return int(np.argmin(distance + METRES_PER_RIGHT_ANGLE * (1 - cosine)))
 
     def read(self, number: int, width: int) -> NDArray[np.uint8]:
-        """A photograph (H, W, 3), W pixels wide. Raises ConfigError if its file cannot be read."""
+        """Read a photograph, (H, W, 3), W pixels wide. Raises ConfigError if its file cannot be read."""
         from PIL import Image
 
-        path = _file(self.folder, self.names[number])
+        name = self.names[number]
+        path = _existing_file(self.folder, name)
         try:
             if path is None:
-                raise FileNotFoundError(self.names[number])
+                raise FileNotFoundError(name)
             full_width, full_height = image_size(path)
-            height = min(max(1, round(full_height * width / full_width)), MOST_PROPORTION * width)
+            height = min(max(1, round(full_height * width / full_width)), MAX_ASPECT * width)
             with Image.open(path) as image:
                 image.draft("RGB", (width, height))
                 small = image if image.mode in ("P", "1") else image.resize((width, height))  # palettes do not mix
                 return np.asarray(small.convert("RGB").resize((width, height)))
         except (OSError, ValueError, Image.DecompressionBombError) as error:
-            problem = f"the photograph cannot be read: {error}"
-            raise ConfigError(problem, path=self.folder, value=self.names[number]) from error
+            raise ConfigError(f"the photograph cannot be read: {error}", path=self.folder, value=name) from error
 
 
-def _file(folder: Path, name: str) -> Path | None:
-    """A model's image, if it lies in the folder; names that lead out of it are none."""
+def _existing_file(folder: Path, name: str) -> Path | None:
+    """Return the path of an image; None if it does not exist or its name leads out of the folder."""
     try:
         path = path_within(folder, name, "an image's name")
     except ConfigError:

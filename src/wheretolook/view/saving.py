@@ -1,4 +1,4 @@
-"""What one who looks takes along: the best views at waypoints placed by hand, and a picture of the scene."""
+"""Save the best views at waypoints and images of the scene."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import numpy as np
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError
 from wheretolook.view.controls import FILES, check_value
+from wheretolook.view.scenery import add_points
 from wheretolook.view.session import Session
 from wheretolook.view.worker import SOON
 
@@ -21,33 +22,34 @@ if TYPE_CHECKING:
     from wheretolook.select.views import SelectedViews
     from wheretolook.select.where_to_look import WhereToLook
 
-MOST = 500  # waypoints
-COLOR = (213, 94, 0)
-WAIT_S = 20.0  # for a browser to draw a picture
-LARGEST_PX = 2160
+MAX_WAYPOINTS = 500
+WAYPOINT_COLOR = (213, 94, 0)
+RENDER_TIMEOUT_S = 20.0
+MAX_IMAGE_PX = 2160
 
 
-def views_at(look: WhereToLook, points: Float, n: int, format: str) -> Iterator[SelectedViews]:
-    """The n best views at each of points (W, 3) m, one point at a time; for formats of one view each the best.
+def views_at(selector: WhereToLook, points: Float, n: int, format: str) -> Iterator[SelectedViews]:
+    """Select the n best views at each of points (W, 3) m, point by point; one view for formats of trajectories.
 
-    Raises a TableError for points outside the map or inside geometry.
+    Raises TableError for points outside the map or inside geometry.
     """
     from wheretolook.select.surroundings import usable_waypoints
     from wheretolook.select.waypoints import Waypoints
 
-    usable_waypoints(look.localization_map, Waypoints.of(points))
+    usable_waypoints(selector.localization_map, Waypoints.of(points))
+    n = 1 if FILES[format][0] in ("tum", "benchmark") else n
     for number, point in enumerate(points):
-        found = look.best(point, 1 if FILES[format][0] in ("tum", "benchmark") else n, ids=(str(number),))
-        yield replace(found, waypoint=found.waypoint + number)
+        views = selector.best(point, n, ids=(str(number),))
+        yield replace(views, waypoint=views.waypoint + number)
 
 
 def views_file(views: Sequence[SelectedViews], format: str) -> bytes:
-    """The file of views of several points, one after another, in a format of `FILES`."""
+    """Write views of several points in a format of `FILES`; returns the content of the file."""
     from wheretolook.select.views import joined
 
-    kind, ending = FILES[format]
+    kind, suffix = FILES[format]
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"views{ending}"
+        path = Path(folder) / f"views{suffix}"
         joined(views).save(path, kind)
         return path.read_bytes()
 
@@ -59,89 +61,74 @@ class WaypointList:
         self.session = session
         self.points: list[Float] = []
         controls = session.controls
-        session.on(controls.add, self._add_place, "on_click")
+        session.on(controls.add, self._add_selected, "on_click")
         session.on(controls.clear, self._clear, "on_click")
         session.on(controls.save, self._save, "on_click")
 
     def add(self, point: Float) -> None:
-        """Place one more."""
-        if len(self.points) >= MOST:
-            raise ConfigError("there is room for no more waypoints", value=MOST, fix="Save these and begin anew.")
+        """Add a waypoint (3,) m."""
+        if len(self.points) >= MAX_WAYPOINTS:
+            raise ConfigError("no more waypoints can be added", value=MAX_WAYPOINTS, fix="Save and remove them first.")
         self.points.append(np.asarray(point, dtype=np.float64))
         self._draw()
 
-    def _add_place(self) -> None:
-        if self.session.place is None:
-            raise ConfigError("no place is looked at", fix="Click one on the floor first.")
-        self.add(self.session.place.position)
+    def _add_selected(self) -> None:
+        location = self.session.place.location
+        if location is None:
+            raise ConfigError("no place is selected", fix="Click one on the floor first.")
+        self.add(location.position)
 
     def _clear(self) -> None:
         self.points.clear()
         self._draw()
 
     def _draw(self) -> None:
-        scene = self.session.scene
-        size = self.session.shared.mark_m
+        session = self.session
         rows = [f"{k + 1}. {x:.2f}, {y:.2f}, {z:.2f}" for k, (x, y, z) in enumerate(self.points)]
-        self.session.controls.waypoints.content = "\n".join(rows) or "No waypoints yet."
-        if not self.points:
-            scene.remove_by_name("/waypoints")
-            return
-        at = np.array(self.points)
-        scene.add_point_cloud(
-            "/waypoints",
-            (at - at[0]).astype(np.float32),
-            COLOR,
-            point_size=0.35 * size,
-            point_shape="circle",
-            precision="float32",
-            position=at[0],
-            point_shading="flat",
-        )
+        session.controls.waypoints.content = "\n".join(rows) or "No waypoints yet."
+        if self.points:
+            size_m = 0.35 * session.shared.marker_m
+            add_points(session.scene, "/waypoints", np.array(self.points), WAYPOINT_COLOR, size_m)
+        else:
+            session.scene.remove_by_name("/waypoints")
 
     def _save(self) -> None:
         if not self.points:
             fix = "Tick `clicks set waypoints` and click the floor, or add the place looked at."
             raise ConfigError("there are no waypoints to save", fix=fix)
-        self.session.submit("save", SOON, self._saved())
+        self.session.submit("save", SOON, self._save_views())
 
-    def _saved(self) -> Iterator[None]:
+    def _save_views(self) -> Iterator[None]:
         session = self.session
         check_value(session.controls.format, next(iter(FILES)))
         format = str(session.controls.format.value)
-        look = session.shared.look(session.state.method, session.state.occlusion)
         views = []
-        for found in views_at(look, np.array(self.points), session.state.n, format):
-            views.append(found)
-            yield  # others do not wait for hundreds of places
+        for selected in views_at(session.selector, np.array(self.points), session.state.n, format):
+            views.append(selected)
+            yield  # to other jobs
         content = views_file(views, format)
         session.client.send_file_download(f"views{FILES[format][1]}", content, save_immediately=True)
-        yield
 
 
 class PictureButton:
-    """Saves a picture of what is seen."""
+    """Saves an image of the scene as the browser shows it."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
-        session.on(session.controls.photo, self._save_picture, "on_click")
+        session.on(session.controls.photo, self._save, "on_click")
 
-    def _save_picture(self) -> None:
+    def _save(self) -> None:
+        from PIL import Image
+
         client = self.session.client
         height = client.camera.image_height or 1080
         width = client.camera.image_width or 1920
-        scale = min(1.0, LARGEST_PX / max(height, width))
+        scale = min(1.0, MAX_IMAGE_PX / max(height, width))
         try:
             size = max(1, round(height * scale)), max(1, round(width * scale))
-            image = client.get_render(*size, transport_format="png", timeout=WAIT_S)
+            image = client.get_render(*size, transport_format="png", timeout=RENDER_TIMEOUT_S)
         except (TimeoutError, RuntimeError) as error:
-            raise ConfigError(f"the browser gave no picture: {error}", fix="Keep its window in front.") from error
-        client.send_file_download("wheretolook.png", _png(image), save_immediately=True)
-
-
-def _png(image: np.ndarray) -> bytes:
-    from PIL import Image
-
-    file = io.BytesIO()
-    Image.fromarray(image).save(file, format="PNG")
-    return file.getvalue()
+            raise ConfigError(f"the browser sent no image: {error}", fix="Keep its window in front.") from error
+        file = io.BytesIO()
+        Image.fromarray(image).save(file, format="PNG")
+        client.send_file_download("wheretolook.png", file.getvalue(), save_immediately=True)

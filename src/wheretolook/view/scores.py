@@ -1,4 +1,4 @@
-"""What the viewer computes: scores of a floor, of all directions at a place, of one view; and where labels disagree."""
+"""Computations of the viewer: scores of a floor, a location and a view; comparison with labels."""
 
 from __future__ import annotations
 
@@ -10,46 +10,42 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.poses import Float, camera_centers
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from wheretolook.scorers.base import Scorer, ViewReport
+    from wheretolook.scorers.base import Scorer
     from wheretolook.select.views import SelectedViews
     from wheretolook.select.where_to_look import WhereToLook
 
-FLOOR_CELLS = 1200  # of a floor's rectangle, about
-LEAST_CELL_M = 0.1
+FLOOR_CELLS = 1200  # approximate number of cells in a floor's rectangle
+MIN_CELL_M = 0.1
 FLOOR_DIRECTIONS = 96
-"""Directions looked along at each place of a floor, 19 degrees apart: the best of them is as good as the best of 500
-to within a hundredth or two, and takes a third of the time."""
+"""Directions per cell of a floor, 19 degrees apart: the best score is within 0.02 of that of 500 directions, in a third
+of the time."""
 
-FIRST_PLACES = 12  # that are scored before a floor is drawn: fewer would say little of a house
-VIEWS_AT_ONCE = 1 << 10  # labelled views scored between two looks at what else is to be done
+FIRST_CELLS = 12  # scored before a floor is drawn
+BLOCK = 1 << 10  # labelled views scored per step
 
 
 @dataclass(eq=False)
 class Floor:
-    """Free places at one height, on a grid, and the best score at each as it comes in.
-
-    `lower` (2,) and `cell_m` place the grid of `shape` (rows along y, columns along x); `cells` (K,) are flat indices
-    of the free cells, each as far as can be from those before it; `ground_m` is the height of the ground below, where
-    it is known; `scores` (K,) and the best direction's `axes` (K, 3) are NaN until computed.
-    """
+    """Free cells of a horizontal grid, and the best score in each once computed."""
 
     height_m: float
-    lower: Float
+    lower: Float  # (2,) m, corner of the grid
     cell_m: float
-    shape: tuple[int, int]
-    cells: NDArray[np.int64]
-    ground_m: float | None = None
-    scores: Float = field(init=False)
-    axes: Float = field(init=False)
+    shape: tuple[int, int]  # rows along y, columns along x
+    cells: NDArray[np.int64]  # (K,) flat indices of free cells, in farthest-first order
+    ground_m: float | None = None  # height of the ground below, if known
+    scores: Float = field(init=False)  # (K,) NaN until computed
+    axes: Float = field(init=False)  # (K, 3) best directions
     n_scored: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
-        self.scores, self.axes = np.full(len(self.cells), np.nan), np.full((len(self.cells), 3), np.nan)
+        self.scores = np.full(len(self.cells), np.nan)
+        self.axes = np.full((len(self.cells), 3), np.nan)
 
     @property
     def points(self) -> Float:
@@ -60,161 +56,160 @@ class Floor:
 
     @property
     def done(self) -> bool:
-        """Whether all places are scored."""
+        """Whether all cells are scored."""
         return self.n_scored == len(self.cells)
 
     @property
     def n_first(self) -> int:
-        """How many places are scored first, all over the floor: with them all of it has a colour."""
-        return min(FIRST_PLACES, len(self.cells))
+        """Number of cells, spread over the floor, that are scored before it is drawn."""
+        return min(FIRST_CELLS, len(self.cells))
 
-    def score_next(self, look: WhereToLook, n: int = 1) -> bool:
-        """Score the next n places in the directions of `look`. Returns whether any were left."""
-        rows = slice(self.n_scored, min(self.n_scored + n, len(self.cells)))
-        if rows.start == rows.stop:
+    def score_next(self, selector: WhereToLook, n: int = 1) -> bool:
+        """Score the next n cells in the selector's directions. Returns whether any were left."""
+        if self.done:
             return False
-        axes = look.directions
-        found = look.scorer.score_around(self.points[rows], axes)
-        best = found.argmax(axis=1)
-        self.scores[rows] = found.max(axis=1)
-        self.axes[rows] = axes[best]
+        rows = slice(self.n_scored, min(self.n_scored + n, len(self.cells)))
+        scores = selector.scorer.score_around(self.points[rows], selector.directions)
+        self.scores[rows] = scores.max(axis=1)
+        self.axes[rows] = selector.directions[scores.argmax(axis=1)]
         self.n_scored = rows.stop
         return True
 
     def raster(self) -> Float:
-        """Scores (rows, columns); NaN where a camera cannot be. A place not yet scored has the nearest one's."""
+        """Return scores (rows, columns), NaN outside free space; cells not yet scored have the nearest one's score."""
         values = np.full(self.shape[0] * self.shape[1], np.nan)
         if self.n_scored:
             from scipy.spatial import cKDTree
 
-            at = self.points
-            _, nearest = cKDTree(at[: self.n_scored]).query(at)
+            points = self.points
+            _, nearest = cKDTree(points[: self.n_scored]).query(points)
             values[self.cells] = self.scores[nearest]
         return values.reshape(self.shape)
 
 
-def floor_at(space: Any, hides: Any, height_m: float) -> Floor:
-    """The free places at a height, of a `space` with `bounds` and `is_free`, none inside geometry of the occlusion."""
+def floor_at(space: Any, occlusion: Any, height_m: float) -> Floor:
+    """Make the floor of the free cells at a height of `space`, without those inside the occlusion model's geometry."""
     (x0, y0, _), (x1, y1, _) = np.asarray(space.bounds, dtype=np.float64)
-    cell = max(LEAST_CELL_M, float(np.sqrt((x1 - x0) * (y1 - y0) / FLOOR_CELLS)))
+    cell = max(MIN_CELL_M, float(np.sqrt((x1 - x0) * (y1 - y0) / FLOOR_CELLS)))
     columns = max(1, ceil((x1 - x0) / cell))
     rows = max(1, ceil((y1 - y0) / cell))
     lower = np.array([(x0 + x1) / 2 - columns * cell / 2, (y0 + y1) / 2 - rows * cell / 2])
-    floor = Floor(height_m, lower, cell, (rows, columns), np.arange(rows * columns))
-    free = space.is_free(floor.points)
-    free[free] = ~hides.inside_geometry(floor.points[free])
+    points = Floor(height_m, lower, cell, (rows, columns), np.arange(rows * columns)).points
+    free = space.is_free(points)
+    free[free] = ~occlusion.inside_geometry(points[free])
     cells = np.flatnonzero(free)
-    order = farthest_first(np.stack(np.divmod(cells, columns), axis=1))
     ground = None
     if len(cells) and hasattr(space, "floor_below"):
-        ground = float(np.median(space.floor_below(floor.points[cells])))
+        ground = float(np.median(space.floor_below(points[cells])))
+    order = farthest_first(np.stack(np.divmod(cells, columns), axis=1))
     return Floor(height_m, lower, cell, (rows, columns), cells[order], ground)
 
 
-def farthest_first(at: NDArray[np.int64]) -> NDArray[np.int64]:
-    """An order (K,) of places (K, 2), each the farthest from all before it, from one in the middle on.
+def farthest_first(points: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Order points (K, 2) from a central one, each the farthest from all before it; indices (K,).
 
-    However many of them are taken, no place is more than twice as far from these as it would be from the best choice
-    of as many (Gonzalez, "Clustering to minimize the maximum intercluster distance", 1985).
+    The first n cover the rest within twice the optimal distance (Gonzalez, "Clustering to minimize the maximum
+    intercluster distance", 1985).
     """
-    order = np.zeros(len(at), dtype=np.int64)
-    away = -((at - at.mean(axis=0)) ** 2).sum(1) if len(at) else np.empty(0)
-    for k in range(len(at)):
-        order[k] = away.argmax()
-        to_it = ((at - at[order[k]]) ** 2).sum(1)
-        away = to_it if k == 0 else np.minimum(away, to_it)
-        away[order[k]] = -1
+    order = np.zeros(len(points), dtype=np.int64)
+    distance = -((points - points.mean(axis=0)) ** 2).sum(1) if len(points) else np.empty(0)
+    for k in range(len(points)):
+        order[k] = distance.argmax()
+        to_new = ((points - points[order[k]]) ** 2).sum(1)
+        distance = to_new if k == 0 else np.minimum(distance, to_new)
+        distance[order[k]] = -1
     return order
 
 
-def heights_of(space: Any, centers: Float) -> tuple[float, float, float]:
-    """Lowest and highest height a camera may be at, and where it usually was when it mapped; metres."""
+def height_range(space: Any, mapping_centers: Float) -> tuple[float, float, float]:
+    """Return the lowest and highest free height, and the median height of the mapping cameras (M, 3), metres."""
     low, high = (float(z) for z in np.asarray(space.bounds)[:, 2])
-    usual = float(np.median(centers[:, 2])) if len(centers) else (low + high) / 2
+    usual = float(np.median(mapping_centers[:, 2])) if len(mapping_centers) else (low + high) / 2
     return low, high, min(max(usual, low), high)
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
-    """What is known of a place: the score of each direction, and the best views."""
+class ScoredLocation:
+    """A location with the score of each direction and its best views."""
 
-    position: Float  # (3,) metres
+    position: Float  # (3,) m
     directions: Float  # (D, 3) unit optical axes
     scores: Float  # (D,)
-    best: SelectedViews  # the N best views, the best first
+    best: SelectedViews  # best first
 
 
-def look_around(look: WhereToLook, position: Float, n: int) -> Place:
-    """Score all directions at a place, and find the n best views, those that `wheretolook select` gives.
+def score_location(selector: WhereToLook, position: Float, n: int) -> ScoredLocation:
+    """Score all directions at a position (3,) m and select the n best views, as `wheretolook select` does.
 
-    Raises a TableError if the place is outside the map or inside geometry.
+    Raises TableError if the position is outside the map or inside geometry.
     """
-    best = look.best(np.asarray(position, dtype=np.float64)[None], n)
-    scores = look.scorer.score_around(np.asarray(position, dtype=np.float64)[None], look.directions)[0]
-    return Place(np.asarray(position, dtype=np.float64), look.directions, scores, best)
-
-
-def report_of(scorer: Scorer, position: Float, axis: Float) -> ViewReport:
-    """What there is to know of one view of a camera without roll; arrays of length 1. PoseError if it is none."""
-    return scorer.report(poses_looking_along(np.asarray(position)[None], np.asarray(axis)[None]))
+    position = np.asarray(position, dtype=np.float64)
+    best = selector.best(position[None], n)
+    scores = selector.scorer.score_around(position[None], selector.directions)[0]
+    return ScoredLocation(position, selector.directions, scores, best)
 
 
 @dataclass(frozen=True, eq=False)
-class SeenLandmarks:
-    """The K landmarks that a view sees."""
+class VisibleLandmarks:
+    """The K landmarks visible in a view."""
 
-    points: Float  # (K, 3) metres
+    points: Float  # (K, 3) m
     pixels: Float  # (K, 2)
-    chances: Float  # (K,) of being found; NaN where nothing tells them
+    probabilities: Float  # (K,) of being detected; NaN if unknown
 
 
-def landmarks_seen(scorer: Scorer, pose: Float, teller: Scorer | None = None) -> SeenLandmarks:
-    """The landmarks a view (3, 4) sees, with their chances of being found by the scorer, or by another one."""
-    known = scorer.landmark_probabilities(pose[None])
-    if known is None and teller is not None:
-        known = teller.landmark_probabilities(pose[None])
-    around = scorer.localization_map
-    rows = around.landmarks_in_view(pose[None])[0].astype(np.int64) if known is None else known.rows
-    points = around.landmarks.points[rows]
-    p_detect = np.full(len(rows), np.nan) if known is None else known.p_detect
-    return SeenLandmarks(points, around.camera.project(points @ pose[:, :3].T + pose[:, 3]), p_detect)
+def visible_landmarks(scorer: Scorer, pose: Float, fallback: Scorer | None = None) -> VisibleLandmarks:
+    """Return the landmarks visible in a view (3, 4) with detection probabilities by `scorer` or by `fallback`."""
+    localization_map = scorer.localization_map
+    estimated = scorer.landmark_probabilities(pose[None])
+    if estimated is None and fallback is not None:
+        estimated = fallback.landmark_probabilities(pose[None])
+    if estimated is None:
+        rows = localization_map.landmarks_in_view(pose[None])[0].astype(np.int64)
+        probabilities = np.full(len(rows), np.nan)
+    else:
+        rows = estimated.rows
+        probabilities = estimated.p_detect
+    points = localization_map.landmarks.points[rows]
+    pixels = localization_map.camera.project(points @ pose[:, :3].T + pose[:, 3])
+    return VisibleLandmarks(points, pixels, probabilities)
 
 
 @dataclass(frozen=True, eq=False)
-class JudgedLabels:
-    """Labelled views, and what the method said of them."""
+class ScoredLabels:
+    """Labelled views and their scores."""
 
-    positions: Float  # (B, 3) metres
+    positions: Float  # (B, 3) m
     axes: Float  # (B, 3)
-    good: NDArray[np.bool_]  # whether the view localized
+    good: NDArray[np.bool_]  # (B,) whether the view localized
     scores: Float  # (B,)
     threshold: float
 
     @property
-    def promised(self) -> NDArray[np.bool_]:
-        """Views said to localize, that did not (B,)."""
+    def false_positive(self) -> NDArray[np.bool_]:
+        """Views (B,) predicted to localize that did not."""
         return (self.scores >= self.threshold) & ~self.good
 
     @property
-    def missed(self) -> NDArray[np.bool_]:
-        """Views said not to localize, that did (B,)."""
+    def false_negative(self) -> NDArray[np.bool_]:
+        """Views (B,) predicted not to localize that did."""
         return (self.scores < self.threshold) & self.good
 
 
-def judged_labels(
+def score_labels(
     scorer: Scorer, table: pd.DataFrame, limits: tuple[float, float], threshold: float
-) -> Generator[None, None, JudgedLabels]:
-    """Score labelled viewpoints, a block at each step. The generator returns what came of it.
+) -> Generator[None, None, ScoredLabels]:
+    """Score labelled viewpoints block by block; the generator returns the result.
 
-    A view is good if it localized with errors below limits in metres and degrees.
+    A view is good if its errors are below `limits` (m, degrees).
     """
     from wheretolook.dataset.viewpoint_table import is_good, poses
 
     cam_from_world = poses(table)
     scores = np.empty(len(cam_from_world))
-    for begin in range(0, len(scores), VIEWS_AT_ONCE):
-        rows = slice(begin, begin + VIEWS_AT_ONCE)
+    for begin in range(0, len(scores), BLOCK):
+        rows = slice(begin, begin + BLOCK)
         scores[rows] = scorer.score(cam_from_world[rows])
         yield None
-    positions = -(np.swapaxes(cam_from_world[..., :3], 1, 2) @ cam_from_world[..., 3:])[..., 0]
-    return JudgedLabels(positions, cam_from_world[:, 2, :3], is_good(table, *limits), scores, threshold)
+    centers = camera_centers(cam_from_world)
+    return ScoredLabels(centers, cam_from_world[:, 2, :3], is_good(table, *limits), scores, threshold)

@@ -1,4 +1,4 @@
-"""What somebody looks at, as a short text: in a link, and for `--state`."""
+"""What one client shows, as a short text for links and `--state`."""
 
 from __future__ import annotations
 
@@ -10,67 +10,67 @@ from urllib.parse import parse_qs, urlsplit
 
 from wheretolook.utils.errors import ConfigError
 
-MOST_VIEWS = 20
-_LONGEST = 2000  # characters; a longer one is no state of ours
+MAX_VIEWS = 20
+_MAX_LENGTH = 2000  # characters
 
 
 @dataclass(frozen=True)
 class ViewState:
-    """The choices of one who looks.
+    """Choices of one client, in metres and degrees in the world, z up; None leaves a choice to the viewer.
 
-    Metres and degrees in the world, z up; None stands for what the viewer chooses. The text has a field each that is
-    not as it is by default, "method=set;n=3;place=1,2,1.5": nothing in it must be escaped in a link.
+    The text holds the fields that differ from their default, "method=set;n=3;place=1,2,1.5", and needs no escaping in
+    a link.
     """
 
-    method: str = ""  # that of the best weights
-    occlusion: str = ""  # the best there is
-    n: int = 5  # best views of a place
-    threshold: float = 0.5  # score from which a view is good enough
+    method: str = ""  # the best weights' method by default
+    occlusion: str = ""  # the best available by default
+    n: int = 5  # best views per location
+    threshold: float = 0.5  # score from which a view is good
     height: float | None = None  # of the floor
-    cut: float | None = None  # what lies above is left out
-    place: tuple[float, float, float] | None = None  # the place looked at
-    yaw: float | None = None  # of the camera turned by hand
+    cut: float | None = None  # height above which the scene is hidden
+    place: tuple[float, float, float] | None = None  # selected location
+    yaw: float | None = None  # of the selected view
     pitch: float | None = None
-    eye: tuple[float, float, float] | None = None  # where the scene is seen from
-    target: tuple[float, float, float] | None = None  # the point in the middle of the picture
+    eye: tuple[float, float, float] | None = None  # of the browser's camera
+    target: tuple[float, float, float] | None = None  # of the browser's camera
 
     def text(self) -> str:
-        """The state as a text."""
+        """Return the state as text."""
         parts = []
         for item in fields(self):
             value = getattr(self, item.name)
             if value != item.default:
-                told = ",".join(map(_short, value)) if isinstance(value, tuple) else _short(value)
-                parts.append(f"{item.name}={told}")
+                text = ",".join(map(_short, value)) if isinstance(value, tuple) else _short(value)
+                parts.append(f"{item.name}={text}")
         return ";".join(parts)
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """The state of a text. Raises ConfigError if it has a field that there is not, or a value that is none."""
-        found: dict[str, object] = {}
-        if len(text) > _LONGEST:
-            raise ConfigError("the state of a view is a short text", value=f"{text[:60]}...", fix=_FIX)
+        """Parse the text of a state. Raises ConfigError for an unknown field or an invalid value."""
+        if len(text) > _MAX_LENGTH:
+            raise ConfigError("the state is too long", value=f"{text[:60]}...", fix=_FIX)
+        values: dict[str, object] = {}
         for part in filter(None, text.split(";")):
             name, _, value = part.partition("=")
             try:
-                found[name] = _READ[name](value)
+                values[name] = _READERS[name](value)
             except (KeyError, ValueError, TypeError) as error:
-                raise ConfigError("this is no state of a view", value=part, fix=_FIX) from error
-        state = cls(**found)  # type: ignore[arg-type]
+                raise ConfigError("invalid view state", value=part, fix=_FIX) from error
+        state = cls(**values)  # type: ignore[arg-type]
         if state.eye is not None and state.eye == state.target:
-            raise ConfigError("a scene is seen from elsewhere than the point looked at", value=state.eye, fix=_FIX)
+            raise ConfigError("eye and target of a view state must differ", value=state.eye, fix=_FIX)
         return state
 
     @classmethod
     def of_path(cls, path: str) -> Self | None:
-        """The state in the path of a request, "/?view=n=3;height=1.4"; None if there is none. Raises as `parse`."""
-        given = parse_qs(urlsplit(path).query, separator="&").get("view")
-        return cls.parse(given[0]) if given else None
+        """Parse the state in the path of a request, "/?view=n=3;height=1.4"; None without one. Raises as `parse`."""
+        values = parse_qs(urlsplit(path).query, separator="&").get("view")
+        return cls.parse(values[0]) if values else None
 
     def link(self, host: str) -> str:
-        """The address that opens the viewer at "host:port" in this state.
+        """Return the address that opens the viewer at "host:port" in this state.
 
-        The page takes the address of its own connection from the field `websocket`, and so brings the state along.
+        The page connects to the address in the field `websocket`, which carries the state.
         """
         return f"http://{host}/?websocket=ws://{host}/?view={self.text()}"
 
@@ -79,7 +79,7 @@ _FIX = "Copy it from the field `state` of the viewer, such as n=3;height=1.4;pla
 
 
 def _short(value: object) -> str:
-    """To the millimetre, however far a map lies from its origin."""
+    """Format a value; numbers to the millimetre, however far a map is from its origin."""
     return f"{value:.3f}".rstrip("0").rstrip(".") if isinstance(value, float) else str(value)
 
 
@@ -91,7 +91,7 @@ def _number(text: str) -> float:
 
 
 def _point(text: str) -> tuple[float, float, float]:
-    x, y, z = (_number(part) for part in text.split(","))
+    x, y, z = map(_number, text.split(","))
     return x, y, z
 
 
@@ -103,12 +103,12 @@ def _word(text: str) -> str:
 
 def _count(text: str) -> int:
     value = int(text)
-    if not 1 <= value <= MOST_VIEWS:
+    if not 1 <= value <= MAX_VIEWS:
         raise ValueError(text)
     return value
 
 
-_READ = {
+_READERS = {
     "method": _word, "occlusion": _word, "n": _count, "threshold": _number, "height": _number, "cut": _number,
     "place": _point, "yaw": _number, "pitch": _number, "eye": _point, "target": _point,
 }  # fmt: skip

@@ -1,8 +1,7 @@
-"""Which weights score here: those given, or else the place's own, or else those that ship."""
+"""Choose the weights of each method for a map: given, adapted to the scene, trained with its dataset, or bundled."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,91 +12,80 @@ if TYPE_CHECKING:
     from wheretolook.dataset.layout import SceneFolder
     from wheretolook.geometry.poses import Float
 
-GIVEN = "given"
-ADAPTED = "adapted to this place"
-TRAINED = "trained with this dataset"
-SHIPPED = "that ship"
-
 
 @dataclass(frozen=True)
-class KnownWeights:
-    """Files of weights by the kind they are of, and where each comes from, for people."""
+class AvailableWeights:
+    """Weights files and their origin, by the method that they belong to; the preferred method comes first."""
 
     files: dict[str, Path]
-    sources: dict[str, str]
+    origins: dict[str, str]
 
-    def told(self, method: str) -> str:
-        """With which weights a method scores; empty if it has learnt nothing."""
+    @classmethod
+    def of(cls, features: str, own: dict[str, Path | None]) -> AvailableWeights:
+        """Collect the weights of existing files or folders by origin, then bundled ones, for a map with `features`."""
+        from wheretolook.weights.resolve import weights_by_method
+
+        available = cls({}, {})
+        for origin, place in {**own, "bundled with wheretolook": shipped(WEIGHTS)}.items():
+            for method, path in weights_by_method(place, features).items() if place is not None else ():
+                if method not in available.files:
+                    available.files[method] = path
+                    available.origins[method] = origin
+        return available
+
+    def describe(self, method: str) -> str:
+        """Describe the weights that a method scores with; empty for a method without weights."""
         from wheretolook.scorers.registry import scorers
 
         kind = scorers()[method].weights
-        return f"weights {self.sources[kind]}: {self.files[kind].name}" if kind in self.files else ""
+        return f"weights {self.origins[kind]}: {self.files[kind].name}" if kind in self.files else ""
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """Names of the methods that can score with these or without any, that of the first file first."""
+        """Methods that can score with these weights or without any, the preferred one first."""
         from wheretolook.scorers.registry import scorers
 
-        able = [
+        usable = [
             name
-            for name, known in scorers().items()
-            if known.group != "probes" and name != "random" and (not known.weights or known.weights in self.files)
+            for name, method in scorers().items()
+            if method.group != "probes" and name != "random" and (not method.weights or method.weights in self.files)
         ]
         first = next(iter(self.files), "")
-        return tuple(sorted(able, key=lambda name: (scorers()[name].weights != first, name != first)))
+        return tuple(sorted(usable, key=lambda name: (scorers()[name].weights != first, name != first)))
 
 
-def given_weights(path: Path, features: str = "") -> KnownWeights:
-    """A file, or a folder of them, before those that ship, for a map by these features.
-
-    Raises a WeightsError if they cannot be used.
-    """
-    return _known([(or_shipped(path), GIVEN)], features)
+def given_weights(path: Path, features: str = "") -> AvailableWeights:
+    """Collect the weights in a file or folder, and bundled ones. Raises WeightsError if they cannot be used."""
+    return AvailableWeights.of(features, {"given": or_shipped(path)})
 
 
-def scene_weights(files: SceneFolder, landmarks: Float, features: str = "") -> KnownWeights:
-    """Those of a scene of a dataset: adapted to it, or else those its dataset has trained (`resolve_weights`).
-
-    `landmarks` (N, 3) m are those of the scene's map, by these features.
-    """
-    own = []
+def scene_weights(files: SceneFolder, landmarks: Float, features: str = "") -> AvailableWeights:
+    """Collect weights adapted to a scene with landmarks (N, 3) m, trained with its dataset, and bundled ones."""
     root = files.folder.parent
-    if _are_of(adapted := root / "adapted" / f"{files.name}.safetensors", landmarks):
-        own.append((adapted, ADAPTED))
+    trained = None
     if any((root / "weights").glob("*.safetensors")):
         from wheretolook.dataset.layout import Dataset
         from wheretolook.weights.resolve import resolve_weights
 
         trained = resolve_weights(dataset=Dataset.load(root))
-        if trained is not None and trained.is_relative_to(root):
-            own.append((trained, TRAINED))
-    return _known(own, features)
+        if trained is not None and not trained.is_relative_to(root):
+            trained = None
+    adapted = _if_adapted_to(root / "adapted" / f"{files.name}.safetensors", landmarks)
+    return AvailableWeights.of(features, {"adapted to this scene": adapted, "trained with this dataset": trained})
 
 
-def map_weights(model: Path, data: Path, landmarks: Float, features: str = "") -> KnownWeights:
-    """Those that `wheretolook adapt --map` has adapted to a COLMAP model with landmarks (N, 3) m, if it has."""
+def map_weights(model: Path, data: Path, landmarks: Float, features: str = "") -> AvailableWeights:
+    """Collect weights adapted to a COLMAP model with landmarks (N, 3) m by `wheretolook adapt --map`, and bundled ones."""
     from wheretolook.mapping.config import ExistingModelConfig
 
-    adapted = data / "checks" / ExistingModelConfig(model=model).scene_name / "adapted.safetensors"
-    return _known([(adapted, ADAPTED)] if _are_of(adapted, landmarks) else [], features)
+    path = data / "checks" / ExistingModelConfig(model=model).scene_name / "adapted.safetensors"
+    return AvailableWeights.of(features, {"adapted to this scene": _if_adapted_to(path, landmarks)})
 
 
-def _known(own: Iterable[tuple[Path, str]], features: str) -> KnownWeights:
-    from wheretolook.weights.resolve import weights_by_method
-
-    known = KnownWeights({}, {})
-    for place, source in [*own, (shipped(WEIGHTS), SHIPPED)]:
-        for kind, path in weights_by_method(place, features).items():
-            if kind not in known.files:
-                known.files[kind] = path
-                known.sources[kind] = source
-    return known
-
-
-def _are_of(path: Path, landmarks: Float) -> bool:
-    """Whether there are weights adapted to a place, and landmarks (N, 3) m are of it."""
+def _if_adapted_to(path: Path, landmarks: Float) -> Path | None:
+    """Return the path if the file has weights adapted to a scene with these landmarks (N, 3) m."""
     if not path.is_file():
-        return False
+        return None
     from safetensors import SafetensorError, safe_open
 
     from wheretolook.scorers.adapted.place import LEAST_SAME, share_of_place
@@ -106,5 +94,5 @@ def _are_of(path: Path, landmarks: Float) -> bool:
         with safe_open(path, framework="np") as file:
             place = file.get_tensor("place")
     except (SafetensorError, OSError):
-        return False
-    return share_of_place(place, landmarks) >= LEAST_SAME
+        return None
+    return path if share_of_place(place, landmarks) >= LEAST_SAME else None

@@ -1,54 +1,51 @@
-"""One thread that computes for all who look: the most urgent first, and of what somebody asks for again, the newest."""
+"""Single-threaded job queue of three urgencies; newer jobs replace older ones of the same client and kind."""
 
 from __future__ import annotations
 
-import itertools
 import logging
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Hashable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 NOW = 0
 SOON = 1
 LATER = 2
-"""Urgency of work: a view turned by hand, a place clicked, a floor that fills."""
+"""Urgencies: a view turned by hand, a clicked location, the floor."""
 
 QUIET_S = 0.4
 PATIENCE_S = 4.0
-"""So long after a view was turned nothing is begun that can wait, as the next turn would have to wait for its step;
-unless for so long nothing of that kind was done: where many look, somebody always turns."""
+"""A LATER job does not start within QUIET_S of a NOW job, since the next one would wait for its step, unless no LATER
+job has run for PATIENCE_S."""
 
-CLICK_PATIENCE_S = 1.0
-"""After so long without a place being done, one goes before turns: a client that floods turns without end."""
+CLICK_PATIENCE_S = 1.0  # a SOON job precedes NOW jobs if none has run for this long
 
 _log = logging.getLogger(__name__)
 
 
-@dataclass(order=True)
+@dataclass(eq=False)
 class _Job:
     urgency: int
-    turn: int
-    key: tuple[Hashable, Hashable] = field(compare=False)
-    steps: Iterator[object] = field(compare=False)
-    failed: Callable[[Exception], None] = field(compare=False)
+    key: tuple[Hashable, Hashable]
+    steps: Iterator[object]
+    on_error: Callable[[Exception], None]
 
 
 class Worker:
-    """Computes jobs, iterators each, one step at a time, in a thread of this name.
+    """Runs jobs, each an iterator, one step at a time in one thread, since scorers are not thread-safe.
 
-    Scorers are not for several threads, and two cores have no more to give. Between two steps a more urgent job goes
-    first; jobs as urgent take turns, so that nobody waits for all of another's floor. While somebody turns a view,
-    floors wait. None waits for ever. A job that raises is told so, by `failed`, and ends; others go on.
+    Before each step the most urgent job is chosen; equally urgent jobs alternate. A job that raises ends, and its
+    `on_error` is called.
     """
 
     def __init__(self, name: str = "scores") -> None:
         self._jobs: dict[tuple[Hashable, Hashable], _Job] = {}
-        self._turns = itertools.count()
-        self._wake = threading.Condition()
+        self._queues: dict[int, deque[_Job]] = {NOW: deque(), SOON: deque(), LATER: deque()}
+        self._last_run = dict.fromkeys(self._queues, -math.inf)
+        self._changed = threading.Condition()
         self._stopped = False
-        self._done = dict.fromkeys((NOW, SOON, LATER), -math.inf)  # when one as urgent was done last
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
@@ -58,68 +55,72 @@ class Worker:
         kind: Hashable,
         urgency: int,
         steps: Iterator[object],
-        failed: Callable[[Exception], None],
+        on_error: Callable[[Exception], None],
     ) -> None:
-        """Do a job of an owner, in place of the one of that kind that is still to be done."""
-        with self._wake:
-            self._jobs[owner, kind] = _Job(urgency, next(self._turns), (owner, kind), steps, failed)
-            self._wake.notify()
+        """Queue a job of an owner. It replaces the pending job of the same owner and kind."""
+        job = _Job(urgency, (owner, kind), steps, on_error)
+        with self._changed:
+            self._jobs[job.key] = job
+            self._queues[urgency].append(job)
+            self._changed.notify()
 
     def forget(self, owner: Hashable) -> None:
         """Drop all jobs of an owner."""
-        with self._wake:
-            for key in [key for key in self._jobs if key[0] == owner]:
-                del self._jobs[key]
+        with self._changed:
+            self._jobs = {key: job for key, job in self._jobs.items() if key[0] != owner}
 
     def stop(self, wait: bool = True) -> None:
-        """End after the step that is being done; wait for it, unless told not to."""
-        with self._wake:
+        """End the thread after its current step, and by default wait for it."""
+        with self._changed:
             self._stopped = True
-            self._wake.notify()
+            self._changed.notify()
         if wait:
             self._thread.join(timeout=10)
 
     def _run(self) -> None:
         while True:
-            with self._wake:
+            with self._changed:
                 while not self._jobs and not self._stopped:
-                    self._wake.wait()
+                    self._changed.wait()
                 if self._stopped:
                     return
-                job = self._next()
-                now = time.monotonic()
-                until = min(self._done[NOW] + QUIET_S, self._done[LATER] + PATIENCE_S) - now
-                if job.urgency == LATER and until > 0:
-                    self._wake.wait(until)
+                queue = self._next_queue()
+                start = min(self._last_run[NOW] + QUIET_S, self._last_run[LATER] + PATIENCE_S)
+                pause_s = start - time.monotonic()
+                if queue is self._queues[LATER] and pause_s > 0:
+                    self._changed.wait(pause_s)
                     continue
+                job = queue.popleft()
             self._step(job)
-            self._done[job.urgency] = time.monotonic()
+            self._last_run[job.urgency] = time.monotonic()
 
-    def _next(self) -> _Job:
-        """The most urgent job, or a less urgent one whose kind has waited for too long."""
+    def _next_queue(self) -> deque[_Job]:
+        """Return the queue to serve: of the most urgent jobs, or of less urgent ones that have waited too long."""
+        for queue in self._queues.values():
+            while queue and self._jobs.get(queue[0].key) is not queue[0]:
+                queue.popleft()  # replaced or forgotten
+        now = time.monotonic()
         for urgency, patience_s in ((SOON, CLICK_PATIENCE_S), (LATER, PATIENCE_S)):
-            if time.monotonic() - self._done[urgency] > patience_s:
-                waiting = [job for job in self._jobs.values() if job.urgency == urgency]
-                if waiting:
-                    return min(waiting)
-        return min(self._jobs.values())
+            if self._queues[urgency] and now - self._last_run[urgency] > patience_s:
+                return self._queues[urgency]
+        return next(queue for queue in self._queues.values() if queue)
 
     def _step(self, job: _Job) -> None:
-        goes_on = False
         try:
             next(job.steps)
-            goes_on = True
+            finished = False
         except StopIteration:
-            pass
-        except Exception as error:  # whatever one job raises, the others go on
+            finished = True
+        except Exception as error:  # must not end the thread
+            finished = True
             _log.debug("a job failed: %s", job.key, exc_info=error)
             try:
-                job.failed(error)
+                job.on_error(error)
             except Exception:
-                _log.exception("what failed could not be told")
-        with self._wake:
+                _log.exception("an error could not be reported")
+        with self._changed:
             if self._jobs.get(job.key) is job:
-                if goes_on:
-                    job.turn = next(self._turns)
-                else:
+                if finished:
                     del self._jobs[job.key]
+                else:
+                    self._queues[job.urgency].append(job)

@@ -18,8 +18,8 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.utils.errors import ConfigError
 from wheretolook.view import drawing
-from wheretolook.view.paths import FORWARD, Played
-from wheretolook.view.scores import SeenLandmarks, landmarks_seen
+from wheretolook.view.paths import FORWARD, RecordedPath
+from wheretolook.view.scores import VisibleLandmarks, visible_landmarks
 from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
 
@@ -38,13 +38,13 @@ def film(shared: Shared, path: Path, state: ViewState = ViewState()) -> int:
     ConfigError without a mesh or with fewer than two paths.
     """
     try:
-        if shared.opened.mesh is None or len(shared.paths) < 2:
+        if shared.viewed.mesh is None or len(shared.paths) < 2:
             fix = "Give --path of a scene with a mesh."
             raise ConfigError("a film needs a mesh, and two paths to compare", path=path, fix=fix)
         state = replace(
             state,
-            method=state.method or shared.opened.methods[0],
-            occlusion=state.occlusion or shared.opened.occlusions[0],
+            method=state.method or shared.viewed.methods[0],
+            occlusion=state.occlusion or shared.viewed.occlusions[0],
         )
         frames = list(_frames(shared, state))
     finally:
@@ -54,11 +54,11 @@ def film(shared: Shared, path: Path, state: ViewState = ViewState()) -> int:
 
 
 def _frames(shared: Shared, state: ViewState) -> Iterator[drawing.Rgb]:
-    mesh = shared.opened.mesh
-    opened = shared.opened
+    mesh = shared.viewed.mesh
+    viewed = shared.viewed
     assert mesh is not None
     (first, ahead), *_, (second, told) = shared.paths.items()
-    look = shared.look(state.method, state.occlusion)
+    look = shared.selector(state.method, state.occlusion)
     verdicts = [_localized(played, look.scorer.score(played.cam_from_world), state) for played in (ahead, told)]
     heights = camera_centers(told.cam_from_world)[:, 2]
     house = dollhouse(mesh, elevation_deg=62, cut_m=float(heights.max()) + 0.3, width_px=700)
@@ -72,17 +72,19 @@ def _frames(shared: Shared, state: ViewState) -> Iterator[drawing.Rgb]:
             for row, (name, played, good) in enumerate(zip((first, second), (ahead, told), verdicts, strict=True)):
                 at = min(round(number * (len(played) - 1)), len(played) - 1)
                 color = COLORS.get(name, BLUE)
-                _draw_way(above, house, played.cam_from_world, good, at, color, opened.camera, shared.mark_m)
-                seen = landmarks_seen(look.scorer, played.cam_from_world[at], shared.teller(state.occlusion))
-                image, _ = opened.picture(played.cam_from_world[at], SeenLandmarks(*_marked(seen)))
+                _draw_way(above, house, played.cam_from_world, good, at, color, viewed.camera, shared.marker_m)
+                seen = visible_landmarks(
+                    look.scorer, played.cam_from_world[at], shared.landmark_scorer(state.occlusion)
+                )
+                image, _ = viewed.picture(played.cam_from_world[at], VisibleLandmarks(*_marked(seen)))
                 _draw_view(figure.add_subplot(grid[row, 1]), image, name, bool(good[at]), good[: at + 1], color)
             yield pixels_of(figure)
 
 
-def _marked(seen: SeenLandmarks) -> tuple[Float, Float, Float]:
+def _marked(seen: VisibleLandmarks) -> tuple[Float, Float, Float]:
     """The landmarks likely to be found: a dot for each one in view would hide the picture."""
-    likely = np.nan_to_num(seen.chances) >= 0.3
-    return seen.points[likely], seen.pixels[likely], seen.chances[likely]
+    likely = np.nan_to_num(seen.probabilities) >= 0.3
+    return seen.points[likely], seen.pixels[likely], seen.probabilities[likely]
 
 
 def _steps(n: int) -> Float:
@@ -90,7 +92,7 @@ def _steps(n: int) -> Float:
     return np.linspace(0, 1, min(n, MOST_FRAMES))
 
 
-def _localized(played: Played, scores: Float, state: ViewState) -> np.ndarray:
+def _localized(played: RecordedPath, scores: Float, state: ViewState) -> np.ndarray:
     return scores >= state.threshold if played.localized is None else played.localized
 
 

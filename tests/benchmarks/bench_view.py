@@ -154,7 +154,7 @@ def memory_mb() -> float:
 
 def print_turns(session: Any, n: int) -> None:
     """Print how long the score of a view turned by hand takes while the floor fills."""
-    session.go_to(np.array([9.0, 9.0, 1.5]))
+    session.place.select(np.array([9.0, 9.0, 1.5]))
     while session.place.location is None:
         time.sleep(0.02)
     time.sleep(2)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import shutil
 import subprocess
@@ -16,12 +15,12 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
 def chromium() -> str | None:
-    """The browser's program, if there is one."""
+    """Return the path of the browser, None if there is none."""
     return next((path for name in NAMES if (path := shutil.which(name))), None)
 
 
 class Tab:
-    """One page; `errors` are those of its console, and exceptions nobody caught."""
+    """One page; `errors` are those of its console and uncaught exceptions."""
 
     def __init__(self, address: str, size: tuple[int, int]) -> None:
         from websockets.sync.client import connect
@@ -36,7 +35,7 @@ class Tab:
         )
 
     def call(self, method: str, **params: Any) -> Any:
-        """What the browser answers."""
+        """Call a DevTools method and return its result."""
         self._number += 1
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": params}))
         while True:
@@ -64,14 +63,14 @@ class Tab:
 
     @property
     def text(self) -> str:
-        """What can be read on the page."""
+        """The visible text."""
         return str(self.evaluate("document.body ? document.body.innerText : ''"))
 
-    def wait(self, what: Callable[[Tab], bool], seconds: float = 60.0) -> None:
-        """Until something is so."""
+    def wait(self, condition: Callable[[Tab], bool], seconds: float = 60.0) -> None:
+        """Wait for a condition."""
         end = time.monotonic() + seconds
-        while not what(self):
-            assert time.monotonic() < end, f"it did not happen; the page says:\n{self.text}\n{self.errors}"
+        while not condition(self):
+            assert time.monotonic() < end, f"timed out; the page shows:\n{self.text}\n{self.errors}"
             time.sleep(0.1)
 
     def click(self, x: float, y: float) -> None:
@@ -80,7 +79,7 @@ class Tab:
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **button)
 
     def press(self, label: str) -> None:
-        """Click the first element whose whole text is this, once it is there."""
+        """Click the last element with exactly this text, once it exists."""
         script = (
             "(() => { const e = [...document.querySelectorAll('button, [role=tab], label, span, p, div')]"
             f".filter(e => e.innerText && e.innerText.trim() === {json.dumps(label)}"
@@ -92,7 +91,7 @@ class Tab:
         self.click(*self.evaluate(script))
 
     def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 10) -> None:
-        """Press the mouse at one pixel, move it in steps to another, and let go."""
+        """Drag the mouse from one pixel to another."""
         ways = [tuple(a + (b - a) * k / steps for a, b in zip(start, end, strict=True)) for k in range(steps + 1)]
         moves = [("mouseMoved", start), ("mousePressed", start), *(("mouseMoved", at) for at in ways)]
         for kind, (x, y) in [*moves, ("mouseReleased", end)]:
@@ -103,40 +102,35 @@ class Tab:
             time.sleep(0.03)
 
     def downloads(self, folder: Path) -> None:
-        """Let the page save files in a folder."""
+        """Save downloads in a folder."""
         self.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
-
-    def frames_per_second(self, seconds: float = 3.0) -> float:
-        """How many pictures the page draws in a second."""
-        script = "new Promise(done => { let n = 0; const t = performance.now(); const count = () => { n++; const s = "
-        script += f"(performance.now() - t) / 1000; s > {seconds} ? done(n / s) : requestAnimationFrame(count); }}; "
-        return float(self.evaluate(script + "requestAnimationFrame(count); })"))
-
-    def picture(self, path: Path) -> None:
-        """Write a picture of the page, PNG."""
-        path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
 
     def close(self) -> None:
         self._socket.close()
 
 
 class Browser:
-    """Several tabs of one browser, whose profile lies in a folder."""
+    """A browser with its profile in a folder."""
 
-    def __init__(self, folder: Path, size: tuple[int, int] = (1280, 800), angle: str = "swiftshader") -> None:
+    def __init__(self, folder: Path, size: tuple[int, int] = (1280, 800)) -> None:
         program = chromium()
         assert program is not None
-        options = ["--headless=new", "--no-sandbox", "--disable-dev-shm-usage", f"--use-angle={angle}"]
-        options += [
+        options = [
+            "--headless=new",
+            "--no-sandbox",
+            "--disable-dev-shm-usage",
+            "--use-angle=swiftshader",
             "--enable-unsafe-swiftshader",
             "--ignore-gpu-blocklist",
             "--remote-debugging-port=0",
+            "--remote-allow-origins=*",
             "--no-first-run",
+            "--hide-scrollbars",
+            "--disable-background-networking",
+            "--disable-renderer-backgrounding",
+            "--disable-background-timer-throttling",
+            "--disable-backgrounding-occluded-windows",
         ]
-        options += ["--disable-background-networking", "--hide-scrollbars", "--no-first-run"]
-        options += ["--remote-allow-origins=*"]
-        options += ["--disable-renderer-backgrounding", "--disable-background-timer-throttling"]
-        options += ["--disable-backgrounding-occluded-windows"]
         self.size = size  # type: ignore[var-annotated]
         self._tabs = []
         self.process = subprocess.Popen(
@@ -152,7 +146,7 @@ class Browser:
         self.port = int(port.read_text().split()[0])
 
     def open(self, url: str) -> Tab:
-        """A new tab."""
+        """Open an address in a new tab."""
         request = Request(f"http://127.0.0.1:{self.port}/json/new?about:blank", method="PUT")
         with urlopen(request) as answer:
             tab = Tab(json.load(answer)["webSocketDebuggerUrl"], self.size)

@@ -171,7 +171,7 @@ class Viewer:
             return True
         try:
             site = urlsplit(headers["Origin"])
-            return site.hostname in LOCAL or site.netloc == headers.get("X-Forwarded-Host")
+            return site.hostname in LOCAL or (bool(site.netloc) and site.netloc == headers.get("X-Forwarded-Host"))
         except ValueError:
             return False
 

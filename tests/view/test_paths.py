@@ -1,0 +1,115 @@
+"""Paths are read from every file that holds poses; states survive text and links."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from selection.room import POINTS, write_room
+from wheretolook.dataset.viewpoint_table import pose_columns
+from wheretolook.geometry.poses import camera_centers
+from wheretolook.select.where_to_look import WhereToLook
+from wheretolook.utils.errors import ConfigError, TableError
+from wheretolook.view.paths import FORWARD, looking_ahead, read_paths
+from wheretolook.view.state import ViewState
+
+STATE = ViewState("visible", "none", 3, 0.25, 1.4, 2.0, (1.0, 2.0, 1.5), -30.0, 5.0, (0.0, 0.0, 9.0), (1.0, 1.0, 0.0))
+
+
+def test_states_survive_text_and_link() -> None:
+    far = replace(STATE, place=(431207.125, 5412345.5, 312.046), eye=(431207.0, 5412345.5, 312.05), cut=1234.05)
+    for state in (STATE, ViewState(), far):
+        assert ViewState.parse(state.text()) == state
+    link = STATE.link("localhost:8080")
+    assert not {*link.partition("?")[2]} & {*' &#%+"<>'}  # needs no escaping
+    assert ViewState.of_path("/" + link.rpartition("/")[2]) == STATE and ViewState.of_path("/?other=1") is None
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["n=0", "n=x", "height=nan", "place=1,2", "place=1,2,inf", "what=1", "n", "x" * 3000, "eye=1,2,3;target=1,2,3"],
+)
+def test_invalid_states(text: str) -> None:
+    with pytest.raises(ConfigError):
+        ViewState.parse(text)
+
+
+def test_paths_of_poses(tmp_path: Path) -> None:
+    sparse = write_room(tmp_path / "sparse")
+    views = WhereToLook.from_colmap(sparse, method="visible", occlusion="none", directions=60).best(POINTS)
+    views.save(tmp_path / "views.csv")
+    views.save(tmp_path / "views.tum")
+    pd.DataFrame({"score": 0.5, **pose_columns(views.cam_from_world)}).to_csv(tmp_path / "path.csv", index=False)
+    for name, method in (("views.csv", "views"), ("views.tum", "views"), ("path.csv", "planned"), ("", "planned")):
+        paths = read_paths(tmp_path / name)
+        assert [*paths] == [FORWARD, method] and paths[method].localized is None
+        np.testing.assert_allclose(paths[method].cam_from_world, views.cam_from_world, atol=1e-5)
+        np.testing.assert_allclose(camera_centers(paths[FORWARD].cam_from_world), POINTS, atol=1e-5)
+
+
+def test_compared_paths_have_labels_if_there_are_any(tmp_path: Path) -> None:
+    poses = looking_ahead(POINTS)
+    rows = [
+        pd.DataFrame({**pose_columns(poses), "method": method, "pair": pair, "task": "planned", "waypoint": range(4)})
+        for pair in (0, 1)
+        for method in ("forward", "set")
+    ]
+    table = pd.concat(rows)
+    scene = tmp_path / "paths" / "compared"
+    scene.mkdir(parents=True)
+    table.to_parquet(scene / "views.parquet")
+    assert read_paths(scene, 1)["set"].localized is None
+    far = np.where(table["method"] == "forward", 1.0, 0.01)
+    labelled = table.assign(scene="compared", status="localized", error_m=far, error_deg=0.1)
+    labelled.to_parquet(scene.parent / "views.parquet")
+    localized = [path.localized for path in read_paths(scene, 1).values()]
+    np.testing.assert_array_equal(localized, [[False] * 4, [True] * 4])
+    # where a method planned no path, all have their views along the given one
+    lost = (table["method"] == "set") & (table["pair"] == 1)
+    given = table[table["pair"] == 1].assign(task="given")
+    (scene.parent / "views.parquet").unlink()
+    pd.concat([table[~lost], given]).to_parquet(scene / "views.parquet")
+    np.testing.assert_allclose(read_paths(scene, 1)["set"].cam_from_world, poses, atol=1e-9)
+    with pytest.raises(TableError):
+        read_paths(scene, 7)
+
+
+def test_looking_ahead_follows_the_path_and_keeps_direction_where_it_stops() -> None:
+    positions = np.array([(0.0, 0, 1), (0, 0, 1), (1, 0, 1), (1, 2, 1.5), (1, 2, 1.5)])
+    axes = looking_ahead(positions)[:, 2, :3]
+    np.testing.assert_allclose(axes, [(1, 0, 0), (1, 0, 0), (0, 1, 0), (0, 1, 0), (0, 1, 0)], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["path.csv", "path.tum"])
+@pytest.mark.parametrize("text", ["", "1 2 3\n", "x,y\n1,2\n", "\0\0", "0 1 2 3 0 0 0 0\n" * 2, "0 " * 9_000_000])
+def test_invalid_text_files(name: str, text: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(TableError):
+        read_paths(tmp_path / name)
+
+
+POSES = {**pose_columns(np.tile(np.eye(3, 4), (4, 1, 1))), "pair": 0, "task": "planned", "waypoint": range(4)}
+ONE = pd.DataFrame({**POSES, "method": "set"})
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        ONE.assign(tx=1e300),
+        ONE.assign(qw=np.nan),
+        pd.concat([ONE.assign(method=f"m{number}") for number in range(30)]),
+        pa.table({"pair": pa.array(np.zeros(20_000_000, dtype=np.int64))}),  # 160 MB in a few kilobytes
+    ],
+    ids=["far", "no rotation", "too many methods", "bomb"],
+)
+def test_invalid_tables(table: pd.DataFrame | pa.Table, tmp_path: Path) -> None:
+    path = tmp_path / "views.parquet"
+    pq.write_table(table if isinstance(table, pa.Table) else pa.Table.from_pandas(table), path, compression="zstd")
+    with pytest.raises(TableError):
+        read_paths(path)

@@ -1,0 +1,296 @@
+"""The viewer's server and sessions, without a browser."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from urllib.error import HTTPError
+from urllib.parse import quote
+from urllib.request import urlopen
+
+import numpy as np
+import pycolmap
+import pytest
+
+pytest.importorskip("viser")
+
+import msgspec
+from markdown_it import MarkdownIt
+
+from box_scenes import furnished_room
+from selection.room import POINTS, WEIGHTS, write_room
+from wheretolook.cli import main
+from wheretolook.scenes.loading import save_glb
+from wheretolook.select.where_to_look import WhereToLook
+from wheretolook.utils.errors import ConfigError, InUseError, MapWarning
+from wheretolook.view.controls import FILES, check_value, value_of
+from wheretolook.view.drawing import escape_markdown
+from wheretolook.view.paths import FORWARD, RecordedPath, looking_ahead
+from wheretolook.view.saving import views_at, views_file
+from wheretolook.view.server import Viewer, check_port, intersect_plane
+from wheretolook.view.shared import Shared
+from wheretolook.view.state import ViewState
+from wheretolook.view.viewed_map import open_map
+
+STATE = ViewState(method="visible", occlusion="none")
+
+
+@pytest.fixture(scope="module")
+def sparse(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_room(tmp_path_factory.mktemp("view") / "sparse")
+
+
+@pytest.fixture
+def viewer(sparse: Path) -> Iterator[Viewer]:
+    paths = {FORWARD: RecordedPath(looking_ahead(np.tile(POINTS, (20, 1))))}
+    made = Viewer(Shared(open_map(sparse, weights=WEIGHTS), paths), port=0, state=STATE)
+    yield made
+    made.stop()
+
+
+def connect(viewer: Viewer, path: str = "", headers: dict[str, str] | None = None) -> Any:
+    import viser
+    from websockets.sync import client
+
+    address = f"ws://127.0.0.1:{viewer.port}/{path}"
+    protocols: Any = [f"viser-v{viser.__version__}"]
+    return client.connect(address, subprotocols=protocols, max_size=None, close_timeout=1, additional_headers=headers)
+
+
+def message(kind: str, **fields: object) -> bytes:
+    return msgspec.msgpack.encode({"type": kind, **fields})
+
+
+def camera(x: float = 0.0) -> bytes:
+    """What a browser sends when it joins and when its camera moves."""
+    pose = {"wxyz": [1, 0, 0, 0], "position": [x, 0, 9], "look_at": [0, 0, 0], "up_direction": [0, 0, 1]}
+    return message("ViewerCameraMessage", **pose, fov=1.0, near=0.1, far=99.0, image_height=600, image_width=800)
+
+
+def click(z: float = -1.0) -> bytes:
+    ray = {"ray_origin": [1.5, 2.0, 9.0], "ray_direction": [0.01, 0, z]}
+    return message("ScenePointerMessage", event_type="click", screen_pos=[[0.5, 0.5]], modifier=None, **ray)
+
+
+def setting(session: Any, control: str, value: object, field: str = "value") -> bytes:
+    handle = getattr(session.controls, control)
+    return message("GuiUpdateMessage", uuid=handle._impl.uuid, updates={field: value})
+
+
+def wait_until(condition: Callable[[], object], seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def join(viewer: Viewer, client: Any) -> Any:
+    """Wait for the session of the newest client, which can be clicked."""
+    n = len(viewer.sessions)
+    client.send(camera())
+    wait_until(lambda: len(viewer.sessions) > n, 60)
+    session = viewer.sessions[max(viewer.sessions)]
+    wait_until(lambda: session.client.scene._scene_pointer_cb, 60)
+    return session
+
+
+def test_clients_have_their_own_state_and_survive_invalid_messages(viewer: Viewer) -> None:
+    with connect(viewer) as first, connect(viewer, "?view=n=2;place=1.5,2,1.5;method=bins") as second:
+        one = join(viewer, first)
+        other = join(viewer, second)
+        wait_until(lambda: other.place.location is not None)
+        assert (one.state.method, other.state.method) == ("visible", "bins")
+        assert len(other.place.location.best) == 2 and one.place.location is None
+        for invalid in (b"\xff\x00", "text", message("NoSuchMessage")):
+            with connect(viewer) as bad:
+                bad.send(camera())
+                bad.send(invalid)
+                time.sleep(0.1)
+        first.send(click(float("nan")))
+        first.send(click())
+        wait_until(lambda: one.place.location is not None)
+        np.testing.assert_allclose(one.place.location.position[:2], (1.5, 2), atol=0.1)
+
+
+def test_a_flood_of_messages_does_not_delay_other_clients(viewer: Viewer) -> None:
+    with connect(viewer) as bad, connect(viewer) as good:
+        session = join(viewer, bad)
+        n_threads = threading.active_count()
+        for turn in range(200):
+            values = {
+                "yaw": turn % 180, "step": turn % 80 + 1, "threshold": turn / 200, "play": True, "add": True,
+                "save": True, "photo": True, "method": f"none {turn}", "height": 1e308, "state": "x" * 1000,
+            }  # fmt: skip
+            bad.send(click())
+            bad.send(camera())
+            for name, value in values.items():
+                bad.send(setting(session, name, value))
+            bad.send(setting(session, "yaw", 1.0, "no such field"))
+        joined = join(viewer, good)
+        good.send(click())
+        caption = joined.controls.picture_caption
+        wait_until(lambda: joined.place.location is not None and bool(caption.content), 60)
+        caption.content = ""
+        good.send(setting(joined, "yaw", 77.0))
+        wait_until(lambda: "landmarks in view" in caption.content, 10)
+        assert sum("_play" in thread.name for thread in threading.enumerate()) <= 1
+        assert threading.active_count() < n_threads + 12
+
+
+def test_landmarks_are_thinned_by_level_of_detail(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wheretolook.view.scenery.FEWER_LANDMARKS", (500, 100, 20))  # of 400
+    with connect(viewer) as client:
+        session = join(viewer, client)
+
+        def sizes() -> list[int]:
+            clouds = [session.scene.get_handle_by_name(f"/landmarks{name}") for name in ("", "-1", "-2", "-3")]
+            return [len(cloud.points) for cloud in clouds if cloud is not None and cloud.visible]
+
+        shown = []
+        for level in (0, 1, 2, 3, 0):
+            session.scenery.set_level(level)
+            session.draw_scene()
+            shown.append(sizes())
+        assert shown == [[400], [400], [100], [20], [400]]
+
+
+def test_invalid_values_of_controls_are_reported_and_restored(viewer: Viewer) -> None:
+    with connect(viewer) as client:
+        session = join(viewer, client)
+        controls = session.controls
+        errors: list[Exception] = []
+        session.show_error = errors.append
+        values = {"method": "../../weights", "occlusion": "x", "n": 10**9, "height": float("nan")}
+        values |= {"threshold": float("inf"), "cut": -1e300, "limits": "no", "yaw": 1e9}
+        for name, value in values.items():
+            client.send(setting(session, name, value))
+        wait_until(lambda: len(errors) >= len(values))
+        assert {type(error) for error in errors} == {ConfigError}
+        assert controls.method.value == "visible" and 1 <= controls.n.value <= 20
+        assert session.state.n == 5 and np.isfinite(session.state.height)
+        controls.format._impl.value = "/x"
+        with pytest.raises(ConfigError):
+            check_value(controls.format, "CSV")
+        assert controls.format.value == "CSV"
+        controls.height._impl.value = float("nan")  # not restored yet
+        assert value_of(controls.height, 1.5) == 1.5 and value_of(controls.n, 7) == controls.n.value
+
+
+def test_only_the_page_is_served(viewer: Viewer) -> None:
+    with urlopen(f"http://127.0.0.1:{viewer.port}") as answer:
+        assert b"<html" in answer.read(2000).lower()
+    for path in ("/../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/sparse/images.bin"):
+        with pytest.raises(HTTPError):
+            urlopen(f"http://127.0.0.1:{viewer.port}{path}")
+    assert viewer.server.request_share_url() is None and viewer.server.get_host() == "127.0.0.1"
+
+
+@pytest.mark.parametrize(
+    ("origin", "forwarded", "allowed"),
+    [
+        ("http://localhost:8080", "", True),
+        ("http://[::1]:8080", "", True),
+        ("https://evil.example", "", False),
+        ("https://localhost.evil.example", "", False),
+        ("null", "", False),
+        ("http://[", "", False),
+        ("https://mine.example", "mine.example", True),
+    ],
+)
+def test_pages_of_other_sites_are_rejected(origin: str, forwarded: str, allowed: bool, viewer: Viewer) -> None:
+    headers = {"Origin": origin, "X-Forwarded-Host": forwarded}
+    assert viewer._is_allowed(headers) == allowed
+    with connect(viewer, headers=headers) as client:
+        if allowed:
+            join(viewer, client)
+        else:
+            client.send(camera())
+            time.sleep(0.3)
+            assert not viewer.sessions
+    viewer.host = "0.0.0.0"
+    assert viewer._is_allowed(headers)
+
+
+def test_text_of_files_and_links_is_escaped(viewer: Viewer) -> None:
+    hostile = "<iframe srcdoc='<script>steal()</script>'> ![x](http://evil/x) **b** `c` &lt;a&gt; [l](javascript:x)"
+    shown = MarkdownIt().render(escape_markdown(hostile))
+    assert shown.count("<") == 2 and "<p>&lt;iframe" in shown  # the paragraph only
+    with connect(viewer, "?view=" + quote("what=<img src=http://evil>")) as client:
+        session = join(viewer, client)
+        wait_until(lambda: "\\<img src" in session.controls.summary.content)
+
+
+@pytest.mark.parametrize(("scale", "up_m", "warned"), [(1.0, 0.0, False), (1.0, 40.0, True), (0.01, 0.0, True)])
+def test_a_mesh_in_another_frame_is_reported_in_terminal_and_page(
+    scale: float, up_m: float, warned: bool, sparse: Path, tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    room = furnished_room()
+    vertices = (scale * room.vertices + np.float32([0, 0, up_m])).astype(np.float32)
+    save_glb(replace(room, vertices=vertices), tmp_path / "room.glb")
+    viewed = open_map(sparse, tmp_path / "room.glb", weights=WEIGHTS)
+    assert any(warning.category is MapWarning for warning in recwarn) == warned
+    assert any("from the mesh" in text for text in viewed.warnings) == warned
+
+
+def test_a_map_that_is_not_metric_and_upright_is_reported(sparse: Path, tmp_path: Path) -> None:
+    model = pycolmap.Reconstruction(sparse)
+    turn = pycolmap.Rotation3d(np.array([np.sin(np.pi / 4), 0, 0, np.cos(np.pi / 4)]))  # y is up
+    model.transform(pycolmap.Sim3d(100.0, turn, np.zeros(3)))
+    model.write(tmp_path)
+    with pytest.warns(MapWarning):
+        shared = Shared(open_map(tmp_path, weights=WEIGHTS))
+    assert len(shared.viewed.warnings) == 2
+    viewer = Viewer(shared, port=0, state=STATE)
+    try:
+        with connect(viewer) as client:
+            assert join(viewer, client).controls.warnings.visible
+    finally:
+        viewer.stop()
+
+
+@pytest.mark.parametrize("format", FILES)
+def test_waypoints_are_saved_as_select_saves_them(format: str, sparse: Path, tmp_path: Path) -> None:
+    look = WhereToLook.from_colmap(sparse, method="visible", occlusion="none", directions=60)
+    kind, suffix = FILES[format]
+    file = tmp_path / f"views{suffix}"
+    look.best(POINTS, 1 if kind in ("tum", "benchmark") else 3).save(file, kind)
+    assert views_file([*views_at(look, POINTS, 3, format)], format) == file.read_bytes()
+
+
+def test_rays_meet_the_floor() -> None:
+    np.testing.assert_allclose(intersect_plane((0, 0, 5), (1, 0, -2), 1.0), (2, 0, 1))  # type: ignore[arg-type]
+    for direction in ((1, 0, 2), (1, 0, 0), (1, 0, np.nan), ()):
+        assert intersect_plane((0, 0, 5), direction, 1.0) is None
+
+
+def test_a_port_in_use(sparse: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(InUseError):
+            check_port("127.0.0.1", port)
+        assert main(["view", "--map", str(sparse), "--port", str(port)]) == 2
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        "", "--map nowhere", "--map nowhere --scene x", "--scene x --data nowhere", "--scene x --mesh x.glb",
+        "--map nowhere --state n=0", "--map nowhere --port 70000", "--map nowhere --host no.such.host.invalid",
+        "--map nowhere --path nowhere.csv", "--map nowhere --images nowhere", "--scene half --data {data}",
+    ],
+)  # fmt: skip
+def test_invalid_options(options: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    about = {"camera": {"width": 64, "height": 48, "focal_px": 32.0}, "scenes": [{"name": "half", "split": "test"}]}
+    (tmp_path / "set" / "half").mkdir(parents=True)  # a scene that has not been mapped
+    (tmp_path / "set" / "dataset.json").write_text(json.dumps(about))
+    port = [] if "--port" in options else ["--port", "0"]
+    assert main(["view", *options.format(data=tmp_path).split(), *port]) == 2
+    assert "Traceback" not in capsys.readouterr().err

@@ -1,0 +1,110 @@
+"""The worker's priorities and the level of detail of slow browsers."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from wheretolook.view.level_of_detail import LevelOfDetail
+from wheretolook.view.worker import LATER, NOW, SOON, Worker
+
+
+def wait_until(condition: Callable[[], object], seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_urgent_jobs_go_first_and_failures_stop_nothing_else() -> None:
+    worker = Worker()
+    done: list[str] = []
+    errors: list[Exception] = []
+    ready = threading.Event()
+
+    def steps(name: str, n: int) -> Iterator[None]:
+        ready.wait(10)
+        for _ in range(n):
+            done.append(name)
+            yield
+        if name == "fails":
+            raise ValueError
+
+    worker.submit(1, "floor", LATER, steps("first", 3), errors.append)
+    worker.submit(2, "floor", LATER, steps("second", 2), errors.append)
+    worker.submit(3, "floor", LATER, steps("fails", 1), errors.append)
+    worker.submit(1, "view", NOW, steps("replaced", 5), errors.append)
+    worker.submit(1, "view", NOW, steps("new", 2), errors.append)
+    worker.submit(4, "floor", LATER, steps("forgotten", 5), errors.append)
+    worker.forget(4)
+    ready.set()
+    wait_until(lambda: len(done) >= 8 and errors)
+    worker.stop()
+    assert sorted(done) == ["fails"] + 3 * ["first"] + 2 * ["new"] + 2 * ["second"]
+    assert done.index("new") <= 1 and isinstance(errors[0], ValueError)
+
+
+def test_no_urgency_starves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Floors wait while a view is turned without end, but not for ever; nor do clicked locations."""
+    monkeypatch.setattr("wheretolook.view.worker.PATIENCE_S", 0.6)
+    monkeypatch.setattr("wheretolook.view.worker.CLICK_PATIENCE_S", 0.2)
+    worker = Worker()
+    floors: list[float] = []
+    clicks: list[float] = []
+
+    def turns() -> Iterator[None]:
+        while True:
+            time.sleep(0.01)
+            yield
+
+    def note(times: list[float]) -> Iterator[None]:
+        times.append(time.monotonic())
+        yield
+
+    worker.submit(1, "view", NOW, turns(), pytest.fail)
+    for n in (1, 2):
+        worker.submit(2, "place", SOON, note(clicks), pytest.fail)
+        worker.submit(2, "floor", LATER, note(floors), pytest.fail)
+        wait_until(lambda n=n: len(clicks) == len(floors) == n, 10)  # type: ignore[misc]
+    worker.stop()
+    assert np.diff(floors)[0] >= 0.6
+
+
+@pytest.mark.parametrize(
+    ("gap_s", "step_m", "levels"),
+    [(0.12, 0.4, [1, 2]), (0.12, 0.1, []), (0.01, 0.4, [])],  # slow browser, slow hand, fast browser
+)
+def test_detail_is_reduced_while_the_camera_of_a_slow_browser_moves(
+    gap_s: float, step_m: float, levels: list[int]
+) -> None:
+    shown: list[int] = []
+    detail = LevelOfDetail(shown.append, 2)
+    for step in range(10):
+        detail.moved((step_m * step, 0.0, 9.0), (0.0, 0.0, 0.0))
+        detail.moved((step_m * step, 0.0, 9.0), (0.0, 0.0, 0.0))  # browsers send each pose twice
+        time.sleep(gap_s)
+    if levels:
+        wait_until(lambda: shown == [*levels, 0], 2)
+        detail.moved((99.0, 0.0, 9.0), (0.0, 0.0, 0.0))
+        assert shown[-1] == 2  # begins with the last level
+    else:
+        assert shown == []
+
+
+def test_full_detail_is_restored_however_long_showing_less_took() -> None:
+    shown: list[int] = []
+
+    def show(level: int) -> None:
+        time.sleep(0.5 if level else 0.0)  # longer than until the camera counts as still
+        shown.append(level)
+
+    detail = LevelOfDetail(show, 1)
+    for step in range(5):
+        detail.moved((float(step), 0.0, 9.0), (0.0, 0.0, 0.0))
+        time.sleep(0.1)
+    wait_until(lambda: len(shown) > 1 and detail._timer is None)
+    assert shown[0] == 1 and shown[-1] == 0

@@ -14,8 +14,8 @@ from mapping.test_own_models import rig_model
 from wheretolook.mapping.config import ExistingModelConfig, MapConfig, PhotographsConfig
 from wheretolook.mapping.imported_map import map_existing
 from wheretolook.mapping.photographs import read_photograph
+from wheretolook.scans.depth_images import _read_depth
 from wheretolook.scans.frames import _size
-from wheretolook.select.surroundings import _read_depth
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.utils.images import image_size, read_image
 from wheretolook.view.photographs import MAX_ASPECT, Photographs

@@ -147,9 +147,3 @@ def test_a_margin_and_a_volume_without_sense_are_refused(volume: TsdfVolume) -> 
         TsdfOcclusion(volume, margin_m=-0.1)
     with pytest.raises(SceneError, match="no surface"):
         TsdfOcclusion(TsdfVolume())
-
-
-def test_what_depth_images_are_fused_with_can_be_imported_from_where_it_was() -> None:
-    from wheretolook.visibility import tsdf
-
-    assert (tsdf.DepthImage, tsdf.TsdfConfig, tsdf.TsdfVolume) == (DepthImage, TsdfConfig, TsdfVolume)

@@ -1,11 +1,13 @@
-"""A scene opened once, mesh or photographs: where a camera can be, what hides landmarks, what cameras see."""
+"""Map, camera, occlusion, free space and renderer of a place, each made once when it is first needed."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, overload
 
 import numpy as np
@@ -18,94 +20,106 @@ from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.mapping.georeference import read_scale
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.utils.devices import usable_device
-from wheretolook.utils.errors import MapError, SceneError
-from wheretolook.visibility.config import OcclusionConfig
+from wheretolook.utils.errors import ConfigError, MapError, SceneError
+from wheretolook.visibility.config import OCCLUSION_MODELS, OcclusionConfig, check_occlusion_names
 
 if TYPE_CHECKING:
     from wheretolook.geometry.mesh import TexturedMesh
     from wheretolook.geometry.tsdf import DepthImage, TsdfVolume
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.mapping.landmarks import Landmarks
+    from wheretolook.mapping.opened_map import OpenedMap
     from wheretolook.rendering.raycasting import MeshRaycaster
-    from wheretolook.rendering.warp_renderer import WarpRenderer
+    from wheretolook.rendering.types import Renderer
     from wheretolook.space.free_space import FreeSpace
     from wheretolook.space.mapped_space import MappedSpace
     from wheretolook.visibility.occlusion import OcclusionModel
 
 
 @dataclass(frozen=True)
-class SceneConfig:
-    """How a scene is looked at."""
+class EnvironmentConfig:
+    """Options of an environment."""
 
-    occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)  # what hides landmarks
-    free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)  # where a camera can be, by a mesh
-    mapped_space: MappedSpaceConfig = field(default_factory=MappedSpaceConfig)  # and by photographs
-    assume_metric: bool = False  # whether the unit of a map without a scale is taken for a metre
+    occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)
+    free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)  # with a mesh or depth images
+    mapped_space: MappedSpaceConfig = field(default_factory=MappedSpaceConfig)  # with photographs alone
+    assume_metric: bool = False  # take the unit of a map without a known scale for a metre
+    occlusion_cache_bytes: int = 0  # memory for lines of sight that are asked for again
+    renderer: str = "warp"  # name in `wheretolook.rendering.registry.RENDERERS`
 
 
-class Scene:
-    """A scene of a dataset with the camera that will look. Each part is made when it is first asked for, and kept.
+class Environment(ABC):
+    """A map with its camera, occlusion models, free space and renderer; world in metres, z up.
 
-    The camera is that of the scene unless another one is given. `device` is where kernels run: "cpu", a CUDA device, or
-    "auto" for the first GPU there is. A `mesh` (metres, z up) is given if there is no file of it. `progress` shows
-    progress bars where depth images are fused.
+    `SceneEnvironment` opens a scene of a dataset, `ColmapEnvironment` a COLMAP model. Every part is computed when it is
+    first used, and kept. `device` runs the kernels: "cpu", a CUDA device, or "auto" for the first GPU. `progress` shows
+    bars where depth images are fused.
 
-    Raises (each part, when it is made):
-        SceneError: the mesh is missing or cannot be used.
+    Raises (when a part is first used):
+        SceneError: the mesh or the depth images are missing or cannot be used.
         MapError: the map is missing, damaged, or not in metres.
-        ConfigError: there is no such device, or the voxels of a TSDF do not fit into memory.
+        ConfigError: unknown device or occlusion model, or the voxels of a TSDF exceed the memory.
     """
 
-    def __init__(
-        self,
-        files: SceneFolder,
-        camera: Camera | None = None,
-        config: SceneConfig = SceneConfig(),
-        device: str = "cpu",
-        mesh: TexturedMesh | None = None,
-        progress: bool = True,
-    ) -> None:
-        self.files = files
-        self.camera = camera or files.camera
+    name: str
+    camera: Camera  # the one that will look
+
+    def __init__(self, config: EnvironmentConfig, device: str, progress: bool) -> None:
         self.config = config
         self.progress = progress
         self._device = device
-        if mesh is not None:
-            self.mesh = mesh
-
-    @property
-    def name(self) -> str:
-        """Name of the scene."""
-        return self.files.name
+        self._occlusion_models: dict[str, OcclusionModel] = {}
 
     @cached_property
     def device(self) -> str:
-        """Where kernels run."""
+        """The device that runs kernels, such as "cpu" or "cuda:0"."""
         return usable_device(self._device)
 
-    @cached_property
-    def is_photographed(self) -> bool:
-        """Whether the scene is known from photographs alone."""
-        return self.files.is_photographed
+    # What the sources provide
 
     @property
-    def source(self) -> Path:
-        """The file that everything follows from: the mesh, or else the poses of the photographs."""
-        return self.files.mapping_cameras if self.is_photographed else self.files.mesh
+    @abstractmethod
+    def landmarks(self) -> Landmarks:
+        """The map's landmarks."""
 
-    @cached_property
+    @property
+    @abstractmethod
+    def mapping_poses(self) -> Float | None:
+        """Poses cam_from_world (M, 3, 4) of the mapping images; None if unknown."""
+
+    @property
+    @abstractmethod
     def mesh(self) -> TexturedMesh:
-        """The textured mesh."""
-        from wheretolook.scenes.loading import load_mesh
+        """The mesh."""
 
-        return load_mesh(self.files.mesh)
+    @property
+    @abstractmethod
+    def depth_images(self) -> Sequence[DepthImage]:
+        """Depth images of the mapping images."""
+
+    @property
+    @abstractmethod
+    def has_mesh(self) -> bool:
+        """Whether `mesh` is available."""
+
+    @property
+    @abstractmethod
+    def has_depth(self) -> bool:
+        """Whether `depth_images` are available."""
+
+    @property
+    @abstractmethod
+    def space(self) -> FreeSpace | MappedSpace:
+        """Where a camera can be."""
+
+    # What follows from these
 
     @cached_property
-    def renderer(self) -> WarpRenderer:
+    def renderer(self) -> Renderer:
         """Renders the mesh."""
-        from wheretolook.rendering.warp_renderer import WarpRenderer
+        from wheretolook.rendering.registry import make_renderer
 
-        return WarpRenderer(self.mesh, self.device)
+        return make_renderer(self.mesh, self.device, self.config.renderer)
 
     @property
     def raycaster(self) -> MeshRaycaster:
@@ -121,15 +135,148 @@ class Scene:
 
     @cached_property
     def mapped_space(self) -> MappedSpace:
-        """Where a camera can be according to the photographs."""
+        """Where a camera can be according to landmarks and mapping images."""
         from wheretolook.space.mapped_space import MappedSpace
 
+        poses = np.empty((0, 3, 4)) if self.mapping_poses is None else self.mapping_poses
+        return MappedSpace(self.landmarks.points, camera_centers(poses.astype(np.float64)), self.config.mapped_space)
+
+    @cached_property
+    def tsdf_space(self) -> FreeSpace:
+        """Where a camera can be according to the depth images."""
+        from wheretolook.space.tsdf_space import TsdfSpace
+
+        images = self.depth_images
+        return TsdfSpace(self.tsdf_volume, images, self.config.free_space, self.device, self.progress)
+
+    @cached_property
+    def tsdf_volume(self) -> TsdfVolume:
+        """The truncated signed distance field fused from the depth images."""
+        from wheretolook.geometry.tsdf import TsdfConfig, TsdfVolume
+
+        occlusion = self.config.occlusion
+        tsdf = TsdfConfig(voxel_size_m=occlusion.voxel_m, max_depth_m=occlusion.max_depth_m)
+        return TsdfVolume.from_images(self.depth_images, tsdf, self.progress)
+
+    @property
+    def available_occlusion(self) -> tuple[str, ...]:
+        """Names of the occlusion models that can be made here, the most accurate first."""
+        available = {"": True, "mesh": self.has_mesh, "depth images": self.has_depth}
+        return tuple(name for name, kind in OCCLUSION_MODELS.items() if available[kind.needs])
+
+    def check_occlusion(self, name: str) -> None:
+        """Raise ConfigError if an occlusion model is unknown or cannot be made here."""
+        check_occlusion_names((name,))
+        if name not in self.available_occlusion:
+            fix = f"Give them, or use {' or '.join(self.available_occlusion)}."
+            raise ConfigError(f"this occlusion model needs a {OCCLUSION_MODELS[name].needs}", value=name, fix=fix)
+
+    @property
+    def occlusion_config(self) -> OcclusionConfig:
+        """The occlusion model that is used, and its options."""
+        return self.config.occlusion
+
+    @property
+    def occlusion(self) -> OcclusionModel:
+        """Decides which landmarks are unoccluded from any location."""
+        return self.occlusion_model(self.occlusion_config.model)
+
+    def occlusion_model(self, name: str) -> OcclusionModel:
+        """Make the occlusion model of a name in `available_occlusion`, with the options of `config.occlusion`."""
+        if name not in self._occlusion_models:
+            self.check_occlusion(name)
+            model: OcclusionModel = resolve_name(OCCLUSION_MODELS[name].model).from_inputs(self)
+            if self.config.occlusion_cache_bytes and name != "none":
+                from wheretolook.visibility.cached_occlusion import CachedOcclusion
+
+                model = CachedOcclusion(model, self.config.occlusion_cache_bytes)
+            self._occlusion_models[name] = model
+        return self._occlusion_models[name]
+
+    @cached_property
+    def localization_map(self) -> LocalizationMap:
+        """The input of scorers, with `occlusion`."""
+        from wheretolook.inputs.localization_map import LocalizationMap
+
+        return LocalizationMap(self.landmarks, self.camera, self.occlusion, self.device, self.mapping_poses)
+
+
+class SceneEnvironment(Environment):
+    """A scene of a dataset, known from a mesh or from photographs.
+
+    `camera` takes the place of the scene's camera, `mesh` (metres, z up) that of the mesh file.
+    """
+
+    def __init__(
+        self,
+        files: SceneFolder,
+        camera: Camera | None = None,
+        config: EnvironmentConfig = EnvironmentConfig(),
+        device: str = "cpu",
+        progress: bool = True,
+        mesh: TexturedMesh | None = None,
+    ) -> None:
+        super().__init__(config, device, progress)
+        self.files = files
+        self.name = files.name
+        self.camera = camera or files.camera
+        if mesh is not None:
+            self.mesh = mesh
+
+    @cached_property
+    def is_photographed(self) -> bool:
+        """Whether the scene is known from photographs alone."""
+        return self.files.is_photographed
+
+    @property
+    def source(self) -> Path:
+        """The file that everything follows from: the mesh, or else the poses of the photographs."""
+        return self.files.mapping_cameras if self.is_photographed else self.files.mesh
+
+    @cached_property
+    def mesh(self) -> TexturedMesh:  # type: ignore[override]
+        """The textured mesh."""
+        from wheretolook.scenes.loading import load_mesh
+
+        return load_mesh(self.files.mesh)
+
+    @property
+    def has_mesh(self) -> bool:
+        """Whether there is a mesh."""
+        return "mesh" in vars(self) or self.files.mesh.is_file()
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether depth images can be rendered."""
+        return self.has_mesh
+
+    @cached_property
+    def landmarks(self) -> Landmarks:  # type: ignore[override]
+        """The map's landmarks."""
+        return self.files.read_landmarks()
+
+    @cached_property
+    def mapping_poses(self) -> Float | None:  # type: ignore[override]
+        """Poses cam_from_world (M, 3, 4) of the mapping images; None if unknown."""
+        return self.files.mapping_poses()
+
+    @cached_property
+    def depth_images(self) -> Sequence[DepthImage]:  # type: ignore[override]
+        """Depth images rendered where the map's images were taken."""
+        from wheretolook.mapping.colmap_model import colmap_poses, read_model
+
+        model = read_model(self.files.map)
+        mapped = only_camera(cameras_by_id(model.cameras, self.files.map), self.files.map)
+        return RenderedDepth(self.renderer, mapped, colmap_poses(self.files.map, model))
+
+    @cached_property
+    def mapped_space(self) -> MappedSpace:
+        """Where a camera can be according to the photographs."""
         self.require_metres()
         if self.mapping_poses is None:
             fix = "Run the map stage again."
             raise MapError("the poses of the map's photographs are missing", path=self.files.map, fix=fix)
-        centers = camera_centers(self.mapping_poses.astype(np.float64))
-        return MappedSpace(self.landmarks.points, centers, self.config.mapped_space)
+        return super().mapped_space
 
     @cached_property
     def scanned_space(self) -> MappedSpace:
@@ -147,18 +294,14 @@ class Scene:
             return self.mapped_space
         return self.scanned_space if self.files.is_scanned else self.mesh_space
 
-    @cached_property
+    @property
     def space(self) -> FreeSpace | MappedSpace:
-        """Where a camera can be: with occlusion by "tsdf" according to depth images, else as `sampled_space`."""
-        if self.is_photographed or self.config.occlusion.model != "tsdf":
-            return self.sampled_space
-        from wheretolook.space.tsdf_space import TsdfSpace
-
-        volume, images = self._fused
-        return TsdfSpace(volume, images, self.config.free_space, self.device, self.progress)
+        """Where a camera can be: with occlusion "tsdf" according to depth images, else `sampled_space`."""
+        tsdf = self.config.occlusion.model == "tsdf" and not self.is_photographed
+        return self.tsdf_space if tsdf else self.sampled_space
 
     def require_metres(self) -> None:
-        """Raise MapError if the map is not in metres, unless it is to be taken for one that is."""
+        """Raise MapError if the map is not known to be in metres, unless `assume_metric` is set."""
         scale = read_scale(self.files.map)
         if scale is not None and not scale.is_metric and not self.config.assume_metric:
             fix = "Map it with marker sizes, a distance or positions (map.photographs.scale), or pass "
@@ -167,9 +310,9 @@ class Scene:
             raise MapError(problem, path=self.files.map, value=scale.source, fix=fix)
 
     def free_voxels(self, views: ViewLattice, space: FreeSpace | MappedSpace) -> tuple[VoxelGrid, NDArray[np.int64]]:
-        """The voxels of a lattice, and the ids of those where a camera can be, ascending.
+        """The voxels of a lattice over `space` or `sampled_space`, and the ids of the free ones, ascending.
 
-        `space` is the scene's `space` or `sampled_space`. Raises SceneError if no voxel is free.
+        Raises SceneError if no voxel is free.
         """
         from wheretolook.dataset.sampling import free_locations
 
@@ -178,67 +321,137 @@ class Scene:
         # depth images that have not seen all of the scene may put free space behind surfaces
         return grid, free[~self.occlusion.inside_geometry(grid.centers()[free])]
 
-    @cached_property
-    def landmarks(self) -> Landmarks:
-        """The map's landmarks."""
-        return self.files.read_landmarks()
-
-    @cached_property
-    def mapping_poses(self) -> Float | None:
-        """Poses cam_from_world (M, 3, 4) of the mapping images, if they are known."""
-        return self.files.mapping_poses()
-
     @property
     def occlusion_config(self) -> OcclusionConfig:
-        """What hides landmarks: as asked for, or hidden-point removal where that needs a mesh and there is none."""
+        """The configured model, or hidden-point removal if that needs a mesh and the scene has photographs only."""
         config = self.config.occlusion
-        needs_mesh = config.model in ("mesh", "tsdf")
-        return replace(config, model="hidden-points") if needs_mesh and self.is_photographed else config
+        replaced = OCCLUSION_MODELS[config.model].needs and self.is_photographed
+        return replace(config, model="hidden-points") if replaced else config
+
+    def check_occlusion(self, name: str) -> None:
+        """Raise SceneError if the mesh is missing that an occlusion model needs."""
+        if name not in self.available_occlusion:
+            fix = "Run the scenes stage, or use hidden-points or none."
+            raise SceneError(f"occlusion by {name} needs the scene's mesh", path=self.files.mesh, fix=fix)
+
+
+@dataclass(frozen=True)
+class ColmapFiles:
+    """A COLMAP model in metres with z up, and files in its frame."""
+
+    model: Path
+    mesh: Path | None = None
+    depth: Path | None = None  # folder of depth images, see `wheretolook.scans.depth_images.read_depth_images`
+    depth_scale: float = 1000.0  # units of integer depth images in a metre
+    database: Path | None = None  # COLMAP database or hloc features, for the landmarks' ambiguity
+    max_reprojection_error_px: float | None = None  # landmarks with a larger mean error are dropped
+
+
+class ColmapEnvironment(Environment):
+    """A COLMAP model, known from its landmarks and optionally a mesh or depth images.
+
+    `camera` is a camera or a camera_id, None for the model's only one. `occlusion` is the name of an occlusion model,
+    empty for the most accurate one available; it takes the place of `config.occlusion.model`.
+
+    Raises:
+        ConfigError: the occlusion model is unknown or its files are missing, or a value is out of range.
+    """
+
+    def __init__(
+        self,
+        files: ColmapFiles,
+        camera: Camera | int | None = None,
+        occlusion: str = "",
+        config: EnvironmentConfig = EnvironmentConfig(),
+        device: str = "cpu",
+    ) -> None:
+        super().__init__(config, device, progress=True)
+        self.files = files
+        self.name = files.model.resolve().name
+        self._camera = camera
+        if files.mesh is not None and files.depth is not None:
+            problem = "occlusion uses a mesh or depth images"
+            raise ConfigError(problem, value=str(files.depth), fix="Give one of them.")
+        limit_px = files.max_reprojection_error_px
+        if limit_px is not None and not limit_px > 0:
+            raise ConfigError(
+                "the largest reprojection error must be positive", value=limit_px, fix="Such as 2 pixels."
+            )
+        name = occlusion or self.available_occlusion[0]
+        self.check_occlusion(name)
+        self.config = replace(config, occlusion=replace(config.occlusion, model=name))
 
     @cached_property
-    def occlusion(self) -> OcclusionModel:
-        """Tells which landmarks are unoccluded from any location."""
-        from wheretolook.visibility.hidden_points import HiddenPointRemoval
-        from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion
-        from wheretolook.visibility.tsdf import TsdfOcclusion
+    def _opened(self) -> OpenedMap:
+        from wheretolook.mapping.opened_map import open_colmap
 
-        config = self.occlusion_config
-        if config.model == "none":
-            return NoOcclusion()
-        if config.model == "hidden-points":
-            return HiddenPointRemoval(config.radius, config.margin_m)
-        if "mesh" not in vars(self) and not self.files.mesh.is_file():
-            fix = "Run the scenes stage, or use hidden-points or none."
-            raise SceneError(f"occlusion by {config.model} needs the scene's mesh", path=self.files.mesh, fix=fix)
-        if config.model == "tsdf":
-            return TsdfOcclusion(self._fused[0], config.margin_m, self.device)
-        return MeshOcclusion(self.raycaster, config.margin_m, self.mesh_space.two_sided)
+        files = self.files
+        limit_px = files.max_reprojection_error_px
+        return open_colmap(files.model, self._camera, files.database, limit_px, self.device)
+
+    @property
+    def camera(self) -> Camera:  # type: ignore[override]
+        """The camera that will look."""
+        return self._opened.camera
+
+    @property
+    def landmarks(self) -> Landmarks:
+        """The map's landmarks."""
+        return self._opened.landmarks
+
+    @property
+    def mapping_poses(self) -> Float:
+        """Poses cam_from_world (M, 3, 4) of the mapping images."""
+        return self._opened.mapping_poses
+
+    @property
+    def has_mesh(self) -> bool:
+        """Whether a mesh was given."""
+        return self.files.mesh is not None
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether depth images were given."""
+        return self.files.depth is not None
+
+    @cached_property
+    def mesh(self) -> TexturedMesh:  # type: ignore[override]
+        """The mesh, with or without colours."""
+        from wheretolook.scenes.loading import load_mesh
+
+        assert self.files.mesh is not None
+        return load_mesh(self.files.mesh, colored=False)
+
+    @cached_property
+    def depth_images(self) -> Sequence[DepthImage]:  # type: ignore[override]
+        """Depth images of the model's images."""
+        from wheretolook.scans.depth_images import read_depth_images
+
+        assert self.files.depth is not None
+        return read_depth_images(self.files.model, self.files.depth, self.files.depth_scale)
+
+    @property
+    def space(self) -> FreeSpace | MappedSpace:
+        """Where a camera can be, by mesh, depth images, or the map alone."""
+        if self.has_mesh:
+            return self.mesh_space
+        return self.tsdf_space if self.has_depth else self.mapped_space
 
     @cached_property
     def localization_map(self) -> LocalizationMap:
-        """What a scorer is built from; answers for any location."""
-        from wheretolook.inputs.localization_map import LocalizationMap
+        """The input of scorers; warns if the mesh seems to be in another frame."""
+        from wheretolook.mapping.sanity import warn_of_mesh
 
-        return LocalizationMap(self.landmarks, self.camera, self.occlusion, self.device, self.mapping_poses)
-
-    @cached_property
-    def _fused(self) -> tuple[TsdfVolume, RenderedDepth]:
-        """The volume that depth images fuse to, and these, rendered where the map's images were taken."""
-        from wheretolook.geometry.tsdf import TsdfConfig, TsdfVolume
-        from wheretolook.mapping.colmap_model import colmap_poses, read_model
-
-        config = self.config.occlusion
-        model = read_model(self.files.map)
-        mapped = only_camera(cameras_by_id(model.cameras, self.files.map), self.files.map)
-        images = RenderedDepth(self.renderer, mapped, colmap_poses(self.files.map, model))
-        tsdf = TsdfConfig(voxel_size_m=config.voxel_m, max_depth_m=config.max_depth_m)
-        return TsdfVolume.from_images(images, tsdf, self.progress), images
+        opened = super().localization_map
+        if self.files.mesh is not None:
+            warn_of_mesh(self.files.mesh, self.landmarks.points, self.raycaster)
+        return opened
 
 
 class RenderedDepth(Sequence["DepthImage"]):
-    """Depth images of poses (B, 3, 4), each rendered when it is asked for."""
+    """Depth images of poses (B, 3, 4), each rendered when it is accessed."""
 
-    def __init__(self, renderer: WarpRenderer, camera: Camera, cam_from_world: Float) -> None:
+    def __init__(self, renderer: Renderer, camera: Camera, cam_from_world: Float) -> None:
         self.renderer = renderer
         self.camera = camera
         self.cam_from_world = cam_from_world

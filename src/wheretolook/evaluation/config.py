@@ -12,7 +12,7 @@ import numpy as np
 from wheretolook.dataset.thresholds import THRESHOLDS, threshold_key
 from wheretolook.scorers.registry import methods_named, scorers
 from wheretolook.utils.errors import ConfigError
-from wheretolook.visibility.config import OcclusionName, check_occlusion_names
+from wheretolook.visibility.config import check_occlusion_names
 
 
 def _all_methods() -> tuple[str, ...]:
@@ -57,7 +57,7 @@ class EvaluateConfig:
     thresholds: tuple[tuple[float, float], ...] = THRESHOLDS
     seed: int = 0
     resamples: int = 2000
-    occlusions: tuple[OcclusionName, ...] = ()
+    occlusions: tuple[str, ...] = ()
     candidates: tuple[int, ...] = (0,)
     block_m: float = 1.0
     heading: tuple[tuple[float, float, float], ...] = ()

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from tqdm.auto import tqdm
 
-from wheretolook.dataset.environment import Scene, SceneConfig
+from wheretolook.dataset.environment import EnvironmentConfig, SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
 from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.evaluation.config import EvaluateConfig
@@ -110,7 +110,7 @@ def score_scenes(
             localization_map = scene.localization_map(device=device)
             # a release has no mesh, but what each location sees by it
             if occlusion is not None and (scene.mesh.is_file() or occlusion.model != localization_map.occlusion.name):
-                opened = Scene(scene, config=SceneConfig(occlusion), device=device, progress=progress)
+                opened = SceneEnvironment(scene, config=EnvironmentConfig(occlusion), device=device, progress=progress)
                 localization_map = replace(localization_map, occlusion=opened.occlusion)
             used.add(localization_map.occlusion.name)
             cam_from_world = poses(table)

@@ -23,7 +23,7 @@ from wheretolook.geometry.poses import Float
 if TYPE_CHECKING:
     import pandas as pd
 
-    from wheretolook.dataset.environment import Scene
+    from wheretolook.dataset.environment import SceneEnvironment
 
 SCORE_COLORS: Style = {"cmap": "cividis", "vmin": 0, "vmax": 1}
 
@@ -39,7 +39,7 @@ class View:
 
 
 def rendered_views(
-    scene: Scene, rows: pd.DataFrame, scores: Float, words: Callable[[pd.Series], str]
+    scene: SceneEnvironment, rows: pd.DataFrame, scores: Float, words: Callable[[pd.Series], str]
 ) -> tuple[View, ...]:
     """Render B labelled viewpoints (rows of the viewpoint table) with scores (B,) and outcomes described by `words`."""
     cam_from_world = poses(rows)

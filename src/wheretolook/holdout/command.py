@@ -167,11 +167,11 @@ def _open(
     options: argparse.Namespace, scene: SceneFolder | None, out: Path, device: str, workers: int
 ) -> tuple[PhotographedMap, OcclusionModel]:
     """The map, of a scene if one was named, and what hides its landmarks; results go to a folder."""
+    from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
     from wheretolook.features.config import ExtractorConfig
     from wheretolook.holdout import photo_map as source
     from wheretolook.mapping.config import ExistingModelConfig
     from wheretolook.mapping.sources import features_beside, photographs_of
-    from wheretolook.select.surroundings import surroundings
 
     mesh = options.mesh
     metric = options.metres
@@ -188,7 +188,8 @@ def _open(
     if mesh is not None and not metric:
         fix = "Say --metres if it is, or leave --mesh out."
         raise ConfigError("a mesh is of use only for a map in metres", value=str(mesh), fix=fix)
-    hides, _ = surroundings(mesh, None, 1000.0, options.occlusion, model, device)
+    environment = ColmapEnvironment(ColmapFiles(model, mesh=mesh), occlusion=options.occlusion or "", device=device)
+    occlusion = environment.occlusion
     given = options.images or options.database or features_beside(model) or photographs_of(model)
     if given is None and scene is not None and scene.mesh.is_file():  # its images were rendered, and are gone
         problem = "neither the features nor the photographs of this map are known"
@@ -197,4 +198,4 @@ def _open(
     extractor = ExtractorConfig(options.extractor or "opencv", weights=options.extractor_weights)
     where = (out / source.WORK, workers, device, extractor)
     model, features = source.features_of(model, options.images, options.database, *where)
-    return source.open_map(model, features, metric, name, keep_frame=mesh is not None), hides
+    return source.open_map(model, features, metric, name, keep_frame=mesh is not None), occlusion

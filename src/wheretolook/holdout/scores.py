@@ -25,7 +25,7 @@ from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import find, make_scorer
 from wheretolook.training.weights import method_of_weights
 from wheretolook.utils.errors import MapWarning, OutOfRangeWarning
-from wheretolook.visibility.cached_occlusion import RememberedOcclusion
+from wheretolook.visibility.cached_occlusion import CachedOcclusion
 from wheretolook.visibility.occlusion import OcclusionModel
 from wheretolook.weights.resolve import load_scorer, resolve_weights
 
@@ -109,7 +109,7 @@ def maps_without(
 ) -> Iterator[tuple[NDArray[np.int64], LocalizationMap]]:
     """The map without a block as each camera of its photographs looks at it, and the rows of the block's views."""
     kept = np.setdiff1d(np.arange(len(source.poses)), one.block.left_out)
-    hides = occlusion if occlusion.name == "none" else RememberedOcclusion(occlusion)
+    hides = occlusion if occlusion.name == "none" else CachedOcclusion(occlusion)
     looking = [source.cameras[row] for row in one.views["row"]]
     around = LocalizationMap(one.landmarks, looking[0], hides, device, compact_poses(source.poses[kept]))
     for camera, rows in _by_camera(looking):

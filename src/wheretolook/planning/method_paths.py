@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wheretolook.dataset.environment import Scene
+from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -18,12 +18,12 @@ from wheretolook.planning.routes import PathView, PlannedPath
 from wheretolook.planning.rrt import check_ends, plan_path
 from wheretolook.planning.scene_map import check_methods, planner_map, planner_scorer
 from wheretolook.planning.stops import can_stop, check_stopping, stops_along, within_pitch
-from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.rendering.types import Renderer
 from wheretolook.weights.resolve import resolve_weights
 
 
 def plan_by_methods(
-    scene: Scene,
+    scene: SceneEnvironment,
     dataset: Dataset,
     methods: Iterable[str],
     start: ArrayLike,
@@ -74,7 +74,7 @@ def plan_by_methods(
 
 
 def path_views(
-    path: PlannedPath, localization_map: LocalizationMap, renderer: WarpRenderer | None = None
+    path: PlannedPath, localization_map: LocalizationMap, renderer: Renderer | None = None
 ) -> list[PathView]:
     """What the camera sees along a path: the landmarks in view, and the image if there is a renderer.
 

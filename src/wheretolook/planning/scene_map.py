@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wheretolook.dataset.environment import Scene
+from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.planning.map_building import build_viewpoint_map
@@ -25,7 +25,9 @@ INSIDE = np.stack(np.meshgrid(*[(-1 / 3, 0.0, 1 / 3)] * 3, indexing="ij"), -1).r
 """Points of a voxel that are tested for free space (27, 3), relative to its centre in units of its size."""
 
 
-def scene_scorer(scene: Scene, method: str = "", weights: Path | None = None, anywhere: bool = False) -> Scorer:
+def scene_scorer(
+    scene: SceneEnvironment, method: str = "", weights: Path | None = None, anywhere: bool = False
+) -> Scorer:
     """What scores views of a scene by a method (empty for that of the weights, or bins).
 
     With `anywhere`, weights that are adapted to one place score in another, too.
@@ -39,7 +41,7 @@ def scene_scorer(scene: Scene, method: str = "", weights: Path | None = None, an
     return make_scorer(method or fallback().name, scene.localization_map, weights=weights, anywhere=anywhere)
 
 
-def scene_viewpoint_map(scene: Scene, views: ViewLattice, scorer: Scorer) -> ViewpointMap:
+def scene_viewpoint_map(scene: SceneEnvironment, views: ViewLattice, scorer: Scorer) -> ViewpointMap:
     """Build the viewpoint map of a scene by a scorer of its views, with progress bars.
 
     Raises SceneError if no voxel is free, MapError if there are no landmarks.
@@ -49,7 +51,7 @@ def scene_viewpoint_map(scene: Scene, views: ViewLattice, scorer: Scorer) -> Vie
 
 
 def planner_scorer(
-    scene: Scene, dataset: Dataset, method: str = "", weights: Path | None = None, anywhere: bool = False
+    scene: SceneEnvironment, dataset: Dataset, method: str = "", weights: Path | None = None, anywhere: bool = False
 ) -> Scorer:
     """The scorer by which paths are planned in a scene of a dataset, with weights from `resolve_weights`.
 
@@ -60,7 +62,7 @@ def planner_scorer(
     return scene_scorer(scene, method, weights, anywhere)
 
 
-def planner_map(scene: Scene, views: ViewLattice, scorer: Scorer) -> ViewpointMap:
+def planner_map(scene: SceneEnvironment, views: ViewLattice, scorer: Scorer) -> ViewpointMap:
     """The map that a planner is given: scores in [0, 1], and something to go by wherever a camera can be.
 
     Scores are the scorer's probabilities, or ranks of scores that are none; views are borrowed where needed. Raises as

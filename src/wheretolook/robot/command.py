@@ -64,25 +64,15 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _export(given: argparse.Namespace) -> None:
+    from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
     from wheretolook.geometry.camera_text import parse_camera
-    from wheretolook.inputs.localization_map import LocalizationMap
-    from wheretolook.mapping.sanity import warn_of_mesh
     from wheretolook.robot.export import export_robot, pinhole_of
-    from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion, OcclusionModel
 
-    occlusion: OcclusionModel = NoOcclusion()
-    places = None
-    if given.mesh is not None:
-        from wheretolook.scenes.loading import load_mesh
-        from wheretolook.space.free_space import FreeSpace
-
-        space = FreeSpace(load_mesh(given.mesh))
-        places = _places(space, given.spacing)
-        occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
     named = given.camera_id if given.camera is None else parse_camera(given.camera)
-    found = LocalizationMap.from_colmap(given.map, named, occlusion=occlusion, database=given.database)
-    if given.mesh is not None:
-        warn_of_mesh(given.mesh, found.landmarks.points, space.raycaster)
+    files = ColmapFiles(given.map, mesh=given.mesh, database=given.database)
+    environment = ColmapEnvironment(files, named, occlusion="none" if given.mesh is None else "mesh")
+    places = None if given.mesh is None else _places(environment.mesh_space, given.spacing)
+    found = environment.localization_map
     camera = pinhole_of(found.camera)
     if camera != found.camera:
         print("the map's camera has distortion, the robot's is the pinhole of its rectified images; or give --camera")

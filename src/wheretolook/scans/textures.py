@@ -18,7 +18,8 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.local_origin import poses_from
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, transform
-from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.rendering.registry import make_renderer
+from wheretolook.rendering.types import Renderer
 from wheretolook.scans.frames import Frames
 
 MAX_PHOTOGRAPHS = 100  # that are looked at; of more, so many evenly
@@ -41,7 +42,7 @@ def textured(
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MAX_PHOTOGRAPHS)).round().astype(int))
     poses = cam_from_world[chosen]
     areas = np.zeros((len(chosen), len(mesh.triangles)), dtype=np.float16)
-    renderer = WarpRenderer(mesh, device)
+    renderer = make_renderer(mesh, device)
     for row, pose in enumerate(tqdm(poses, desc="find textures", unit="photograph", disable=not progress)):
         areas[row] = _areas_px(mesh, renderer, camera, pose)
     photograph = _cover(areas)
@@ -66,7 +67,7 @@ def textured(
     return replace(mesh, corner_uvs=uvs, triangle_texture=number, textures=tuple(textures), vertex_colors=None)
 
 
-def _areas_px(mesh: TexturedMesh, renderer: WarpRenderer, camera: PinholeCamera, pose: Float) -> NDArray[np.float16]:
+def _areas_px(mesh: TexturedMesh, renderer: Renderer, camera: PinholeCamera, pose: Float) -> NDArray[np.float16]:
     """How many pixels a photograph shows of each triangle (T,); 0 of those hidden, turned away or not all in it."""
     depth = renderer.render(camera, pose[None]).depth_m[0]
     nearest = cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), np.ones((_EDGE_PX, _EDGE_PX), np.uint8))

@@ -10,24 +10,24 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
+from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, EnvironmentConfig
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import Lattice, direction_lattice
-from wheretolook.geometry.poses import Float, check_poses, poses_looking_along
+from wheretolook.geometry.poses import Float, camera_centers, check_poses, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.looks.selection import best_views
-from wheretolook.mapping.sanity import warn_of_mesh
 from wheretolook.planning.config import StopConfig
 from wheretolook.planning.routes import PlannedPath
 from wheretolook.planning.stops import check_stopping, stops_along
 from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook.select.limits import check_limits
-from wheretolook.select.surroundings import grid_waypoints, map_space, surroundings, usable_waypoints
+from wheretolook.select.surroundings import grid_waypoints, usable_waypoints
 from wheretolook.select.views import SelectedViews, joined
 from wheretolook.select.waypoints import Waypoints
+from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError
-from wheretolook.visibility.cached_occlusion import RememberedOcclusion
 
 if TYPE_CHECKING:
     from wheretolook.scorers.base import Scorer
@@ -40,6 +40,8 @@ VIEWS_AT_ONCE = {
 SPARE = 3
 """Views of a waypoint, beyond those asked for, whose scores are computed again: where many landmarks are in view, the
 scores of all directions stand on other samples of them."""
+
+OCCLUSION_CACHE_BYTES = 1 << 30
 
 SIGHT_LINES = 1 << 24  # lines of sight looked at at once when views are told of
 
@@ -94,7 +96,7 @@ class WhereToLook:
             fov_deg: instead, a pinhole of that horizontal field of view in degrees, of 640 x 480 px.
             mesh: mesh of the scene, for true occlusion.
             depth: folder of depth images of the model's images, for occlusion by the surface they fuse to; see
-                `wheretolook.select.surroundings.read_depth_images`.
+                `wheretolook.scans.depth_images.read_depth_images`.
             depth_scale: units of integer depth images in a metre.
             occlusion: "mesh", "tsdf" (depth images), "hidden-points" (from the landmarks alone) or "none" (landmarks
                 are seen through walls); None for the first of these that there is something for.
@@ -125,26 +127,27 @@ class WhereToLook:
         elif fov_deg is not None:
             camera = camera_of_view(fov_deg)
         resolve_weights(method, weights)  # so that one that cannot be had is known before anything is read
-        hides, space = surroundings(
-            None if mesh is None else Path(mesh), None if depth is None else Path(depth), depth_scale, occlusion, model,
+        environment = ColmapEnvironment(
+            ColmapFiles(
+                model,
+                mesh=None if mesh is None else Path(mesh),
+                depth=None if depth is None else Path(depth),
+                depth_scale=depth_scale,
+                database=None if database is None else Path(database),
+                max_reprojection_error_px=max_reprojection_error_px,
+            ),
+            camera,
+            occlusion or "",
+            EnvironmentConfig(occlusion_cache_bytes=OCCLUSION_CACHE_BYTES),
             device,
-        )  # fmt: skip
-        options: dict[str, Any] = {}
-        if database is not None:
-            options["database"] = Path(database)
-        if max_reprojection_error_px is not None:
-            options["max_reprojection_error_px"] = max_reprojection_error_px
-        if hides.name != "none":
-            hides = RememberedOcclusion(hides)
-        around = LocalizationMap.from_colmap(model, camera, occlusion=hides, device=device, **options)
-        if mesh is not None:
-            warn_of_mesh(mesh, around.landmarks.points, space.raycaster)
+        )
+        around = environment.localization_map
         weights = resolve_weights(method, weights, around.landmarks.features)
         if method:
             scorer = make_scorer(method, around, weights=weights, anywhere=anywhere)
         else:
             scorer = load_scorer(str(weights), around, anywhere=anywhere)
-        return cls(scorer, axes, space)
+        return cls(scorer, axes, environment.space)
 
     @property
     def localization_map(self) -> LocalizationMap:
@@ -155,7 +158,10 @@ class WhereToLook:
     def space(self) -> Any:
         """Where a camera can be: by mesh, depth images, or the map alone."""
         if self._space is None:
-            self._space = map_space(self.localization_map)
+            here = self.localization_map
+            assert here.mapping_poses is not None
+            centers = camera_centers(here.mapping_poses.astype(np.float64))
+            self._space = MappedSpace(here.landmarks.points, centers)
         return self._space
 
     def grid(self, spacing_m: float) -> Waypoints:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from wheretolook.config import Experiment
 from wheretolook.dataset.dataset_lock import reading
-from wheretolook.dataset.environment import Scene
+from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.config import ExistingModelConfig
@@ -110,10 +110,10 @@ def adapt(experiment: Experiment, say: Say = print, tick: Tick = lambda work: No
 
 def _adapt_map(experiment: Experiment, model: Path, weights: Path, say: Say, tick: Tick) -> Path | None:
     """Adapt to a COLMAP map by its photographs alone."""
+    from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
     from wheretolook.holdout.photo_map import folder_of_check
     from wheretolook.mapping.colmap_model import model_arrays, read_model
     from wheretolook.mapping.georeference import read_scale
-    from wheretolook.select.surroundings import surroundings
 
     name = ExistingModelConfig(model=model).scene_name
     path = experiment.adapt.out or folder_of_check(experiment.data, name) / "adapted.safetensors"
@@ -124,10 +124,9 @@ def _adapt_map(experiment: Experiment, model: Path, weights: Path, say: Say, tic
         fix = "Map it with a scale (map.photographs.scale), or pass --map.photographs.assume_metric true."
         raise MapError("the map has no scale, and this needs metres", path=model, value=scale.source, fix=fix)
     points = model_arrays(read_model(model)).points
-    device = experiment.warp_device
-    asked = experiment.occlusion.model
-    hides, _ = surroundings(None, None, 1000.0, "none" if asked == "none" else "hidden-points", model, device)
-    views = _left_out(experiment, model, hides, weights, name, say)
+    occlusion = "none" if experiment.occlusion.model == "none" else "hidden-points"
+    environment = ColmapEnvironment(ColmapFiles(model), occlusion=occlusion, device=experiment.warp_device)
+    views = _left_out(experiment, model, environment.occlusion, weights, name, say)
     _check_enough(views, model)
     with hold(path.with_name(f".{path.name}.lock"), "adapt"):
         return _learn(experiment, _Place(name, "", model, weights, path), views, points, say, tick)
@@ -210,7 +209,7 @@ def _check_out(path: Path, weights: Path) -> None:
 
 
 def _labelled(
-    experiment: Experiment, files: SceneFolder, scene: Scene, has_photographs: bool, say: Say
+    experiment: Experiment, files: SceneFolder, scene: SceneEnvironment, has_photographs: bool, say: Say
 ) -> pd.DataFrame | None:
     """The scene's labelled viewpoints: all if the label stage has been here, else those that the time allows.
 
@@ -234,7 +233,7 @@ def _labelled(
     return _label_for(experiment, files, scene, say)
 
 
-def _label_for(experiment: Experiment, files: SceneFolder, scene: Scene, say: Say) -> pd.DataFrame:
+def _label_for(experiment: Experiment, files: SceneFolder, scene: SceneEnvironment, say: Say) -> pd.DataFrame:
     """Label views for so many minutes, one location after the other in random order. What was labelled is kept."""
     from wheretolook.localization.labeller import LabelTask, label_scenes
     from wheretolook.localization.shard import SceneJob
@@ -287,7 +286,7 @@ def _remove_stale(folder: Path, tasks: list[LabelTask]) -> None:
                 path.unlink()
 
 
-def labelled_views(files: SceneFolder, scene: Scene, table: pd.DataFrame, weights: Path) -> LocalizedViews:
+def labelled_views(files: SceneFolder, scene: SceneEnvironment, table: pd.DataFrame, weights: Path) -> LocalizedViews:
     """The labelled views, and what the weights to start from think of them."""
     from wheretolook.dataset.viewpoint_table import is_good, poses
     from wheretolook.geometry.poses import camera_centers

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wheretolook.config import Experiment
-from wheretolook.dataset.environment import Scene, SceneConfig
+from wheretolook.dataset.environment import EnvironmentConfig, SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.names import RELEASE_FILE
 from wheretolook.geometry.camera import CameraConfig
@@ -52,12 +52,12 @@ def dataset_after(
     return dataset
 
 
-def open_scene(experiment: Experiment, dataset: Dataset, files: SceneFolder) -> Scene:
+def open_scene(experiment: Experiment, dataset: Dataset, files: SceneFolder) -> SceneEnvironment:
     """A scene of the dataset as the experiment looks at it; nothing is read yet."""
     scenes = experiment.scenes
     assume_metric = experiment.map.photographs.assume_metric
-    config = SceneConfig(experiment.occlusion, scenes.free_space, scenes.mapped_space, assume_metric)
-    return Scene(files, config=config, device=experiment.device)
+    config = EnvironmentConfig(experiment.occlusion, scenes.free_space, scenes.mapped_space, assume_metric)
+    return SceneEnvironment(files, config=config, device=experiment.device)
 
 
 def refuse_release(root: Path) -> None:

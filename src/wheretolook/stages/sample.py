@@ -9,7 +9,7 @@ import numpy as np
 
 from wheretolook.config import Experiment
 from wheretolook.dataset.dataset_lock import changes_dataset
-from wheretolook.dataset.environment import Scene
+from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.geometry.camera import Camera, draw_camera, write_cameras
@@ -41,7 +41,7 @@ def sample(experiment: Experiment, say: Say = print, tick: Tick = lambda work: N
     return dataset
 
 
-def _key(scene: Scene, config: SampleConfig) -> str:
+def _key(scene: SceneEnvironment, config: SampleConfig) -> str:
     files = scene.files
     space = asdict(scene.config.free_space)
     stage = "scenes"
@@ -60,7 +60,7 @@ def _key(scene: Scene, config: SampleConfig) -> str:
     return cache_key("sample", [*settings, *made_from])
 
 
-def _cameras(scene: Scene, config: SampleConfig) -> Camera | dict[int, Camera]:
+def _cameras(scene: SceneEnvironment, config: SampleConfig) -> Camera | dict[int, Camera]:
     """The scene's camera, or those drawn for it, by number."""
     if not config.cameras:
         return scene.camera
@@ -68,7 +68,7 @@ def _cameras(scene: Scene, config: SampleConfig) -> Camera | dict[int, Camera]:
     return {number: draw_camera(rng) for number in range(1, config.cameras + 1)}
 
 
-def _sample(scene: Scene, config: SampleConfig, say: Say) -> None:
+def _sample(scene: SceneEnvironment, config: SampleConfig, say: Say) -> None:
     from wheretolook.dataset.sampling import sample_viewpoints
     from wheretolook.dataset.viewpoint_table import write_table
 

@@ -13,7 +13,7 @@ from wheretolook.visibility.occlusion import DevicePoints, OcclusionModel
 DECIMALS = 5  # locations that agree to this many decimals of a metre are one
 
 
-class RememberedOcclusion(OcclusionModel):
+class CachedOcclusion(OcclusionModel):
     """Another model's answers for the landmarks of one map, kept as a bit for each line of sight.
 
     Hidden-point removal takes a tenth of a second for a location, and is asked several times: for the scores of all

@@ -1,10 +1,9 @@
-"""Options of occlusion."""
+"""Names and options of occlusion models; without the models, so that the command line reads them quickly."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import inf
-from typing import Literal, get_args
 
 from wheretolook.utils.errors import ConfigError
 
@@ -12,8 +11,29 @@ DEFAULT_RADIUS = 50.0
 """Greatest mean F1 against the meshes of six mapped scenes (tests/benchmarks/bench_hidden_points.py). It is flat: from
 30 to 100 the mean stays within 0.01. Single scenes are best served by 5 to 100, mostly the larger the more open."""
 
-OcclusionName = Literal["mesh", "tsdf", "hidden-points", "none"]
-OCCLUSION_NAMES: tuple[str, ...] = get_args(OcclusionName)
+
+@dataclass(frozen=True)
+class OcclusionKind:
+    """What `Environment` needs to make an occlusion model."""
+
+    model: str  # "module:class"; the class method `from_inputs` makes an instance
+    needs: str = ""  # "mesh" or "depth images", if the landmarks are not enough
+    settings: tuple[str, ...] = ()  # fields of `OcclusionConfig` that the model reads
+
+
+OCCLUSION_MODELS = {
+    "mesh": OcclusionKind("wheretolook.visibility.occlusion:MeshOcclusion", "mesh", ("margin_m",)),
+    "tsdf": OcclusionKind(
+        "wheretolook.visibility.tsdf:TsdfOcclusion", "depth images", ("margin_m", "voxel_m", "max_depth_m")
+    ),
+    "hidden-points": OcclusionKind(
+        "wheretolook.visibility.hidden_points:HiddenPointRemoval", settings=("margin_m", "radius")
+    ),
+    "none": OcclusionKind("wheretolook.visibility.occlusion:NoOcclusion"),
+}
+"""Occlusion models by name, the most accurate first."""
+
+OCCLUSION_NAMES = tuple(OCCLUSION_MODELS)
 
 
 @dataclass(frozen=True)
@@ -21,8 +41,8 @@ class OcclusionConfig:
     """Options of occlusion.
 
     Args:
-        model: how occlusion is found: mesh, tsdf, hidden-points or none. "mesh" casts one ray for each landmark; "tsdf"
-            does so against the surface that depth images fuse to, here rendered where the map's images were taken;
+        model: occlusion model: mesh, tsdf, hidden-points or none. "mesh" casts one ray for each landmark; "tsdf" does
+            so against the surface that depth images fuse to, in a dataset rendered where the map's images were taken;
             "hidden-points" needs nothing but the landmarks; "none" sees through walls, as the paper's released code.
             With "tsdf", collisions of viewpoint maps and paths are with that surface too, not with the mesh, and what
             no depth image saw is not free.
@@ -31,11 +51,11 @@ class OcclusionConfig:
         max_depth_m: range of the depth images.
 
     Attributes:
-        margin_m: a surface this close in front of a landmark is the landmark's own: triangulated points
-            lie a few centimetres off it.
+        margin_m: a surface this close in front of a landmark is the landmark's own: triangulated points are a few
+            centimetres off it.
     """
 
-    model: OcclusionName = "mesh"
+    model: str = "mesh"
     margin_m: float = field(default=0.05, init=False)
     radius: float = DEFAULT_RADIUS
     voxel_m: float = 0.02
@@ -50,14 +70,12 @@ class OcclusionConfig:
                 raise ConfigError(f"occlusion.{name} must be positive", value=getattr(self, name))
 
     def settings(self) -> dict[str, str | float]:
-        """The model and the settings it reads."""
-        names = {"mesh": "margin_m", "tsdf": "margin_m voxel_m max_depth_m", "hidden-points": "margin_m radius"}
-        return {"model": self.model, **{name: getattr(self, name) for name in names.get(self.model, "").split()}}
+        """The model's name and the settings it reads; part of the keys of samples and labels."""
+        return {"model": self.model, **{name: getattr(self, name) for name in OCCLUSION_MODELS[self.model].settings}}
 
 
 def check_occlusion_names(names: tuple[str, ...]) -> None:
     """Raise ConfigError if an occlusion model is unknown or named twice."""
-    unknown = [name for name in names if name not in OCCLUSION_NAMES]
-    if unknown or len(set(names)) < len(names):
+    if not set(names) <= set(OCCLUSION_NAMES) or len(set(names)) < len(names):
         fix = f"There are {', '.join(OCCLUSION_NAMES)}."
         raise ConfigError("occlusion models must be known and named once", value=" ".join(names), fix=fix)

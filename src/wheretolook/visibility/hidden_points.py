@@ -15,7 +15,7 @@ from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.visibility.config import DEFAULT_RADIUS
 from wheretolook.visibility.hull import hull_length, may_be_near_hull
-from wheretolook.visibility.occlusion import OcclusionModel
+from wheretolook.visibility.occlusion import OcclusionInputs, OcclusionModel
 
 TOUCHING_M = 1e-6  # a landmark this close to a location is in the same place, and has no direction as seen from it
 _FLAT = 1e-12  # least mean square of the directions along an axis; below it, all lie in the plane across that axis
@@ -74,6 +74,11 @@ class HiddenPointRemoval(OcclusionModel):
         self.margin_m = float(margin_m)
         self.threads = threads
         self._places: _Places | None = None  # of the landmarks that were asked about last
+
+    @classmethod
+    def from_inputs(cls, inputs: OcclusionInputs) -> HiddenPointRemoval:
+        """Make the model with the options' radius and margin."""
+        return cls(inputs.occlusion_config.radius, inputs.occlusion_config.margin_m)
 
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
         """(L, N), True where no surface that the landmarks suggest stands between; raises what `check` raises."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import warp as wp
@@ -22,7 +22,10 @@ from wheretolook.utils.npz_files import load_npz, save_npz
 from wheretolook.utils.warp import start_warp, vec3_array
 
 if TYPE_CHECKING:
+    from wheretolook.geometry.tsdf import TsdfVolume
     from wheretolook.rendering.raycasting import MeshRaycaster
+    from wheretolook.space.free_space import FreeSpace
+    from wheretolook.visibility.config import OcclusionConfig
 
 MORTON_BITS = 10  # bits along each axis of the curve that landmarks are ordered by
 MATCH_M = 1e-4  # locations closer than this are taken for the same stored location
@@ -73,6 +76,19 @@ def morton_codes(positions: NDArray[np.float64]) -> NDArray[np.int64]:
         for axis in range(3):
             codes[finite] |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
     return codes
+
+
+class OcclusionInputs(Protocol):
+    """What an occlusion model can be made from by its class method `from_inputs`; an `Environment` provides it."""
+
+    @property
+    def occlusion_config(self) -> OcclusionConfig: ...
+    @property
+    def device(self) -> str: ...
+    @property
+    def mesh_space(self) -> FreeSpace: ...
+    @property
+    def tsdf_volume(self) -> TsdfVolume: ...
 
 
 class OcclusionModel(ABC):
@@ -126,6 +142,11 @@ class NoOcclusion(OcclusionModel):
 
     name = "none"
 
+    @classmethod
+    def from_inputs(cls, inputs: OcclusionInputs) -> NoOcclusion:
+        """Make the model, which needs nothing."""
+        return cls()
+
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
         """All True, (L, N)."""
         return np.ones((len(locations), len(points)), dtype=bool)
@@ -150,6 +171,12 @@ class MeshOcclusion(OcclusionModel):
         self.raycaster = raycaster
         self.margin_m = margin_m
         self.two_sided = two_sided
+
+    @classmethod
+    def from_inputs(cls, inputs: OcclusionInputs) -> MeshOcclusion:
+        """Make the model from the mesh."""
+        space = inputs.mesh_space
+        return cls(space.raycaster, inputs.occlusion_config.margin_m, space.two_sided)
 
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
         """(L, N), True where no triangle stands between location and landmark."""

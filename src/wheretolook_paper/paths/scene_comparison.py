@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from wheretolook.dataset.environment import Scene
+from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import SCHEMA, UNLABELLED
 from wheretolook.localization.joint_labels import label_sets
@@ -56,7 +56,7 @@ class SceneComparison:
         log: prints a line of progress.
     """
 
-    scene: Scene
+    scene: SceneEnvironment
     dataset: Dataset
     folder: Path
     config: PathsConfig

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.dataset.environment import Scene, SceneConfig
+from wheretolook.dataset.environment import EnvironmentConfig, SceneEnvironment
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.names import RELEASE_FILE
 from wheretolook.dataset.sampling import free_locations
@@ -40,7 +40,7 @@ _CHECKED = 16  # locations whose lines of sight are compared
 _SEEDED = re.compile(rf"({'|'.join(get_args(SceneKind))})-(\d+)")
 
 
-class Showcase(Scene):
+class Showcase(SceneEnvironment):
     """A scene of a release with everything that figures need; its mesh tells what is occluded."""
 
     sampling: SampleConfig  # how its viewpoints were sampled
@@ -148,18 +148,18 @@ def open_showcase(dataset: Dataset, name: str | None = None, device: str = "cpu"
     if seeded is None:
         raise SceneError("this scene was not generated from a seed", path=scene.folder, value=scene.name)
     occlusion = recorded(OcclusionConfig, {**settings["occlusion"], "model": "mesh"})
-    config = SceneConfig(occlusion, recorded(FreeSpaceConfig, settings["scenes"]["free_space"]))
+    config = EnvironmentConfig(occlusion, recorded(FreeSpaceConfig, settings["scenes"]["free_space"]))
     kind = cast(SceneKind, seeded[1])
     apartment = recorded(ApartmentConfig, settings["scenes"]["apartment"])
     mesh, _ = generate_scene(kind, apartment, int(seeded[2]), device=device)
-    showcase = Showcase(scene, None, config, device, mesh)
+    showcase = Showcase(scene, None, config, device, mesh=mesh)
     showcase.sampling = recorded(SampleConfig, settings["sample"])
     if settings["occlusion"]["model"] == "mesh":
         _check_same(showcase)
     return showcase
 
 
-def _check_same(scene: Scene) -> None:
+def _check_same(scene: SceneEnvironment) -> None:
     """Raise a SceneError if lines of sight are not those stored."""
     stored = StoredOcclusion.load(scene.files.occlusion)
     points = scene.landmarks.points

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from wheretolook.dataset.environment import Scene
+from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, poses
 from wheretolook.evaluation.adaptation import compare_log_odds
@@ -40,7 +40,7 @@ def main() -> None:
         if options.scenes and files.name not in options.scenes:
             continue
         table = files.read_table()
-        scene = Scene(files, device="cpu")
+        scene = SceneEnvironment(files, device="cpu")
         views = labelled_views(files, scene, table, shipped(WEIGHTS) / "set.safetensors")
         numbers = table[CAMERA_ID].to_numpy() if CAMERA_ID in table else np.zeros(len(table), dtype=int)
         bins = np.empty(len(table))

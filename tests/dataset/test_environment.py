@@ -1,4 +1,4 @@
-"""A scene opened once."""
+"""Environments of a scene and of a COLMAP model."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 import wheretolook
 from box_scenes import furnished_room
 from planning.rooms import CAMERA, room_landmarks
-from wheretolook.dataset.environment import Scene, SceneConfig
+from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, EnvironmentConfig, SceneEnvironment
 from wheretolook.dataset.layout import SceneFolder
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.rendering import raycasting
@@ -21,6 +21,7 @@ from wheretolook.scenes import loading
 from wheretolook.scenes.loading import save_glb
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.utils.files import write_json
+from wheretolook.visibility.cached_occlusion import CachedOcclusion
 from wheretolook.visibility.config import OcclusionConfig
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 
@@ -43,7 +44,7 @@ def test_a_mesh_is_loaded_once_and_rays_are_cast_against_one_tree(
     build = raycasting.MeshRaycaster.__init__
     monkeypatch.setattr(loading, "load_mesh", lambda *args, **options: loaded.append(args) or load(*args, **options))
     monkeypatch.setattr(raycasting.MeshRaycaster, "__init__", lambda *args: trees.append(args) or build(*args))
-    scene = Scene(files, CAMERA)
+    scene = SceneEnvironment(files, CAMERA)
     assert not loaded
     views = ViewLattice((5, 4, 3), directions=10)
     grid, free = scene.free_voxels(views, scene.space)
@@ -56,16 +57,33 @@ def test_a_mesh_is_loaded_once_and_rays_are_cast_against_one_tree(
 def test_without_a_mesh_landmarks_hide_one_another_and_metres_are_needed(files: SceneFolder) -> None:
     files.mesh.unlink()
     with pytest.raises(SceneError, match="needs the scene's mesh"):
-        _ = Scene(files, CAMERA).occlusion
+        _ = SceneEnvironment(files, CAMERA).occlusion
     write_json(files.map / "report.json", {"scale": {"source": "unknown"}})
-    scene = Scene(files, CAMERA)
+    scene = SceneEnvironment(files, CAMERA)
     assert scene.is_photographed and isinstance(scene.occlusion, HiddenPointRemoval)
-    none = SceneConfig(OcclusionConfig(model="none"))
-    assert Scene(files, CAMERA, none).occlusion_config.model == "none"
+    none = EnvironmentConfig(OcclusionConfig(model="none"))
+    assert SceneEnvironment(files, CAMERA, none).occlusion_config.model == "none"
     with pytest.raises(MapError, match="no scale, and this needs metres"):
         _ = scene.space
     with pytest.raises(MapError, match="poses of the map's photographs are missing"):
-        _ = Scene(files, CAMERA, replace(none, assume_metric=True)).space
+        _ = SceneEnvironment(files, CAMERA, replace(none, assume_metric=True)).space
+
+
+@pytest.mark.parametrize(
+    ("occlusion", "mesh", "depth"), [("mesh", None, None), ("tsdf", "m", None), ("x", None, None), ("", "m", "d")]
+)
+def test_an_occlusion_model_needs_its_files(occlusion: str, mesh: str | None, depth: str | None) -> None:
+    files = ColmapFiles(Path("sparse"), mesh=mesh and Path(mesh), depth=depth and Path(depth))
+    with pytest.raises(ConfigError):
+        ColmapEnvironment(files, occlusion=occlusion)
+
+
+def test_the_most_accurate_occlusion_model_is_the_default(files: SceneFolder) -> None:
+    by_mesh = ColmapEnvironment(ColmapFiles(Path("sparse"), mesh=files.mesh))
+    assert by_mesh.available_occlusion == ("mesh", "hidden-points", "none") and by_mesh.occlusion.name == "mesh"
+    assert isinstance(ColmapEnvironment(ColmapFiles(Path("sparse"))).occlusion, HiddenPointRemoval)
+    cached = ColmapEnvironment(ColmapFiles(Path("sparse")), config=EnvironmentConfig(occlusion_cache_bytes=1 << 20))
+    assert isinstance(cached.occlusion, CachedOcclusion)
 
 
 @pytest.mark.parametrize("wrong", [{"grid": (8, 0, 8)}, {"directions": 0}, {"lattice": "spiral"}])
@@ -74,7 +92,7 @@ def test_views_that_cannot_be_are_refused(wrong: dict[str, object]) -> None:
         ViewLattice(**wrong)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("module", ["stages", "learning.provenance"])  # the latter tells a finished train stage so
+@pytest.mark.parametrize("module", ["stages", "training.provenance"])
 def test_stages_load_nothing_heavy_until_there_is_work(module: str) -> None:
     heavy = ["torch", "lightning", "warp", "mlflow", "matplotlib", "pycolmap", "open3d", "sklearn", "scipy", "cv2"]
     code = (

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import wheretolook
 from box_scenes import furnished_room
 from planning.rooms import CAMERA, room_landmarks
 from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, EnvironmentConfig, SceneEnvironment
@@ -90,14 +87,3 @@ def test_the_most_accurate_occlusion_model_is_the_default(files: SceneFolder) ->
 def test_views_that_cannot_be_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ConfigError):
         ViewLattice(**wrong)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("module", ["stages", "training.provenance"])
-def test_stages_load_nothing_heavy_until_there_is_work(module: str) -> None:
-    heavy = ["torch", "lightning", "warp", "mlflow", "matplotlib", "pycolmap", "open3d", "sklearn", "scipy", "cv2"]
-    code = (
-        f"import sys; sys.path.insert(0, {str(Path(wheretolook.__file__).parents[1])!r}); import wheretolook.{module}"
-    )
-    code += f"; print([name for name in {heavy} if name in sys.modules])"
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "[]"

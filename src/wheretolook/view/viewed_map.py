@@ -155,7 +155,7 @@ class ViewedMap:
         return selector
 
     def _occlusion_model(self, name: str) -> OcclusionModel:
-        from wheretolook.visibility.cached_occlusion import RememberedOcclusion
+        from wheretolook.visibility.cached_occlusion import CachedOcclusion
         from wheretolook.visibility.hidden_points import HiddenPointRemoval
         from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion
 
@@ -167,7 +167,7 @@ class ViewedMap:
             model: OcclusionModel = MeshOcclusion(space.raycaster, config.margin_m, space.two_sided)
         else:
             model = HiddenPointRemoval(config.radius, config.margin_m)
-        return RememberedOcclusion(model, OCCLUSION_BYTES)
+        return CachedOcclusion(model, OCCLUSION_BYTES)
 
 
 def open_map(
@@ -225,7 +225,7 @@ def open_scene(
     By default views are scored by the scene's own weights (`scene_weights`), or by bundled ones. Raises MapError or
     TableError if the scene has not been mapped, WeightsError if the weights cannot be used.
     """
-    from wheretolook.dataset.environment import Scene, SceneConfig
+    from wheretolook.dataset.environment import EnvironmentConfig, SceneEnvironment
     from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED
     from wheretolook.mapping.colmap_model import holds_model
     from wheretolook.mapping.sources import photographs_of
@@ -234,7 +234,7 @@ def open_scene(
     if not files.landmarks.is_file():
         raise MapError("this scene has no map yet", path=files.map, fix="Run `wheretolook map` for its dataset.")
     number, own_camera = next(iter(files.cameras().items()))
-    scene = Scene(files, camera or own_camera, SceneConfig(assume_metric=True), device)
+    scene = SceneEnvironment(files, camera or own_camera, EnvironmentConfig(assume_metric=True), device)
     mesh = scene.mesh if files.mesh.is_file() else None
     if mesh is None and scene.mapping_poses is None:
         raise SceneError("neither a mesh nor the map's cameras are known", path=files.folder, fix="Map it again.")

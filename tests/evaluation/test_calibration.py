@@ -20,8 +20,8 @@ from wheretolook.evaluation.calibration import (
 from wheretolook.geometry.poses import Float
 
 
-def draw(rng: np.random.Generator, chance: Float) -> np.ndarray:
-    return rng.random(len(chance)) < chance
+def draw(rng: np.random.Generator, probability: Float) -> np.ndarray:
+    return rng.random(len(probability)) < probability
 
 
 def test_reliability_by_hand() -> None:
@@ -77,7 +77,7 @@ def test_temperature_is_recovered(factor: float) -> None:
         assert negative_log_likelihood(scaled, good) < negative_log_likelihood(sure, good)
 
 
-def test_temperature_of_what_cannot_tell() -> None:
+def test_temperature_of_one_class_is_unknown() -> None:
     for labels in (np.ones(5, dtype=bool), np.zeros(5, dtype=bool), np.empty(0, dtype=bool)):
         assert np.isnan(fit_temperature(np.linspace(0, 1, len(labels)), labels))
     certain = np.array([0.0, 1.0, 1.0, 0.0])  # logits beyond all bounds

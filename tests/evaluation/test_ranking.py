@@ -9,29 +9,30 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from wheretolook.dataset.thresholds import threshold_key, threshold_label
-from wheretolook.evaluation.config import EvaluateConfig, candidates_label
-from wheretolook.evaluation.ranking import TestViews, choose_at_random, choose_best, choose_by_truth, rank_views
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.evaluation.ranking import CandidateViews, choose_at_random, choose_best, choose_by_truth, rank_views
 from wheretolook.evaluation.scores import reference_method, score_table
 from wheretolook.utils.errors import ConfigError
 
-HAND = TestViews(
+HAND = CandidateViews(
     # location 0 has four views, location 1 has one, location 2 has three, in mixed order
     location=np.array([2, 0, 0, 1, 0, 2, 0, 2]),
     viewpoint_id=np.array([5, 12, 11, 9, 10, 6, 13, 7]),
     good=np.array([[1, 1], [0, 1], [1, 1], [0, 0], [0, 0], [0, 1], [1, 1], [0, 0]], dtype=bool),
     location_scene=np.array([0, 0, 1]),
+    location_block=np.arange(3),
 )
+HAND_FINE = replace(HAND, good=HAND.good[:, :1])
 HAND_SCORES = np.array([0.2, 0.9, 0.5, 0.1, 0.5, 0.2, 0.4, 0.9])
 
 
-def random_views(rng: np.random.Generator, n_locations: int = 40) -> TestViews:
+def random_views(rng: np.random.Generator, n_locations: int = 40) -> CandidateViews:
     location = np.repeat(np.arange(n_locations), rng.integers(1, 15, n_locations))
     order = rng.permutation(len(location))
     quality = rng.random(len(location))
     good = quality[:, None] < [0.3, 0.5]
     scene = np.sort(rng.integers(0, 3, n_locations))
-    return TestViews(location[order], np.arange(len(location))[order], good[order], scene)
+    return CandidateViews(location[order], np.arange(len(location))[order], good[order], scene, np.arange(n_locations))
 
 
 @pytest.mark.parametrize(
@@ -55,7 +56,9 @@ def test_best_views_by_hand(n: int, chosen: list[int], good: list[list[int]]) ->
 def test_ties_do_not_depend_on_the_order_of_rows() -> None:
     rng = np.random.default_rng(0)
     order = rng.permutation(len(HAND.location))
-    shuffled = TestViews(HAND.location[order], HAND.viewpoint_id[order], HAND.good[order], HAND.location_scene)
+    shuffled = replace(
+        HAND, location=HAND.location[order], viewpoint_id=HAND.viewpoint_id[order], good=HAND.good[order]
+    )
     for n in (1, 2, 3):
         for scores in (HAND_SCORES, np.zeros(8)):
             expected = choose_best(HAND, rank_views(HAND, scores), n).good
@@ -68,9 +71,8 @@ def test_oracle_by_hand() -> None:
     np.testing.assert_array_equal(choose_by_truth(HAND, 2).good, [[2, 2], [0, 0], [1, 2]])
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_nothing_beats_the_oracle(seed: int) -> None:
-    rng = np.random.default_rng(seed)
+def test_nothing_beats_the_oracle() -> None:
+    rng = np.random.default_rng(0)
     views = random_views(rng)
     for n in (1, 2, 5, 20):
         oracle = choose_by_truth(views, n).good
@@ -116,14 +118,6 @@ def test_table_by_hand() -> None:
     assert top1["roc_auc"] == pytest.approx(np.mean(pairs))
     # precision and gain in recall at the scores 0.5, 0.4 and 0.2
     assert top1["average_precision"] == pytest.approx((1 / 4 + 2 / 5 + 3 / 7) / 3)
-
-
-def test_without_a_good_view_shares_are_zero_and_quotients_unknown() -> None:
-    views = TestViews(np.array([0, 0, 1]), np.arange(3), np.zeros((3, 4), dtype=bool), np.array([0, 0]))
-    table = score_table(views, {"bins": np.arange(3.0)}, ["a"], EvaluateConfig(resamples=10))
-    assert (table["raw_0.05m_0.4deg"] == 0).all()
-    assert table["normalized_0.05m_0.4deg"].isna().all()
-    assert table[table["method"] == "bins"][["average_precision", "roc_auc"]].isna().all(axis=None)
 
 
 def test_new_columns_by_hand() -> None:
@@ -208,52 +202,24 @@ def test_a_method_that_chooses_alike_does_not_differ() -> None:
     assert sorted(mirrored) == sorted([*other["difference_5m_10deg"], *other["difference_5m_10deg"]])
 
 
-def test_who_is_compared_with() -> None:
-    methods = ["random", "mlp-2d", "mlp-2d+3d", "fisher-trace-gp"]
+def test_reference_method() -> None:
+    methods = ["random", "mlp-2d", "mlp-2d+3d", "visible"]
     assert reference_method(methods, "") == "mlp-2d+3d"
-    assert reference_method(methods[:2], "") == "mlp-2d"
     assert reference_method(methods[:1], "") == ""
     assert reference_method(methods, "random") == "random"
-    assert reference_method(methods, "mlp-2d") == "mlp-2d"
-    assert reference_method(methods, "fisher-trace-gp") == "fisher-trace-gp"
-    with pytest.raises(ConfigError, match=r"'mlp-2d\+z'.*random, mlp-2d, mlp-2d\+3d, fisher-trace-gp"):
+    with pytest.raises(ConfigError):
         reference_method(methods, "mlp-2d+z")
-    table = score_table(HAND, {"bins": HAND_SCORES}, ["a", "b"], EvaluateConfig(
-        thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=10))  # fmt: skip
+    config = EvaluateConfig(thresholds=((0.05, 0.4),), resamples=10)
+    table = score_table(HAND_FINE, {"bins": HAND_SCORES}, ["a", "b"], config)
     columns = [name for name in table if name.startswith(("difference_", "p_"))]
-    assert len(columns) == 2 * 4 and table[columns].isna().all(axis=None)
-
-
-def test_intervals_of_differences_are_the_normal_ones_of_many_locations() -> None:
-    rng = np.random.default_rng(5)
-    quality = rng.random((1500, 6))
-    views = TestViews(
-        np.repeat(np.arange(1500), 6), np.arange(9000), (quality < 0.4).reshape(-1, 1), np.zeros(1500, int)
-    )
-    scores = {
-        "bins": (rng.random((1500, 6)) - 0.3 * quality).reshape(-1),
-        "mlp-2d": (rng.random((1500, 6)) - 0.6 * quality).reshape(-1),
-    }
-    config = EvaluateConfig(top_n=(1,), thresholds=((0.05, 0.4),), resamples=4000)
-    row = pooled_rows(score_table(views, scores, ["a"], config))["bins", 1]
-    good = {method: (quality < 0.4)[np.arange(1500), values.reshape(1500, 6).argmax(1)].astype(float)
-            for method, values in scores.items()}  # fmt: skip
-    difference = good["bins"] - good["mlp-2d"]
-    error = difference.std() / np.sqrt(1500)
-    assert row["difference_0.05m_0.4deg"] == pytest.approx(difference.mean())
-    assert row["difference_low_0.05m_0.4deg"] == pytest.approx(difference.mean() - 1.96 * error, abs=0.1 * error)
-    assert row["difference_high_0.05m_0.4deg"] == pytest.approx(difference.mean() + 1.96 * error, abs=0.1 * error)
-    regret = 1.0 * (quality < 0.4).any(1) - good["bins"]
-    error = regret.std() / np.sqrt(1500)
-    assert row["regret_low_0.05m_0.4deg"] == pytest.approx(regret.mean() - 1.96 * error, abs=0.1 * error)
-    assert row["regret_high_0.05m_0.4deg"] == pytest.approx(regret.mean() + 1.96 * error, abs=0.1 * error)
+    assert len(columns) == 4 and table[columns].isna().all(axis=None)
 
 
 def test_with_shuffled_labels_every_method_is_as_good_as_chance() -> None:
     rng = np.random.default_rng(0)
     views = random_views(rng, 3000)
     informed = views.good[:, 0] + rng.normal(size=len(views.location))
-    shuffled = TestViews(views.location, views.viewpoint_id, rng.permutation(views.good), views.location_scene)
+    shuffled = replace(views, good=rng.permutation(views.good))
     scores = {"random": rng.random(len(informed)), "bins": informed, "mlp-2d": rng.random(len(informed))}
     config = EvaluateConfig(thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=1000, reference="random")
     table = pooled_rows(score_table(shuffled, scores, ["a", "b", "c"], config))
@@ -281,7 +247,6 @@ def test_only_some_views_by_hand() -> None:
     np.testing.assert_array_equal(some.viewpoint_id, [5, 11, 6, 13])
     np.testing.assert_array_equal(some.good, [[1, 1], [1, 1], [0, 1], [1, 1]])
     np.testing.assert_array_equal(some.location_scene, [0, 1])
-    assert [candidates_label(best) for best in (0, 100)] == ["all", "best 100"]
 
 
 def test_a_scene_without_candidates_has_no_shares() -> None:
@@ -306,14 +271,3 @@ def test_calibration_columns_of_learned_methods() -> None:
     np.testing.assert_allclose(rows.loc[("mlp-2d", "b")], [0.8 - 1 / 3, 2 / 3 - 1 / 3, 2])
     np.testing.assert_allclose(rows.loc[("mlp-2d+z", "all")], [0.8 - 3 / 8, np.nan, np.nan])
     assert rows.loc[["bins", "oracle"]].isna().all(axis=None)
-
-
-def test_threshold_names() -> None:
-    assert [threshold_key(limits) for limits in EvaluateConfig().thresholds] == [
-        "0.05m_0.4deg",
-        "0.25m_2deg",
-        "0.5m_5deg",
-        "5m_10deg",
-    ]
-    assert threshold_label("0.05m_0.4deg") == "5 cm, 0.4°"
-    assert threshold_label("5m_10deg") == "5 m, 10°"

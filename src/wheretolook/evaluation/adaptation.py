@@ -1,4 +1,4 @@
-"""Whether a scorer that was adapted to a place is better there, by views that it has not learnt from."""
+"""Compare a scorer before and after adaptation to a scene, on views that it was not fitted on."""
 
 from __future__ import annotations
 
@@ -16,30 +16,31 @@ from wheretolook.scorers.adapted.gp_correction import log_losses
 from wheretolook.utils.markdown import markdown_table
 
 RESAMPLES = 2000
-NEIGHBOURS_M = 1.0  # locations in one square of the floor of this side are resampled together
+SQUARE_M = 1.0  # locations in one square of the floor of this side are resampled together
+
+Interval = tuple[float, float, float]  # value, lower and upper end of its 95 % interval
 
 
 @dataclass(frozen=True)
 class Gain:
-    """What adapting has changed; intervals are of 95 % over locations, neighbours resampled together, or over
-    blocks of photographs.
+    """Metrics before and after adaptation, and their changes with intervals over neighbourhoods or photograph blocks.
 
-    `before` and `after` have log loss, AUC, regret in percentage points and expected calibration error, by name.
+    `before` and `after` hold log_loss, auc, regret (percentage points) and calibration_error, by name.
     """
 
     before: dict[str, float]
     after: dict[str, float]
-    log_loss_less: tuple[float, float, float]  # how much less the log loss is, and the interval
-    regret_less: tuple[float, float, float]  # likewise regret
+    log_loss_less: Interval  # decrease of the log loss
+    regret_less: Interval  # decrease of regret
 
     @property
     def is_better(self) -> bool:
-        """Whether the chances are truer by more than the interval, and views are not chosen worse by more than it."""
+        """Whether the log loss fell by more than its interval, and regret did not rise by more than its own."""
         return self.log_loss_less[1] > 0 and not self.regret_less[2] < 0
 
     @property
     def is_worse(self) -> bool:
-        """Whether the chances are less true, or views are chosen worse, by more than the interval."""
+        """Whether the log loss or regret rose by more than its interval."""
         return self.log_loss_less[2] < 0 or self.regret_less[2] < 0
 
 
@@ -52,62 +53,70 @@ def compare_log_odds(
     seed: int = 0,
     blocks: NDArray[np.integer] | None = None,
 ) -> Gain:
-    """Compare log-odds (B,) of views that localize or not (B,), at locations by number (B,), of cameras (B, 3) m.
+    """Compare two predictions of log-odds (B,) for views that localize or not.
 
-    Of regret the locations count that have several views. Photographs of a block (`blocks` (B,), -1 for views that are
-    none) are resampled together, and a location of theirs lies in one block.
+    Args:
+        before: (B,) log-odds before adaptation.
+        after: (B,) log-odds after it.
+        good: (B,) whether each view localizes.
+        location: (B,) number of each view's location; regret is over locations with several views.
+        centers: (B, 3) m, camera centres.
+        seed: of the bootstrap.
+        blocks: (B,) block of each held-out photograph, resampled as a whole, -1 for rendered views; None for none.
     """
-    ids, row, times = np.unique(location, return_inverse=True, return_counts=True)
+    ids, first, row, n_views = np.unique(location, return_index=True, return_inverse=True, return_counts=True)
     row = row.reshape(-1)
-    first = np.unique(row, return_index=True)[1]
-    squares = np.unique(np.floor(centers[first, :2] / NEIGHBOURS_M), axis=0, return_inverse=True)[1].reshape(-1)
+    clusters = np.unique(np.floor(centers[first, :2] / SQUARE_M), axis=0, return_inverse=True)[1].reshape(-1)
     if blocks is not None:
-        squares = np.where(blocks[first] >= 0, squares.max() + 1 + blocks[first], squares)
-    bootstrap = ClusterBootstrap(squares, RESAMPLES, seed)
+        clusters = np.where(blocks[first] >= 0, clusters.max() + 1 + blocks[first], clusters)
+    bootstrap = ClusterBootstrap(clusters, RESAMPLES, seed)
+    has_choice = (n_views > 1).astype(np.float64)
+    localizes_somewhere = np.zeros(len(ids), dtype=bool)
+    np.logical_or.at(localizes_somewhere, row, good)
 
-    def less(values: Float, counts: Float) -> tuple[float, float, float]:
+    def mean_with_interval(values: Float, counts: Float) -> Interval:
         low, high = bootstrap.ratio_interval(values[:, None], counts[:, None])
         return float(values.sum() / max(1e-12, counts.sum())), float(low[0]), float(high[0])
 
     def missed(log_odds: Float) -> Float:
-        """Of each location, 1 if a good view was there to choose and the first one chosen is none."""
+        """1 at locations (L,) with a choice whose best-scored view does not localize although another does."""
         order = np.lexsort((-log_odds, row))
         chosen = order[np.flatnonzero(np.diff(row[order], prepend=-1))]
-        possible = np.zeros(len(ids), dtype=bool)
-        np.logical_or.at(possible, row, good)
-        return (possible & ~good[chosen]).astype(np.float64) * (times > 1)
+        return (localizes_somewhere & ~good[chosen]) * has_choice
 
-    choice = np.asarray(times > 1, dtype=np.float64)
-    both = (before, after)
-    losses = [log_losses(z, good) for z in both]
-    misses = [missed(z) for z in both]
-    told = []
-    for z, loss, miss in zip(both, losses, misses, strict=True):
-        auc = float(roc_auc_score(good, z)) if 0 < good.sum() < len(good) else float("nan")
-        regret = 100 * float(miss.sum() / max(1.0, choice.sum()))
-        error = expected_calibration_error(expit(z), good)
-        told.append({"log_loss": float(loss.mean()), "auc": auc, "regret": regret, "calibration_error": error})
-    changed = np.bincount(row, weights=losses[0] - losses[1]).astype(np.float64)
-    loss_less = less(changed, times.astype(np.float64))
-    return Gain(told[0], told[1], loss_less, less(100 * (misses[0] - misses[1]), choice))
+    metrics = []
+    losses = []
+    misses = []
+    for log_odds in (before, after):
+        loss = log_losses(log_odds, good)
+        miss = missed(log_odds)
+        auc = float(roc_auc_score(good, log_odds)) if 0 < good.sum() < len(good) else float("nan")
+        regret = 100 * float(miss.sum() / max(1.0, has_choice.sum()))
+        error = expected_calibration_error(expit(log_odds), good)
+        metrics.append({"log_loss": float(loss.mean()), "auc": auc, "regret": regret, "calibration_error": error})
+        losses.append(loss)
+        misses.append(miss)
+    decrease = np.bincount(row, weights=losses[0] - losses[1]).astype(np.float64)
+    return Gain(
+        metrics[0],
+        metrics[1],
+        mean_with_interval(decrease, n_views.astype(np.float64)),
+        mean_with_interval(100 * (misses[0] - misses[1]), has_choice),
+    )
 
 
 def gain_markdown(gain: Gain) -> str:
-    """A gain as a table."""
+    """Format a gain as a Markdown table and a sentence."""
     names = {"regret": "regret", "auc": "AUC", "calibration_error": "calibration error", "log_loss": "log loss"}
     rows = []
     for key, text in names.items():
         digits = ".1f" if key == "regret" else ".3f"
         rows.append([text, format(gain.before[key], digits), format(gain.after[key], digits)])
-    loss = gain.log_loss_less
-    regret = gain.regret_less
-    if np.isnan(regret[1]):
-        less = (
-            f"Log loss is less by {loss[0]:.3f} [{loss[1]:.3f}, {loss[2]:.3f}]; there is no choice to judge regret by."
-        )
-        return f"{markdown_table(('', 'before', 'adapted'), rows)}\n\n{less}\n"
-    less = (
-        f"Log loss is less by {loss[0]:.3f} [{loss[1]:.3f}, {loss[2]:.3f}], regret by {regret[0]:+.1f} points "
-        f"[{regret[1]:+.1f}, {regret[2]:+.1f}]."
-    )
-    return f"{markdown_table(('', 'before', 'adapted'), rows)}\n\n{less}\n"
+    loss, low, high = gain.log_loss_less
+    summary = f"Log loss decreases by {loss:.3f} [{low:.3f}, {high:.3f}]"
+    regret, low, high = gain.regret_less
+    if np.isnan(low):
+        summary += "; regret is unknown, as no location has several views."
+    else:
+        summary += f", regret by {regret:+.1f} points [{low:+.1f}, {high:+.1f}]."
+    return f"{markdown_table(('', 'before', 'adapted'), rows)}\n\n{summary}\n"

@@ -68,45 +68,51 @@ class ClusterBootstrap:
 
         NaN where the denominator's sum is not positive.
         """
-        return divide(self.times @ self.sums(numerator), self.times @ self.sums(denominator))
+        return divide(self._weighted(numerator), self._weighted(denominator))
+
+    def _weighted(self, values: Float) -> Float:
+        """Sums (1 + R, ...) of values (L, ...) over the data and over each resample."""
+        sums = self.sums(values)
+        return (self.times @ sums.reshape(self.n_clusters, -1)).reshape(len(self.times), *sums.shape[1:])
 
     def interval(self, values: Float) -> tuple[Float, Float]:
-        """95 % percentile interval of statistics (1 + R, C), of the data and of the resamples, without NaN.
+        """95 % percentile interval of statistics (1 + R, ...), of the data and of the resamples, without NaN.
 
-        Returns lower and upper ends, (C,) each; NaN where all are NaN, or where no stratum has two clusters.
+        Returns lower and upper ends, (...) each; NaN where all are NaN, or where no stratum has two clusters.
         """
-        ends = np.full((2, values.shape[1]), np.nan)
+        ends = np.full((2, *values.shape[1:]), np.nan)
         if not self._has_intervals:
             return ends[0], ends[1]
         resampled = values[1:]
         known = np.isfinite(resampled)
         complete = known.all(0)
         ends[:, complete] = np.percentile(resampled[:, complete], _PERCENTILES, axis=0)
-        for column in np.flatnonzero(known.any(0) & ~complete):
-            ends[:, column] = np.percentile(resampled[known[:, column], column], _PERCENTILES)
+        for column in np.argwhere(known.any(0) & ~complete):
+            at = (slice(None), *column)
+            ends[at] = np.percentile(resampled[at][known[at]], _PERCENTILES)
         return ends[0], ends[1]
 
     def ratio_interval(self, numerator: Float, denominator: Float) -> tuple[Float, Float]:
-        """95 % interval of the ratio of two sums over observations, of (L, C) and (L, C) or (L, 1); see `interval`."""
+        """95 % interval of the ratio of sums over observations of values (L, ...) that broadcast; see `interval`."""
         return self.interval(self.ratios(numerator, denominator))
 
     def paired_p(self, differences: Float) -> Float:
-        """Two-sided p-values (C,) of paired permutation tests that two methods are equally good in every cluster.
+        """Two-sided p-values (...) of paired permutation tests that two methods are equally good in every cluster.
 
-        Under that hypothesis the difference of a cluster (sum of `differences`, (L, C)) has a random sign. The p-value
+        Under that hypothesis the difference of a cluster (sum of `differences`, (L, ...)) has a random sign. The p-value
         is the share of sign flips, the observed signs included, whose sum over clusters is at least as far from zero as
         the observed one: at least 1 / (R + 1); NaN without observations. The test does not apply to expectations, such
         as those of random choice.
         """
         if self.n_clusters == 0:
-            return np.full(differences.shape[1], np.nan)
+            return np.full(differences.shape[1:], np.nan)
         shape = (len(self.times) - 1, self.n_clusters)
         signs = 1 - 2.0 * np.random.default_rng([self._seed, 0, _SIGNS]).integers(0, 2, shape, dtype=np.int8)
-        by_cluster = self.sums(differences)
+        by_cluster = self.sums(differences).reshape(self.n_clusters, -1)
         # sums that are equal up to rounding count as equal
         observed = np.abs(by_cluster.sum(0)) - 1e-9 * np.abs(by_cluster).sum(0)
         as_far = (np.abs(signs @ by_cluster) >= observed).sum(0)
-        return np.asarray((1 + as_far) / (len(signs) + 1))
+        return np.asarray((1 + as_far) / (len(signs) + 1)).reshape(differences.shape[1:])
 
 
 def divide(numerator: Float, denominator: Float | float) -> Float:

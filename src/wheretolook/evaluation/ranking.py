@@ -1,8 +1,10 @@
-"""How many of each location's best-scored views are good, and how many could be."""
+"""Choose the best-scored views of each location and count how many of them localize."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,47 +12,80 @@ from scipy.special import gammaln
 
 from wheretolook.geometry.poses import Float
 
+Ids = NDArray[np.int64]
+
 
 @dataclass(frozen=True, eq=False)
-class TestViews:
-    """Labelled views to choose from."""
+class CandidateViews:
+    """B labelled views at L locations to choose from.
 
-    __test__ = False  # no test class, whatever its name says
+    Attributes:
+        location: (B,) number of each view's location, 0 .. L-1 over all scenes.
+        viewpoint_id: (B,) unique within a location.
+        good: (B, T) whether the view localizes within each of T thresholds.
+        location_scene: (L,) number of each location's scene.
+        location_block: (L,) block of neighbouring locations that are resampled together
+            (`wheretolook.evaluation.bootstrap.ClusterBootstrap`).
+    """
 
-    location: NDArray[np.int64]  # (B,) int64, number of each view's location, 0 .. L-1 over all scenes
-    viewpoint_id: NDArray[np.int64]  # (B,) int64, unique within a location
-    good: NDArray[np.bool_]  # (B, T) bool, whether the view localizes within each of T thresholds
-    location_scene: NDArray[np.int64]  # (L,) int64, number of each location's scene
-    # (L,) int64, number of the block of neighbouring locations that each is resampled with, see
-    # `wheretolook.evaluation.bootstrap.ClusterBootstrap`; None for each by itself
-    location_block: NDArray[np.int64] | None = None
+    location: Ids
+    viewpoint_id: Ids
+    good: NDArray[np.bool_]
+    location_scene: Ids
+    location_block: Ids
 
     @property
     def n_locations(self) -> int:
         """L."""
         return len(self.location_scene)
 
-    def only(self, mask: NDArray[np.bool_]) -> TestViews:
-        """The views where `mask` (B,) is set, in the same order.
-
-        Locations without any are left out and the others renumbered, in the same order; scenes keep their numbers.
-        """
+    def only(self, mask: NDArray[np.bool_]) -> CandidateViews:
+        """Return the views where `mask` (B,) is set; locations are renumbered without empty ones, scenes are not."""
         kept, location = np.unique(self.location[mask], return_inverse=True)
-        block = None if self.location_block is None else self.location_block[kept]
-        return TestViews(location, self.viewpoint_id[mask], self.good[mask], self.location_scene[kept], block)
+        return CandidateViews(
+            location, self.viewpoint_id[mask], self.good[mask], self.location_scene[kept], self.location_block[kept]
+        )
+
+
+class SceneViews(NamedTuple):
+    """Labelled views of one scene: B views at L locations."""
+
+    location: Ids  # (B,) row of each view's location
+    viewpoint_id: Ids  # (B,)
+    good: NDArray[np.bool_]  # (B, T)
+    location_id: Ids  # (L,)
+    location_block: Ids  # (L,)
+
+
+def join_scenes(parts: Sequence[SceneViews]) -> tuple[CandidateViews, Ids]:
+    """Join views of scenes, numbered in this order; also returns the location_id (L,) of each location."""
+    sizes = [len(part.location_id) for part in parts]
+    starts = np.cumsum([0, *sizes])
+    views = CandidateViews(
+        location=np.concatenate([part.location + start for part, start in zip(parts, starts, strict=False)]),
+        viewpoint_id=np.concatenate([part.viewpoint_id for part in parts]),
+        good=np.concatenate([part.good for part in parts]),
+        location_scene=np.repeat(np.arange(len(parts)), sizes),
+        location_block=np.concatenate([part.location_block for part in parts]),
+    )
+    return views, np.concatenate([part.location_id for part in parts])
 
 
 @dataclass(frozen=True, eq=False)
 class TopN:
-    """What the views chosen at each location are worth."""
+    """Counts of the N views chosen at each of L locations; expectations and probabilities for random choice."""
 
-    chosen: Float  # (L,) views chosen at each location: N, or all there are
-    good: Float  # (L, T) how many of them are good within each threshold (an expectation for random choice)
-    any_good: Float  # (L, T) whether at least one is (a probability for random choice)
+    chosen: Float  # (L,) views chosen: N, or all there are
+    good: Float  # (L, T) how many of them are good within each threshold
+    any_good: Float  # (L, T) 1 where at least one is
+
+    def only(self, locations: NDArray[np.bool_]) -> TopN:
+        """Return the counts of the locations where the mask (L,) is set."""
+        return TopN(self.chosen[locations], self.good[locations], self.any_good[locations])
 
 
-def rank_views(views: TestViews, scores: Float) -> NDArray[np.int64]:
-    """Rank (B,) of every view within its location by scores (B,), 0 the highest; of equals the smaller viewpoint_id."""
+def rank_views(views: CandidateViews, scores: Float) -> Ids:
+    """Rank views within their locations by scores (B,): (B,) from 0, the highest; ties by rising viewpoint_id."""
     order = np.lexsort((views.viewpoint_id, -scores, views.location))
     location = views.location[order]
     first = np.searchsorted(location, np.arange(views.n_locations))
@@ -59,23 +94,23 @@ def rank_views(views: TestViews, scores: Float) -> NDArray[np.int64]:
     return ranks
 
 
-def choose_best(views: TestViews, ranks: NDArray[np.int64], n: int) -> TopN:
-    """Choose the n views of every location that rank first (`rank_views`); where there are fewer, all."""
+def choose_best(views: CandidateViews, ranks: Ids, n: int) -> TopN:
+    """Choose the n views of every location that rank first (`rank_views`), or all where there are fewer."""
     good = _sum_by_location(views, views.good & (ranks < n)[:, None])
     return TopN(np.minimum(_n_views(views), n), good, (good > 0).astype(np.float64))
 
 
-def choose_by_truth(views: TestViews, n: int) -> TopN:
-    """The oracle: for each threshold the N views of every location that are best by it. No choice of N does better."""
+def choose_by_truth(views: CandidateViews, n: int) -> TopN:
+    """Choose n good views of every location as far as there are some, for each threshold: the oracle."""
     good = np.minimum(_sum_by_location(views, views.good), n)
     return TopN(np.minimum(_n_views(views), n), good, (good > 0).astype(np.float64))
 
 
-def choose_at_random(views: TestViews, n: int) -> TopN:
-    """The exact expectation of choosing N views of every location uniformly at random, without replacement.
+def choose_at_random(views: CandidateViews, n: int) -> TopN:
+    """Compute the exact expectation of choosing n views of every location uniformly, without replacement.
 
-    With g good views of m, min(N, m) g / m of the chosen ones are good, and at least one is with probability
-    1 - C(m - g, N) / C(m, N) (hypergeometric).
+    With g good views of m, min(n, m) g / m of the chosen ones are good, and at least one is with probability
+    1 - C(m - g, n) / C(m, n) (hypergeometric).
     """
     total = _n_views(views)[:, None]
     good = _sum_by_location(views, views.good)
@@ -87,10 +122,10 @@ def choose_at_random(views: TestViews, n: int) -> TopN:
     return TopN(chosen[:, 0], chosen * good / total, 1 - none)
 
 
-def _n_views(views: TestViews) -> Float:
+def _n_views(views: CandidateViews) -> Float:
     return np.bincount(views.location, minlength=views.n_locations).astype(np.float64)
 
 
-def _sum_by_location(views: TestViews, flags: NDArray[np.bool_]) -> Float:
+def _sum_by_location(views: CandidateViews, flags: NDArray[np.bool_]) -> Float:
     columns = [np.bincount(views.location, weights=column, minlength=views.n_locations) for column in flags.T]
     return np.stack(columns, axis=-1)

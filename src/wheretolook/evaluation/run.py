@@ -1,9 +1,9 @@
-"""One evaluation: the views of a split scored by every method, seen by every occlusion model, and compared."""
+"""Score the labelled views of a split by every method and occlusion model, and compare the methods."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +14,8 @@ from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good
 from wheretolook.evaluation.calibration import calibration_rows, fit_temperature
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.photographs import LeftOutPhotographs, photographs_set, score_photographs
-from wheretolook.evaluation.ranking import TestViews
+from wheretolook.evaluation.photographs import HeldOutPhotographs, photographs_set, score_photographs
+from wheretolook.evaluation.ranking import CandidateViews
 from wheretolook.evaluation.results import Evaluation, ScoredSet
 from wheretolook.evaluation.scores import choose, is_probability, score_table
 from wheretolook.evaluation.scoring import Weights, check_unseen, choose_weights, score_scenes
@@ -26,7 +26,16 @@ from wheretolook.training.provenance import TrainedModel
 from wheretolook.utils.errors import TableError
 from wheretolook.visibility.config import OcclusionConfig
 
-Scores = Mapping[str, Float]  # by method
+
+@dataclass(frozen=True, eq=False)
+class _ScoredViews:
+    """All labelled views (B,) of scenes, with the scores by one occlusion model."""
+
+    occlusion: str
+    scenes: Sequence[SceneFolder]
+    views: CandidateViews
+    scores: Mapping[str, Float]  # (B,) by method
+    sets: Sequence[CandidateSet]
 
 
 def compare_methods(
@@ -36,9 +45,9 @@ def compare_methods(
     progress: bool = True,
     device: str = "cpu",
     occlusion: OcclusionConfig = OcclusionConfig(),
-    photographs: Sequence[LeftOutPhotographs] = (),
+    photographs: Sequence[HeldOutPhotographs] = (),
 ) -> Evaluation:
-    """Score and compare all methods on the scenes of one split; see `wheretolook.stages.evaluate.evaluate_methods`."""
+    """Score and compare all methods on the scenes of one split; see the evaluate command."""
     scenes = dataset.split(config.split)
     if not scenes:
         fix = "Make one, or choose another split."
@@ -48,45 +57,43 @@ def compare_methods(
         check_unseen(scenes, weights)
     occlusions = [None if name is None else replace(occlusion, model=name) for name in config.occlusions or (None,)]
     temperatures, n_val = _fit_temperatures(dataset, config, weights, device, progress, occlusions[0])
-
-    def tabulated(among: Sequence[SceneFolder], candidates: CandidateSet, values: Scores, used: str) -> ScoredSet:
-        choices = choose(candidates.views, values, config.top_n)
-        part = score_table(candidates.views, values, [one.name for one in among], config, temperatures, choices)
-        part.insert(1, "occlusion", used)
-        part.insert(2, "candidates", candidates.name)
-        return ScoredSet(used, candidates, values, choices, part, among)
-
-    scored: list[ScoredSet] = []
-    all_views: list[TestViews] = []
-    calibration = pd.DataFrame()
     photographed = {one.scene.name for one in photographs}
     rendered = [scene for scene in scenes if scene.name not in photographed or has_labels(scene)]
+    scored: list[_ScoredViews] = []
     if rendered:
         tables = [scene.read_table() for scene in rendered]
         views, location_id = views_of(rendered, tables, config)
-        all_views.append(views)
         sets = candidate_sets(views, location_id, rendered, tables, config)
         for model in occlusions:
             scores, used = score_scenes(dataset, rendered, tables, config, weights, device, progress, model)
-            if not scored:
-                calibration = _calibration(scores, views.good[:, 0], temperatures, n_val)
-            for candidates in sets:
-                subset = {method: values[candidates.mask] for method, values in scores.items()}
-                scored.append(tabulated(rendered, candidates, subset, used))
+            scored.append(_ScoredViews(used, rendered, views, scores, sets))
     if photographs:
-        candidates = photographs_set(photographs, config)
-        all_views.append(candidates.views)
+        held_out = photographs_set(photographs, config)
         scores = score_photographs(photographs, config, weights, progress)
-        if not rendered:
-            calibration = _calibration(scores, candidates.views.good[:, 0], temperatures, n_val)
         used = " ".join(sorted({one.occlusion for one in photographs}))
-        scored.append(tabulated([one.scene for one in photographs], candidates, scores, used))
-    table = pd.concat([one.table for one in scored], ignore_index=True)
-    return Evaluation(scenes, weights, all_views[0], scored, table, calibration)
+        scored.append(_ScoredViews(used, [one.scene for one in photographs], held_out.views, scores, [held_out]))
+    first = scored[0]
+    calibration = _calibration(first.scores, first.views.good[:, 0], temperatures, n_val)
+    parts = [_compare(one, candidates, config, temperatures) for one in scored for candidates in one.sets]
+    table = pd.concat([part.table for part in parts], ignore_index=True)
+    return Evaluation(scenes, weights, first.views, parts, table, calibration)
+
+
+def _compare(
+    scored: _ScoredViews, candidates: CandidateSet, config: EvaluateConfig, temperatures: Mapping[str, float]
+) -> ScoredSet:
+    """Choose among one set of candidates by each method, and tabulate the results."""
+    scores = {method: values[candidates.mask] for method, values in scored.scores.items()}
+    choices = choose(candidates.views, scores, config.top_n)
+    names = [scene.name for scene in scored.scenes]
+    table = score_table(candidates.views, scores, names, config, temperatures, choices)
+    table.insert(1, "occlusion", scored.occlusion)
+    table.insert(2, "candidates", candidates.name)
+    return ScoredSet(scored.occlusion, candidates, scores, choices, table, scored.scenes)
 
 
 def has_labels(scene: SceneFolder) -> bool:
-    """Whether views of a scene have been labelled."""
+    """Whether a scene has labelled views."""
     return scene.table.is_file() and bool((scene.read_table()["status"] != UNLABELLED).any())
 
 
@@ -98,16 +105,14 @@ def _fit_temperatures(
     progress: bool,
     occlusion: OcclusionConfig | None,
 ) -> tuple[dict[str, float], int]:
-    """Temperature of each learned method, and the number of labelled views of the val scenes it was fitted on."""
-    labelled: list[tuple[SceneFolder, pd.DataFrame]] = []
-    if weights and config.split != "val":  # fitted on what it is judged by, it would flatter
-        for scene in dataset.split("val"):
-            table = scene.read_table() if scene.table.is_file() else None
-            if table is not None and (table["status"] != UNLABELLED).any():
-                labelled.append((scene, table[table["status"] != UNLABELLED]))
-    if not labelled:
+    """Fit each learned method's temperature on the labelled views of the val scenes; also returns their number."""
+    if not weights or config.split == "val":  # fitted on the views it is judged by, it would be optimistic
         return {}, 0
-    scenes, tables = zip(*labelled, strict=True)
+    scenes = [scene for scene in dataset.split("val") if has_labels(scene)]
+    if not scenes:
+        return {}, 0
+    tables = [scene.read_table() for scene in scenes]
+    tables = [table[table["status"] != UNLABELLED] for table in tables]
     chosen = methods_named(config.methods, scorers())
     config = replace(config, methods=tuple(method.name for method in chosen if method.probability), reference="")
     scores, _ = score_scenes(dataset, scenes, tables, config, weights, device, progress, occlusion)
@@ -118,7 +123,7 @@ def _fit_temperatures(
 def _calibration(
     scores: Mapping[str, Float], good: NDArray[np.bool_], temperatures: Mapping[str, float], n_val: int
 ) -> pd.DataFrame:
-    """Reliability curves of the learned methods over all labelled views, one below the other; empty without any.
+    """Return the reliability curves of all learned methods over all labelled views; empty without any.
 
     Columns: method, temperature, n_val (views that it was fitted on), then those of `calibration_rows`.
     """
@@ -126,7 +131,9 @@ def _calibration(
     for name, values in scores.items():
         if is_probability(name):
             temperature = temperatures.get(name, float("nan"))
-            about = {"method": name, "temperature": temperature, "n_val": n_val}
             curves = calibration_rows(values, good, temperature)
-            parts.append(pd.DataFrame({**about, **{str(column): curves[column] for column in curves}}))
+            curves.insert(0, "method", name)
+            curves.insert(1, "temperature", temperature)
+            curves.insert(2, "n_val", n_val)
+            parts.append(curves)
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()

@@ -1,4 +1,4 @@
-"""The table of localization scores: every method, every N, all scenes together and each alone."""
+"""Tables of localization scores: a row for each method, N and scene, and for all scenes together."""
 
 from __future__ import annotations
 
@@ -13,30 +13,64 @@ from wheretolook.dataset.thresholds import ALL, threshold_key
 from wheretolook.evaluation.bootstrap import ClusterBootstrap, divide
 from wheretolook.evaluation.calibration import expected_calibration_error, scale_probability
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.ranking import TestViews, TopN, choose_at_random, choose_best, choose_by_truth, rank_views
+from wheretolook.evaluation.ranking import (
+    CandidateViews,
+    TopN,
+    choose_at_random,
+    choose_best,
+    choose_by_truth,
+    rank_views,
+)
 from wheretolook.geometry.poses import Float
 from wheretolook.scorers.registry import find
 from wheretolook.scorers.styles import ORACLE
 from wheretolook.utils.errors import ConfigError
 
-RELEASED_DIVISOR = 0.527
-"""What the paper's released code divides every share by, whatever the threshold, the scenes and N."""
+PHOTOGRAPHS = "photographs"  # value of the column `candidates` in rows of held-out photographs
 
+RELEASED_DIVISOR = 0.527
+"""Divisor of every share in the paper's released code, whatever the threshold, the scenes and N."""
 
 _PAIRED = ("difference", "difference_low", "difference_high", "p")
 _CALIBRATION = ("ece", "ece_scaled", "temperature")
 
-Choices = Mapping[tuple[str, int], TopN]  # what each method, the oracle too, chooses for each N
+Choices = Mapping[tuple[str, int], TopN]  # by method, the oracle included, and N
 
 
 def read_scores(path: Path) -> pd.DataFrame:
-    """A score table from its CSV file, see `score_table`."""
+    """Read a score table (`score_table`) from its CSV file."""
     table = pd.read_csv(path, keep_default_na=False, na_values=[""])
     return table.assign(reference=table["reference"].fillna("")) if "reference" in table else table
 
 
-def by_chance(method: str) -> bool:
-    """Whether a method draws at random, so that an evaluation tells its exact expectation."""
+def threshold_keys(scores: pd.DataFrame) -> list[str]:
+    """Return the thresholds of a score table, as in its column names."""
+    intervals = ("normalized_low_", "normalized_high_")
+    shares = [name for name in scores.columns if name.startswith("normalized_") and not name.startswith(intervals)]
+    return [name.removeprefix("normalized_") for name in shares]
+
+
+def main_rows(scores: pd.DataFrame, columns: Sequence[str] = ("occlusion", "candidates")) -> pd.DataFrame:
+    """Return the rows of a table's first occlusion model and first set of candidates, as far as it has the columns."""
+    for name in columns:
+        if name in scores:
+            scores = scores[scores[name] == scores[name].iloc[0]]
+    return scores
+
+
+def methods_of(scores: pd.DataFrame) -> list[str]:
+    """Return the methods of a score table, in order."""
+    return list(scores["method"].unique())
+
+
+def reference_of(scores: pd.DataFrame) -> str:
+    """Return the method that a score table compares the others with; "" if there is none."""
+    name = scores["reference"].iloc[0] if "reference" in scores else ""
+    return str(name) if name in methods_of(scores) else ""
+
+
+def is_random(method: str) -> bool:
+    """Whether a method chooses at random, so that its rows hold exact expectations."""
     known = find(method)
     return known is not None and known.by_chance
 
@@ -47,11 +81,11 @@ def is_probability(method: str) -> bool:
     return known is not None and known.probability
 
 
-def choose(views: TestViews, scores: Mapping[str, Float], top_n: Sequence[int]) -> Choices:
-    """Let every method choose N views of every location; see `score_table`, whose rows come in the same order."""
+def choose(views: CandidateViews, scores: Mapping[str, Float], top_n: Sequence[int]) -> Choices:
+    """Choose N views of every location by each method's scores (B,), and by the oracle."""
     choices: dict[tuple[str, int], TopN] = {}
     for method, values in scores.items():
-        if by_chance(method):
+        if is_random(method):
             choices |= {(method, n): choose_at_random(views, n) for n in top_n}
         else:
             ranks = rank_views(views, values)
@@ -60,77 +94,82 @@ def choose(views: TestViews, scores: Mapping[str, Float], top_n: Sequence[int]) 
 
 
 def reference_method(methods: Iterable[str], name: str) -> str:
-    """The method that the others are compared with: see `EvaluateConfig.reference`. "" if there is none.
+    """Return the method that the others are compared with (`EvaluateConfig.reference`); "" if there is none.
 
     Raises a ConfigError if no method has that name.
     """
     methods = list(methods)
     if name and name not in methods:
-        known = f"There are {', '.join(methods)}."
+        known = f"Use one of {', '.join(methods)}."
         raise ConfigError("the reference is none of the methods evaluated", value=name, fix=known)
-    found = {other: find(other) for other in methods}
-    ranks = {other: known.reference for other, known in found.items() if known is not None and known.probability}
-    return name or max(ranks, key=lambda other: ranks[other], default="")
+    learned = {method: known for method in methods if (known := find(method)) is not None and known.probability}
+    return name or max(learned, key=lambda method: learned[method].reference, default="")
 
 
 def score_table(
-    views: TestViews,
+    views: CandidateViews,
     scores: Mapping[str, Float],
     scenes: Sequence[str],
     config: EvaluateConfig,
     temperatures: Mapping[str, float] | None = None,
     choices: Choices | None = None,
 ) -> pd.DataFrame:
-    """Compare methods by their scores (B,) of views (paper, Sec. 4.1 and its tables 2 and 3).
+    """Compare methods by their scores (B,) of views (paper, Sec. 4.1, tables 2 and 3).
 
-    At every location the N views with the highest score are chosen, and the chosen views of all locations are pooled. A
-    location with fewer than N views contributes what it has. The paper divides all shares by one constant, 0.527; here
-    each is also divided by the oracle's at the same threshold, scenes and N.
+    At every location the N views with the highest scores are chosen, or all where there are fewer; the chosen views of
+    all locations are pooled. The paper divides all shares by one constant, 0.527; here each is also divided by the
+    oracle's share at the same threshold, scenes and N. Rows of random choice hold exact expectations, but its average
+    precision and ROC AUC are those of one seeded draw.
 
-    Choosing at random is not drawn but computed: its rows hold exact expectations. Its average precision and ROC AUC
-    are those of one seeded draw.
+    Args:
+        views: the views to choose from.
+        scores: (B,) by method.
+        scenes: names of the scenes by their numbers in `views`.
+        config: values of N, thresholds, reference, seed and resamples.
+        temperatures: of learned methods, where known (`wheretolook.evaluation.calibration`).
+        choices: result of `choose`, if known already.
 
-    `scenes` are the names of the scenes by their number in `views`, `temperatures` those of learned methods as far as
-    known (`wheretolook.evaluation.calibration`), `choices` what `choose` gives, if that is known already. A ConfigError
-    is raised if the reference is none of the methods.
+    Returns:
+        One row for each method (and the oracle), N and scene, `scene` being "all" in rows over all scenes. Columns:
+        method, top_n, scene, n_locations, n_views (chosen views), and for each threshold, such as "0.05m_0.4deg":
 
-    One row for each method (and the oracle), N and scene, `scene` being "all" in rows over all scenes. Columns: method,
-    top_n, scene, n_locations, n_views (chosen views), and for each threshold, such as "0.05m_0.4deg":
+        - good_*: number of chosen views that are good.
+        - raw_*: share of good views. normalized_*: divided by the oracle's share; NaN if that is 0. released_*: divided
+          by `RELEASED_DIVISOR`, which can give more than 1.
+        - any_*: share of locations with at least one good view.
+        - regret_*: the oracle's raw share less the method's, at least 0.
+        - difference_*: the method's raw share less the reference's, and p_*, the p-value of
+          `ClusterBootstrap.paired_p`; NaN without a reference, p_* also for random choice.
+        - low_* and high_* of raw_, normalized_, any_, regret_ and difference_, such as raw_low_*: bootstrap interval
+          over blocks of locations, paired where two methods are compared (`ClusterBootstrap.ratio_interval`).
 
-    - good_*: number of chosen views that are good.
-    - raw_*: share of good views. normalized_*: divided by the oracle's share; NaN if that is 0. released_*: divided by
-      `RELEASED_DIVISOR`, which can give more than 1.
-    - any_*: share of locations with at least one good view.
-    - regret_*: the oracle's raw share less the method's, at least 0.
-    - difference_*: the method's raw share less the reference's (`EvaluateConfig.reference`), and p_*, the p-value of
-      `ClusterBootstrap.paired_p`; NaN without a reference, p_* also for random choice, an expectation.
-    - low_* and high_* of raw_, normalized_, any_, regret_ and difference_, such as raw_low_*: bootstrap interval over
-      blocks of locations, paired where two methods meet (`ClusterBootstrap.ratio_interval`).
+        Then reference ("" for none); average_precision and roc_auc of the scores against the first threshold, NaN where
+        all views are of one class; and for learned methods ece (expected calibration error), ece_scaled (with logits
+        divided by the temperature) and temperature, NaN where unknown. A scene without candidates has rows with 0
+        locations and NaN.
 
-    Then reference (the method that differences are from, "" for none); average_precision and roc_auc of the scores
-    against the first threshold, NaN where all views are of one class; and for learned methods, NaN for others, ece
-    (expected calibration error, against the first threshold), ece_scaled (with logits divided by the temperature) and
-    temperature, both NaN where it is not known. A scene without candidates has rows with 0 locations and NaN.
+    Raises:
+        ConfigError: the reference is none of the methods.
     """
-    pools: list[tuple[str, NDArray[np.bool_]]] = [(ALL, np.ones(views.n_locations, dtype=bool))]
-    if len(scenes) > 1:
-        pools += [(name, views.location_scene == number) for number, name in enumerate(scenes)]
-    else:
-        pools += [(scenes[0], pools[0][1])]
+    pools = [(ALL, np.ones(views.n_locations, dtype=bool))]
+    pools += [(name, views.location_scene == number) for number, name in enumerate(scenes)]
     reference = reference_method(scores, config.reference)
     choices = choose(views, scores, config.top_n) if choices is None else choices
     rows: list[dict[str, object]] = []
     for name, locations in pools:
         inside = locations[views.location]
-        block = np.arange(views.n_locations) if views.location_block is None else views.location_block
-        scene = views.location_scene[locations]
-        bootstrap = ClusterBootstrap(block[locations], config.resamples, config.seed, strata=scene)
+        blocks = views.location_block[locations]
+        bootstrap = ClusterBootstrap(blocks, config.resamples, config.seed, strata=views.location_scene[locations])
         good = views.good[inside, 0]
         metrics = {ORACLE: {"average_precision": 1.0, "roc_auc": 1.0, **dict.fromkeys(_CALIBRATION, float("nan"))}}
         for method, values in scores.items():
+            temperature = (temperatures or {}).get(method, float("nan"))
             metrics[method] = _ranking_metrics(good, values[inside])
-            metrics[method] |= _calibration_metrics(method, good, values[inside], (temperatures or {}).get(method))
-        shares = {n: _shares(_only(choices, n, locations), reference, bootstrap, config) for n in config.top_n}
+            metrics[method] |= _calibration_metrics(method, good, values[inside], temperature)
+        shares = {}
+        for n in config.top_n:
+            tops = {method: top.only(locations) for (method, number), top in choices.items() if number == n}
+            shares[n] = _share_columns(tops, reference, bootstrap, config)
         for method in [*scores, ORACLE]:
             for n in config.top_n:
                 row = {"method": method, "top_n": n, "scene": name}
@@ -138,60 +177,43 @@ def score_table(
     return pd.DataFrame(rows)
 
 
-def _only(choices: Choices, n: int, locations: NDArray[np.bool_]) -> dict[str, TopN]:
-    """What the methods choose for one N at some of the locations."""
-    tops = {method: top for (method, number), top in choices.items() if number == n}
-    return {name: TopN(t.chosen[locations], t.good[locations], t.any_good[locations]) for name, t in tops.items()}
-
-
-def _shares(
+def _share_columns(
     tops: Mapping[str, TopN], reference: str, bootstrap: ClusterBootstrap, config: EvaluateConfig
 ) -> dict[str, dict[str, float]]:
-    """Columns of all methods for one N and one pool of locations; M methods are computed together."""
+    """Return the columns of each of M methods for one N and one pool of L locations."""
     good = np.stack([top.good for top in tops.values()], axis=1)  # (L, M, T)
     any_good = np.stack([top.any_good for top in tops.values()], axis=1)
-    chosen = tops[ORACLE].chosen[:, None]  # (L, 1): every method chooses as many
+    chosen = tops[ORACLE].chosen[:, None, None]  # (L, 1, 1): the same for every method
     best = np.broadcast_to(tops[ORACLE].good[:, None], good.shape)
-    n_locations = len(good)
-    n_views = float(chosen.sum())
-    columns = {"good": good.sum(0), "raw": divide(good.sum(0), n_views)}
-    columns["raw_low"], columns["raw_high"] = _interval(bootstrap, good, chosen)
-    columns["normalized"] = divide(good.sum(0), best.sum(0))
-    columns["normalized_low"], columns["normalized_high"] = _interval(bootstrap, good, best)
-    columns["any"] = divide(any_good.sum(0), n_locations)
-    columns["any_low"], columns["any_high"] = _interval(bootstrap, any_good, np.ones((n_locations, 1)))
+    columns = {"good": good.sum(0)}
+
+    def add(name: str, numerator: Float, denominator: Float) -> None:
+        columns[name] = divide(numerator.sum(0), denominator.sum(0))
+        columns[f"{name}_low"], columns[f"{name}_high"] = bootstrap.ratio_interval(numerator, denominator)
+
+    add("raw", good, chosen)
+    add("normalized", good, best)
+    add("any", any_good, np.ones_like(chosen))
     columns["released"] = columns["raw"] / RELEASED_DIVISOR
-    columns["regret"] = divide((best - good).sum(0), n_views)
-    columns["regret_low"], columns["regret_high"] = _interval(bootstrap, best - good, chosen)
+    add("regret", best - good, chosen)
     if not reference:
         columns |= dict.fromkeys(_PAIRED, np.full(good.shape[1:], np.nan))
     else:
         difference = good - tops[reference].good[:, None]
-        columns["difference"] = divide(difference.sum(0), n_views)
-        columns["difference_low"], columns["difference_high"] = _interval(bootstrap, difference, chosen)
-        columns["p"] = bootstrap.paired_p(_flat(difference)).reshape(good.shape[1:])
-        expected = [by_chance(reference) or by_chance(method) for method in tops]
-        columns["p"][expected] = np.nan  # an expectation is no draw
+        add("difference", difference, chosen)
+        columns["p"] = bootstrap.paired_p(difference)
+        expected = [is_random(reference) or is_random(method) for method in tops]
+        columns["p"][expected] = np.nan  # the test does not apply to expectations
     keys = list(enumerate(map(threshold_key, config.thresholds)))
     return {
-        method: {"n_locations": n_locations, "n_views": int(n_views)}
+        method: {"n_locations": len(good), "n_views": int(chosen.sum())}
         | {f"{name}_{key}": float(values[row, index]) for index, key in keys for name, values in columns.items()}
         for row, method in enumerate(tops)
     }
 
 
-def _flat(values: Float) -> Float:
-    return values.reshape(len(values), values.shape[1] * values.shape[2])
-
-
-def _interval(bootstrap: ClusterBootstrap, numerator: Float, denominator: Float) -> tuple[Float, Float]:
-    """Interval of the ratio of sums over locations, (M, T) each end, of (L, M, T) and (L, M, T) or (L, 1)."""
-    low, high = bootstrap.ratio_interval(_flat(numerator), denominator if denominator.ndim == 2 else _flat(denominator))
-    return low.reshape(numerator.shape[1:]), high.reshape(numerator.shape[1:])
-
-
 def _ranking_metrics(good: NDArray[np.bool_], scores: Float) -> dict[str, float]:
-    from sklearn.metrics import average_precision_score, roc_auc_score  # takes a second, and reading a table needs none
+    from sklearn.metrics import average_precision_score, roc_auc_score  # takes a second; reading a table needs none
 
     measures = {"average_precision": average_precision_score, "roc_auc": roc_auc_score}
     if good.all() or not good.any():
@@ -199,13 +221,11 @@ def _ranking_metrics(good: NDArray[np.bool_], scores: Float) -> dict[str, float]
     return {name: float(measure(good, scores)) for name, measure in measures.items()}
 
 
-def _calibration_metrics(
-    method: str, good: NDArray[np.bool_], scores: Float, temperature: float | None
-) -> dict[str, float]:
+def _calibration_metrics(method: str, good: NDArray[np.bool_], scores: Float, temperature: float) -> dict[str, float]:
     metrics = dict.fromkeys(_CALIBRATION, float("nan"))
     if is_probability(method):
         metrics["ece"] = expected_calibration_error(scores, good)
-        if temperature is not None and np.isfinite(temperature):
+        if np.isfinite(temperature):
             scaled = scale_probability(scores, temperature)
             metrics |= {"ece_scaled": expected_calibration_error(scaled, good), "temperature": temperature}
     return metrics

@@ -1,10 +1,11 @@
-"""The scores of all methods for the views of an evaluation."""
+"""Choose the weights of an evaluation, and score its views by all methods."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pandas as pd
@@ -23,65 +24,59 @@ from wheretolook.training.provenance import TrainedModel, was_trained_on, weight
 from wheretolook.training.weights import method_of_weights, read_training
 from wheretolook.utils.errors import TableError, WeightsError
 from wheretolook.utils.files import fingerprint
-from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped
 from wheretolook.visibility.config import OcclusionConfig
 
-BLOCK = 4096  # views binned and scored at a time
-SHIPPED = "that ships"  # stands after the method's name where the weights that ship are compared beside others
-Weights = Mapping[Path, str]  # files of weights, and the name of the method that each serves
+BATCH = 4096  # views binned and scored at a time
+BUNDLED = "that ships"  # follows the method's name in rows of bundled weights that are compared with others
+Weights = Mapping[Path, str]  # files of weights, and the method that each serves
 
 
 def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[TrainedModel | Path] | None) -> Weights:
-    """The weights to evaluate: those given, or those that the configuration names, or the dataset's own.
+    """Return the weights to evaluate: the given models, or those in the configuration, or the dataset's own.
 
     Raises a WeightsError if there are none for a method that needs them, or the dataset's were trained on other data.
     """
-    asked = {name: {method.weights for method in members(name, scorers())} for name in config.methods}
-    wanted = set().union(*asked.values()) - {""}
+    kinds = {name: {method.weights for method in members(name, scorers())} for name in config.methods}
+    wanted = set().union(*kinds.values()) - {""}
     if not wanted:
         return {}
     if models is not None:
         paths = [model if isinstance(model, Path) else model.path for model in models]
     else:
-        paths = list(config.weights) or own_weights(dataset)
-    served = {path: method_of_weights(path) for path in paths}
-    folder = dataset.root / "weights"
-    if not served:
-        need = ", ".join(name for name, kinds in asked.items() if "" not in kinds)
-        fix = f"Run the train stage first, name weights, or leave {need} out of the methods."
-        raise WeightsError("there are no weights to evaluate", path=folder, fix=fix)
-    for name, kinds in asked.items():
-        # who asks for all methods gets those that have been trained
-        if "" not in kinds and not kinds & {*served.values()} and config.methods != EvaluateConfig().methods:
-            fix = f"Run the train stage first, name weights, or leave {name} out of the methods."
-            problem = f"there are no weights of {' or '.join(sorted(kinds))} to evaluate"
-            raise WeightsError(problem, path=folder, fix=fix)
-    return {path: kind for path, kind in served.items() if kind in wanted}
+        paths = [or_shipped(path) for path in config.weights] or own_weights(dataset)
+    weights = {path: method_of_weights(path) for path in paths}
+    available = set(weights.values())
+    missing = [name for name, of_name in kinds.items() if "" not in of_name and not of_name & available]
+    # the default asks for all methods, and takes those that have been trained
+    if missing and (not weights or config.methods != EvaluateConfig().methods):
+        fix = f"Run the train stage first, name weights, or leave {', '.join(missing)} out of the methods."
+        raise WeightsError("there are no weights to evaluate", path=dataset.root / "weights", value=missing, fix=fix)
+    return {path: kind for path, kind in weights.items() if kind in wanted}
 
 
 def own_weights(dataset: Dataset) -> list[Path]:
-    """The weights in the dataset's folder, which must be trained on what the dataset now holds."""
-    paths = {name: weights_path(dataset, name) for name in learned()}
-    found = {name: path for name, path in paths.items() if path.is_file()}
-    for name, path in found.items():
-        # compact tables hold no matches: what has learnt from these has learnt from the dataset they were copied from
-        if name in scorers() and not was_trained_on(dataset, read_training(path)):
+    """Return the weights in a dataset's folder; a WeightsError is raised if the dataset's data has changed since."""
+    paths = [path for name in learned() if (path := weights_path(dataset, name)).is_file()]
+    for path in paths:
+        # methods that learn from matches cannot be compared where compact tables hold none
+        if path.stem in scorers() and not was_trained_on(dataset, read_training(path)):
             fix = "Run the train stage again, remove the file, or name weights in evaluate.weights."
             raise WeightsError(
                 "these weights were trained on other data than the dataset now holds", path=path, fix=fix
             )
-    return list(found.values())
+    return paths
 
 
 def check_unseen(scenes: Sequence[SceneFolder], weights: Weights) -> None:
-    """Raise a WeightsError if weights would be tested on a scene they have learnt from."""
-    landmarks = {fingerprint(scene.landmarks): scene.name for scene in scenes if scene.landmarks.is_file()}
+    """Raise a WeightsError if weights would be tested on a scene that they were trained on."""
+    tested = {fingerprint(scene.landmarks): scene.name for scene in scenes if scene.landmarks.is_file()}
     for path in weights:
-        for seen in read_training(path).get("landmarks", {}).values():
-            if seen in landmarks:
-                problem = "these weights have learnt from a scene of the test split"
+        for trained in read_training(path).get("landmarks", {}).values():
+            if trained in tested:
+                problem = "these weights were trained on a scene of the test split"
                 fix = "Train again without that scene, or evaluate on others."
-                raise WeightsError(problem, path=path, value=landmarks[seen], fix=fix)
+                raise WeightsError(problem, path=path, value=tested[trained], fix=fix)
 
 
 def score_scenes(
@@ -94,60 +89,82 @@ def score_scenes(
     progress: bool,
     occlusion: OcclusionConfig | None,
 ) -> tuple[dict[str, Float], str]:
-    """Scores (B,) by method of the views in scenes' tables, which are binned once, and the occlusion model's name.
+    """Score (B,) the views in scenes' tables by each method; also returns the occlusion model's name.
 
-    The occlusion model is that to see the landmarks by; None for the one that is stored with the sampled locations.
+    The occlusion model None is the one that is stored with the sampled locations.
 
-    Raises a TableError if a method gives scores that are not finite; a WeightsError if weights were trained for another
-    field of view; a MapError or SceneError if a scene has no landmarks, or no mesh where one is needed; a ConfigError
-    if the reference is none of the methods.
+    Raises:
+        TableError: a method gives scores that are not finite.
+        WeightsError: weights were trained for another field of view.
+        MapError, SceneError: a scene has no landmarks, or no mesh where one is needed.
+        ConfigError: the reference is none of the methods.
     """
     scores: dict[str, list[Float]] = {}
     used: set[str] = set()
     text = f"score {scenes[0].split} views" + ("" if occlusion is None else f", {occlusion.model}")
     with tqdm(total=sum(map(len, tables)), desc=text, unit="view", disable=not progress) as bar:
         for scene, table in zip(scenes, tables, strict=True):
-            localization_map = scene.localization_map(device=device)
-            # a release has no mesh, but what each location sees by it
-            if occlusion is not None and (scene.mesh.is_file() or occlusion.model != localization_map.occlusion.name):
-                opened = SceneEnvironment(scene, config=EnvironmentConfig(occlusion), device=device, progress=progress)
-                localization_map = replace(localization_map, occlusion=opened.occlusion)
+            localization_map = _open_map(scene, occlusion, device, progress)
             used.add(localization_map.occlusion.name)
-            cam_from_world = poses(table)
-            looking = None
-            of_scene: dict[str, Float] = {}
-            for camera, rows in views_by_camera(scene, table, BLOCK):
-                if camera != looking:
-                    looking = camera
-                    looked_at = localization_map.of_camera(camera)
-                    scorers = scorers_of(looked_at, config, weights)
-                    reference_method(scorers, config.reference)  # an unknown one is told before the work
-                block = cam_from_world[rows]
-                binned = looked_at.bin_views(block)
-                for method, scorer in scorers.items():
-                    values = scorer.score_binned(block, binned)
-                    if not np.isfinite(values).all():
-                        problem = "a method gives scores that are not finite"
-                        fix = "Check the scene's landmarks and poses, and the weights; or leave the method out."
-                        raise TableError(problem, path=scene.folder, value=method, fix=fix)
-                    of_scene.setdefault(method, np.empty(len(table)))[rows] = values
-                bar.update(len(block))
-            for method, values in of_scene.items():
+            for method, values in _score_scene(scene, table, localization_map, config, weights, bar).items():
                 scores.setdefault(method, []).append(values)
     return {method: np.concatenate(parts) for method, parts in scores.items()}, " ".join(sorted(used))
+
+
+def _open_map(scene: SceneFolder, occlusion: OcclusionConfig | None, device: str, progress: bool) -> LocalizationMap:
+    localization_map = scene.localization_map(device=device)
+    # a release has no mesh, but stores visibility by it for each location
+    if occlusion is None or not (scene.mesh.is_file() or occlusion.model != localization_map.occlusion.name):
+        return localization_map
+    environment = SceneEnvironment(scene, config=EnvironmentConfig(occlusion), device=device, progress=progress)
+    return replace(localization_map, occlusion=environment.occlusion)
+
+
+def _score_scene(
+    scene: SceneFolder,
+    table: pd.DataFrame,
+    localization_map: LocalizationMap,
+    config: EvaluateConfig,
+    weights: Weights,
+    bar: tqdm[NoReturn],
+) -> dict[str, Float]:
+    """Score (B,) the views of one scene by each method; each batch is binned once for all methods."""
+    cam_from_world = poses(table)
+    scores: dict[str, Float] = {}
+    current = None
+    for camera, rows in views_by_camera(scene, table, BATCH):
+        if camera != current:
+            current = camera
+            of_camera = localization_map.of_camera(camera)
+            scorers_by_row = scorers_of(of_camera, config, weights)
+            reference_method(scorers_by_row, config.reference)  # fails before the work
+        batch = cam_from_world[rows]
+        binned = of_camera.bin_views(batch)
+        for method, scorer in scorers_by_row.items():
+            values = scorer.score_binned(batch, binned)
+            if not np.isfinite(values).all():
+                problem = "a method gives scores that are not finite"
+                fix = "Check the scene's landmarks and poses, and the weights; or leave the method out."
+                raise TableError(problem, path=scene.folder, value=method, fix=fix)
+            scores.setdefault(method, np.empty(len(table)))[rows] = values
+        bar.update(len(batch))
+    return scores
 
 
 def scorers_of(
     localization_map: LocalizationMap, config: EvaluateConfig, weights: Weights, anywhere: bool = False
 ) -> dict[str, Scorer]:
-    """The scorers to compare, by the names of their rows; `anywhere` as of `make_scorer`, or as the options say."""
-    found: dict[str, Scorer] = {}
-    insists = anywhere or config.anywhere
+    """Return the scorers to compare, by their names in the table.
+
+    With `anywhere` (or the option of that name) weights adapted to another scene are allowed.
+    """
+    by_name: dict[str, Scorer] = {}
     for method in methods_named(config.methods, scorers()):
         paths = [path for path, kind in weights.items() if kind == method.weights]
         for path in paths if method.weights else [None]:
-            scorer = make_scorer(method.name, localization_map, config.seed, path, config.heading, insists)
-            # two files of one method are told apart by their names
-            which = SHIPPED if path is not None and path.parent == shipped(WEIGHTS) else path
-            found[f"{method.name} {which}" if method.name in found else method.name] = scorer
-    return found
+            options = (config.seed, path, config.heading, anywhere or config.anywhere)
+            scorer = make_scorer(method.name, localization_map, *options)
+            # files of the same method are distinguished by their names
+            which = BUNDLED if path is not None and path.parent == shipped(WEIGHTS) else path
+            by_name[f"{method.name} {which}" if method.name in by_name else method.name] = scorer
+    return by_name

@@ -14,8 +14,7 @@ from matplotlib.style import context
 from matplotlib.ticker import MaxNLocator
 
 from wheretolook.dataset.thresholds import ALL, threshold_label
-from wheretolook.evaluation.score_table import main_rows, reference_of, threshold_keys
-from wheretolook.evaluation.scores import by_chance
+from wheretolook.evaluation.scores import is_random, main_rows, reference_of, threshold_keys
 from wheretolook.figures.style import INK, RC, Style, new_figure
 from wheretolook.scorers.styles import ORACLE, method_group, method_style
 
@@ -99,7 +98,7 @@ def methods_to_show(pooled: pd.DataFrame, key: str) -> list[str]:
 def _close_to_oracle(pooled: pd.DataFrame, shown: Sequence[str], key: str) -> list[str]:
     """Select the methods at least halfway from random choice to the oracle, or all."""
     shares = _first_rows(pooled)[f"normalized_{key}"].fillna(0.0)
-    baseline = max((share for method, share in shares.items() if by_chance(str(method))), default=0.0)
+    baseline = max((share for method, share in shares.items() if is_random(str(method))), default=0.0)
     return [method for method in shown if shares[method] >= (1 + baseline) / 2] or list(shown)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from wheretolook.dataset.layout import SceneFolder
-from wheretolook.evaluation.photographs import LeftOutPhotographs
+from wheretolook.evaluation.photographs import HeldOutPhotographs
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.holdout.holdout import LeftOut
 from wheretolook.holdout.metrics import places_of
@@ -42,7 +42,7 @@ def evaluated_photographs(
     left_out: Sequence[LeftOut],
     occlusion: OcclusionModel,
     device: str = "cpu",
-) -> LeftOutPhotographs:
+) -> HeldOutPhotographs:
     """The photographs of all blocks of a scene's map as views of an evaluation.
 
     Where metres are not known, errors are brought to those of a map in which each limit is 5 cm.
@@ -57,4 +57,4 @@ def evaluated_photographs(
     place = places_of(camera_centers(poses), views["block"].to_numpy(np.int64), place_radius(source))
     error_m = views["error_m"] * (MAX_ERROR_M / views["limit_m"])
     views = views.assign(photograph=views["row"], place=place, error_m=error_m)
-    return LeftOutPhotographs(scene, views, poses, maps)
+    return HeldOutPhotographs(scene, views, poses, maps)

@@ -13,7 +13,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.evaluation.photographs import number_of
+from wheretolook.evaluation.photographs import score_scale
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
 from wheretolook.holdout.holdout import LeftOut
@@ -126,13 +126,13 @@ def _by_camera(cameras: Sequence[Camera]) -> list[tuple[Camera, NDArray[np.int64
 def _score(around: LocalizationMap, poses: Float, scoring: Scoring) -> dict[str, Any]:
     scorer = _quietly(replace(scoring, anywhere=True).scorer, around)  # `check_place` has seen to it
     told = _quietly(scorer.report, poses)
-    found: dict[str, Any] = {"name": scorer.name, "score": told.score * number_of(scorer.name, around)}
+    found: dict[str, Any] = {"name": scorer.name, "score": told.score * score_scale(scorer.name, around)}
     found |= {"expected_inliers": told.expected_inliers, "n_visible": told.n_visible, "in_range": told.in_range}
     found[VISIBLE] = told.n_visible
     for other in scoring.also:
         if other not in (VISIBLE, scorer.name):
             beside = make_scorer(other, around, weights=resolve_weights(other, features=around.landmarks.features))
-            found[other] = _quietly(beside.score, poses) * number_of(other, around)
+            found[other] = _quietly(beside.score, poses) * score_scale(other, around)
     return found
 
 

@@ -23,7 +23,7 @@ from wheretolook.visibility.config import OcclusionConfig
 from wheretolook_paper.commands.look_sets import evaluate_looks
 
 if TYPE_CHECKING:
-    from wheretolook.evaluation.photographs import LeftOutPhotographs
+    from wheretolook.evaluation.photographs import HeldOutPhotographs
     from wheretolook.training.provenance import TrainedModel
 
 
@@ -48,7 +48,7 @@ def evaluate(experiment: Experiment, say: Say = print, tick: Tick = lambda work:
     return scores
 
 
-def _photographs(experiment: Experiment, dataset: Dataset, say: Say) -> list[LeftOutPhotographs]:
+def _photographs(experiment: Experiment, dataset: Dataset, say: Say) -> list[HeldOutPhotographs]:
     """The photographs of the maps of a split's scenes, left out of them."""
     from wheretolook.holdout.holdout_views import evaluated_photographs
     from wheretolook.holdout.photo_map import says_metric
@@ -79,7 +79,7 @@ def evaluate_methods(
     device: str = "cpu",
     occlusion: OcclusionConfig = OcclusionConfig(),
     show: bool = True,
-    photographs: Sequence[LeftOutPhotographs] = (),
+    photographs: Sequence[HeldOutPhotographs] = (),
 ) -> pd.DataFrame:
     """Compare all methods on the scenes of one split.
 
@@ -133,8 +133,7 @@ def write_results(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, 
     """Write tables, report, calibration curves (if any) and figures; those of an earlier evaluation go."""
     from wheretolook.evaluation import results
     from wheretolook.evaluation.report import score_markdown
-    from wheretolook.evaluation.score_table import main_rows
-    from wheretolook.evaluation.scores import read_scores
+    from wheretolook.evaluation.scores import main_rows, read_scores
     from wheretolook.figures.calibration import calibration_figure
     from wheretolook.figures.scores import regret_figure, score_figure
     from wheretolook.figures.style import save_figure

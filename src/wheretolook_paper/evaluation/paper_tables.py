@@ -9,12 +9,12 @@ from pathlib import Path
 import pandas as pd
 
 from wheretolook.dataset.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
-from wheretolook.evaluation.score_table import main_rows, methods_of
-from wheretolook.evaluation.scores import RELEASED_DIVISOR
+from wheretolook.evaluation.scores import RELEASED_DIVISOR, main_rows, methods_of
 from wheretolook.scorers.registry import find
 from wheretolook.scorers.styles import method_style
 from wheretolook.utils.files import write_text
 from wheretolook.utils.markdown import markdown_table
+from wheretolook_paper.evaluation.comparisons import comparisons_markdown
 
 KEYS = tuple(map(threshold_key, THRESHOLDS))  # the paper's thresholds
 
@@ -115,8 +115,12 @@ def _is_network(method: str) -> bool:
 
 
 def write_paper_tables(scores: pd.DataFrame, folder: Path) -> list[Path]:
-    """Write `table_vs_others` and `table_input_variants` (`paper_tables`) into a folder as .csv, .tex and .md files."""
-    paths = []
+    """Write `table_vs_others` and `table_input_variants` (`paper_tables`) into a folder as .csv, .tex and .md files.
+
+    Also writes `comparisons.md` (`comparisons_markdown`).
+    """
+    paths = [folder / "comparisons.md"]
+    write_text(paths[0], comparisons_markdown(scores))
     for name, table in paper_tables(scores).items():
         texts = {
             "csv": table.to_csv(index=False, float_format="%.2f"),

@@ -12,8 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.style import context
 
 from wheretolook.dataset.thresholds import ALL, threshold_label
-from wheretolook.evaluation.score_table import main_rows, methods_of, threshold_keys
-from wheretolook.evaluation.scores import by_chance
+from wheretolook.evaluation.scores import is_random, main_rows, methods_of, threshold_keys
 from wheretolook.figures.scores import methods_to_show
 from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.scorers.styles import ORACLE, method_style
@@ -38,7 +37,7 @@ def occlusion_figure(scores: pd.DataFrame) -> Figure:
     models = list(pooled["occlusion"].unique())
     chosen = "best view" if n == 1 else f"best {n} views"
     first = pooled[pooled["occlusion"] == models[0]]
-    methods = [method for method in methods_to_show(first, key) if not by_chance(method)]
+    methods = [method for method in methods_to_show(first, key) if not is_random(method)]
     methods = [method for method in methods if _depends(pooled[pooled["method"] == method])] or methods
     y = {method: float(row) for row, method in enumerate(methods)}
     with context(RC):
@@ -59,7 +58,7 @@ def occlusion_figure(scores: pd.DataFrame) -> Figure:
             axes.tick_params(axis="y", length=0)
         names = [_LABELS.get(model, model) for model in models]
         handles = [Line2D([], [], linestyle="none", label=x, **_mark(n, INK)) for n, x in enumerate(names)]
-        labels = [method_style(name).label for name in (ORACLE, *filter(by_chance, methods_of(pooled)))]
+        labels = [method_style(name).label for name in (ORACLE, *filter(is_random, methods_of(pooled)))]
         handles += [line for line in right.lines if line.get_label() in labels]
         figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), columnspacing=1.4)
         return figure
@@ -99,7 +98,7 @@ def _draw(
                 low, high = (by_model[end].iloc[number] for end in ends)
                 axes.hlines(place + shift[number], low, high, color=style.color, linewidth=0.9)
             axes.plot(value, place + shift[number], **_mark(number, style.color), linestyle="none")
-    for method in filter(by_chance, methods_of(pooled)):
+    for method in filter(is_random, methods_of(pooled)):
         style = method_style(method)
         value = scale * pooled.loc[pooled["method"] == method, column].iloc[0]
         axes.axvline(value, color=style.color, linestyle=style.dashes, label=style.label, zorder=1)

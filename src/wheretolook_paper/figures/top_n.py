@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.style import context
 
 from wheretolook.dataset.thresholds import ALL, threshold_label
-from wheretolook.evaluation.score_table import main_rows, methods_of, threshold_keys
+from wheretolook.evaluation.scores import main_rows, methods_of, threshold_keys
 from wheretolook.figures.style import GREY, PRINT, TWO_COLUMNS_IN, Style, new_figure
 from wheretolook.scorers.registry import all_methods, find
 from wheretolook.scorers.styles import ORACLE, method_style

@@ -25,6 +25,7 @@ from wheretolook.utils.files import sha256, write_text
 from wheretolook.utils.markdown import markdown_table
 from wheretolook.utils.reading import read_json_object
 from wheretolook.visibility.occlusion import StoredOcclusion
+from wheretolook_paper.evaluation.comparisons import comparisons_markdown
 from wheretolook_paper.release.copy import CARD, SHELF, read_about, size_text, sizes
 
 GENERALIZATION_CSV = "generalization.csv"
@@ -111,13 +112,13 @@ def release_card(release: Dataset, defaults: Mapping[str, Any]) -> str:
         _HOW_TO_USE.format(root=root),
         "## Scores",
         f"On the test scenes, of which nothing was learnt. The weights are {_names(release)}.",
-        _demoted(score_markdown(read_scores(results / SCORES_CSV), f"Localization score on {source}")),
+        _demoted(_score_tables(read_scores(results / SCORES_CSV), f"Localization score on {source}")),
     ]
     if (results / VARIANTS_CSV).is_file():
         lines += [
             "## Scores of all that was trained",
             "Before what ships was chosen by its validation metrics (see Training), in full precision.",
-            _demoted(score_markdown(read_scores(results / VARIANTS_CSV), f"Localization score on {source}")),
+            _demoted(_score_tables(read_scores(results / VARIANTS_CSV), f"Localization score on {source}")),
         ]
     if (results / GENERALIZATION_CSV).is_file():
         others = read_scores(results / GENERALIZATION_CSV)
@@ -127,7 +128,7 @@ def release_card(release: Dataset, defaults: Mapping[str, Any]) -> str:
         if len(others) and (results / GENERALIZATION_MD).is_file():
             lines += [(results / GENERALIZATION_MD).read_text()]
         for name, part in others.groupby("dataset", sort=False):
-            lines += [_demoted(score_markdown(part.drop(columns="dataset"), f"Localization score on {name}"))]
+            lines += [_demoted(_score_tables(part.drop(columns="dataset"), f"Localization score on {name}"))]
     lines += [
         "## Data",
         _scenes_text(about["settings"]["scenes"]),
@@ -188,6 +189,10 @@ def _network(release: Dataset) -> Path:
         fix = f"Run `wheretolook release --config configs/{release.name}.yaml`."
         raise WeightsError(problem, path=release.root / "weights", value=[path.name for path in found], fix=fix)
     return found[0]
+
+
+def _score_tables(scores: pd.DataFrame, title: str) -> str:
+    return f"{score_markdown(scores, title)}\n{comparisons_markdown(scores)}"
 
 
 def _demoted(markdown: str) -> str:

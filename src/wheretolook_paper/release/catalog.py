@@ -33,6 +33,7 @@ from wheretolook.utils.errors import ConfigError, MissingRunError, WhereToLookEr
 from wheretolook.utils.files import write_text
 from wheretolook.utils.markdown import markdown_table
 from wheretolook.weights.resolve import load_scorer
+from wheretolook_paper.evaluation.comparisons import comparisons_markdown
 from wheretolook_paper.evaluation.looks import LOOKS_CSV
 from wheretolook_paper.figures.inputs import inputs_figure
 from wheretolook_paper.figures.lattices import fibonacci_figure
@@ -159,7 +160,7 @@ def _of_scores(draw: Callable[[pd.DataFrame], Figure]) -> Drawer:
 
 def _score_table(source: Source) -> Texts:
     scores = read_scores(source.file(SCORES_CSV))
-    return {"md": score_markdown(scores), "csv": scores.to_csv(index=False)}
+    return {"md": f"{score_markdown(scores)}\n{comparisons_markdown(scores)}", "csv": scores.to_csv(index=False)}
 
 
 def _training(source: Source) -> Figure:

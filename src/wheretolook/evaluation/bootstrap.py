@@ -72,8 +72,7 @@ class ClusterBootstrap:
 
     def _weighted(self, values: Float) -> Float:
         """Sums (1 + R, ...) of values (L, ...) over the data and over each resample."""
-        sums = self.sums(values)
-        return (self.times @ sums.reshape(self.n_clusters, -1)).reshape(len(self.times), *sums.shape[1:])
+        return np.tensordot(self.times, self.sums(values), axes=1)
 
     def interval(self, values: Float) -> tuple[Float, Float]:
         """95 % percentile interval of statistics (1 + R, ...), of the data and of the resamples, without NaN.
@@ -108,11 +107,11 @@ class ClusterBootstrap:
             return np.full(differences.shape[1:], np.nan)
         shape = (len(self.times) - 1, self.n_clusters)
         signs = 1 - 2.0 * np.random.default_rng([self._seed, 0, _SIGNS]).integers(0, 2, shape, dtype=np.int8)
-        by_cluster = self.sums(differences).reshape(self.n_clusters, -1)
+        by_cluster = self.sums(differences)
         # sums that are equal up to rounding count as equal
         observed = np.abs(by_cluster.sum(0)) - 1e-9 * np.abs(by_cluster).sum(0)
-        as_far = (np.abs(signs @ by_cluster) >= observed).sum(0)
-        return np.asarray((1 + as_far) / (len(signs) + 1)).reshape(differences.shape[1:])
+        as_far = (np.abs(np.tensordot(signs, by_cluster, axes=1)) >= observed).sum(0)
+        return np.asarray((1 + as_far) / (len(signs) + 1))
 
 
 def divide(numerator: Float, denominator: Float | float) -> Float:

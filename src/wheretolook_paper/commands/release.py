@@ -78,9 +78,13 @@ def _finish(experiment: Experiment, dataset: Dataset, say: Say, tick: Tick) -> D
 def release_settings(experiment: Experiment) -> dict[str, Any]:
     """Settings that decide what a dataset holds, as JSON values. Meshes go by name: paths mean nothing elsewhere."""
     meshes = [{"name": mesh.scene_name, "split": mesh.split, "up": mesh.up} for mesh in experiment.scenes.meshes]
-    settings = {name: asdict(getattr(experiment, name)) for name in ("scenes", "map", "occlusion", "sample")}
+    settings = {name: _record(getattr(experiment, name)) for name in ("scenes", "map", "occlusion", "sample")}
     settings = {"camera": experiment.camera.camera.record(), **settings}
     settings["scenes"]["meshes"] = meshes
-    settings["map"]["extractor"] = experiment.map.extractor.record()
     settings["label"] = {"localizer": experiment.label.localizer.record()}
     return dict(json.loads(json.dumps(settings, default=str)))
+
+
+def _record(config: Any) -> dict[str, Any]:
+    """Return a group of options with the constants that it records."""
+    return dict(config.record() if hasattr(config, "record") else asdict(config))

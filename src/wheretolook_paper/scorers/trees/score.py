@@ -1,8 +1,9 @@
-"""The score of boosted trees, which know what landmarks are like."""
+"""The score of boosted trees."""
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import expit
 
 from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.inputs.channels import ATTRIBUTES
@@ -14,27 +15,25 @@ from wheretolook_paper.scorers.trees.learn import BoostedTrees
 
 
 class TreesScorer(LandmarkScorer):
-    """Boosted trees on where the landmarks in view lie and how they were mapped: the probability that a view
-    localizes.
-    """
+    """Probability that a view localizes, by boosted trees on the positions and attributes of its visible landmarks."""
 
     name = "trees"
     local = True
 
     def __init__(self, localization_map: LocalizationMap, trees: BoostedTrees) -> None:
         super().__init__(localization_map, ATTRIBUTES, trees.training_range, trees.camera)
-        self.trees = trees.to(localization_map.device)
+        self.trees = trees
 
     def score(self, cam_from_world: Float) -> Float:
-        """(B,) probabilities in [0, 1]."""
+        """Return probabilities (B,) in [0, 1]."""
         cam_from_world = check_poses(cam_from_world)
         scores = np.empty(len(cam_from_world))
-        looked_at: list[Float] = []
+        quantities: list[Float] = []
         for begin in range(0, len(scores), BLOCK):
             block = cam_from_world[begin : begin + BLOCK]
             described = self.describer.describe(block)
-            looked_at += self._quantities(described, described.counts)
+            quantities += self._quantities(described, described.counts)
             pooled = pool(described, block, self.localization_map.camera)
-            scores[begin : begin + BLOCK] = self.trees.logits(pooled).sigmoid().cpu().numpy()
-        self._watch.check(self.name, looked_at)
+            scores[begin : begin + BLOCK] = expit(self.trees.logits(pooled.cpu().numpy()))
+        self._watch.check(self.name, quantities)
         return scores

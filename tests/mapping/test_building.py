@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +12,12 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping import triangulation
-from wheretolook.mapping.colmap_model import load_mapping_poses
 from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG, MapConfig, WalkConfig
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.rendered_map import build_map
 from wheretolook.mapping.walk import plan_walk
 from wheretolook.rendering.warp_renderer import WarpRenderer
-from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.errors import MapError
 from wheretolook.utils.processes import WorkerPool
 
 CAMERA = PinholeCamera(320, 240, 160.0)
@@ -72,15 +69,6 @@ def test_model_reopens_with_the_poses_of_the_walk(built, room, room_free_space):
         np.testing.assert_allclose(image.cam_from_world().matrix(), pose, atol=1e-9)
 
 
-def test_stored_poses_are_those_of_the_model(built):
-    folder, _ = built
-    images = pycolmap.Reconstruction(str(folder)).images
-    expected = np.stack([images[number].cam_from_world().matrix() for number in sorted(images)])
-    stored = load_mapping_poses(folder / "cameras.npz")
-    assert stored.shape == (CONFIG.n_images, 3, 4) and stored.dtype == np.float32
-    np.testing.assert_array_equal(stored, expected.astype(np.float32))
-
-
 def test_landmarks_project_to_their_keypoints(built):
     folder, report = built
     model = pycolmap.Reconstruction(str(folder))
@@ -127,14 +115,6 @@ def test_stored_landmarks_are_those_of_the_model_and_its_database(built):
     assert stored.triangulation_angle_deg.min() > 0.9 * MIN_TRIANGULATION_ANGLE_DEG
 
 
-def test_report_is_on_disk(built):
-    folder, report = built
-    assert json.loads((folder / "report.json").read_text()) == json.loads(json.dumps(asdict(report)))
-    assert report.n_images == 14 and 12 <= report.n_registered <= 14
-    assert report.coverage >= CONFIG.walk.coverage
-    assert report.config["extractor"]["method"] == "opencv"
-
-
 @pytest.mark.slow
 def test_same_seed_same_bytes_whatever_the_workers(built, room, room_free_space, renderer, tmp_path, monkeypatch):
     monkeypatch.setattr(triangulation, "_PAIRS_AT_A_TIME", 16)  # so that both workers match
@@ -166,67 +146,9 @@ def test_no_two_threads_match_in_one_process(room, room_free_space, renderer, tm
     assert set(threads) == {1}
 
 
-def test_two_view_landmarks_add_short_tracks(built, room, room_free_space, renderer, tmp_path):
-    folder, many = built
-    config = replace(CONFIG, two_view_landmarks=False, keep_images=False, keep_database=False)
-    few = build_map(room, renderer, room_free_space, CAMERA, config, SEED, tmp_path / "map", workers=1, progress=False)
-    length = Landmarks.load(folder / "landmarks.npz").track_length
-    assert (length == 2).sum() > 0.3 * len(length)
-    assert many.n_landmarks > 1.3 * few.n_landmarks
-    assert many.median_track_length < few.median_track_length
-
-
-@pytest.mark.slow
-def test_earlier_map_is_replaced_and_extras_are_optional(room, room_free_space, renderer, tmp_path):
-    folder = tmp_path / "map"
-    config = MapConfig(n_images=10, walk=WalkConfig(image_spacing_m=0.35))
-    build_map(room, renderer, room_free_space, CAMERA, config, 0, folder, workers=1, progress=False)
-    first = (folder / "landmarks.npz").read_bytes()
-    (folder / "stale.txt").write_text("of the earlier map")
-    build_map(room, renderer, room_free_space, CAMERA, config, 1, folder, workers=1, progress=False)
-    assert (folder / "landmarks.npz").read_bytes() != first
-    model_files = {"cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"}
-    assert {p.name for p in folder.iterdir()} == model_files | {"landmarks.npz", "cameras.npz", "report.json"}
-    assert [p.name for p in tmp_path.iterdir()] == ["map"]
-
-
-class FailingRenderer:
-    """Renders the first batch and is then interrupted, as by Ctrl-C."""
-
-    def __init__(self, renderer: WarpRenderer, error: type[BaseException]) -> None:
-        self.renderer = renderer
-        self.error = error
-        self.calls = 0
-
-    def render(self, camera, cam_from_world):
-        self.calls += 1
-        if self.calls > 1:
-            raise self.error
-        return self.renderer.render(camera, cam_from_world)
-
-
-@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
-@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_failed_build_leaves_nothing_and_keeps_the_earlier_map(
-    room, room_free_space, renderer, tmp_path, error, workers
-):
-    failing = FailingRenderer(renderer, error)
-    folder = tmp_path / "map"
-    with pytest.raises(error):
-        build_map(room, failing, room_free_space, CAMERA, CONFIG, SEED, folder, workers=workers, progress=False)
-    assert list(tmp_path.iterdir()) == []
-    folder.mkdir()
-    (folder / "report.json").write_text("{}")
-    failing.calls = 0
-    with pytest.raises(error):
-        build_map(room, failing, room_free_space, CAMERA, CONFIG, SEED, folder, workers=1, progress=False)
-    assert [p.name for p in tmp_path.iterdir()] == ["map"]
-    assert (folder / "report.json").read_text() == "{}"
-
-
 def test_other_peoples_folders_are_not_replaced(room, room_free_space, renderer, tmp_path):
     (tmp_path / "thesis.tex").write_text("precious")
-    with pytest.raises(MapError, match="not a map"):
+    with pytest.raises(MapError):
         build_map(room, renderer, room_free_space, CAMERA, CONFIG, SEED, tmp_path, progress=False)
     assert (tmp_path / "thesis.tex").read_text() == "precious"
 
@@ -239,14 +161,8 @@ def test_scene_without_texture_gives_no_map(room, room_free_space, tmp_path):
         room.triangle_texture,
         tuple(np.full((8, 8, 3), 30 * i + 60, np.uint8) for i in range(6)),
     )
-    with pytest.raises(MapError, match="no landmark"):
+    with pytest.raises(MapError):
         build_map(
             plain, WarpRenderer(plain), room_free_space, CAMERA, CONFIG, 0, tmp_path / "map", workers=1, progress=False
         )
     assert list(tmp_path.iterdir()) == []
-
-
-def test_bad_settings():
-    for settings in ({"n_images": 1}, {"max_reprojection_error_px": 0.0}):
-        with pytest.raises(ConfigError):
-            MapConfig(**settings)

@@ -1,4 +1,4 @@
-"""Landmarks of a map and what is known about each: the input of visibility, features and scorers."""
+"""Landmarks of a map and their attributes: the input of visibility, features and scorers."""
 
 from __future__ import annotations
 
@@ -25,14 +25,15 @@ if TYPE_CHECKING:
     import pycolmap
 
 _BLOCK = 4096  # landmarks whose tracks are gathered at a time
-_SILENT_S = 2.0  # progress is shown of what takes longer
-_WHOLE = ("ids", "track_length", "descriptors")  # arrays of whole numbers; all others are of floats
-_TILE = 512  # descriptors along a side of a product that stays in the cache
+_PROGRESS_AFTER_S = 2.0
+_INTEGERS = ("ids", "track_length")  # arrays in a file; all others but descriptors are of floats
+_ROW_SHAPES = {"points": (3,), "mapping_direction": (3,)}  # of arrays in a file; all others have one number a landmark
+_TILE = 512  # descriptors along a side of a product that fits into the cache
 
 
 @dataclass(frozen=True, eq=False)
 class Landmarks:
-    """Landmarks, one a row, sorted by id."""
+    """Landmarks of a map, one per row, sorted by id."""
 
     ids: NDArray[np.int64]  # (N,) COLMAP's point3D_id
     points: NDArray[np.float64]  # (N, 3) world, metres
@@ -42,22 +43,19 @@ class Landmarks:
     mapping_direction: NDArray[np.float32]  # (N, 3) unit mean direction from the mapping cameras to the landmark, world
     mapping_direction_spread: NDArray[np.float32]  # (N,) 1 - |mean of the unit directions|: 0 if all are the same
     mapping_distance_m: NDArray[np.float32]  # (N,) mean distance of the mapping cameras
-    mapping_distance_spread: NDArray[np.float32]  # (N,) standard deviation of these over their mean; NaN in old files
+    mapping_distance_spread: NDArray[np.float32]  # (N,) standard deviation of these over their mean
     # (N, D) mean over the track of the unit descriptors, as their kind is stored: of SIFT (N, 128) uint8, times 512 as
     # COLMAP stores them; None without a database
     descriptors: NDArray[Any] | None
     # (N,) cosine between the descriptor and the nearest one of another landmark; NaN without descriptors or others
     ambiguity: NDArray[np.float32]
-    # (N,) mean focal length of the mapping cameras, of the logarithms; None in files from before it was told
+    # (N,) geometric mean of the mapping cameras' focal lengths; None in the released maps, which have one camera
     mapping_focal_px: NDArray[np.float32] | None = None
-    described_by: str | None = None  # the kind of learned descriptors; None for SIFT, or where there were none
+    described_by: str | None = None  # the kind of learned descriptors; None for SIFT, or without descriptors
 
     @property
     def features(self) -> str:
-        """Name of the kind of descriptors that the landmarks have, or had: see `wheretolook.features.registry`.
-
-        "" if there were none.
-        """
+        """Name in `wheretolook.features.registry` of the descriptors that the map was built with; "" without any."""
         if self.described_by is not None:
             return self.described_by
         return SIFT.name if self.descriptors is not None or np.isfinite(self.ambiguity).any() else ""
@@ -84,9 +82,9 @@ class Landmarks:
     def save(self, path: str | Path, compact: bool = False) -> None:
         """Write an NPZ file, atomically. The same landmarks give the same bytes.
 
-        `compact` leaves out the descriptors, writes points in single (far from the origin in double) and attributes in
-        half precision, and compresses: about 28 bytes a landmark. Such landmarks serve visibility, features and
-        scorers, but not localization.
+        `compact` omits the descriptors, writes points in single (far from the origin in double) and attributes in
+        half precision, and compresses: about 28 bytes a landmark. Such landmarks suffice for visibility, features and
+        scorers, but not for localization.
         """
         arrays = (f.name for f in fields(self) if f.name != "described_by")
         values = {name: getattr(self, name) for name in arrays if getattr(self, name) is not None}
@@ -100,67 +98,53 @@ class Landmarks:
 
     @classmethod
     def load(cls, path: str | Path) -> Landmarks:
-        """Read what `save` wrote, compact or not. MapError if the file is missing, truncated, or not of landmarks."""
-        path = Path(path)
-        fix = "Run the map stage again."
-        if not path.is_file():
-            raise MapError("there is no file of landmarks", path=path, fix=fix)
+        """Read what `save` wrote, compact or not. Raises MapError if the file is missing or not valid."""
         try:
-            values = load_npz(path)
-        except ValueError as error:
-            raise MapError(str(error), path=path, fix=fix) from error
-        described_by = values.pop("described_by", None)
-        if described_by is not None and str(described_by) not in all_kinds():
-            fix = f"There are {', '.join(all_kinds())}: update wheretolook, or map again."
-            raise MapError("landmarks of unknown features", path=path, value=str(described_by), fix=fix)
-        kind = SIFT if described_by is None else all_kinds()[str(described_by)]
-        names = {f.name for f in fields(cls)} - {"described_by"}
-        if set(values) and "mapping_distance_spread" not in values and "mapping_distance_m" in values:
-            values["mapping_distance_spread"] = np.full(values["mapping_distance_m"].shape[:1], np.nan, np.float32)
-        if set(values) | {"descriptors", "mapping_focal_px"} != names:
-            raise MapError("not a file of landmarks", path=path, value=sorted(values), fix=fix)
-        for name, value in values.items():
-            whole = name in _WHOLE and (name != "descriptors" or kind.in_bytes)
-            if value.ndim == 0 or value.dtype.kind not in ("iu" if whole else "f"):
-                problem = f"the array {name} is not one of {'whole ' if whole else ''}numbers, one a landmark"
-                raise MapError(problem, path=path, value=f"{value.dtype} {value.shape}", fix=fix)
-        if len({len(v) for v in values.values()}) != 1 or values["points"].shape[1:] != (3,):
-            raise MapError("the arrays disagree on the number of landmarks", path=path, fix=fix)
-        sides = {"points": (3,), "mapping_direction": (3,)}
-        for name, value in values.items():
-            if value.shape[1:] != sides.get(name, ()) and (name != "descriptors" or value.ndim != 2):
-                raise MapError(f"the array {name} has another shape", path=path, value=value.shape, fix=fix)
-        if not np.isfinite(values["points"]).all():
-            raise MapError("some landmarks are not at finite places", path=path, fix=fix)
-        found = values.get("descriptors")
-        if found is not None and kind is not SIFT and found.shape[1] != kind.dimension:
-            problem = f"descriptors of {kind.name} have {kind.dimension} numbers"
-            raise MapError(problem, path=path, value=found.shape[1], fix=fix)
-        arrays: dict[str, Any] = {
-            "descriptors": None,
-            "mapping_focal_px": None,
-            **_floats(values, points=np.float64, others=np.float32),
-            "described_by": None if described_by is None else kind.name,
-        }
-        if found is not None:
-            arrays["descriptors"] = found  # halves stay halves
-        return cls(**arrays)
+            return cls(**_validated(load_npz(Path(path))))
+        except (ValueError, KeyError) as error:
+            raise MapError(f"not a file of landmarks: {error}", path=path, fix="Run the map stage again.") from error
 
 
 def features_of(path: Path) -> str:
-    """Name of the kind of descriptors that a file of landmarks was made from, read alone; SIFT's if it says nothing.
+    """Read the name of the descriptors that a file of landmarks was made with; SIFT's if none is recorded.
 
-    "sift" also where there were no descriptors at all. Raises MapError if the file is missing or damaged.
+    Raises MapError if the file is missing or damaged.
     """
     try:
-        said = load_npz(path, ("described_by",)).get("described_by")
+        name = load_npz(path, ("described_by",)).get("described_by")
     except ValueError as error:
         raise MapError(str(error), path=path, fix="Run the map stage again.") from error
-    return SIFT.name if said is None else str(said)
+    return SIFT.name if name is None else str(name)
+
+
+def _validated(values: dict[str, NDArray[Any]]) -> dict[str, Any]:
+    """Fields of `Landmarks` from the arrays of a file. Raises KeyError or ValueError if one is missing or not valid."""
+    described_by = str(values.pop("described_by", SIFT.name))
+    if described_by not in all_kinds():
+        raise ValueError(f"its features, {described_by}, are unknown; there are {', '.join(all_kinds())}")
+    kind = all_kinds()[described_by]
+    descriptors = values.pop("descriptors", None)
+    if descriptors is not None and not _has(descriptors, (len(values["ids"]), kind.dimension), kind.in_bytes):
+        raise ValueError(f"the descriptors are not those of {kind.name}")
+    names = {f.name for f in fields(Landmarks)} - {"described_by", "descriptors"}
+    unexpected = (names - {"mapping_focal_px"} - {*values}) | ({*values} - names)
+    if unexpected:
+        raise ValueError(f"{', '.join(sorted(unexpected))} missing or unknown")
+    for name, value in values.items():
+        if not _has(value, (len(values["ids"]), *_ROW_SHAPES.get(name, ())), name in _INTEGERS):
+            raise ValueError(f"{name} is an array of {value.dtype} and shape {value.shape}")
+    if not np.isfinite(values["points"]).all():
+        raise ValueError("some points are not finite")
+    arrays = _floats(values, points=np.float64, others=np.float32)
+    return {**arrays, "descriptors": descriptors, "described_by": None if kind is SIFT else kind.name}
+
+
+def _has(array: NDArray[Any], shape: tuple[int, ...], integer: bool) -> bool:
+    return array.shape == shape and array.dtype.kind in ("iu" if integer else "f")
 
 
 def _floats(values: dict[str, NDArray[Any]], points: DTypeLike, others: DTypeLike) -> dict[str, NDArray[Any]]:
-    """The same arrays, with the points and all other arrays of floats cast to the types given."""
+    """Cast the points and all other arrays of floats to the given types; arrays of integers stay as they are."""
     floats = {name: points if name == "points" else others for name, value in values.items() if value.dtype.kind == "f"}
     return {name: value.astype(floats.get(name, value.dtype), copy=False) for name, value in values.items()}
 
@@ -173,14 +157,14 @@ def load_colmap_landmarks(
     reconstruction: pycolmap.Reconstruction | None = None,
     progress: bool = True,
 ) -> Landmarks:
-    """Landmarks of a COLMAP model (binary or text) in metres, with their attributes. Its images may have many cameras.
+    """Compute the landmarks of a COLMAP model (binary or text) in metres, with their attributes.
 
-    The features the model was built from (`read_descriptors`) give descriptors and ambiguity, by a search of the
-    nearest descriptors on a torch device. What the model's own mapper kept is kept, unless a largest mean reprojection
-    error is given; a `MapWarning` counts the points that are left out. `reconstruction` is the model, if it has been
-    read already.
+    The features that the model was built from (`read_descriptors`) give descriptors and ambiguity, by a search of the
+    nearest descriptors on a torch device. All points of the model are landmarks, unless a largest mean reprojection
+    error is given; a `MapWarning` counts the points that are left out. `reconstruction` is the model, if it was read
+    before; its images may have many cameras.
 
-    Raises MapError if the folder, a file or the database is missing, corrupt or does not match, or no landmark is left.
+    Raises MapError if the folder, a file or the database is missing, corrupt or does not match, or no landmark remains.
     """
     reconstruction = reconstruction or read_model(model_dir)
     if reconstruction.num_points3D() == 0:
@@ -194,14 +178,12 @@ def load_colmap_landmarks(
     keep = np.flatnonzero(observed & (model.errors_px <= worst_px))
     if len(keep) == 0:
         problem = f"all {observed.sum()} points have more than {max_reprojection_error_px} px mean reprojection error"
-        least = f"least {model.errors_px[observed].min():.2f} px"
+        smallest = f"at least {model.errors_px[observed].min():.2f} px"
         fix = "Raise max_reprojection_error_px, or check the intrinsics and poses of the model."
-        raise MapError(problem, path=model_dir, value=least, fix=fix)
-    if not np.isfinite(model.points[keep]).all():
-        raise MapError("some points are not finite", path=model_dir, fix="Triangulate the model again.")
-    _tell_left_out(observed, len(keep), worst_px, model_dir)
+        raise MapError(problem, path=model_dir, value=smallest, fix=fix)
+    _warn_of_omitted(observed, len(keep), worst_px, model_dir)
     model = _select_points(model, keep)
-    described_by = None
+    kind = SIFT
     descriptors = None
     ambiguity = np.full(len(keep), np.nan, dtype=np.float32)
     observations = None if database is None else read_descriptors(database, model_dir, reconstruction, model)
@@ -209,29 +191,33 @@ def load_colmap_landmarks(
         kind, of_observations = observations
         descriptors = _mean_descriptors(model, of_observations, kind)
         ambiguity = nearest_other_cosine(descriptors, device, progress)
-        described_by = None if kind is SIFT else kind.name
-    track_length = np.diff(model.observation_start).astype(np.int32)
-    errors_px = model.errors_px.astype(np.float32)
-    attributes: Any = {**_viewing_geometry(model), "descriptors": descriptors, "ambiguity": ambiguity}
-    attributes["described_by"] = described_by
-    return Landmarks(model.point_ids, model.points, track_length, errors_px, **attributes)
+    return Landmarks(
+        ids=model.point_ids,
+        points=model.points,
+        track_length=np.diff(model.observation_start).astype(np.int32),
+        reprojection_error_px=model.errors_px.astype(np.float32),
+        **_viewing_geometry(model),
+        descriptors=descriptors,
+        ambiguity=ambiguity,
+        described_by=None if kind is SIFT else kind.name,
+    )
 
 
-def _tell_left_out(observed: NDArray[np.bool_], n_kept: int, worst_px: float, model_dir: str | Path) -> None:
+def _warn_of_omitted(observed: NDArray[np.bool_], n_kept: int, worst_px: float, model_dir: str | Path) -> None:
     n_unobserved = int((~observed).sum())
     n_inaccurate = int(observed.sum()) - n_kept
     if not n_unobserved + n_inaccurate:
         return
     reasons = [f"{n_inaccurate:,} with a mean reprojection error of more than {worst_px:g} px"] if n_inaccurate else []
     reasons += [f"{n_unobserved:,} that no image observes"] if n_unobserved else []
-    text = f"{model_dir}: {n_kept:,} of {len(observed):,} points are landmarks; left out: {', '.join(reasons)}"
+    text = f"{model_dir}: {n_kept:,} of {len(observed):,} points are landmarks; omitted: {', '.join(reasons)}"
     warnings.warn(text, MapWarning, stacklevel=3)
 
 
 def nearest_other_cosine(descriptors: NDArray[Any], device: str = "cpu", progress: bool = True) -> NDArray[np.float32]:
-    """Cosine between each stored descriptor (N, D) and the nearest one of another row. Returns (N,), NaN if N is 1.
+    """Compute the cosine (N,) between each stored descriptor (N, D) and the nearest other one; NaN if N is 1.
 
-    Sums of products of bytes are exact in float32, so that of SIFT the result does not depend on the machine.
+    Sums of products of bytes are exact in float32, so that SIFT's result does not depend on the machine.
     """
     import torch  # takes seconds to load, and most maps are read without it
 
@@ -243,7 +229,9 @@ def nearest_other_cosine(descriptors: NDArray[Any], device: str = "cpu", progres
     best = torch.full((n,), -torch.inf, device=device)
     torch.set_num_threads(1)  # products are small: several threads would mostly wait for one another
     try:
-        tiles = tqdm(range(0, n, _TILE), "landmarks: ambiguity", delay=_SILENT_S, unit="block", disable=not progress)
+        tiles = tqdm(
+            range(0, n, _TILE), "landmarks: ambiguity", delay=_PROGRESS_AFTER_S, unit="block", disable=not progress
+        )
         for i in tiles:
             for j in range(i, n, _TILE):  # each pair of tiles once: its product serves rows and columns
                 rows = slice(i, min(i + _TILE, n))

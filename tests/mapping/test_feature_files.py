@@ -1,0 +1,157 @@
+"""Files of features that do not fit the model, are damaged, or were made to do harm."""
+
+from __future__ import annotations
+
+import sqlite3
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapping.test_landmarks import hand_written_model, random_descriptors, write_database
+from mapping.test_learned_features import database_of, hdf5_of, unit
+from wheretolook.features.registry import all_kinds
+from wheretolook.mapping.colmap_model import model_arrays
+from wheretolook.mapping.feature_files import read_descriptors, read_features
+from wheretolook.utils.errors import MapError
+
+MODEL, KEYPOINTS = hand_written_model()
+ARRAYS = model_arrays(MODEL)
+DESCRIPTORS = random_descriptors([len(pixels) for pixels in KEYPOINTS])
+ALIKED = all_kinds()["aliked"]
+LEARNED = [ALIKED.store(unit(len(pixels), ALIKED.dimension, seed)) for seed, pixels in enumerate(KEYPOINTS)]
+N = len(KEYPOINTS[0])
+COUNT = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT"  # without end
+
+
+def replaced(name: str = "keypoints", **dataset):
+    """An edit that puts another array in the place of an image's."""
+
+    def edit(h5py, file) -> None:
+        del file[f"0.png/{name}"]
+        file.create_dataset(f"0.png/{name}", **dataset)
+
+    return edit
+
+
+def link(h5py, file) -> None:
+    del file["0.png"]
+    file["0.png"] = h5py.ExternalLink("other.h5", "/0.png")
+
+
+def virtual(h5py, file) -> None:
+    layout = h5py.VirtualLayout(shape=(N, 2), dtype="f8")
+    layout[:] = h5py.VirtualSource("other.h5", "0.png/keypoints", shape=layout.shape)
+    del file["0.png/keypoints"]
+    file.create_virtual_dataset("0.png/keypoints", layout)
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        replaced(shape=(2**30, 2), dtype="f8", chunks=(1024, 2)),  # 16 GB
+        replaced("descriptors", shape=(128, 12_000_000), dtype="f2", chunks=(128, 1024)),
+        replaced(shape=(N, 2), maxshape=(None, 2), dtype="f8", chunks=(2**27, 2)),
+        link,
+        replaced(shape=(N, 2), dtype="f8", external=[("secret", 0, N * 16)]),
+        virtual,
+        replaced(data=np.array([[b"a", b"b"]] * N)),
+        replaced(data=np.full((N, 2), np.nan)),
+        replaced("descriptors", data=np.full((128, N), np.nan)),
+        replaced("descriptors", data=np.full((256, N), 1e300)),
+        replaced("descriptors", data=np.zeros((64, N))),
+        replaced(data=3.0),
+        replaced(dtype="f8"),
+        replaced(data=KEYPOINTS[0][:-1]),
+        lambda h5py, file: file.pop("0.png"),
+        lambda h5py, file: file["0.png"].pop("descriptors"),
+    ],
+)
+def test_invalid_hdf5_is_rejected(edit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    h5py = pytest.importorskip("h5py")
+    monkeypatch.chdir(tmp_path)
+    hdf5_of(tmp_path / "other.h5", KEYPOINTS, LEARNED)
+    (tmp_path / "secret").write_bytes((KEYPOINTS[0] - 0.5).tobytes())
+    path = hdf5_of(tmp_path / "feats-aliked.h5", KEYPOINTS, LEARNED)
+    with h5py.File(path, "a") as file:
+        edit(h5py, file)
+    with pytest.raises(MapError) as caught:
+        read_descriptors(path, "model", MODEL, ARRAYS)
+    assert caught.value.path == path
+
+
+def test_hdf5_needs_h5py(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "feats.h5").write_bytes(b"not HDF5")
+    for module in (sys.modules.get("h5py"), None):
+        monkeypatch.setitem(sys.modules, "h5py", module)
+        with pytest.raises(MapError):
+            read_features(tmp_path / "feats.h5", ["0.png"])
+
+
+RENAME = "ALTER TABLE keypoints RENAME TO away"
+NANS = np.full((N, 2), np.nan, "<f4").tobytes().hex()
+FLOATS = np.full((N, 128), 3e38, "<f4").tobytes().hex()
+
+
+@pytest.mark.parametrize(
+    "statements",
+    [
+        ["ALTER TABLE images RENAME TO away", f"CREATE VIEW images AS {COUNT} x AS image_id, 'n' AS name FROM c"],
+        [
+            RENAME,
+            "CREATE VIEW keypoints AS SELECT image_id, 62500000 rows, 4 cols, zeroblob(1000000000) data FROM away",
+        ],
+        [
+            RENAME,
+            "CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY, rows, cols, data BLOB AS (zeroblob(900000000)))",
+        ],
+        ["DROP TABLE wheretolook_features", f"CREATE VIEW Wheretolook_Features AS {COUNT} x AS name FROM c"],
+        [f"UPDATE keypoints SET rows = {N}, cols = 2, data = x'{NANS}'"],
+        ["UPDATE keypoints SET rows = 9223372036854775807"],
+        [f"UPDATE descriptors SET rows = {N}, cols = 512, type = {ALIKED.colmap_type}, data = x'{FLOATS}'"],
+        ["UPDATE descriptors SET cols = 256, data = substr(data, 1, 256 * rows)"],
+        ["UPDATE descriptors SET type = 0, cols = 128, data = substr(data, 1, 128 * rows) WHERE image_id = 2"],
+        ["DELETE FROM descriptors WHERE image_id = 2"],
+        ["DELETE FROM images WHERE image_id = 2"],
+        ["DROP TABLE keypoints"],
+        ["UPDATE keypoints SET rows = rows - 1, data = substr(data, 1, length(data) - 4 * cols)"],
+    ],
+)
+def test_invalid_databases_are_rejected(statements: list[str], tmp_path: Path) -> None:
+    path = database_of(tmp_path / "a.db", MODEL, KEYPOINTS, LEARNED, ALIKED)
+    connection = sqlite3.connect(path)
+    for statement in statements:
+        connection.execute(statement)
+    connection.commit()
+    connection.close()
+    with pytest.raises(MapError) as caught:
+        read_descriptors(path, "model", MODEL, ARRAYS)
+    assert caught.value.path == path
+
+
+@pytest.mark.parametrize("content", [None, b"", b"\x00garbage" * 999])
+def test_files_that_are_not_databases_are_rejected(content: bytes | None, tmp_path: Path) -> None:
+    if content is not None:
+        (tmp_path / "a.db").write_bytes(content)
+    with pytest.raises(MapError):
+        read_features(tmp_path / "a.db", ["0.png"])
+
+
+def test_databases_of_other_keypoints_are_rejected(tmp_path: Path) -> None:
+    path = write_database(tmp_path / "moved.db", MODEL, [pixels + 3 for pixels in KEYPOINTS], DESCRIPTORS)
+    with pytest.raises(MapError):
+        read_descriptors(path, "model", MODEL, ARRAYS)
+
+
+def test_a_database_of_hloc_without_descriptors_suggests_its_hdf5_file(tmp_path: Path) -> None:
+    (tmp_path / "sfm").mkdir()
+    path = database_of(tmp_path / "sfm" / "database.db", MODEL, KEYPOINTS, LEARNED, ALIKED)
+    with sqlite3.connect(path) as database:
+        database.execute("DELETE FROM descriptors")
+    database.close()
+    (tmp_path / "feats-aliked-n16_matches-lightglue.h5").touch()
+    features = hdf5_of(tmp_path / "feats-aliked-n16.h5", KEYPOINTS, LEARNED)
+    with pytest.raises(MapError) as caught:
+        read_features(path, ["0.png"])
+    assert f"--database {features}" in str(caught.value.fix)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any, Self
 
@@ -94,6 +94,7 @@ class SetNetwork(LandmarkNetwork):
     ) -> None:
         options = {"width": width, "pooled": pooled, "head": head, "dropout": dropout}
         super().__init__(statistics, **options, hidden=hidden, told=told)
+        self.pose_variances = pose_variances  # replaced where there is no Cholesky decomposition
         self._told = [ALL_TOLD.index(name) for name in told]
         self._cells = "log_expected_cells" in told
         self.matchability = MatchabilityNetwork(statistics, width, hidden)
@@ -168,7 +169,8 @@ class SetNetwork(LandmarkNetwork):
 
     def logits(self, sums: Tensor, n_visible: Tensor, axis_height: Tensor, cells: Tensor | None = None) -> Tensor:
         """Logits (B,) from the sums over each view's landmarks (B, D), and `expected_cells` (B,) if told of them."""
-        known = [expected_statistics(sums[:, :N_EXPECTED], n_visible), axis_height[:, None]]
+        statistics = expected_statistics(sums[:, :N_EXPECTED], n_visible, self.pose_variances)
+        known = [statistics, axis_height[:, None]]
         if cells is not None:
             known.append(cells.log1p()[:, None])
         features = [torch.cat(known, 1)[:, self._told]]
@@ -202,21 +204,31 @@ def expected_cells(
     return -torch.expm1(none * each[:, None]).sum(1)
 
 
-def expected_statistics(sums: Tensor, n_visible: Tensor) -> Tensor:
-    """`EXPECTED`, (B, len(EXPECTED)), of views by sums of `expected_parts` (B, N_EXPECTED), and landmarks seen (B,)."""
-    inliers = sums[:, 0]
-    moments = sums[:, 16:] / (sums[:, :1] + 1e-6)
-    # in double precision: the covariance is an inverse
-    information = information_matrices(sums[:, 1:16].double()) + PRIOR * torch.eye(6, device=sums.device).double()
+def pose_variances(information: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the diagonals of inverses (B, 6) and the log determinants (B,) of information matrices (B, 6, 6)."""
     try:
         factor = torch.linalg.cholesky(information)
-    except torch.linalg.LinAlgError as error:  # chances that are not numbers, by weights that are too large
+    except torch.linalg.LinAlgError as error:  # NaN, by weights that are too large
         problem = "these weights give no numbers: they are damaged, or the map is"
         raise WeightsError(problem, fix="Give other weights, or train again.") from error
     unit = torch.eye(6, dtype=factor.dtype, device=factor.device).expand_as(factor)
     # not by `cholesky_inverse`, which takes the matrices of a batch one by one on a GPU
     variances = torch.linalg.solve_triangular(factor, unit, upper=False).square().sum(-2)
-    log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    return variances, 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+
+
+def expected_statistics(
+    sums: Tensor, n_visible: Tensor, variances_of: Callable[[Tensor], tuple[Tensor, Tensor]] = pose_variances
+) -> Tensor:
+    """`EXPECTED`, (B, len(EXPECTED)), of views by sums of `expected_parts` (B, N_EXPECTED), and landmarks seen (B,).
+
+    `variances_of` computes what `pose_variances` does.
+    """
+    inliers = sums[:, 0]
+    moments = sums[:, 16:] / (sums[:, :1] + 1e-6)
+    # in double precision: the covariance is an inverse
+    information = information_matrices(sums[:, 1:16].double()) + PRIOR * torch.eye(6, device=sums.device).double()
+    variances, log_det = variances_of(information)
     across = moments[:, 0]
     down = moments[:, 1]
     spread = (moments[:, 2] - across**2) * (moments[:, 4] - down**2) - (moments[:, 3] - across * down) ** 2

@@ -139,12 +139,15 @@ def _read(path: Path) -> pd.DataFrame:
 
 
 def _score_table(scores: pd.DataFrame, dataset: str) -> str:
-    """Format scores with headings two levels lower; empty without scores."""
+    """Format scores and their comparisons with headings two levels lower; empty without scores."""
     if scores.empty:
         return ""
-    title = f"Localization score on {dataset}"
-    markdown = f"{score_markdown(scores, title)}\n{comparisons_markdown(scores)}".strip("\n")
-    return re.sub(r"^#", "###", markdown, flags=re.MULTILINE)
+    markdown = score_markdown(scores, f"Localization score on {dataset}")
+    details = re.search(r"^## (Calibration|Probes)", markdown, re.MULTILINE)
+    at = details.start() if details else len(markdown)
+    parts = (markdown[:at], comparisons_markdown(scores), markdown[at:])
+    joined = "\n\n".join(part.strip("\n") for part in parts if part.strip())
+    return re.sub(r"^#", "###", joined, flags=re.MULTILINE)
 
 
 def _scenes_text(scenes: Mapping[str, Any]) -> str:

@@ -22,8 +22,7 @@ from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 from wheretolook_paper.fisher.exact import exact_information, exact_information_plain
 from wheretolook_paper.fisher.field import FisherField
-from wheretolook_paper.fisher.field_sums import field_sums_plain
-from wheretolook_paper.fisher.metrics import METRICS, eigenvalues, eigenvalues_plain, metric_of
+from wheretolook_paper.fisher.metrics import METRICS, eigenvalues, metric_of
 from wheretolook_paper.fisher.soft_visibility import (
     GaussianProcessVisibility,
     QuadraticVisibility,
@@ -41,7 +40,6 @@ def query(locations: Float, points: Float, visibilities: dict[str, SoftVisibilit
             timed(f"  {name} {metric}", lambda f=field, m=metric: f.metric(3, axes, m), 200, 1e3, "ms")
         numbers = field.information(3, axes)
         timed(f"  {name} eigenvalues alone", lambda n=numbers: eigenvalues(n), 200, 1e3, "ms")
-        timed(f"  {name} eigenvalues, NumPy", lambda n=numbers: eigenvalues_plain(n), 200, 1e3, "ms")
 
 
 def errors_over_samples(samples: list[int], n_landmarks: int) -> None:
@@ -109,9 +107,6 @@ def main() -> None:
         for label, mask in (("none occluded", None), ("half occluded", free)):
             timed(f"  {name} ({visibility.n_factors} factors), {label}",
                   lambda v=visibility, m=mask: FisherField.build(voxels, points, v, m, device), repeats)  # fmt: skip
-        start = time.perf_counter()
-        field_sums_plain(voxels[:2], points, visibility)
-        print(f"  {'  NumPy, from two voxels':60} {(time.perf_counter() - start) * len(voxels) / 2:9.1f} s")
 
     axes = fibonacci_sphere(args.directions)
     if device == "cpu":

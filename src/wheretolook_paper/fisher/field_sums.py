@@ -8,11 +8,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from wheretolook.geometry.pose_information import N_NUMBERS, bearing_numbers
+from wheretolook.geometry.pose_information import N_NUMBERS
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.parts import run_in_parts
 from wheretolook.utils.warp import start_warp
-from wheretolook.visibility.frustum import offsets_from
 from wheretolook_paper.fisher import field_kernel
 from wheretolook_paper.fisher.field_kernel import numbers_kernel, process_kernel, quadratic_kernel, vec16
 from wheretolook_paper.fisher.soft_visibility import GaussianProcessVisibility, QuadraticVisibility, SoftVisibility
@@ -65,20 +64,6 @@ def field_sums(
             result[rows] = by_axes[:, : visibility.n_factors]
 
     run_in_parts(len(locations), 1 if device == "cpu" else GPU_LOCATIONS, work, device)
-    return result
-
-
-def field_sums_plain(
-    locations: Float, points: Float, visibility: SoftVisibility, unoccluded: NDArray[np.bool_] | None = None
-) -> Float:
-    """What `field_sums` computes, in NumPy and double precision."""
-    result = np.empty((len(locations), visibility.n_factors, N_NUMBERS))
-    for row, location in enumerate(locations):
-        offsets = offsets_from(location, points if unoccluded is None else points[unoccluded[row]]).astype(np.float64)
-        distance = np.linalg.norm(offsets, axis=1, keepdims=True)
-        kept = distance[:, 0] > NEAREST_M
-        bearings = offsets[kept] / distance[kept]
-        result[row] = visibility.of_bearings(bearings).T @ bearing_numbers(offsets[kept])
     return result
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from wheretolook.geometry.pose_information import N_NUMBERS, TRACE, information_matrices
+from wheretolook.geometry.pose_information import N_NUMBERS, TRACE
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.parts import run_in_parts
@@ -69,8 +69,3 @@ def eigenvalues(numbers: ArrayLike, pivots: ArrayLike | None = None, device: str
     wp.load_module(metrics_kernel, device=device)  # only one thread may do that
     run_in_parts(len(numbers), ROWS_AT_ONCE if device == "cpu" else max(1, len(numbers)), work, device)
     return values
-
-
-def eigenvalues_plain(numbers: ArrayLike, pivots: ArrayLike | None = None) -> Float:
-    """What `eigenvalues` computes, in NumPy, ascending."""
-    return np.asarray(np.linalg.eigvalsh(information_matrices(numbers, pivots)))

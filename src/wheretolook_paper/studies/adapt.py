@@ -1,10 +1,10 @@
-"""How much adapting to a place gains: learnt from half of each scene's labelled locations, judged by the other half.
+"""Measure what adaptation to a scene gains: trained on half of the labelled locations, tested on the other half.
 
     python -m wheretolook_paper.studies.adapt data/cameras --split val
     python -m wheretolook_paper.studies.adapt data/test-90 --split test --out adapted.csv
 
-A row for each scene, and the means: regret in percentage points, AUC and calibration error of the weights that ship, of
-the adapted ones and, to compare, of bins.
+Prints a row for each scene and the means: regret in percentage points, AUC and calibration error of the bundled
+weights, of the adapted ones, and of bins.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from wheretolook.utils.shipped import WEIGHTS, shipped
 
 
 def main() -> None:
-    """Measure, print and write."""
+    """Adapt the bundled weights to every scene, print and write the numbers."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, help="a labelled dataset")
     parser.add_argument("--split", default="test")
     parser.add_argument("--scenes", nargs="*", default=[])
-    parser.add_argument("--seed", type=int, default=0, help="which half is learnt from")
+    parser.add_argument("--seed", type=int, default=0, help="which half is trained on")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     rows = []
@@ -49,17 +49,17 @@ def main() -> None:
             at = numbers == number
             bins[at] = make_scorer("bins", files.localization_map(camera, "cpu")).score(poses(table)[at])
         locations = np.random.default_rng(options.seed).permutation(np.unique(views.group))
-        learn = np.isin(views.group, locations[: len(locations) // 2])
+        training = np.isin(views.group, locations[: len(locations) // 2])
         start = time.monotonic()
-        rest = views.rows(~learn)
-        learnt = adapt(views.rows(learn))
+        rest = views.rows(~training)
+        adapted = adapt(views.rows(training))
         seconds = time.monotonic() - start
         judged = rest.good, rest.group, rest.centers
-        gain = compare_log_odds(rest.log_odds, learnt.adaptation.log_odds(rest), *judged)
-        by_bins = compare_log_odds(rest.log_odds, bins[~learn], *judged).after
+        gain = compare_log_odds(rest.log_odds, adapted.adaptation.log_odds(rest), *judged)
+        by_bins = compare_log_odds(rest.log_odds, bins[~training], *judged).after
         row = {
             "scene": files.name,
-            "views": int(learn.sum()),
+            "views": int(training.sum()),
             "regret_bins": by_bins["regret"],
             "auc_bins": by_bins["auc"],
         }
@@ -67,7 +67,7 @@ def main() -> None:
         row |= {f"{name}_adapted": value for name, value in gain.after.items()}
         less = zip(("less", "low", "high"), gain.regret_less, strict=True)
         row |= {f"regret_{name}": value for name, value in less}
-        rows.append({**row, "length_m": learnt.length_m, "amplitude": learnt.amplitude, "seconds": seconds})
+        rows.append({**row, "length_m": adapted.length_m, "amplitude": adapted.amplitude, "seconds": seconds})
         print(
             {name: round(value, 3) if isinstance(value, float) else value for name, value in rows[-1].items()},
             flush=True,

@@ -1,13 +1,13 @@
-"""Which scorer to ship for any camera: regret, AUC and calibration over unlike scenes and over fields of view.
+"""Choose the scorer for any camera: regret, AUC and calibration over different scenes and fields of view.
 
-    python -m wheretolook_paper.studies.cameras data/cameras --split val --weights data/release/weights --out cameras.csv
+    python -m wheretolook_paper.studies.cameras data/cameras --split val --weights data/release/weights --out a.csv
     python -m wheretolook_paper.studies.cameras data/test-45 data/test-60 ... --split test --weights ...
 
-Each dataset has been labelled; the first line is the choice on the val scenes of `configs/cameras.yaml`, the second the
-test by angle: datasets of the same scenes and maps, made with `--camera.fov_deg 45 --map.camera '{fov_deg: 90}'` and so
-on. Scenes of a kind (`building-537` is of the kind building) are averaged first, then kinds; views of narrow (below 60
-degrees across) and wide cameras (above 95) count as two more kinds where a scene has several cameras. Intervals are of
-95 % over locations, neighbours resampled together; differences are paired, against the first method.
+Datasets are labelled. The first line chooses on the val scenes of `configs/cameras.yaml`, the second tests by angle on
+datasets of the same scenes and maps made with `--camera.fov_deg 45 --map.camera '{fov_deg: 90}'` and so on. Scenes of
+a kind (`building-537` is a building) are averaged first, then kinds; narrow cameras (below 60 degrees) and wide ones
+(above 95) count as two more kinds where scenes have several cameras. 95 % intervals are over locations, neighbours
+resampled together; differences to the first method are paired.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ from wheretolook.training.weights import method_of_weights
 NARROW_DEG = 60
 WIDE_DEG = 95
 LIMITS = 0.05, 0.4  # metres and degrees
-RIGHT = 0.5, 5.0  # a pose that is the view's, however exact
-SHARES = ("expected-inliers", "visible")  # these give shares of a map's landmarks, which differ in number by scene
+RIGHT = 0.5, 5.0  # metres and degrees within which a pose is not a wrong hypothesis
+SHARES = ("expected-inliers", "visible")  # scores that are shares of a map's landmarks
 SQUARE_M = 1.0  # locations in one square of the floor are resampled together
 DRAWS = 2000
 
 
 @dataclass(frozen=True)
 class Group:
-    """Views that are judged together: of a scene, or by some cameras.
+    """Views evaluated together: of a scene, or of some cameras.
 
     Args:
-        kind: what it is averaged with.
+        kind: groups of a kind are averaged first.
         name: of the scene or the cameras.
         rows: (V,) of the views in their table.
     """
@@ -58,7 +58,7 @@ class Group:
 
 
 def scored(root: Path, split: Split, methods: tuple[str, ...], weights: list[Path]) -> pd.DataFrame:
-    """All labelled views of a split: what they are, and a column for each method."""
+    """Return all labelled views of a split, with a column of scores for each method."""
     dataset = Dataset.load(root)
     scenes = dataset.split(split)
     tables = [scene.read_table() for scene in scenes]
@@ -89,7 +89,7 @@ def scored(root: Path, split: Split, methods: tuple[str, ...], weights: list[Pat
 
 
 def groups(views: pd.DataFrame) -> list[Group]:
-    """Scenes by kind, and the narrow and the wide cameras where scenes have several."""
+    """Return the scenes, and narrow and wide cameras where scenes have several cameras."""
     found = [
         Group(str(part["kind"].iloc[0]), str(scene), part.index.to_numpy())
         for scene, part in views.groupby("scene", sort=False)
@@ -104,7 +104,7 @@ def groups(views: pd.DataFrame) -> list[Group]:
 
 
 def regrets(views: pd.DataFrame, method: str) -> pd.DataFrame:
-    """What the best view of each location by a method loses, 0 or 1, with the location's square."""
+    """Return the regret (0 or 1) of each location's best view by a method, and the location's square."""
     order = views.assign(score=views[method]).sort_values("score", ascending=False, kind="stable")
     best = order.groupby("location")["good"].first()
     one = views.groupby("location").agg(good=("good", "any"), square=("square", "first"))
@@ -112,9 +112,9 @@ def regrets(views: pd.DataFrame, method: str) -> pd.DataFrame:
 
 
 def _drawn_squares(views: pd.DataFrame) -> tuple[dict[str, int], NDArray[np.float64]]:
-    """The columns of squares, and how often each is drawn, (DRAWS, squares): each scene's as often as it has some.
+    """Return the column of each square, and how often squares are drawn (DRAWS, squares), within scenes.
 
-    All groups and methods go by the same draws, since they share locations.
+    All groups and methods share the draws, because they share locations.
     """
     rng = np.random.default_rng(0)
     columns: dict[str, int] = {}
@@ -127,19 +127,19 @@ def _drawn_squares(views: pd.DataFrame) -> tuple[dict[str, int], NDArray[np.floa
 
 
 def summary(views: pd.DataFrame, methods: list[str]) -> pd.DataFrame:
-    """A row for each group and method, and the mean over kinds."""
+    """Return a row for each group and method, and the mean over kinds."""
     rows: list[dict[str, Any]] = []
     draws: dict[tuple[str, str], Float] = {}
     known, drawn = _drawn_squares(views)
     for group in groups(views):
         part = views.loc[group.rows]
         for method in methods:
-            lost = regrets(part, method)
-            squares = lost.groupby("square")["regret"].agg(["sum", "size"])
+            regret = regrets(part, method)
+            squares = regret.groupby("square")["regret"].agg(["sum", "size"])
             total = drawn[:, [known[square] for square in squares.index]] @ squares.to_numpy()
             draws[group.name, method] = 100 * total[:, 0] / total[:, 1]
-            row = {"kind": group.kind, "group": group.name, "method": method, "n_locations": len(lost)}
-            row |= {"n_views": len(part), "good": part["good"].mean(), "regret": 100 * lost["regret"].mean()}
+            row = {"kind": group.kind, "group": group.name, "method": method, "n_locations": len(regret)}
+            row |= {"n_views": len(part), "good": part["good"].mean(), "regret": 100 * regret["regret"].mean()}
             row["auc"] = roc_auc_score(part["good"], part[method])
             if is_probability(method):
                 row["ece"] = expected_calibration_error(part[method].to_numpy(), part["good"].to_numpy())
@@ -166,7 +166,7 @@ def summary(views: pd.DataFrame, methods: list[str]) -> pd.DataFrame:
 
 
 def main() -> None:
-    """Score, print and write."""
+    """Score the datasets, print and write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("datasets", nargs="+", type=Path)
     parser.add_argument("--split", default="val")

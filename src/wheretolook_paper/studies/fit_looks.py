@@ -1,12 +1,12 @@
-"""Fits what ships with looks: the confidence in a joint pose, and what a set of looks is worth.
+"""Fit the bundled models of view sets: the confidence of a joint pose, and the score of a set.
 
     python -m wheretolook_paper.studies.fit_looks SCENE_FOLDER... [--places 60] [--sets 4]
 
-Of validation scenes whose labels keep their pixels (`wheretolook label --label.store_pixels true`), looked at by one
-camera. At each place sets of 1, 2, 3 and 5 looks are drawn at random, the likelier the higher their scores, and joined.
-Two logistic regressions are fitted, and each is judged on scenes it was not fitted to, if there are several. Prints the
-JSON of `labelling/confidence.json` and `looks/set_score.json`. The weight of the position's variance is not fitted but
-given, as random sets do not tell what it is for: that looks which see the same fail together.
+The scenes are validation scenes with one camera whose labels store pixels (`--label.store_pixels true`). At each
+location, sets of 1, 2, 3 and 5 views are drawn with probabilities that grow with their scores, and localized jointly.
+Two logistic regressions are fitted; each is tested on scenes it was not fitted to. Prints the JSON of both models. The
+weight of the position's variance is fixed, because random sets do not show that views of the same landmarks fail
+together.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from wheretolook.looks.joint_visibility import candidate_views, log_position_var
 from wheretolook.utils.shipped import WEIGHTS, shipped
 from wheretolook.weights.resolve import load_scorer
 
-VARIANCE = 0.375  # how much the log of the position's variance counts, against the log-odds
+VARIANCE = 0.375  # weight of the log of the position's variance, relative to the log-odds
 SURE = 0.99
 
 
 def drawn_sets(scene: SceneFolder, places: int, draws: int) -> pd.DataFrame:
-    """Sets drawn at random, with what was expected of them and what became of them."""
+    """Draw sets of views at random locations; return their expected and actual results."""
     table = read_table(scene.table, pixels=True)
-    around = scene.localization_map()
-    scorer = load_scorer(str(shipped(WEIGHTS) / "set.safetensors"), around)
+    localization_map = scene.localization_map()
+    scorer = load_scorer(str(shipped(WEIGHTS) / "set.safetensors"), localization_map)
     rng = np.random.default_rng(0)
     cam_from_world = poses(table)
     scores = scorer.score(cam_from_world)
     sets = []
-    told = []
+    expectations = []
     of_place = list(table.groupby("location_id").indices.values())
     for number in rng.permutation(len(of_place))[:places]:
         rows = of_place[number]
@@ -54,27 +54,27 @@ def drawn_sets(scene: SceneFolder, places: int, draws: int) -> pd.DataFrame:
         for n in np.tile((1, 2, 3, 5), draws):
             looks = rng.choice(len(rows), n, replace=False, p=likely / likely.sum())
             sets.append(rows[looks])
-            told.append((seen.p_none(looks), log_position_variance(seen.joint_sums(looks))))
-    labelled = label_sets(table, sets, around.landmarks.points, scene.camera, progress=scene.name)
-    expected = pd.DataFrame(told, columns=["failed", "log_position_variance"])
+            expectations.append((seen.p_none(looks), log_position_variance(seen.joint_sums(looks))))
+    labelled = label_sets(table, sets, localization_map.landmarks.points, scene.camera, progress=scene.name)
+    expected = pd.DataFrame(expectations, columns=["failed", "log_position_variance"])
     return pd.concat([labelled, expected], axis=1).assign(scene=scene.name, good=is_good(labelled))
 
 
 def report(name: str, inputs: np.ndarray, sets: pd.DataFrame) -> LogisticRegression:
-    """Fit on all scenes; print how well a fit on the others does on each."""
+    """Fit on all scenes; print how well a fit on the others does on each scene."""
     good = sets["good"].to_numpy()
     for scene in sets["scene"].unique() if sets["scene"].nunique() > 1 else []:
         own = (sets["scene"] == scene).to_numpy()
-        chance = LogisticRegression().fit(inputs[~own], good[~own]).predict_proba(inputs[own])[:, 1]
-        sure = chance >= SURE
+        probability = LogisticRegression().fit(inputs[~own], good[~own]).predict_proba(inputs[own])[:, 1]
+        sure = probability >= SURE
         right = f"{good[own][sure].mean():.3f}" if sure.any() else "-"
-        numbers = f"AUC {roc_auc_score(good[own], chance):.3f}, log loss {log_loss(good[own], chance):.3f}"
+        numbers = f"AUC {roc_auc_score(good[own], probability):.3f}, log loss {log_loss(good[own], probability):.3f}"
         print(f"{name}, without {scene}: {numbers}; {sure.sum()} of {own.sum()} sure at {SURE}, right of these {right}")
     return LogisticRegression().fit(inputs, good)
 
 
 def main() -> None:
-    """Fit and print."""
+    """Draw sets, fit both models and print them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path, nargs="+")
     parser.add_argument("--places", type=int, default=60)
@@ -87,8 +87,8 @@ def main() -> None:
     fitted = report("confidence", confidence.confidence_features(*(accepted[name] for name in names)), accepted)
     weights = dict(zip(confidence.FEATURE_NAMES, fitted.coef_[0].round(4).tolist(), strict=True))
     print(json.dumps({"weights": weights, "bias": round(float(fitted.intercept_[0]), 4)}, indent=2))
-    chance = np.clip(1 - sets["failed"].to_numpy(), worth.MIN_PROBABILITY, 1 - worth.MIN_PROBABILITY)
-    mixed = np.log(chance / (1 - chance)) - VARIANCE * sets["log_position_variance"].to_numpy()
+    probability = np.clip(1 - sets["failed"].to_numpy(), worth.MIN_PROBABILITY, 1 - worth.MIN_PROBABILITY)
+    mixed = np.log(probability / (1 - probability)) - VARIANCE * sets["log_position_variance"].to_numpy()
     fitted = report("worth", mixed[:, None], sets)
     scale = float(fitted.coef_[0, 0])
     bias = float(fitted.intercept_[0])

@@ -1,26 +1,22 @@
-"""How well methods rank real photographs, by `wheretolook check` on maps made here: of photographs, or of known poses.
+"""Measure how well methods rank real photographs: map them, or take known poses, then run `wheretolook check`.
 
     python -m wheretolook_paper.studies.photographs --images fox --work work/fox --out photographs.csv
     python -m wheretolook_paper.studies.photographs --poses kitchen --work work/kitchen --out photographs.csv
-    python -m wheretolook_paper.studies.photographs --poses kitchen --work work/aliked --extractor aliked=aliked-n16rot.pth
+    python -m wheretolook_paper.studies.photographs --poses kitchen --work work/aliked --extractor aliked=FILE.pth
 
-Photographs are mapped as `wheretolook map --images` does, or from the poses beside them (7-Scenes layout:
-frame-*.color.*, .depth.png, .pose.txt with world_from_cam in metres). Such poses choose the pairs to match and the
-first triangulation; bundle adjustment then refines them and the focal length, and the result is fitted to them. Then
-the map is checked (docs/check.md): blocks are left out, and localized against the rest.
+Photographs are mapped as by `wheretolook map --images`, or from poses in the layout of 7-Scenes (frame-*.color.*,
+.depth.png, .pose.txt with world_from_cam in metres). These poses choose the image pairs and the first triangulation;
+bundle adjustment then refines them and the focal length, and the result is aligned to them.
 
-The table has, for each method: AUC over all photographs left out and that of pairs of one block, and regret, each with
-a 95 % interval by resampling blocks; of the first method the expected calibration error, and real over expected
-inliers; and a row for that method adapted to the place, judged by blocks that it has not learnt from (docs/adapt.md).
-`--out` keeps the rows of other places that the file has. `--work` keeps maps and blocks, so that other weights are
-quickly scored; results of the check lie in its `check`.
+The table has, for each method, the AUC over all held-out photographs and within blocks, and the regret, with 95 %
+intervals by resampling blocks; for the first method also the calibration error and real over expected inliers. `--out`
+keeps the rows of other scenes. `--work` caches maps and blocks. `wheretolook adapt` measures adapted weights.
 """
 
 from __future__ import annotations
 
 import argparse
 import tempfile
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -29,22 +25,13 @@ import cv2
 import numpy as np
 import pandas as pd
 import pycolmap
-from scipy.special import expit
 from tqdm.auto import tqdm
 
-from wheretolook.evaluation.adaptation import compare_log_odds, gain_markdown
 from wheretolook.features.config import ExtractorConfig
-from wheretolook.features.registry import kind_of
-from wheretolook.figures.style import save_figure
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, camera_centers, invert_poses, pose_error
 from wheretolook.holdout.checking import check_map
-from wheretolook.holdout.figure import check_figure
-from wheretolook.holdout.holdout import left_out_blocks
-from wheretolook.holdout.holdout_views import photographed_views
-from wheretolook.holdout.metrics import measure
-from wheretolook.holdout.photo_map import PhotographedMap, open_map, says_metric
-from wheretolook.holdout.report import place_radius
+from wheretolook.holdout.photo_map import open_map, says_metric
 from wheretolook.holdout.scores import Scoring
 from wheretolook.mapping.colmap_model import colmap_poses, holds_model
 from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG, MapConfig, PhotographsConfig
@@ -61,10 +48,8 @@ from wheretolook.mapping.triangulation import (
     shrink_depth,
     surface_overlap,
 )
-from wheretolook.scorers.adapted.gp_correction import adapt
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.processes import WorkerPool
-from wheretolook.visibility.hidden_points import HiddenPointRemoval
 
 PARTNERS = 20  # that each photograph with a pose is matched with
 ROUNDS = 3  # of triangulation and bundle adjustment
@@ -72,7 +57,7 @@ MAP = MapConfig()
 
 
 def posed_model(camera: Any, names: list[str], poses: Mapping[int, Float], stored: list[Stored]) -> Any:
-    """A reconstruction of photographs with poses (3, 4), by their rows, and with keypoints, but without points."""
+    """Return a reconstruction of photographs with keypoints and poses (3, 4) by row, without points."""
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(camera)
     for row, pose in poses.items():
@@ -83,7 +68,7 @@ def posed_model(camera: Any, names: list[str], poses: Mapping[int, Float], store
 
 
 def triangulate(model: Any, database: Path) -> Any:
-    """Points of a model of images with poses, which stay, from the matches between them in a database."""
+    """Triangulate a model with fixed poses from the matches in a database."""
     options = pycolmap.IncrementalPipelineOptions(random_seed=0, num_threads=1, extract_colors=False)
     options.image_names = [image.name for image in model.images.values()]
     options.triangulation.random_seed = options.mapper.random_seed = 0
@@ -98,7 +83,7 @@ def triangulate(model: Any, database: Path) -> Any:
 def map_known_poses(
     folder: Path, work: Path, focal_px: float, extractor: ExtractorConfig, workers: int, device: str
 ) -> None:
-    """Map photographs in the layout of 7-Scenes into `work/map`, in the frame of their poses."""
+    """Map photographs in the layout of 7-Scenes into `work/map`, aligned to their poses."""
     colors = sorted(path for path in folder.glob("*.color.*") if path.suffix in SUFFIXES)
     for name in ("images", "photographs"):
         (work / name).mkdir(parents=True, exist_ok=True)
@@ -155,7 +140,7 @@ def map_known_poses(
 
 
 def rows_of(scene: str, numbers: Mapping[str, Any], method: str) -> list[dict[str, Any]]:
-    """One row for each method; of one of them what else a check measures."""
+    """Return a row for each method; that of `method` has all numbers of a check."""
     rows = []
     for name, found in numbers["methods"].items():
         row = {"scene": scene, "method": name, "views": numbers["n_views"], "good": numbers["n_localized"]}
@@ -176,76 +161,44 @@ def _ends(column: str, measured: Mapping[str, Any]) -> dict[str, Any]:
     return {column + end: measured.get(key) for end, key in ends.items()}
 
 
-def adapted_rows(scene: str, opened: PhotographedMap, work: Path, weights: Path, views: int) -> list[dict[str, Any]]:
-    """The row of the weights adapted to the place, by blocks that they have not learnt from."""
-    left_out = left_out_blocks(opened, work, views)
-    learnt_from = photographed_views(opened, left_out, weights, HiddenPointRemoval())
-    learnt = adapt(learnt_from)
-    judged = (learnt_from.log_odds, learnt.held_out, learnt_from.good, learnt_from.place, learnt_from.centers)
-    gain = compare_log_odds(*judged, blocks=learnt_from.blocks)
-    kernel = f"kernel {learnt.length_m} m, {learnt.amplitude}" if learnt.amplitude else "calibrated alone"
-    print(gain_markdown(gain), f"{kernel}; {'kept' if gain.is_better else 'not kept'}", sep="\n")
-    found = pd.concat([one.views.assign(block=one.block.number) for one in left_out], ignore_index=True)
-    found = found.assign(score=expit(learnt.held_out), in_range=True, expected_inliers=np.nan)
-    numbers = measure(found, ["adapted"], ["score"], learnt_from.centers, place_radius(opened), True)
-    rows = rows_of(scene, {**numbers, "share_in_range": None}, "adapted")
-    none = dict.fromkeys(_ends("auc_above_visible", {}))
-    return [{**row, **none, "kept": gain.is_better} for row in rows]
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__.splitlines()[0],
-        epilog=__doc__.partition("\n\n")[2],
-        formatter_class=argparse.RawTextHelpFormatter,
-    )
+    """Map the photographs, check the map, and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     source = parser.add_mutually_exclusive_group(required=True)
-    source.add_argument("--images", type=Path, help="folder of photographs, to be mapped from nothing else")
+    source.add_argument("--images", type=Path, help="folder of photographs to map")
     source.add_argument("--poses", type=Path, help="folder of photographs, depth images and poses, as of 7-Scenes")
-    parser.add_argument("--name", help="what the table calls the place (that of the folder)")
-    parser.add_argument(
-        "--extractor", default="opencv", metavar="NAME[=WEIGHTS]", help="that maps (default: %(default)s)"
-    )
-    parser.add_argument("--device", default="cpu", help="where it does (default: %(default)s)")
-    parser.add_argument("--weights", type=Path, help="file or folder of weights (those that ship)")
-    parser.add_argument("--also", nargs="+", default=["expected-inliers", "bins"], help="other methods to compare")
-    parser.add_argument("--views", type=int, default=60, help="of a block, at most (default: %(default)s)")
-    parser.add_argument("--max-side-px", type=int, default=1600, help="longer side of --images (default: %(default)s)")
-    parser.add_argument("--focal-px", type=float, default=525.0, help="first guess for --poses (default: %(default)s)")
-    parser.add_argument("--workers", type=int, default=1, help="processes that localize (default: %(default)s)")
-    parser.add_argument("--out", type=Path, help="write the table to this CSV file")
-    parser.add_argument("--work", type=Path, help="keep maps and blocks in this folder; default: a temporary one")
+    add = parser.add_argument
+    add("--name", help="scene name in the table (the folder's)")
+    add("--extractor", default="opencv", metavar="NAME[=WEIGHTS]", help="features of the map (default: %(default)s)")
+    add("--device", default="cpu")
+    add("--weights", type=Path, help="file or folder of weights (the bundled ones)")
+    add("--also", nargs="+", default=["expected-inliers", "bins"], help="other methods to compare")
+    add("--views", type=int, default=60, help="maximum of a block (default: %(default)s)")
+    add("--max-side-px", type=int, default=1600, help="longer side of --images (default: %(default)s)")
+    add("--focal-px", type=float, default=525.0, help="initial focal length for --poses (default: %(default)s)")
+    add("--workers", type=int, default=1, help="worker processes (default: %(default)s)")
+    add("--out", type=Path, help="CSV file of the table")
+    add("--work", type=Path, required=True, help="folder of maps and blocks")
     args = parser.parse_args()
     method, _, network = args.extractor.partition("=")
     extractor = ExtractorConfig(method, weights=network)
-    with tempfile.TemporaryDirectory() as name:
-        work = args.work or Path(name)
-        start = time.perf_counter()
-        metric = True
-        if args.poses and not holds_model(work / "map"):
-            map_known_poses(args.poses, work, args.focal_px, extractor, args.workers, args.device)
-        if args.images:
-            if not holds_model(work / "map"):
-                photographs = PhotographsConfig(images=args.images, max_side_px=args.max_side_px)
-                settings = MapConfig(photographs=photographs, extractor=extractor)
-                places = work / "map", work / "photographs"
-                map_photographs(settings, *places, workers=args.workers, device=args.device)
-            metric = says_metric(work / "map")
-        mapped = time.perf_counter()
-        scene = args.name or (args.poses or args.images).resolve().name
-        opened = open_map(work / "map", work / "photographs" / "database.db", metric, scene)
-        scoring = Scoring(weights=args.weights, also=tuple(args.also))
-        how = {"views": args.views, "workers": args.workers, "device": args.device}
-        found = check_map(opened, work / "check" / "work", scoring, **how)
-        found.save(work / "check")
-        save_figure(check_figure(found), work / "check" / "check.png")
-        print("\n".join(found.lines()))
-        print(f"mapped in {mapped - start:.0f} s, checked in {time.perf_counter() - mapped:.0f} s\n")
-        lines = rows_of(scene, found.numbers, found.method)
-        chosen = scoring.chosen_for(kind_of(method).name)
-        if found.method == "set" and chosen is not None:
-            lines += adapted_rows(scene, opened, work / "check" / "work", chosen, args.views)
-    rows = pd.DataFrame(lines)
+    work = args.work
+    model = work / "map"
+    if not holds_model(model) and args.poses:
+        map_known_poses(args.poses, work, args.focal_px, extractor, args.workers, args.device)
+    elif not holds_model(model):
+        photographs = PhotographsConfig(images=args.images, max_side_px=args.max_side_px)
+        settings = MapConfig(photographs=photographs, extractor=extractor)
+        map_photographs(settings, model, work / "photographs", workers=args.workers, device=args.device)
+    scene = args.name or (args.poses or args.images).resolve().name
+    metric = bool(args.poses) or says_metric(model)
+    opened = open_map(model, work / "photographs" / "database.db", metric, scene)
+    scoring = Scoring(weights=args.weights, also=tuple(args.also))
+    options = {"views": args.views, "workers": args.workers, "device": args.device}
+    result = check_map(opened, work / "check" / "work", scoring, **options)
+    result.save(work / "check")
+    print("\n".join(result.lines()))
+    rows = pd.DataFrame(rows_of(scene, result.numbers, result.method))
     print(rows.to_string(index=False, float_format="{:.3f}".format))
     if args.out:
         if args.out.is_file():

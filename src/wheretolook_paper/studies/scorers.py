@@ -1,20 +1,16 @@
-"""Which learner to ship: seeds, ablations and learning curves, all judged on the validation scenes alone.
+"""Compare learners on validation scenes: seeds, ablations and learning curves.
 
     python -m wheretolook_paper.studies.scorers seeds --data data --dataset release --out study
-    python -m wheretolook_paper.studies.scorers attributes ...   the set network without each attribute of a landmark
+    python -m wheretolook_paper.studies.scorers attributes ...   the set network without each landmark attribute
     python -m wheretolook_paper.studies.scorers options ...      the set network with other options
     python -m wheretolook_paper.studies.scorers curves ...       with fewer training scenes and viewpoints
 
-The protocol, fixed before the test scenes were looked at: options are chosen by the mean validation average precision
-over seeds; of all learners the one with the best mean ships, made by the train stage with the best seed; test scenes
-and scenes of others are scored once, with every seed's weights. (For the table in docs/landmarks.md it was twice:
-with two candidates, before the rooms learnt from got patterns that repeat, and then as said.)
+Options are chosen by the mean validation average precision over seeds; the learner with the best mean ships, trained
+by the train stage with the best seed. Test scenes are scored once, with the weights of every seed.
 
-Appends one row a training to `<out>/<part>.csv`; rows that are there are not made again. Weights lie in
-`<out>/<method>-<seed>/weights`, and those of other parts in `<out>/<part>/<condition>-<seed>.safetensors`.
-
-`--set '{"pooled": 8}'` changes the network that attributes, options and curves start from; `--choices '[{"head": 96},
-...]'` are the options to try.
+Appends a row per training to `<out>/<part>.csv` and skips existing rows. Weights are in `<out>/<method>-<seed>/weights`
+and `<out>/<part>/<condition>-<seed>.safetensors`. `--set '{"pooled": 8}'` changes the network that attributes, options
+and curves start from; `--choices '[{"head": 96}, ...]'` are the options to try.
 """
 
 from __future__ import annotations
@@ -48,7 +44,7 @@ from wheretolook.training.scenes import with_also
 METHODS = ("mlp-2d+z", "mlp-2d+3d+landmark", "conv", "trees", "set", "sphere")
 
 OF_NETWORKS = MlpConfig(epochs=100, batch_size=4096, noise_px=1.0, noise_m=0.02, balance=True)
-"""Options of the paper's network: those of configs/release.yaml, with a third of its epochs."""
+"""Options of the paper's network: those of configs/release.yaml with a third of the epochs."""
 
 
 CHOICES: list[dict[str, Any]] = [
@@ -83,7 +79,7 @@ class Table:
 
 
 def seeds(dataset: Dataset, args: argparse.Namespace, tracking: TrackingConfig) -> None:
-    """Every learner, several times."""
+    """Train every learner with every seed."""
     table = Table(args.out / "seeds.csv")
     described: dict[str, SetData] = {}
 
@@ -110,12 +106,12 @@ def seeds(dataset: Dataset, args: argparse.Namespace, tracking: TrackingConfig) 
 
 
 def metrics_of(metrics: dict[str, float]) -> dict[str, float]:
-    """The metrics that a study notes."""
+    """Return the metrics of a study's row."""
     return {name: round(metrics[f"val_{name}"], 5) for name in ("average_precision", "roc_auc", "bce")}
 
 
 def of_set_network(dataset: Dataset, args: argparse.Namespace, tracking: TrackingConfig) -> None:
-    """The set network under other conditions, all on views that are described once."""
+    """Train the set network under other conditions, on views that are described once."""
     table = Table(args.out / f"{args.part}.csv")
     log = RunLog(tracking, "")
     task = Task(dataset, "set", TrainConfig(methods=("set",)), SetConfig(), "set", args.progress, log)
@@ -142,7 +138,7 @@ def of_set_network(dataset: Dataset, args: argparse.Namespace, tracking: Trackin
                 continue
             data.train_rows = rows
             settings = replace(SetConfig(**args.set), **options)
-            # as many steps, whatever there is to learn from
+            # the same number of steps for any amount of data
             epochs = min(200, round(settings.epochs * len(whole) / len(rows)))
             config = replace(task.config, seed=seed)
             own = replace(settings, epochs=epochs)
@@ -150,19 +146,19 @@ def of_set_network(dataset: Dataset, args: argparse.Namespace, tracking: Trackin
             torch.manual_seed(seed)
             about = {"condition": name, "seed": seed}
             with start_run(tracking, f"study {args.part} {name}", "train", about) as (_, run):
-                learnt = learn_set(replace(task, config=config, options=own, run_log=RunLog(tracking, run)), data)
+                result = learn_set(replace(task, config=config, options=own, run_log=RunLog(tracking, run)), data)
             file = f"{name.replace(' ', '_').replace('=', '-') or 'default'}-{seed}.safetensors"
-            learnt.model.save(args.out / args.part / file, {"method": "set", "condition": name, "seed": seed})
-            table.add({"condition": name, "seed": seed, "views": len(rows), **metrics_of(learnt.metrics)})
+            result.model.save(args.out / args.part / file, {"method": "set", "condition": name, "seed": seed})
+            table.add({"condition": name, "seed": seed, "views": len(rows), **metrics_of(result.metrics)})
 
 
 def main() -> None:
-    """Do one part of the study."""
+    """Run one part of the study."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("part", choices=("seeds", "attributes", "options", "curves"))
     parser.add_argument("--data", type=Path, default=Path("data"))
     parser.add_argument("--dataset", default="release")
-    parser.add_argument("--also", nargs="+", default=[], help="datasets whose train scenes help")
+    parser.add_argument("--also", nargs="+", default=[], help="further datasets to train on")
     parser.add_argument("--out", type=Path, default=Path("study"))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--methods", nargs="+", default=list(METHODS))

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from twins.fisher import field_sums_plain
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.pose_information import TRACE, information_matrices
 from wheretolook.geometry.poses import Float
 from wheretolook_paper.fisher.field import FisherField, stationary_axis_of_trace, worst_axis_of_trace
-from wheretolook_paper.fisher.field_sums import field_sums, field_sums_plain
+from wheretolook_paper.fisher.field_sums import field_sums
 from wheretolook_paper.fisher.metrics import METRICS
 from wheretolook_paper.fisher.soft_visibility import (
     JITTER,

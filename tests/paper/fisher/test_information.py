@@ -7,10 +7,11 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from twins.fisher import eigenvalues_plain
 from wheretolook.geometry.pose_information import TRACE, bearing_numbers, information_matrices
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError
-from wheretolook_paper.fisher.metrics import METRICS, eigenvalues, eigenvalues_plain, metric_of
+from wheretolook_paper.fisher.metrics import METRICS, eigenvalues, metric_of
 
 
 def turn_of(vector: torch.Tensor) -> torch.Tensor:

@@ -1,0 +1,31 @@
+"""Plain versions of the Fisher information kernels."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from wheretolook.geometry.pose_information import N_NUMBERS, bearing_numbers, information_matrices
+from wheretolook.geometry.poses import Float
+from wheretolook.visibility.frustum import offsets_from
+from wheretolook_paper.fisher.field_sums import NEAREST_M
+from wheretolook_paper.fisher.soft_visibility import SoftVisibility
+
+
+def field_sums_plain(
+    locations: Float, points: Float, visibility: SoftVisibility, unoccluded: NDArray[np.bool_] | None = None
+) -> Float:
+    """What `field_sums` computes, in NumPy and double precision."""
+    result = np.empty((len(locations), visibility.n_factors, N_NUMBERS))
+    for row, location in enumerate(locations):
+        offsets = offsets_from(location, points if unoccluded is None else points[unoccluded[row]]).astype(np.float64)
+        distance = np.linalg.norm(offsets, axis=1, keepdims=True)
+        kept = distance[:, 0] > NEAREST_M
+        bearings = offsets[kept] / distance[kept]
+        result[row] = visibility.of_bearings(bearings).T @ bearing_numbers(offsets[kept])
+    return result
+
+
+def eigenvalues_plain(numbers: ArrayLike, pivots: ArrayLike | None = None) -> Float:
+    """What `eigenvalues` computes, in NumPy, ascending."""
+    return np.asarray(np.linalg.eigvalsh(information_matrices(numbers, pivots)))

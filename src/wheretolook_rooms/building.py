@@ -155,14 +155,14 @@ def _place(rng: np.random.Generator, module: Module, count: int) -> tuple[Room, 
 
 
 def _repainted(own: Style, style: Style, patches: list[Patch], share: float) -> list[Patch]:
-    """The same surfaces, a share of the pictures among them painted anew."""
+    """The same surfaces, a share of the pictures among them painted again."""
     prints = set(map(id, style.prints))
-    anew = [id(p.material) in prints and own.chance(share) for p in patches]
-    return [replace(p, material=own.print()) if new else p for p, new in zip(patches, anew, strict=True)]
+    repainted = [id(p.material) in prints and own.bernoulli(share) for p in patches]
+    return [replace(p, material=own.print()) if new else p for p, new in zip(patches, repainted, strict=True)]
 
 
 def _own_furniture(own: Style, layouts: list[Layout], height: float, share: float) -> list[Patch]:
-    """What one copy has beside what stands and hangs in all of them."""
+    """What one copy has in addition to the content of all copies."""
     patches: list[Patch] = []
     for common in layouts:
         layout = copy(common)

@@ -27,7 +27,9 @@ def court(config: ApartmentConfig, seed: int) -> Furnished:
     room = large.one_room(width, float(rng.uniform(0.5, 1)) * width)
     style = Style(rng, config.texture_richness, config.clutter)
     stone = materials.plain(rng, (0.78, 0.76, 0.71), shared=True)
-    ground = materials.plain(rng, (0.5, 0.48, 0.44), speckle=0.05) if style.chance(0.2) else large.large_pattern(style)
+    ground = (
+        materials.plain(rng, (0.5, 0.48, 0.44), speckle=0.05) if style.bernoulli(0.2) else large.large_pattern(style)
+    )
     finish = Finish([_facade(style) for _ in range(4)], ground, stone)
 
     windows: list[Patch] = []
@@ -36,7 +38,7 @@ def court(config: ApartmentConfig, seed: int) -> Furnished:
     for side in range(4):
         bay = float(rng.uniform(2.6, 4.5))
         opening = float(rng.uniform(0.3, 0.5)) * bay
-        for floor in range(0 if style.chance(0.5) else 1, n_storeys):
+        for floor in range(0 if style.bernoulli(0.5) else 1, n_storeys):
             large.add_windows(room, side, bay, opening, floor * storey + 0.9, (floor + 0.8) * storey)
         for o in room.openings[side]:
             windows += wall_items(room, side, (o.a0 + o.a1) / 2, _window(style, o, stone, style.pick(glass)))
@@ -62,9 +64,9 @@ def _facade(style: Style) -> Material:
     """Plaster, brick or large stones."""
     rng = style.rng
     colour = materials.vary(rng, style.pick((*WALLS, *ACCENTS)), 0.04)
-    if style.chance(0.3):
+    if style.bernoulli(0.3):
         return materials.plain(rng, colour, mottle=0.02, speckle=0.02)
-    if style.chance(0.5):
+    if style.bernoulli(0.5):
         brick = materials.vary(rng, (0.58, 0.36, 0.28), 0.04)
         return materials.tiles(rng, brick, (0.7, 0.68, 0.64), size_m=(0.4, 0.14), variation=0.08, brick=True)
     return large.large_pattern(style)

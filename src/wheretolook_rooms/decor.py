@@ -23,11 +23,11 @@ def books_in_row(style: Style, length: float, height: float, depth: float) -> li
         deep = float(min(rng.uniform(0.13, 0.2), depth - 0.01))
         if x + width > length:
             return patches
-        if style.chance(0.05):
+        if style.bernoulli(0.05):
             x += width  # a gap
             continue
         colour = materials.vary(rng, style.pick(style.cover_colours), 0.06)
-        printed = style.chance(0.35 + 0.6 * style.richness)
+        printed = style.bernoulli(0.35 + 0.6 * style.richness)
         spine = artwork.book_spine(rng, colour) if printed else materials.plain(rng, colour)
         cover = style.pick(style.covers)
         book = box((x, 0, 0), (x + width - 0.001, deep, tall), cover, faces={"front": spine, "top": style.paper})
@@ -128,7 +128,7 @@ def plant(style: Style, height: float, leaves: int, reach_m: float) -> list[Patc
     patches = lathe(profile, pot, sides=20)
     patches += lathe([(0, 0.92 * h), (r * 0.91, 0.92 * h), (0, 0.9 * h)], earth, sides=20)
     stem = materials.plain(rng, (0.3, 0.36, 0.18), shared=True)
-    wide = style.chance(0.5)
+    wide = style.bernoulli(0.5)
     for _ in range(leaves):
         turn = rng.uniform(0, 2 * np.pi)
         lean = rng.uniform(0.1, 0.75)

@@ -64,7 +64,7 @@ def kitchen_run(style: Style, width: float, height: float, window: bool) -> list
     patches += box((hx - 0.27, 0.06, top), (hx + 0.27, 0.55, top + 0.008), style.black)
     for dx, dy, r in ((-0.13, 0.18, 0.09), (0.13, 0.18, 0.07), (-0.13, 0.42, 0.07), (0.13, 0.42, 0.09)):
         patches += move(cylinder(r, 0.008, 0.011, style.metal, sides=20), shift=(hx + dx, dy, top))
-    if style.chance(0.6):
+    if style.bernoulli(0.6):
         enamel = materials.plain(rng, style.pick([(0.7, 0.7, 0.72), (0.6, 0.16, 0.14), (0.2, 0.28, 0.36)]), shared=True)
         pot = lathe([(0, 0.135), (0.02, 0.135), (0.02, 0.12), (0.1, 0.11), (0.1, 0), (0, 0)], enamel, sides=24)
         patches += move(pot, shift=(hx + 0.13, 0.42, top + 0.0115))
@@ -74,7 +74,7 @@ def kitchen_run(style: Style, width: float, height: float, window: bool) -> list
         patches += move(above, shift=(0, 0, 1.45))
     for x in np.arange(-w + 0.12, w - 0.1, 0.2):
         free = abs(x - sx) > basin_w / 2 + 0.1 and abs(x - hx) > 0.4
-        if not free or not style.chance(0.25 + 0.6 * style.clutter):
+        if not free or not style.bernoulli(0.25 + 0.6 * style.clutter):
             continue
         kind = rng.integers(5 if abs(x) < w - 0.3 else 4)  # leaves must not reach past the end
         item = [
@@ -109,7 +109,7 @@ def bathtub(style: Style, width: float) -> list[Patch]:
     patches = trough((-width / 2, 0.0, 0.0), (width / 2, 0.75, 0.56), 0.09, 0.14, style.ceramic)
     patches += move(tap(style, 0.16), shift=(width / 4, 0.03, 0.56))
     for x in np.arange(-width / 2 + 0.15, 0, 0.12):
-        if style.chance(0.3 + 0.4 * style.clutter):
+        if style.bernoulli(0.3 + 0.4 * style.clutter):
             patches += move(decor.bottle(style, 0.2), shift=(x, 0.045, 0.56))
     return patches
 
@@ -125,14 +125,14 @@ def toilet(style: Style) -> list[Patch]:
 
 
 def basin(style: Style) -> list[Patch]:
-    """Washbasin on a cabinet with a mirror above; bottles beside the tap."""
+    """Washbasin on a cabinet with a mirror above; bottles next to the tap."""
     patches = cabinet(style, (0.62, 0.42, 0.72), columns=2, carcass=style.front)
     patches += trough((-0.34, 0.0, 0.72), (0.34, 0.47, 0.86), 0.04, 0.03, style.ceramic)
     patches += move(tap(style, 0.16), shift=(0, 0.02, 0.86))
     glass = materials.plain(style.rng, (0.70, 0.75, 0.77))
     patches += box((-0.32, 0, 1.15), (0.32, 0.03, 1.95), style.metal, faces={"front": glass}, hidden=("back",))
     for x in (-0.28, 0.28):
-        if style.chance(0.4 + 0.5 * style.clutter):
+        if style.bernoulli(0.4 + 0.5 * style.clutter):
             patches += move(decor.bottle(style, 0.15), shift=(x, 0.021, 0.86))
     return patches
 
@@ -213,6 +213,6 @@ def coat_rack(style: Style, count: int) -> list[Patch]:
     for k in range(count):
         x = -half + 0.16 + 0.32 * k
         patches += tube([(x, 0.02, 1.75), (x, 0.08, 1.75), (x, 0.09, 1.79)], 0.006, style.metal, sides=6)
-        if style.chance(0.45 + 0.3 * style.clutter):
+        if style.bernoulli(0.45 + 0.3 * style.clutter):
             patches += move(decor.coat(style), shift=(x, 0, 1.74))
     return patches

@@ -43,7 +43,7 @@ class Furnisher:
     def __init__(self, style: Style, plan: Plan) -> None:
         self.style = style
         self.plan = plan
-        self.dining_chair = (style.wood, style.patterned() if style.chance(0.4) else style.upholstery)
+        self.dining_chair = (style.wood, style.patterned() if style.bernoulli(0.4) else style.upholstery)
 
     def fill(self, layout: Layout) -> None:
         """Put the furniture of its kind into a room."""
@@ -93,7 +93,7 @@ class Furnisher:
         for count in range(seats, 1, -2):
             length = {2: 0.75, 4: 1.2, 6: 1.7}[count]
             depth = 0.8
-            turned = style.chance(0.5)
+            turned = style.bernoulli(0.5)
             w, d = (depth + 1.0, length + 0.1) if turned else (length + 0.1, depth + 1.0)
             spot = layout.find_on_floor(w, d, 0.25)
             if spot is None:
@@ -113,7 +113,7 @@ class Furnisher:
         style = self.style
         patches: list[Patch] = []
         for x in np.arange(-length / 2 + 0.2, length / 2 - 0.15, 0.3):
-            if not style.chance(0.25 + 0.6 * style.clutter):
+            if not style.bernoulli(0.25 + 0.6 * style.clutter):
                 continue
             item = [
                 lambda: decor.bowl(style, 0.13, True),
@@ -141,7 +141,7 @@ class Furnisher:
         for _ in range(1 + round(1.5 * style.clutter)):
             width = float(style.rng.choice([0.8, 1.0, 1.4]))
             height = float(style.rng.uniform(1.7, 2.15))
-            self._bookshelf(layout, width, height, "corner" if style.chance(0.5) else "any")
+            self._bookshelf(layout, width, height, "corner" if style.bernoulli(0.5) else "any")
         if room.area > 15:
             self._dining(layout, 6)
         self._stand(layout, furniture.sofa(style, 1), (0.98, 0.92, 0.85), "any")
@@ -152,15 +152,19 @@ class Furnisher:
         self._rug(layout, layout.point(sofa.side, sofa.at, 1.65), (2.3, 1.6), bool(sofa.side % 2))
         footprint = layout.rectangle(sofa.side, sofa.at - 0.52, sofa.at + 0.52, 1.36, 1.93)
         # The table may stand where the sofa and the television keep the floor free, but not before a door.
-        taken = layout.footprints + layout.keep_free[: len(layout.doors)]
-        if layout.contains(footprint) and not any(overlap(footprint, f) for f in taken) and layout.passable(footprint):
+        occupied = layout.footprints + layout.keep_free[: len(layout.doors)]
+        if (
+            layout.contains(footprint)
+            and not any(overlap(footprint, f) for f in occupied)
+            and layout.passable(footprint)
+        ):
             table = furniture.table(self.style, 1.0, 0.55, 0.42, self.style.second_wood)
             table += move(self._on_table(1.0, 0.55, 0.42), shift=(0, 0.275, 0))
             layout.put_on_wall(sofa.side, sofa.at, move(table, shift=(0, 1.37, 0)))
             layout.footprints.append(footprint)
 
     def _floor_lamp(self, layout: Layout) -> None:
-        lit = layout.room.lamp_on and self.style.chance(0.7)
+        lit = layout.room.lamp_on and self.style.bernoulli(0.7)
         spot = layout.find_by_wall((0.46, 0.46, 1.7), "corner", front=0.0)
         if spot is not None:
             layout.put_by_wall(move(decor.floor_lamp(self.style, lit), shift=(0, 0.23, 0)), spot)
@@ -178,7 +182,7 @@ class Furnisher:
                 break
         self._stand(layout, fixtures.fridge(style), (0.64, 0.66, 1.9), "corner", 0.6)
         if layout.room.kind == "kitchen":
-            if style.chance(0.5):
+            if style.bernoulli(0.5):
                 self._stand(layout, fixtures.washing_machine(style), (0.62, 0.6, 0.88), "corner")
             self._dining(layout, 4)
             self._bookshelf(layout, 0.8, 1.6)
@@ -206,21 +210,21 @@ class Furnisher:
         if spot is not None:
             for sign in (-1, 1):
                 self._nightstand(layout, spot.side, spot.at + sign * (width / 2 + 0.05 + 0.24))
-            if style.chance(0.7):
+            if style.bernoulli(0.7):
                 self._rug(layout, layout.point(spot.side, spot.at, 1.7), (width + 1.0, 1.5), bool(spot.side % 2))
         for width in (float(style.rng.choice([1.2, 1.6, 2.0])), 1.0):
-            front = style.wood if style.chance(0.5) else style.front
+            front = style.wood if style.bernoulli(0.5) else style.front
             wardrobe = furniture.cabinet(style, (width, 0.6, 2.1), columns=round(width / 0.5), front=front)
             if self._stand(layout, wardrobe, (width, 0.62, 2.12), "corner", 0.6) is not None:
                 break
-        if style.chance(0.6):
+        if style.bernoulli(0.6):
             self._desk(layout)
-        if style.chance(0.7):
+        if style.bernoulli(0.7):
             chest = furniture.cabinet(style, (0.9, 0.42, 0.85), columns=2, rows=3)
             chest += move(decor.vase(style, 0.25), shift=(-0.25, 0.2, 0.85))
             chest += move(decor.book_stack(style, 2), shift=(0.2, 0.2, 0.85))
             self._stand(layout, chest, (0.9, 0.46, 1.1))
-        if style.chance(0.2 + 0.6 * style.clutter):
+        if style.bernoulli(0.2 + 0.6 * style.clutter):
             self._bookshelf(layout, 0.8, 1.8)
 
     def _nightstand(self, layout: Layout, side: int, at: float) -> None:
@@ -228,7 +232,7 @@ class Furnisher:
         a1 = at + 0.22
         spot = Spot(side, at, (0.44, 0.4, 0.95), 0.0, layout.rectangle(side, a0, a1, 0, 0.4))
         if layout.wall_is_clear(side, a0, a1, 0, 0.9, gap=0.0) and layout.is_clear(spot.footprint, 0.0):
-            lit = layout.room.lamp_on and self.style.chance(0.6)
+            lit = layout.room.lamp_on and self.style.bernoulli(0.6)
             layout.put_by_wall(furniture.nightstand(self.style, lit), spot)
             if lit:
                 layout.add_lamp(*layout.point(side, at - 0.06, 0.16), 0.87, 0.25)
@@ -255,7 +259,7 @@ class Furnisher:
                 break
         self._stand(layout, fixtures.basin(style), (0.7, 0.5, 1.95), "any", 0.5)
         self._stand(layout, fixtures.toilet(style), (0.5, 0.68, 1.0), "any", 0.45)
-        if style.chance(0.6):
+        if style.bernoulli(0.6):
             self._stand(layout, fixtures.washing_machine(style), (0.62, 0.6, 0.88), "corner", 0.5)
         for side in map(int, style.rng.permutation(4)[:3]):
             at = layout.hang(0.66, 0.7, 1.5, side, depth=0.1)
@@ -310,7 +314,7 @@ def _pictures(style: Style, layout: Layout) -> None:
     if layout.room.kind == "bathroom":
         return
     for side in range(4):
-        if not style.chance(0.45 + 0.5 * style.richness):
+        if not style.bernoulli(0.45 + 0.5 * style.richness):
             continue
         for _ in range(int(style.rng.integers(1, 3 + round(1.5 * style.richness)))):
             width = float(style.rng.uniform(0.35, 1.2))
@@ -325,7 +329,7 @@ def _wall_shelves(style: Style, layout: Layout) -> None:
     if layout.room.kind in ("bathroom", "hall"):
         return
     for side in range(4):
-        if style.chance(0.2 + 0.5 * style.clutter):
+        if style.bernoulli(0.2 + 0.5 * style.clutter):
             width = float(style.rng.uniform(0.7, 1.3))
             height = float(style.rng.uniform(1.3, 1.6))
             at = layout.hang(width, height - 0.05, height + 0.4, side, depth=0.25)
@@ -352,7 +356,7 @@ def _ceiling_lamp(style: Style, layout: Layout, top: float) -> None:
     (x, y) = layout.room.centre
     dx, dy = (room.width / 4, 0.0) if room.width > room.depth else (0.0, room.depth / 4)
     centres = [(x - dx, y - dy), (x + dx, y + dy)] if max(room.width, room.depth) > 5.5 else [(x, y)]
-    pendant = room.kind in ("living", "kitchen", "bedroom", "study") and style.chance(0.5)
+    pendant = room.kind in ("living", "kitchen", "bedroom", "study") and style.bernoulli(0.5)
     for x, y in centres:
         glass = materials.glow((1.0, 0.96, 0.87)) if lit else materials.plain(style.rng, (0.86, 0.85, 0.82))
         if pendant:

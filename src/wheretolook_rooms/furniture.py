@@ -88,7 +88,7 @@ def bed(style: Style, width: float) -> list[Patch]:
     rng = style.rng
     length = 2.08
     w = width / 2
-    frame = style.wood if style.chance(0.6) else style.upholstery
+    frame = style.wood if style.bernoulli(0.6) else style.upholstery
     sheet = materials.fabric(rng, (0.90, 0.89, 0.86), weave=0.01)
     cover = style.patterned()
     head = float(rng.uniform(0.9, 1.15))
@@ -103,7 +103,7 @@ def bed(style: Style, width: float) -> list[Patch]:
         low = (x - 0.32, 0.14, 0.46)
         high = (x + 0.32, 0.56, 0.56)
         patches += cushion(low, high, sheet, radius_m=0.04, puff=(0, 0, 0.05), span=7)
-        if style.chance(0.6):
+        if style.bernoulli(0.6):
             patches += move(tilted_back(decor.pillow(style, cover, 0.38), 0.5), shift=(x, 0.62, 0.55))
     return patches
 
@@ -195,7 +195,7 @@ def bookshelf(style: Style, width: float, height: float, depth: float = 0.28) ->
                 books = decor.books_in_row(style, run, gap, depth - 0.03)
                 patches += move(books, shift=(x, 0.03, low + board))
             elif draw < 0.92 and run > 0.2:
-                vase = style.chance(0.5)
+                vase = style.bernoulli(0.5)
                 gap_m = min(gap * 0.85, 0.26)
                 item = decor.vase(style, gap_m) if vase else decor.book_stack(style, int(rng.integers(1, 4)))
                 patches += move(item, shift=(x + run / 2, depth / 2, low + board))
@@ -232,7 +232,7 @@ def media_unit(style: Style, width: float) -> list[Patch]:
     patches += box(low, high, style.black, faces={"front": style.screen}, hidden=("back",))
     patches += box((-0.2, 0.08, 0.48), (0.2, 0.26, 0.495), style.black)
     patches += box((-0.04, 0.14, 0.495), (0.04, 0.17, 0.57), style.black)
-    if width - tv > 0.5 and style.chance(0.7):
+    if width - tv > 0.5 and style.bernoulli(0.7):
         patches += move(decor.vase(style, 0.24), shift=(width / 2 - 0.12, 0.2, 0.48))
     return patches
 

@@ -25,13 +25,13 @@ def hall(config: ApartmentConfig, seed: int) -> Furnished:
         large.add_windows(room, side, bay, bay * float(rng.uniform(0.4, 0.7)), 0.45 * height, 0.85 * height)
 
     plain = materials.plain(rng, materials.vary(rng, style.pick(WALLS), 0.03))
-    walls = [large.large_pattern(style) if style.chance(0.4 + 0.4 * style.richness) else plain for _ in range(4)]
+    walls = [large.large_pattern(style) if style.bernoulli(0.4 + 0.4 * style.richness) else plain for _ in range(4)]
     finish = Finish(walls, large.large_pattern(style), materials.plain(rng, (0.85, 0.85, 0.84)))
     shell = build_shell(style, Plan([room], [], height), [finish])
 
     layout = Layout(room, rng)
     large.hang_doors(style, layout, 3)
-    if style.chance(0.6):
+    if style.bernoulli(0.6):
         _pillars(style, layout, height)
     pieces = large.mixed_furniture(style)
     for _ in range(round(room.area / 60 * (0.5 + config.clutter)) + 3):

@@ -64,13 +64,13 @@ def large_pattern(style: Style) -> Material:
     colour = materials.vary(rng, style.pick(WALLS), 0.06)
     second = materials.vary(rng, style.pick(FRONTS), 0.06)
     side = float(rng.uniform(0.8, 2.5))
-    if style.chance(0.3):
+    if style.bernoulli(0.3):
         return materials.wallpaper(rng, colour, second, period_m=side, motif=True)
     size = (side, side * float(rng.uniform(0.5, 1)))
-    every = int(rng.integers(2, 6)) if style.chance(0.5) else 0
-    chequered = second if style.chance(0.4) else None
+    every = int(rng.integers(2, 6)) if style.bernoulli(0.5) else 0
+    chequered = second if style.bernoulli(0.4) else None
     veins = style.richness * float(rng.uniform(0.5, 2))
-    brick = style.chance(0.4)
+    brick = style.bernoulli(0.4)
     grout = (0.5, 0.49, 0.47)
     return materials.tiles(
         rng, colour, grout, size_m=size, second=chequered, veins=veins, brick=brick, decor_every=every
@@ -86,7 +86,7 @@ def ceiling_lamps(style: Style, layout: Layout, height: float, pitch_m: float, d
     off = materials.plain(style.rng, (0.86, 0.85, 0.82))
     for x in room.x0 + (np.arange(nx) + 0.5) * room.width / nx:
         for y in room.y0 + (np.arange(ny) + 0.5) * room.depth / ny:
-            lit = not style.chance(dark) or len(layout.lamps) == 0
+            lit = not style.bernoulli(dark) or len(layout.lamps) == 0
             glass = materials.glow((1.0, 0.97, 0.9)) if lit else off
             faces = {"bottom": glass}
             layout.patches += box(

@@ -87,7 +87,7 @@ class Layout:
         return min(px, qx), min(py, qy), max(px, qx), max(py, qy)
 
     def passable(self, extra: Rectangle) -> bool:
-        """Whether one can still walk from door to door, and over most of the free floor, with `extra` taken too."""
+        """Whether one can still walk from door to door, and over most of the free floor, with `extra` occupied as well."""
         room = self.room
         nx = int(room.width / CELL_M)
         ny = int(room.depth / CELL_M)
@@ -108,16 +108,16 @@ class Layout:
         return bool(sizes[main - 1] > 0.8 * sizes.sum())
 
     def contains(self, footprint: Rectangle) -> bool:
-        """Whether a footprint lies in the room."""
+        """Return whether a footprint is inside the room."""
         (x0, y0, x1, y1) = footprint
         room = self.room
         return x0 > room.x0 - 1e-6 and y0 > room.y0 - 1e-6 and x1 < room.x1 + 1e-6 and y1 < room.y1 + 1e-6
 
     def is_clear(self, footprint: Rectangle, gap: float = 0.02) -> bool:
-        """Whether a footprint lies in the room, touches nothing and blocks no way."""
-        taken = any(overlap(footprint, f, gap) for f in self.footprints)
-        taken = taken or any(overlap(footprint, f) for f in self.keep_free)
-        return self.contains(footprint) and not taken and self.passable(footprint)
+        """Return whether a footprint is inside the room, touches nothing and blocks no way."""
+        occupied = any(overlap(footprint, f, gap) for f in self.footprints)
+        occupied = occupied or any(overlap(footprint, f) for f in self.keep_free)
+        return self.contains(footprint) and not occupied and self.passable(footprint)
 
     def wall_is_clear(self, side: int, a0: float, a1: float, z0: float, z1: float, gap: float = 0.01) -> bool:
         """Whether a piece of wall is bare."""

@@ -61,5 +61,5 @@ def _desks(style: Style, layout: Layout) -> None:
             for k in range(count):
                 at = (k - (count - 1) / 2) * width
                 for angle in (0.0, np.pi):
-                    if style.chance(0.92):
+                    if style.bernoulli(0.92):
                         layout.patches += move(move(desk, angle_rad=angle, shift=(at, 0, 0)), shift=(x, y, 0))

@@ -124,7 +124,7 @@ def shared_wall(a: Room, b: Room) -> tuple[int, float, float] | None:
 
 
 def _name(rooms: list[Room], corridor: bool) -> None:
-    """Choose the rooms' kinds: bathroom the smallest, living room the largest, the kitchen beside it."""
+    """Choose the rooms' kinds: bathroom the smallest, living room the largest, the kitchen next to it."""
     rest = sorted(rooms, key=lambda r: r.area)
     if corridor:
         rooms[0].kind = "hall"
@@ -138,8 +138,8 @@ def _name(rooms: list[Room], corridor: bool) -> None:
         rest.remove(hall)
     kinds = ["bedroom", "kitchen", "bedroom", "study"]
     if len(rest) >= 2:
-        beside = [r for r in rest if shared_wall(r, living)] or rest
-        kitchen = min(beside, key=lambda r: r.area)
+        adjacent = [r for r in rest if shared_wall(r, living)] or rest
+        kitchen = min(adjacent, key=lambda r: r.area)
         kitchen.kind = "kitchen"
         rest.remove(kitchen)
         kinds.remove("kitchen")
@@ -197,16 +197,16 @@ def _add_doors(rng: np.random.Generator, rooms: list[Room], doors: list[tuple[in
 
 
 def outside_spans(room: Room, rooms: list[Room], side: int) -> list[tuple[float, float]]:
-    """Intervals of a wall, in wall coordinates, behind which no room lies."""
+    """Intervals of a wall, in wall coordinates, with no room behind."""
     length = room.wall_length(side)
-    taken = []
+    occupied = []
     for other in rooms:
         wall = shared_wall(room, other) if other is not room else None
         if wall is not None and wall[0] == side:
-            taken.append(sorted((room.along(side, wall[1]), room.along(side, wall[2]))))
+            occupied.append(sorted((room.along(side, wall[1]), room.along(side, wall[2]))))
     free = []
     at = 0.0
-    for low, high in sorted(taken):
+    for low, high in sorted(occupied):
         free.append((at, low - INNER_WALL_M))
         at = high + INNER_WALL_M
     free.append((at, length))

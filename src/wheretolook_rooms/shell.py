@@ -39,28 +39,28 @@ def choose_finish(style: Style, room: Room) -> Finish:
     floor = materials.planks(rng, style.floor_colour, width_m, length_m, contrast, along_x)
     if room.kind == "bathroom":
         walls = [_bathroom_tiles(style)] * 4
-        second = (0.38, 0.40, 0.42) if style.chance(0.4) else None
+        second = (0.38, 0.40, 0.42) if style.bernoulli(0.4) else None
         veins = 0.8 * style.richness
         size = (0.3, 0.3)
         floor = materials.tiles(rng, (0.62, 0.62, 0.60), (0.48, 0.48, 0.47), size_m=size, veins=veins, second=second)
     elif room.kind == "kitchen":
         tile = materials.vary(rng, (0.70, 0.66, 0.60))
-        second = (0.55, 0.48, 0.42) if style.chance(0.3) else None
+        second = (0.55, 0.48, 0.42) if style.bernoulli(0.3) else None
         veins = 0.9 * style.richness
         floor = materials.tiles(rng, tile, (0.52, 0.50, 0.47), size_m=(0.4, 0.4), veins=veins, second=second)
-    if room.kind in ("living", "study") and style.chance(0.6):
+    if room.kind in ("living", "study") and style.bernoulli(0.6):
         walls[int(rng.integers(4))] = materials.plain(rng, materials.vary(rng, style.pick(ACCENTS), 0.02))
     papered = {"bedroom": 0.4, "hall": 0.2, "living": 0.15, "study": 0.15}.get(room.kind, 0.0)
-    if style.chance(papered + 0.3 * style.richness) and room.kind not in ("bathroom", "kitchen"):
+    if style.bernoulli(papered + 0.3 * style.richness) and room.kind not in ("bathroom", "kitchen"):
         second = materials.vary(rng, style.pick(ACCENTS), 0.03)
         period_m = float(rng.uniform(0.12, 0.24))
-        paper = materials.wallpaper(rng, colour, second, period_m=period_m, motif=style.chance(0.6))
+        paper = materials.wallpaper(rng, colour, second, period_m=period_m, motif=style.bernoulli(0.6))
         side = int(rng.integers(4))
-        if style.chance(0.3):
+        if style.bernoulli(0.3):
             walls = [paper] * 4
         else:
             walls[side] = paper
-    if room.kind == "bedroom" and style.chance(0.4):
+    if room.kind == "bedroom" and style.bernoulli(0.4):
         floor = materials.plain(rng, materials.vary(rng, (0.62, 0.57, 0.50)), speckle=0.03 + 0.07 * style.richness)
     return Finish(walls, floor, ceiling)
 
@@ -70,9 +70,9 @@ def _bathroom_tiles(style: Style) -> Material:
     richness = style.richness
     size = style.pick([(0.3, 0.6), (0.2, 0.2), (0.3, 0.3), (0.15, 0.15)])
     tile = materials.vary(rng, style.pick([(0.90, 0.91, 0.90), (0.72, 0.80, 0.82), (0.84, 0.80, 0.72)]), 0.02)
-    brick = style.chance(0.3)
+    brick = style.bernoulli(0.3)
     grout = (0.62, 0.62, 0.60)
-    every = int(rng.integers(3, 8)) if style.chance(0.3 + 0.6 * richness) else 0
+    every = int(rng.integers(3, 8)) if style.bernoulli(0.3 + 0.6 * richness) else 0
     return materials.tiles(rng, tile, grout, size_m=size, brick=brick, veins=0.5 * richness, decor_every=every)
 
 
@@ -158,7 +158,7 @@ def build_shell(style: Style, plan: Plan, finishes: list[Finish] | None = None, 
     """
     finishes = finishes or [choose_finish(style, room) for room in plan.rooms]
     patches: list[Patch] = []
-    if style.chance(0.25 + 0.4 * style.richness):
+    if style.bernoulli(0.25 + 0.4 * style.richness):
         cloth = style.patterned()
     else:
         cloth = materials.fabric(style.rng, materials.vary(style.rng, (0.80, 0.76, 0.68), 0.05), weave=0.02)

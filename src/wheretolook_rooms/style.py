@@ -57,14 +57,14 @@ class Style:
         """One of the options at random."""
         return options[int(self.rng.integers(len(options)))]
 
-    def chance(self, probability: float) -> bool:
+    def bernoulli(self, probability: float) -> bool:
         """True with the given probability."""
         return bool(self.rng.random() < probability)
 
     def patterned(self) -> Material:
         """Cloth with a pattern, for pillows, throws and bed covers."""
         patterns = ["plain", "stripes", "checks", "dots", "zigzag"]
-        pattern = self.pick(patterns) if self.chance(self.richness + 0.35) else "plain"
+        pattern = self.pick(patterns) if self.bernoulli(self.richness + 0.35) else "plain"
         colours = self.pick(artwork.PALETTES)
         first, second = (colours[k] for k in self.rng.permutation(5)[:2])
         period_m = float(self.rng.uniform(0.05, 0.14))
@@ -72,7 +72,7 @@ class Style:
 
     def print(self) -> Material:
         """A picture, sometimes one that already hangs in another room."""
-        if self.prints and self.chance(0.3):
+        if self.prints and self.bernoulli(0.3):
             return self.pick(self.prints)
         material = artwork.picture(self.rng, mat=float(self.pick([0.0, 0.0, 0.1, 0.16])))
         self.prints.append(material)

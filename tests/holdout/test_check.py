@@ -3,48 +3,30 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import warnings
+from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pandas as pd
 import pycolmap
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from tests.disks import file_limit
 
-from box_scenes import furnished_room
 from holdout.corridor import ALONE, N, corridor_poses, write_corridor
 from holdout.rendered_room import write_rendered_room
 from selection.room import WEIGHTS
-from wheretolook.cli import main
-from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.poses import camera_centers
-from wheretolook.holdout import holdout as leave_out
 from wheretolook.holdout.command import run
 from wheretolook.holdout.holdout import without
-from wheretolook.holdout.holdout_blocks import (
-    KEPT,
-    LEAST_REST,
-    Block,
-    choose_blocks,
-    landmarks_kept,
-    observation_matrix,
-)
+from wheretolook.holdout.holdout_blocks import KEPT, MIN_REST, choose_blocks, landmarks_kept, observation_matrix
 from wheretolook.holdout.photo_map import open_map
 from wheretolook.mapping.colmap_model import model_arrays, read_model
-from wheretolook.mapping.feature_files import read_features
-from wheretolook.scenes.loading import save_glb
 from wheretolook.scorers.adapted.network import AdaptedNetwork
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.trained_network import TrainedNetwork
-from wheretolook.utils.errors import ConfigError, InUseError, MapError, StorageError, WeightsError
-from wheretolook.utils.locks import hold
-from wheretolook.utils.npz_files import load_npz, save_npz
+from wheretolook.utils.errors import ConfigError, MapError, WeightsError
 
 
 @pytest.fixture(scope="module")
@@ -117,10 +99,10 @@ def test_blocks_share_out_all_photographs_and_grow(corridor: tuple[Path, Path]) 
     assert len(parts) == 8 and max(sizes) >= 3 * min(sizes)
     sees = observation_matrix(source)
     grown = [block for block in blocks if not block.is_part]
-    assert grown and max(len(block.left_out) for block in grown) <= (1 - LEAST_REST) * N
+    assert grown and max(len(block.left_out) for block in grown) <= (1 - MIN_REST) * N
     for block in grown:
         worse = np.quantile(landmarks_kept(sees, source.moment[block.left_out]), 0.25)
-        assert worse <= KEPT[0] or len(block.left_out) == int((1 - LEAST_REST) * N)
+        assert worse <= KEPT[0] or len(block.left_out) == int((1 - MIN_REST) * N)
     again = choose_blocks(open_map(*corridor, metric=True))
     assert all(np.array_equal(one.left_out, other.left_out) for one, other in zip(blocks, again, strict=True))
     few = choose_blocks(source, views=3)
@@ -156,6 +138,12 @@ def test_photographs_localize_where_the_rest_knows_what_they_show(checked: Path)
     assert views["score"].between(0, 1).all() and {"bins", "visible", "expected_inliers"} <= {*views}
 
 
+def test_auc_of_the_checked_method(checked: Path) -> None:
+    auc = json.loads((checked / "check.json").read_text())["methods"]["set"]["auc"]
+    assert 0.9 < auc["value"] <= 1 and auc["low"] <= auc["value"] <= auc["high"]
+    assert (checked / "check.png").is_file()
+
+
 def test_the_part_that_nothing_else_shows_is_named(checked: Path) -> None:
     content = json.loads((checked / "check.json").read_text())
     named = [part for part in content["weak_parts"] if "027.jpg" in part["photographs"]]
@@ -165,85 +153,6 @@ def test_the_part_that_nothing_else_shows_is_named(checked: Path) -> None:
     table = pd.read_csv(checked / "check.csv")
     assert (table.loc[[*ALONE], "part"] == named[0]["number"]).all()
     assert (table.loc[table["localized"] == 1, "part"] == 0).all()
-
-
-def test_it_says_how_often_the_better_view_is_picked(
-    checked: Path, corridor: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
-) -> None:
-    content = json.loads((checked / "check.json").read_text())
-    auc = content["methods"]["set"]["auc"]
-    assert 0.9 < auc["value"] <= 1 and auc["low"] <= auc["value"] <= auc["high"]
-    before = {path: path.stat().st_mtime_ns for path in checked.glob("work/*/*/views.csv")}
-    run(_arguments(*corridor, checked, "--metres", "--also", "bins"))
-    told = capsys.readouterr().out
-    assert told.startswith(f"of two views, one that localizes and one that does not, set picks the better one "
-                           f"{100 * auc['value']:.0f} times in 100")  # fmt: skip
-    assert content["says"] in told and "027.jpg" in told and "photograph again" in told
-    assert before and before == {path: path.stat().st_mtime_ns for path in before}  # nothing was localized anew
-    picture = cv2.imread(str(checked / "check.png"))
-    assert picture.shape[1] > 1500 and len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
-
-
-def test_an_interrupted_check_goes_on(checked: Path, corridor: tuple[Path, Path], tmp_path: Path) -> None:
-    shutil.copytree(checked, tmp_path / "out")
-    (work,) = (tmp_path / "out" / "work").glob("blocks-*")
-    (work / "02" / "views.csv").unlink()
-    (work / "03" / "matches.npz").write_bytes(b"half a file")
-    flipped = (work / "04" / "views.csv").read_text()
-    (work / "04" / "views.csv").write_text(flipped.replace(",1", ",7"))
-    kept = (work / "01" / "views.csv").stat().st_mtime_ns
-    run(_arguments(*corridor, tmp_path / "out", "--metres", "--also", "bins"))
-    for name in ("check.csv", "blocks.csv", "views.csv"):
-        assert (tmp_path / "out" / name).read_bytes() == (checked / name).read_bytes(), name
-    assert (work / "01" / "views.csv").stat().st_mtime_ns == kept
-
-
-@pytest.mark.parametrize("damage", ["a column", "a row", "landmarks"])
-def test_damaged_blocks_of_an_earlier_version_are_refused_by_name(
-    damage: str, checked: Path, corridor: tuple[Path, Path], tmp_path: Path
-) -> None:
-    (work,) = (checked / "work").glob("blocks-*")
-    shutil.copytree(work / "01", tmp_path / "01")
-    (tmp_path / "01" / "whole.json").unlink()
-    kept = load_npz(tmp_path / "01" / "matches.npz")
-    block = Block(1, kept["left_out"], kept["looked_at"], True)
-    assert len(leave_out._load(tmp_path / "01", block).views) == len(block.looked_at)
-    if damage == "landmarks":
-        save_npz(tmp_path / "01" / "matches.npz", {**kept, "matched_rows": kept["matched_rows"] + 10_000})
-    else:
-        text = (tmp_path / "01" / "views.csv").read_text()
-        text = text.replace("error_m", "error", 1) if damage == "a column" else text.rpartition("\n")[0][:-40]
-        (tmp_path / "01" / "views.csv").write_text(text)
-    with pytest.raises(MapError, match="damaged results of a block") as caught:
-        leave_out._load(tmp_path / "01", block)
-    assert caught.value.path == tmp_path / "01"
-
-
-def test_blocks_of_other_limits_or_versions_are_not_taken(
-    checked: Path, corridor: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shutil.copytree(checked, tmp_path / "out")
-    (before,) = (tmp_path / "out" / "work").glob("blocks-*")
-    names = set[str]()
-    for what, value in (("versions", lambda: {"wheretolook": "0.0.1"}), ("MAX_ERROR_DEG", 1e-9)):
-        monkeypatch.setattr(leave_out, what, value)
-        run(_arguments(*corridor, tmp_path / "out", "--metres", "--views", "1"))
-        (now,) = (tmp_path / "out" / "work").glob("blocks-*")
-        assert now.name not in {before.name, *names}
-        names.add(now.name)
-    assert not pd.read_csv(tmp_path / "out" / "views.csv")["good"].any()  # by a limit that nothing stays under
-
-
-def test_two_checks_do_not_write_the_same_results(corridor: tuple[Path, Path], tmp_path: Path) -> None:
-    with hold(tmp_path / "out" / ".lock", "check"), pytest.raises(InUseError, match=rf"process {os.getpid()}"):
-        run(_arguments(*corridor, tmp_path / "out"))
-    assert [path.name for path in (tmp_path / "out").iterdir()] == []
-
-
-def test_a_disk_that_is_full_is_told_not_a_damaged_model(corridor: tuple[Path, Path], tmp_path: Path) -> None:
-    with file_limit(100_000), pytest.raises(StorageError, match="is the disk full") as raised:
-        run(_arguments(*corridor, tmp_path / "out"))
-    assert Path(raised.value.path).name == "points3D.bin"
 
 
 def _adapted(folder: Path, place: np.ndarray) -> Path:
@@ -298,122 +207,90 @@ def test_a_map_of_any_scale_and_frame_gives_the_same(
     assert not content["in_metres"] and "1 % of the median depth" in content["limits"]
 
 
-# --- bad input
+def test_finished_blocks_are_reused(checked: Path, corridor: tuple[Path, Path], tmp_path: Path) -> None:
+    shutil.copytree(checked, tmp_path / "out")
+    (work,) = (tmp_path / "out" / "work").glob("blocks-*")
+    (work / "02" / "views.parquet").unlink()
+    (work / "03" / "landmarks.npz").write_bytes(b"half a file")
+    cached = (work / "01" / "views.parquet").stat().st_mtime_ns
+    run(_arguments(*corridor, tmp_path / "out", "--metres", "--also", "bins"))
+    for name in ("check.csv", "blocks.csv", "views.csv"):
+        assert (tmp_path / "out" / name).read_bytes() == (checked / name).read_bytes(), name
+    assert (work / "01" / "views.parquet").stat().st_mtime_ns == cached
 
 
-@pytest.mark.parametrize(
-    ("options", "problem"),
-    [
-        ([], "--map or by --scene"),
-        (["--map", "sparse", "--scene", "photos"], "--map or by --scene"),
-        (["--map", "sparse", "--database", "d.db", "--images", "photos"], "database or from images"),
-        (["--map", "sparse", "--views", "0"], "not such numbers"),
-        (["--map", "sparse", "--method", "best"], "unknown method"),
-        (["--map", "sparse", "--mesh", "scan.glb"], "only for a map in metres"),
-    ],
-)
-def test_options_that_do_not_go_together_are_refused(options: list[str], problem: str) -> None:
-    with pytest.raises(ConfigError, match=problem):
-        run(options)
+# --- invalid input
 
 
-def test_a_model_without_features_or_photographs_says_what_is_needed(tmp_path: Path) -> None:
-    sparse, database = write_corridor(tmp_path)
-    database.rename(tmp_path / "elsewhere.db")
-    with pytest.raises(MapError, match=r"--database.*--images"):
-        run(["--map", str(sparse), "--out", str(tmp_path / "out")])
-    with pytest.raises(MapError, match="no such folder"):
-        run(["--map", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out")])
-    with pytest.raises(MapError, match="no such database"):
-        run(_arguments(sparse, database, tmp_path / "out"))
-    with pytest.raises(WeightsError):
-        run(_arguments(sparse, tmp_path / "elsewhere.db", tmp_path / "out", "--weights", str(tmp_path / "none")))
+def no_features(corridor: tuple[Path, Path], folder: Path) -> list[str]:
+    shutil.copytree(corridor[0], folder / "alone" / "sparse")
+    return ["--map", str(folder / "alone" / "sparse")]
 
 
-def test_a_database_beside_the_model_is_found(tmp_path: Path) -> None:
-    sparse, database = write_corridor(tmp_path)
-    database.rename(sparse.parent / "database.db")
-    run(["--map", str(sparse), "--out", str(tmp_path / "out"), "--workers", "1", "--views", "2", "--occlusion", "none"])
-    assert (tmp_path / "out" / "check.png").is_file()
+def no_model(corridor: tuple[Path, Path], folder: Path) -> list[str]:
+    return ["--map", str(folder / "nowhere")]
 
 
-def test_too_few_photographs_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(MapError, match=r"at least 20 photographs.*got 19"):
-        run(_arguments(*write_corridor(tmp_path, photographs=19), tmp_path / "out"))
+def no_weights(corridor: tuple[Path, Path], folder: Path) -> list[str]:
+    return ["--map", str(corridor[0]), "--database", str(corridor[1]), "--weights", str(folder / "none")]
 
 
-def test_features_of_another_model_are_refused(corridor: tuple[Path, Path], tmp_path: Path) -> None:
-    _, other = write_corridor(tmp_path, noise_px=2.0)
-    with pytest.raises(MapError, match=r"disagree|other keypoints"):
-        run(_arguments(corridor[0], other, tmp_path / "out"))
+def too_few_photographs(corridor: tuple[Path, Path], folder: Path) -> list[str]:
+    sparse, database = write_corridor(folder, photographs=19)
+    return ["--map", str(sparse), "--database", str(database)]
 
 
-def test_photographs_of_something_else_are_refused(corridor: tuple[Path, Path], tmp_path: Path) -> None:
-    photos = tmp_path / "photos"
-    rng = np.random.default_rng(0)
-    photos.mkdir()
-    arguments = ["--map", str(corridor[0]), "--images", str(photos), "--out", str(tmp_path / "out"), "--workers", "1"]
-    with pytest.raises(MapError, match="is missing"):
-        run(arguments)
-    for row in range(N):
-        noise = cv2.resize(rng.integers(0, 255, (24, 32), dtype=np.uint8), (320, 240))
-        cv2.imwrite(str(photos / f"{row:03}.jpg"), noise)
-    with pytest.raises(MapError, match=r"no landmark at|fewer than 10 landmarks"):
-        run(arguments)
+def other_features(corridor: tuple[Path, Path], folder: Path) -> list[str]:
+    return ["--map", str(corridor[0]), "--database", str(write_corridor(folder, noise_px=2.0)[1])]
 
 
-def test_blocks_that_leave_no_map_are_refused(tmp_path: Path) -> None:
-    sparse, database = write_corridor(tmp_path)
+def no_landmarks_without_a_block(corridor: tuple[Path, Path], folder: Path) -> list[str]:
+    sparse, database = write_corridor(folder)
     model = read_model(sparse)
     for number in sorted(model.points3D)[:-40]:
         model.delete_point3D(number)
-    shutil.rmtree(sparse)
-    sparse.mkdir()
     model.write_binary(str(sparse))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with pytest.raises(MapError, match=r"fewer than \d+ landmarks"):
-            run(_arguments(sparse, database, tmp_path / "out"))
+    return ["--map", str(sparse), "--database", str(database)]
 
 
-def test_features_are_read_by_names(corridor: tuple[Path, Path]) -> None:
-    _, ((pixels, descriptors),) = read_features(corridor[1], ["004.jpg"])
-    image = read_model(corridor[0]).images[5]
-    assert np.abs(pixels - [point.xy for point in image.points2D]).max() < 1e-4
-    assert descriptors.shape == (len(pixels), 128) and descriptors.dtype == np.uint8
-    with pytest.raises(MapError, match="lacks an image"):
-        read_features(corridor[1], ["other.jpg"])
+def neither_map_nor_scene(corridor: tuple[Path, Path], folder: Path) -> list[str]:
+    return []
 
 
-def test_a_scene_that_is_not_there_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["check", "--scene", "hall", "--data", str(tmp_path)]) == 2
-    assert "there is no such scene" in capsys.readouterr().err
+def mesh_without_metres(corridor: tuple[Path, Path], folder: Path) -> list[str]:
+    return ["--map", str(corridor[0]), "--mesh", "scan.glb"]
 
 
-def test_another_dataset_that_is_damaged_is_not_in_the_way(
-    corridor: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    "make, error",
+    [
+        (neither_map_nor_scene, ConfigError),
+        (mesh_without_metres, ConfigError),
+        (no_features, MapError),
+        (no_model, MapError),
+        (too_few_photographs, MapError),
+        (other_features, MapError),
+        (no_landmarks_without_a_block, MapError),
+        (no_weights, WeightsError),
+    ],
+)
+def test_invalid_input(
+    make: Callable[[tuple[Path, Path], Path], list[str]],
+    error: type[Exception],
+    corridor: tuple[Path, Path],
+    tmp_path: Path,
 ) -> None:
-    scene = SceneFolder(tmp_path / "mine" / "hall", "test")
-    shutil.copytree(corridor[0], scene.map)
-    save_glb(furnished_room(), scene.mesh)
-    Dataset(tmp_path / "mine", (scene,)).save()
-    (tmp_path / "broken").mkdir()
-    (tmp_path / "broken" / "dataset.json").write_text("{")
-    options = ["--data", str(tmp_path), "--metres", "--occlusion", "none"]
-    assert main(["check", "--scene", "hall", *options]) == 2
-    said = capsys.readouterr().err
-    assert "neither the features" in said and "wheretolook map --map.keep_database true" in said
-    assert main(["check", "--scene", "cellar", *options]) == 2
-    assert "There are hall" in capsys.readouterr().err
+    with pytest.raises(error):
+        run([*make(corridor, tmp_path), "--out", str(tmp_path / "out"), "--workers", "1", "--device", "cpu"])
 
 
 @pytest.mark.slow
-def test_photographs_without_features_are_extracted_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_photographs_without_features_are_extracted_again(tmp_path: Path) -> None:
     write_rendered_room(tmp_path)
     arguments = ["--map", str(tmp_path / "sparse"), "--images", str(tmp_path / "photographs")]
     arguments += ["--metres", "--workers", "1"]
     run([*arguments, "--out", str(tmp_path / "out"), "--views", "8"])
-    assert "of two views" in capsys.readouterr().out
     table = pd.read_csv(tmp_path / "out" / "check.csv")
     assert table["localized"].sum() >= 12 and table["n_observed"].median() > 50
     database = tmp_path / "out" / "work" / "map" / "database.db"

@@ -59,7 +59,7 @@ def test_weights_that_hope_too_little_are_adapted_by_photographs_alone(
     timid = TrainedNetwork.load(SET, SetNetwork, "set")
     timid.offset -= 4
     timid.save(tmp_path / "timid.safetensors", read_training(SET))
-    before = {path: path.stat().st_mtime_ns for path in data.glob(f"checks/corridor/{WORK}/*/*/views.csv")}
+    before = {path: path.stat().st_mtime_ns for path in data.glob(f"checks/corridor/{WORK}/*/*/views.parquet")}
     assert adapt(checked, tmp_path, "--weights", str(tmp_path / "timid.safetensors")) == 0
     said = capsys.readouterr().out
     adapted = data / "checks" / "corridor" / "adapted.safetensors"
@@ -97,23 +97,6 @@ def test_where_photographs_teach_nothing_the_weights_stay(
     assert adapt(checked, tmp_path, "--weights", str(tmp_path / "calibrated.safetensors"), "--out", str(again)) == 0
     assert "does not make the weights better" in capsys.readouterr().out
     assert not again.exists() and again.with_suffix(".md").is_file()
-
-
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        (("--scene", "corridor"), "a scene or to a map"),
-        (("--images", "photos"), "from a database or from images"),
-        (("--weights", str(SET.with_name("mlp-2d+z.safetensors"))), "only a set network"),
-        (("--out", "weights"), "ends in .safetensors"),
-    ],
-)
-def test_bad_input_is_named(
-    checked: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...],
-    says: str,
-) -> None:  # fmt: skip
-    assert adapt(checked, tmp_path, *options) == 2
-    assert says in capsys.readouterr().err
 
 
 def test_photographs_have_rows_beside_rendered_views(checked: tuple[Path, Path, Path], tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What a check with a map's own photographs found, in one picture."""
+"""Draw the results of a check in one figure."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 _GOOD = BLUE
 _BAD = VERMILION
 _UNTESTED = "#999999"
-_DOTS = 20_000  # landmarks that are drawn
-_CURVE = 10  # bins of the reliability curve: fewer than of the error, as photographs are few
+_MAX_LANDMARKS = 20_000  # drawn
+_CURVE_BINS = 10  # fewer than of the calibration error, as photographs are few
 
 
 def check_figure(report: CheckReport) -> Figure:
-    """The map from above with all photographs, localized or not; and predicted against found, of views and of blocks.
+    """Draw the map from above with all photographs, and predictions against results for views and for blocks.
 
-    On the map a photograph has the colour of the time that it was left out with few others; numbers are those of parts
-    that relocalize badly.
+    The colour of a photograph is its result in the block of the partition; numbers are those of parts that relocalize
+    badly.
     """
     with context(RC):
         figure = new_figure(12.5, 6.6)
@@ -59,11 +59,11 @@ def _draw_map(axes: Axes, report: CheckReport) -> None:
     low = np.minimum(low, centers[:, :2].min(0))
     high = np.maximum(high, centers[:, :2].max(0))
     margin = 0.04 * (high - low).max()
-    step = max(1, len(points) // _DOTS)
+    step = max(1, len(points) // _MAX_LANDMARKS)
     axes.scatter(points[::step, 0], points[::step, 1], s=1, color="#c4c4c4", linewidths=0, rasterized=True, zorder=1)
     length = 0.035 * float((high - low).max())
     localized = table["localized"].to_numpy(dtype=float, na_value=np.nan)
-    kinds = [(np.isnan(localized), _UNTESTED, "not looked at"), (localized == 1, _GOOD, "localized")]
+    kinds = [(np.isnan(localized), _UNTESTED, "not tested"), (localized == 1, _GOOD, "localized")]
     kinds.append((localized == 0, _BAD, "not localized"))
     for mask, color, label in kinds:
         if not mask.any():
@@ -86,7 +86,7 @@ def _draw_map(axes: Axes, report: CheckReport) -> None:
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), aspect="equal")
     upright = ", turned upright" if source.is_turned else ""
     axes.set(xlabel=f"x ({source.unit})", ylabel=f"y ({source.unit})")
-    axes.set_title(f"from above{upright}; left out with their neighbours, photographs are", pad=24)
+    axes.set_title(f"from above{upright}; photographs held out with their neighbours", pad=24)
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, handletextpad=0.1, borderaxespad=0.2)
 
 
@@ -100,7 +100,7 @@ def _draw_calibration(axes: Axes, report: CheckReport) -> None:
         axes.set(xlabel=f"score of {report.method}", ylabel="views", title="scores")
         axes.legend()
         return
-    curve = reliability(views["score"].to_numpy(), views["good"].to_numpy(dtype=bool), _CURVE)
+    curve = reliability(views["score"].to_numpy(), views["good"].to_numpy(dtype=bool), _CURVE_BINS)
     known = curve[curve["n"] > 0]
     axes.plot([0, 1], [0, 1], color=INK, linewidth=1, linestyle="--")
     axes.plot(known["mean_predicted"], known["share_good"], color=_GOOD, zorder=3)
@@ -113,19 +113,19 @@ def _draw_calibration(axes: Axes, report: CheckReport) -> None:
 def _draw_inliers(axes: Axes, report: CheckReport) -> None:
     views = report.views
     expected = views["expected_inliers"].to_numpy(np.float64)
-    found = views["n_inliers"].to_numpy(np.float64)
-    label = "landmarks expected to be found"
+    n_inliers = views["n_inliers"].to_numpy(np.float64)
+    label = "expected inliers"
     if not np.isfinite(expected).all():
         expected = views["n_visible"].to_numpy(np.float64)
         label = "landmarks in view"
     good = views["good"].to_numpy(dtype=bool)
-    most = 1.3 * max(float(expected.max(initial=1)), float(found.max(initial=1)), 10.0)
+    most = 1.3 * max(float(expected.max(initial=1)), float(n_inliers.max(initial=1)), 10.0)
     axes.plot([1, most], [1, most], color=INK, linewidth=1, linestyle="--")
     for mask, color in ((good, _GOOD), (~good, _BAD)):
         axes.scatter(
-            np.maximum(expected[mask], 0.5), np.maximum(found[mask], 0.5), s=9, color=color, alpha=0.6, linewidths=0
+            np.maximum(expected[mask], 0.5), np.maximum(n_inliers[mask], 0.5), s=9, color=color, alpha=0.6, linewidths=0
         )
-    axes.set(xscale="log", yscale="log", xlabel=label, ylabel="inliers found", title="expected and found")
+    axes.set(xscale="log", yscale="log", xlabel=label, ylabel="inliers", title="expected and actual inliers")
     axes.set(xlim=(0.4, most), ylim=(0.4, most))
 
 
@@ -139,8 +139,8 @@ def _draw_blocks(axes: Axes, report: CheckReport) -> None:
     axes.set(ylim=(0, 1.02), ylabel="share of the views")
     first = int((blocks["kind"] == "part").sum())
     axes.set_xlabel(
-        f"photographs left out ({first} blocks that share out all, {len(blocks) - first} that are grown)\n"
-        "in the bars: landmarks that the rest still has of what a photograph shows"
+        f"photographs held out ({first} blocks that partition all, {len(blocks) - first} grown ones)\n"
+        "in the bars: landmarks of a photograph that the rest still has"
     )
     if 0 < first < len(blocks):
         axes.axvline(first - 0.5, color=INK, linewidth=0.8, linestyle=":")

@@ -1,4 +1,4 @@
-"""Which photographs are left out together: blocks of neighbours, so that the rest covers them from well to badly."""
+"""Choose blocks of neighbouring photographs to hold out, so that the rest covers them from well to badly."""
 
 from __future__ import annotations
 
@@ -13,72 +13,77 @@ from wheretolook.holdout.photo_map import PhotographedMap
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.utils.errors import MapError
 
-PARTS = 8  # blocks that share out all photographs among them
-SPREAD = 4.0  # the largest of these over the smallest
+PARTS = 8  # blocks that partition the photographs
+SPREAD = 4.0  # ratio of the sizes of the largest and the smallest
 KEPT = tuple(LocalizerConfig().min_inliers * share for share in (16, 8, 4, 2))
-"""Landmarks that the rest still has of what a photograph observes, at most, of the worse covered quarter of each grown
-block: from plenty for a pose to hardly enough, since not all are found again."""
+"""Landmarks that the rest may still have of what a photograph observes, at the quantile `COVERED_WORSE` of each grown
+block: from plenty for a pose to hardly enough, since not all are matched again."""
 COVERED_WORSE = 0.25
-LEAST_REST = 0.1  # share of the photographs that is never left out
-LEAST_LANDMARKS = 50  # that a map without a block has; with fewer it is none
-SAME = 0.95  # of two blocks together, photographs in both: from there on only the one that is grown further is taken
-VIEWS = 60  # photographs of a block that are localized, at most; then evenly spread ones
+MIN_REST = 0.1  # share of the photographs that is never held out
+MIN_LANDMARKS = 50  # of a map without a block
+SAME = 0.95  # intersection over union from which on two blocks are the same
+VIEWS = 60  # maximum number of photographs of a block that are localized; then evenly spread ones
 _GOLDEN = 0.6180339887
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Photographs that are left out together, by their rows."""
+    """Photographs that are held out together, by their rows.
 
-    number: int  # from 1
-    left_out: NDArray[np.int64]  # (B,) ascending
-    looked_at: NDArray[np.int64]  # (V,) those that are localized, ascending
-    is_part: bool  # whether it is one of those that share out all photographs, and so left out nowhere else of these
+    Attributes:
+        number: from 1.
+        left_out: (B,) held-out photographs, ascending.
+        looked_at: (V,) those of them that are localized, ascending.
+        is_part: whether the block belongs to the partition of all photographs.
+    """
+
+    number: int
+    left_out: NDArray[np.int64]
+    looked_at: NDArray[np.int64]
+    is_part: bool
 
 
 def choose_blocks(source: PhotographedMap, views: int = VIEWS) -> list[Block]:
-    """8 blocks of several sizes that share out all photographs, and 4 more, grown until the rest hardly covers them.
+    """Choose 8 blocks of several sizes that partition the photographs, and 4 more, grown until the rest hardly covers them.
 
-    Photographs are neighbours by the landmarks that they share, not by name or place: so a second walk past the same
-    wall is a neighbour, and a photograph of the next room is not. A block grows by the photograph that has most of its
-    landmarks in common with it. The first 8 (fewer of few moments) have sizes in geometric progression, the largest 4
-    times the smallest. The others grow from four places until a quarter of the photographs in them observe no more than
-    `KEPT` landmarks that the rest still has; so they hold views of all kinds, well covered ones at their edges and
-    badly covered ones within. No block takes more than nine tenths of the photographs, and blocks that are mostly the
-    same are taken once. What a rig took at one moment stays together. The same map gives the same blocks.
+    Photographs are neighbours by shared landmarks, not by name or place: a second walk past the same wall is a
+    neighbour, a photograph of the next room is not. A block grows by the photograph that shares most of its landmarks
+    with the block. The sizes of the first 8 (fewer for few photographs) are a geometric progression. The others grow
+    from four places until a quarter of their photographs observe at most `KEPT` landmarks that the rest still has, so
+    that they hold well covered views at their edges and badly covered ones within. No block takes more than nine tenths
+    of the photographs, and blocks that are mostly the same are taken once. Photographs of a rig frame stay together.
 
     Raises MapError if fewer than two blocks leave a map.
     """
-    sees = observation_matrix(source)
-    shared = np.asarray((sees @ sees.T).toarray(), dtype=np.float64)
-    observed = np.maximum(np.diag(shared).copy(), 1)
+    observes = observation_matrix(source)
+    shared = np.asarray((observes @ observes.T).toarray(), dtype=np.float64)
+    counts = np.maximum(np.diag(shared).copy(), 1)
     np.fill_diagonal(shared, 0)
-    share = shared / observed[:, None]  # of a moment's landmarks, those that it has in common with each other
+    share = shared / counts[:, None]  # of a frame's landmarks, those that it shares with each other frame
     centers = camera_centers(source.poses)
     sums = np.stack([np.bincount(source.moment, weights=axis) for axis in centers.T], axis=1).astype(np.float64)
     places = sums / np.bincount(source.moment)[:, None]
-    parts = _share_out(share, places)
-    walk = np.concatenate(parts)  # all moments, neighbours next to one another
+    parts = _partition(share, places)
+    walk = np.concatenate(parts)  # all frames, neighbours next to one another
     groups = [(part, True) for part in parts]
     for number, kept in enumerate(KEPT, 1):
-        order = _grow(share, places, int(walk[int(number * _GOLDEN % 1 * len(walk))]), np.ones(len(share), dtype=bool))
-        groups.append((order[: _enough(sees, order, kept)], False))
+        first = int(walk[int(number * _GOLDEN % 1 * len(walk))])
+        order = _grow(share, places, first, np.ones(len(share), dtype=bool))
+        groups.append((order[: _block_size(observes, order, kept)], False))
     taken = list[tuple[NDArray[np.int64], bool]]()
-    for group, is_part in reversed(groups):
-        left_out = np.flatnonzero(np.isin(source.moment, group))
-        leaves_map = _landmarks_without(sees, group) >= LEAST_LANDMARKS
-        if leaves_map and not any(_same(left_out, other) for other, _ in taken):
-            taken.append((left_out, is_part))
-    blocks = list[Block]()
-    for left_out, is_part in reversed(taken):
-        looked_at = left_out[
-            np.unique(np.linspace(0, len(left_out) - 1, min(views, len(left_out))).round().astype(int))
-        ]
-        blocks.append(Block(len(blocks) + 1, left_out, looked_at, is_part))
-    if len(blocks) < 2:
-        problem = f"without a block of neighbouring photographs fewer than {LEAST_LANDMARKS} landmarks are left"
-        fix = "Take more photographs, each part of the place from several sides, and map them all."
+    for group, is_part in reversed(groups):  # of two that are the same, the one that is grown further is taken
+        held_out = np.flatnonzero(np.isin(source.moment, group))
+        leaves_map = _landmarks_without(observes, group) >= MIN_LANDMARKS
+        if leaves_map and not any(_same(held_out, other) for other, _ in taken):
+            taken.append((held_out, is_part))
+    if len(taken) < 2:
+        problem = f"without a block of neighbouring photographs fewer than {MIN_LANDMARKS} landmarks are left"
+        fix = "Take more photographs, each part of the scene from several sides, and map them all."
         raise MapError(problem, path=source.path, value=f"{len(source.poses)} photographs", fix=fix)
+    blocks = list[Block]()
+    for number, (held_out, is_part) in enumerate(reversed(taken), 1):
+        tested = np.unique(np.linspace(0, len(held_out) - 1, min(views, len(held_out))).round().astype(int))
+        blocks.append(Block(number, held_out, held_out[tested], is_part))
     return blocks
 
 
@@ -87,18 +92,18 @@ def _same(one: NDArray[np.int64], other: NDArray[np.int64]) -> bool:
 
 
 def observation_matrix(source: PhotographedMap) -> csr_array:
-    """Which moments (rows) observe which landmarks of the map (columns), ones in a sparse matrix."""
+    """Return a sparse matrix with ones where rig frames (rows) observe landmarks of the map (columns)."""
     arrays = source.arrays
     point = np.repeat(np.arange(len(arrays.points)), np.diff(arrays.observation_start))
-    of_image = source.moment[arrays.observation_image]
+    frame = source.moment[arrays.observation_image]
     shape = (int(source.moment.max()) + 1, len(arrays.points))
-    sees = coo_array((np.ones(len(point), dtype=np.float32), (of_image, point)), shape=shape).tocsr()
-    sees.data[:] = 1
-    return sees
+    observes = coo_array((np.ones(len(point), dtype=np.float32), (frame, point)), shape=shape).tocsr()
+    observes.data[:] = 1
+    return observes
 
 
-def _share_out(share: Float, places: Float) -> list[NDArray[np.int64]]:
-    """All moments in blocks of neighbours of different sizes. Each grows from what is least connected with the rest."""
+def _partition(share: Float, places: Float) -> list[NDArray[np.int64]]:
+    """Partition all frames into blocks of neighbours; each grows from the frame least connected with the rest."""
     n = len(share)
     count = max(2, min(PARTS, n // 2))
     weights = SPREAD ** (np.arange(count) / max(1, count - 1))
@@ -118,9 +123,9 @@ def _share_out(share: Float, places: Float) -> list[NDArray[np.int64]]:
 
 
 def _grow(share: Float, places: Float, first: int, free: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """All free moments, in the order in which a block takes them up that starts with one of them.
+    """Return all free frames in the order in which a block that starts with one of them takes them up.
 
-    Next is the one with most of its landmarks in common with the block, of equals the nearest to the first.
+    Next is the one with most of its landmarks in common with the block; ties go to the nearest to the first.
     """
     near = -np.linalg.norm(places - places[first], axis=1)
     near = near / max(1e-12, -near.min()) * 1e-6
@@ -136,29 +141,29 @@ def _grow(share: Float, places: Float, first: int, free: NDArray[np.bool_]) -> N
     return np.array(order)
 
 
-def _enough(sees: csr_array, order: NDArray[np.int64], kept: float) -> int:
-    """How many of the moments of a growing block to leave out, so that the median one keeps no more landmarks."""
+def _block_size(observes: csr_array, order: NDArray[np.int64], kept: float) -> int:
+    """Return how many frames of a growing block to hold out, so that its worse covered quarter keeps `kept` landmarks."""
     low = 2
-    high = max(2, int((1 - LEAST_REST) * len(order)))
+    high = max(2, int((1 - MIN_REST) * len(order)))
     while low < high:  # the larger the block, the less is left
         middle = (low + high) // 2
-        if np.quantile(landmarks_kept(sees, order[:middle]), COVERED_WORSE) <= kept:
+        if np.quantile(landmarks_kept(observes, order[:middle]), COVERED_WORSE) <= kept:
             high = middle
         else:
             low = middle + 1
-    while low > 2 and _landmarks_without(sees, order[:low]) < LEAST_LANDMARKS:
+    while low > 2 and _landmarks_without(observes, order[:low]) < MIN_LANDMARKS:
         low = low * 9 // 10
     return low
 
 
-def landmarks_kept(sees: csr_array, group: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Of the landmarks that each moment of a group observes, how many two or more of the others observe, too."""
-    return np.asarray((sees[group] @ _left(sees, group)), dtype=np.int64).reshape(-1)
+def landmarks_kept(observes: csr_array, group: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Count, for each frame of a group, the observed landmarks that at least two of the other frames observe, too."""
+    return np.asarray((observes[group] @ _remaining(observes, group)), dtype=np.int64).reshape(-1)
 
 
-def _left(sees: csr_array, group: NDArray[np.int64]) -> NDArray[np.float64]:
-    return np.asarray(sees.sum(0) - sees[group].sum(0) >= 2, dtype=np.float64).reshape(-1)
+def _remaining(observes: csr_array, group: NDArray[np.int64]) -> NDArray[np.float64]:
+    return np.asarray(observes.sum(0) - observes[group].sum(0) >= 2, dtype=np.float64).reshape(-1)
 
 
-def _landmarks_without(sees: csr_array, group: NDArray[np.int64]) -> int:
-    return int(_left(sees, group).sum())
+def _landmarks_without(observes: csr_array, group: NDArray[np.int64]) -> int:
+    return int(_remaining(observes, group).sum())

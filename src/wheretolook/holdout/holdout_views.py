@@ -1,4 +1,4 @@
-"""Photographs that were left out of a map as views to learn from, and as views of an evaluation."""
+"""Held-out photographs as views to adapt a scorer on, and as views of an evaluation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pandas as pd
 from wheretolook.dataset.layout import SceneFolder
 from wheretolook.evaluation.photographs import HeldOutPhotographs
 from wheretolook.geometry.poses import camera_centers
-from wheretolook.holdout.holdout import LeftOut
+from wheretolook.holdout.holdout import HoldoutResult
 from wheretolook.holdout.metrics import places_of
 from wheretolook.holdout.photo_map import MAX_ERROR_M, PhotographedMap
 from wheretolook.holdout.report import place_radius
@@ -22,10 +22,14 @@ from wheretolook.visibility.occlusion import OcclusionModel
 
 
 def photographed_views(
-    source: PhotographedMap, left_out: Sequence[LeftOut], weights: Path, occlusion: OcclusionModel, device: str = "cpu"
+    source: PhotographedMap,
+    results: Sequence[HoldoutResult],
+    weights: Path,
+    occlusion: OcclusionModel,
+    device: str = "cpu",
 ) -> LocalizedViews:
-    """The photographs of all blocks, each scored on the map without its block; groups are blocks."""
-    _, views = score_views(source, left_out, Scoring(weights=weights), occlusion, device)
+    """Score the photographs of all blocks, each on the map without its block; groups are blocks."""
+    _, views = score_views(source, results, Scoring(weights=weights), occlusion, device)
     row = views["row"].to_numpy(np.int64)
     block = views["block"].to_numpy(np.int64)
     poses = source.poses[row]
@@ -39,22 +43,21 @@ def photographed_views(
 def evaluated_photographs(
     scene: SceneFolder,
     source: PhotographedMap,
-    left_out: Sequence[LeftOut],
+    results: Sequence[HoldoutResult],
     occlusion: OcclusionModel,
     device: str = "cpu",
 ) -> HeldOutPhotographs:
-    """The photographs of all blocks of a scene's map as views of an evaluation.
+    """Return the photographs of all blocks of a scene's map as views of an evaluation.
 
-    Where metres are not known, errors are brought to those of a map in which each limit is 5 cm.
+    Where metres are unknown, errors are scaled to a map in which each limit is 5 cm.
     """
-    views = pd.concat([one.views.assign(block=one.block.number) for one in left_out], ignore_index=True)
+    views = pd.concat([one.views.assign(block=one.block.number) for one in results], ignore_index=True)
     poses = source.poses[views["row"].to_numpy()]
     maps = []
     begin = 0
-    for one in left_out:
-        maps += [(begin + rows, around) for rows, around in maps_without(source, one, occlusion, device)]
+    for one in results:
+        maps += [(begin + rows, remaining) for rows, remaining in maps_without(source, one, occlusion, device)]
         begin += len(one.views)
     place = places_of(camera_centers(poses), views["block"].to_numpy(np.int64), place_radius(source))
     error_m = views["error_m"] * (MAX_ERROR_M / views["limit_m"])
-    views = views.assign(photograph=views["row"], place=place, error_m=error_m)
-    return HeldOutPhotographs(scene, views, poses, maps)
+    return HeldOutPhotographs(scene, views.assign(photograph=views["row"], place=place, error_m=error_m), poses, maps)

@@ -1,12 +1,11 @@
-"""Scores photographs that were left out, by any methods, on the maps without them."""
+"""Score held-out photographs by any methods, each on the map without its block."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,9 +13,8 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.evaluation.photographs import score_scale
-from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
-from wheretolook.holdout.holdout import LeftOut
+from wheretolook.holdout.holdout import HoldoutResult
 from wheretolook.holdout.photo_map import PhotographedMap
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import compact_poses
@@ -29,45 +27,49 @@ from wheretolook.visibility.cached_occlusion import CachedOcclusion
 from wheretolook.visibility.occlusion import OcclusionModel
 from wheretolook.weights.resolve import load_scorer, resolve_weights
 
-VISIBLE = "visible"  # the method that all are compared with: its score here is the number of landmarks in view
+VISIBLE = "visible"  # the baseline; its score here is the number of landmarks in view
 
 
 @dataclass(frozen=True)
 class Scoring:
-    """The method that is checked, and others beside it."""
+    """The method that is checked, and others that are compared.
 
-    method: str = ""  # "" for that of the weights
-    weights: Path | None = None  # file or folder; None for those that ship
+    Attributes:
+        method: name; "" for the method of the weights.
+        weights: file or folder; None for the bundled ones.
+        also: further methods, with bundled weights.
+        anywhere: whether weights adapted to another scene are allowed.
+    """
+
+    method: str = ""
+    weights: Path | None = None
     also: tuple[str, ...] = ()
-    anywhere: bool = False  # whether weights that are adapted to another place may score
+    anywhere: bool = False
 
     def check(self) -> None:
-        """Raise a WeightsError if weights are missing or damaged, of any of the methods."""
+        """Raise a WeightsError if weights of any of the methods are missing or unreadable."""
         for weights in (self.chosen, *(resolve_weights(name) for name in self.also)):
             if weights is not None:
                 method_of_weights(weights)
 
     @property
     def chosen(self) -> Path | None:
-        """The file of weights of the method that is checked, on a map by SIFT."""
-        return self.chosen_for("")
+        """The weights file of the checked method, on a map with SIFT features."""
+        return resolve_weights(self.method, self.weights)
 
-    def chosen_for(self, features: str) -> Path | None:
-        """The file of weights of the method that is checked, on a map by some features."""
-        return resolve_weights(self.method, self.weights, features)
-
-    def scorer(self, localization_map: LocalizationMap) -> Scorer:
-        """The scorer that is checked."""
-        chosen = self.chosen_for(localization_map.landmarks.features)
+    def scorer(self, localization_map: LocalizationMap, anywhere: bool = False) -> Scorer:
+        """Build the scorer of the checked method."""
+        chosen = resolve_weights(self.method, self.weights, localization_map.landmarks.features)
+        anywhere = anywhere or self.anywhere
         if self.method:
-            return make_scorer(self.method, localization_map, weights=chosen, anywhere=self.anywhere)
-        return load_scorer(str(chosen), localization_map, anywhere=self.anywhere)
+            return make_scorer(self.method, localization_map, weights=chosen, anywhere=anywhere)
+        return load_scorer(chosen, localization_map, anywhere=anywhere)
 
 
 def check_place(source: PhotographedMap, scoring: Scoring, device: str) -> None:
-    """Raise a WeightsError if the weights are adapted to another place than the whole map, unless that may be.
+    """Raise a WeightsError if weights adapted to another scene would score, unless that is allowed.
 
-    Without a block a map may lack most of the landmarks by which they would know it.
+    The whole map is tested, as the map without a block may lack most of the landmarks that identify the scene.
     """
     chosen = scoring.chosen
     method = find(method_of_weights(chosen)) if chosen is not None else None
@@ -79,64 +81,60 @@ def check_place(source: PhotographedMap, scoring: Scoring, device: str) -> None:
 
 
 def score_views(
-    source: PhotographedMap, left_out: Sequence[LeftOut], scoring: Scoring, occlusion: OcclusionModel, device: str
+    source: PhotographedMap, results: Sequence[HoldoutResult], scoring: Scoring, occlusion: OcclusionModel, device: str
 ) -> tuple[str, pd.DataFrame]:
-    """The name of the method that is checked, and the views of all blocks with what it tells of them.
+    """Score the views of all blocks; returns the name of the checked method, and the views with further columns.
 
-    The views of `LeftOut` have further columns: block, is_part, score, expected_inliers (NaN where the method does not
-    tell), n_visible, in_range, `visible` (n_visible once more), and one for each method beside. Scores of methods that
-    give a share of the map's landmarks are times their number: blocks have maps of different sizes.
+    They are score, expected_inliers (NaN where the method has none), n_visible, in_range, `visible` (n_visible again),
+    one for each further method, block and is_part. Scores that are shares of the map's landmarks are multiplied by
+    their number, as blocks have maps of different sizes.
     """
     parts = []
     name = ""
-    with tqdm(total=sum(len(one.views) for one in left_out), desc="check: score", unit="view") as bar:
-        for one in left_out:
-            views = one.views.copy()
-            columns: dict[str, Float] = {}
-            for rows, around in maps_without(source, one, occlusion, device):
-                found = _score(around, source.poses[views["row"].to_numpy()[rows]], scoring)
-                name = found.pop("name")
-                for column, values in found.items():
-                    columns.setdefault(column, np.full(len(views), np.nan))[rows] = values
+    with tqdm(total=sum(len(one.views) for one in results), desc="check: score", unit="view") as bar:
+        for one in results:
+            columns: dict[str, NDArray[np.generic]] = {}
+            for rows, remaining in maps_without(source, one, occlusion, device):
+                name, scores = _score(remaining, source.poses[one.views["row"].to_numpy()[rows]], scoring)
+                for column, values in scores.items():
+                    columns.setdefault(column, np.empty(len(one.views), values.dtype))[rows] = values
                 bar.update(len(rows))
-            views = views.assign(**columns, block=one.block.number, is_part=one.block.is_part)
-            parts.append(views.astype({"in_range": bool, "n_visible": np.int64}))
+            parts.append(one.views.assign(**columns, block=one.block.number, is_part=one.block.is_part))
     return name, pd.concat(parts, ignore_index=True)
 
 
 def maps_without(
-    source: PhotographedMap, one: LeftOut, occlusion: OcclusionModel, device: str
+    source: PhotographedMap, result: HoldoutResult, occlusion: OcclusionModel, device: str
 ) -> Iterator[tuple[NDArray[np.int64], LocalizationMap]]:
-    """The map without a block as each camera of its photographs looks at it, and the rows of the block's views."""
-    kept = np.setdiff1d(np.arange(len(source.poses)), one.block.left_out)
-    hides = occlusion if occlusion.name == "none" else CachedOcclusion(occlusion)
-    looking = [source.cameras[row] for row in one.views["row"]]
-    around = LocalizationMap(one.landmarks, looking[0], hides, device, compact_poses(source.poses[kept]))
-    for camera, rows in _by_camera(looking):
-        yield rows, around.of_camera(camera)
+    """Yield, for each camera, the rows of a block's views, and the map without the block for that camera."""
+    remaining = np.setdiff1d(np.arange(len(source.poses)), result.block.left_out)
+    cached = occlusion if occlusion.name == "none" else CachedOcclusion(occlusion)
+    cameras = [source.cameras[row] for row in result.views["row"]]
+    poses = compact_poses(source.poses[remaining])
+    localization_map = LocalizationMap(result.landmarks, cameras[0], cached, device, poses)
+    for camera in dict.fromkeys(cameras):
+        rows = np.array([row for row, other in enumerate(cameras) if other == camera])
+        yield rows, localization_map.of_camera(camera)
 
 
-def _by_camera(cameras: Sequence[Camera]) -> list[tuple[Camera, NDArray[np.int64]]]:
-    rows: dict[Camera, list[int]] = {}
-    for row, camera in enumerate(cameras):
-        rows.setdefault(camera, []).append(row)
-    return [(camera, np.array(found)) for camera, found in rows.items()]
-
-
-def _score(around: LocalizationMap, poses: Float, scoring: Scoring) -> dict[str, Any]:
-    scorer = _quietly(replace(scoring, anywhere=True).scorer, around)  # `check_place` has seen to it
-    told = _quietly(scorer.report, poses)
-    found: dict[str, Any] = {"name": scorer.name, "score": told.score * score_scale(scorer.name, around)}
-    found |= {"expected_inliers": told.expected_inliers, "n_visible": told.n_visible, "in_range": told.in_range}
-    found[VISIBLE] = told.n_visible
-    for other in scoring.also:
-        if other not in (VISIBLE, scorer.name):
-            beside = make_scorer(other, around, weights=resolve_weights(other, features=around.landmarks.features))
-            found[other] = _quietly(beside.score, poses) * score_scale(other, around)
-    return found
-
-
-def _quietly(call: Callable[..., Any], *arguments: Any) -> Any:
+def _score(
+    localization_map: LocalizationMap, poses: Float, scoring: Scoring
+) -> tuple[str, dict[str, NDArray[np.generic]]]:
+    """Score poses (B, 3, 4) by all methods; returns the checked method's name, and columns (B,)."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", OutOfRangeWarning)  # the results tell how many are in range
-        return call(*arguments)
+        warnings.simplefilter("ignore", OutOfRangeWarning)  # the column in_range reports them
+        scorer = scoring.scorer(localization_map, anywhere=True)  # `check_place` has been called
+        report = scorer.report(poses)
+        columns: dict[str, NDArray[np.generic]] = {
+            "score": report.score * score_scale(scorer.name, localization_map),
+            "expected_inliers": report.expected_inliers,
+            "n_visible": np.asarray(report.n_visible, dtype=np.int64),
+            "in_range": report.in_range,
+            VISIBLE: np.asarray(report.n_visible, dtype=np.float64),
+        }
+        for name in scoring.also:
+            if name not in (VISIBLE, scorer.name):
+                weights = resolve_weights(name, features=localization_map.landmarks.features)
+                other = make_scorer(name, localization_map, weights=weights)
+                columns[name] = other.score(poses) * score_scale(name, localization_map)
+    return scorer.name, columns

@@ -13,7 +13,7 @@ from wheretolook.utils.errors import MapError
 from wheretolook.utils.locks import hold
 
 if TYPE_CHECKING:
-    from wheretolook.holdout.holdout import LeftOut
+    from wheretolook.holdout.holdout import HoldoutResult
     from wheretolook.holdout.photo_map import PhotographedMap
 
 
@@ -47,7 +47,7 @@ def leave_photographs_out(
     database: Path | None,
     say: Say,
     upright: bool = False,
-) -> tuple[PhotographedMap, list[LeftOut]]:
+) -> tuple[PhotographedMap, list[HoldoutResult]]:
     """A map, and its photographs left out in blocks, in the folder of its check: neither does again what the other did.
 
     See `wheretolook.holdout.photo_map.open_map` for what is asked and raised; with `upright`, a MapError is raised if the

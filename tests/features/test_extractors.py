@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from wheretolook.features.aliked_batch import detect_and_describe, found_plain
+from twins.features import mutual_matches
+from wheretolook.features.aliked_batch import detect_and_describe, detect_by_kornia
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.descriptors import quantize_descriptors, unit_descriptors
 from wheretolook.features.extraction import KeypointExtractor
-from wheretolook.features.registry import all_kinds, kind_of, that_extract
-from wheretolook.features.similarity import SimilarityMatcher, mutual_plain
+from wheretolook.features.registry import all_kinds, kind_of, runnable_extractors
+from wheretolook.features.similarity import SimilarityMatcher
 from wheretolook.localization.config import LabelConfig, LocalizerConfig
 from wheretolook.utils.errors import ConfigError, WeightsError
 
@@ -93,7 +94,7 @@ def test_mutual_nearest_neighbours_are_those_of_all_products(n, monkeypatch):
         (keypoints, rows), nothing = matcher.match(images, limit)
         assert len(nothing[0]) == len(nothing[1]) == 0
         if n:
-            expected = mutual_plain(images[0], landmarks, limit)
+            expected = mutual_matches(images[0], landmarks, limit)
             found, plain = ({*zip(a.tolist(), b.tolist(), strict=True)} for a, b in ((keypoints, rows), expected))
             assert len(found ^ plain) <= n // 1000  # sums that agree up to single precision
         assert len(set(rows.tolist())) == len(rows) and (np.diff(keypoints) > 0).all()
@@ -174,7 +175,7 @@ def test_aliked_finds_in_a_batch_what_kornia_finds_image_by_image(least, tmp_pat
         network.dkd.scores_th = float(scores.quantile(least)) if least else float(scores.min()) - 1e-3
         network.dkd.n_limit = 300  # of which some images have more
         found = detect_and_describe(network, images)
-        plain = found_plain(network, images)
+        plain = detect_by_kornia(network, images)
     assert len(found) == 4 and any(0 < len(each[2]) < 300 for each in plain)
     for (pixels, descriptors, scored), expected in zip(found, plain, strict=True):
         assert len(pixels) == len(expected[0])
@@ -191,9 +192,9 @@ def test_matches_of_images_that_go_together_are_those_of_each_alone(monkeypatch)
     ]
     for descriptors in (landmarks, landmarks[:0], -np.abs(landmarks)):  # the last are unlike every keypoint
         matcher = SimilarityMatcher(descriptors)
-        monkeypatch.setattr("wheretolook.features.similarity._TOGETHER", {"cpu": 3})
+        monkeypatch.setattr("wheretolook.features.similarity._BATCH", {"cpu": 3})
         for (keypoints, rows), of_image in zip(matcher.match(images, -1.0), images, strict=True):
-            expected = mutual_plain(of_image, descriptors, -1.0) if len(of_image) and len(descriptors) else ([], [])
+            expected = mutual_matches(of_image, descriptors, -1.0) if len(of_image) and len(descriptors) else ([], [])
             np.testing.assert_array_equal(keypoints, expected[0])
             np.testing.assert_array_equal(rows, expected[1])
 
@@ -246,4 +247,4 @@ def test_weights_that_are_not_the_networks(method, tmp_path, monkeypatch):
 
 
 def test_every_extractor_that_extracts_says_so():
-    assert that_extract() == ("opencv", "colmap", *LEARNED)
+    assert runnable_extractors() == ("opencv", "colmap", *LEARNED)

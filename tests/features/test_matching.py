@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from twins.features import nearest_two
 from wheretolook.features import matching
 from wheretolook.features.descriptors import quantize_descriptors, unit_descriptors
-from wheretolook.features.matching import DescriptorMatcher, match, nearest_two_plain
+from wheretolook.features.matching import DescriptorMatcher, match
 
 Descriptors = NDArray[np.uint8]
 
@@ -49,7 +50,7 @@ def assert_nearest_two(device: str, queries: Descriptors, landmarks: Descriptors
     rows, nearest, second = DescriptorMatcher(landmarks, device).nearest_two(queries)
     assert rows.dtype == nearest.dtype == second.dtype == np.int64
     assert rows.shape == nearest.shape == second.shape == (len(queries),)
-    plain_rows, plain_nearest, plain_second = nearest_two_plain(queries, landmarks)
+    plain_rows, plain_nearest, plain_second = nearest_two(queries, landmarks)
     np.testing.assert_array_equal(nearest, plain_nearest)
     np.testing.assert_array_equal(second, plain_second)
     apart = plain_nearest > plain_second  # of several equally near, any may be named

@@ -19,7 +19,7 @@ def _build(config: ExtractorSettings, device: str) -> Extraction:
     from torch import Tensor, nn
 
     from wheretolook.features.aliked_batch import detect_and_describe
-    from wheretolook.features.learned import Found, LearnedExtraction, kornia_feature, load_state
+    from wheretolook.features.learned import Detection, LearnedExtraction, kornia_feature, load_state
 
     class Aliked(LearnedExtraction):
         dimension = ALIKED.dimension
@@ -28,7 +28,7 @@ def _build(config: ExtractorSettings, device: str) -> Extraction:
             network = kornia_feature().ALIKED("aliked-n16rot", config.max_keypoints, _LEAST_SCORE)
             return load_state(network, config.weights, _FILE, _URLS)
 
-        def detect(self, images: Tensor) -> list[Found]:
+        def detect(self, images: Tensor) -> list[Detection]:
             # ALIKED counts pixels from the middle of the first
             found = detect_and_describe(self._network, images)
             return [(pixels + 0.5, descriptors, scores) for pixels, descriptors, scores in found]

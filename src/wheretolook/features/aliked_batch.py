@@ -1,4 +1,4 @@
-"""Keypoints and descriptors of ALIKED for all images of a batch at once, where kornia takes image after image."""
+"""Runs ALIKED on all images of a batch at once, where kornia runs on one image after the other."""
 
 from __future__ import annotations
 
@@ -8,40 +8,42 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from wheretolook.features.learned import Found
+from wheretolook.features.learned import Detection
 
 
-def detect_and_describe(network: Any, images: Tensor) -> list[Found]:
-    """What kornia's `ALIKED` returns of images (B, 3, H, W), RGB in 0..1: pixels from the middle of the first.
+def detect_and_describe(network: Any, images: Tensor) -> list[Detection]:
+    """Detect and describe keypoints in images (B, 3, H, W), RGB in 0..1, as kornia's `ALIKED` does.
 
-    On a GPU the many small steps of an image take as long as those of a batch, and the network itself takes less than
-    either. Keypoints are the same; sums are in another order. `found_plain` is the twin.
+    On a GPU the many small steps for one image take as long as those for a batch. Keypoints are the same; sums are in
+    another order.
     """
     features, scores = network.extract_dense_map(images)
     n_images = len(scores)
-    image, pixels, found_scores = _detected(network.dkd, scores)
+    image, pixels, keypoint_scores = _detected(network.dkd, scores)
     counts = torch.bincount(image, minlength=n_images).tolist()
     if not any(counts):
-        return found_plain(network, images)
-    # an image with nothing above the threshold, or more than may be kept, goes kornia's way: both are rare
-    alone = {
-        i: found_plain(network, images[i : i + 1])[0] for i, n in enumerate(counts) if not 0 < n <= network.dkd.n_limit
+        return detect_by_kornia(network, images)
+    # kornia's own way for images without a keypoint above the threshold, or with too many: both are rare
+    exceptions = {
+        i: detect_by_kornia(network, images[i : i + 1])[0]
+        for i, n in enumerate(counts)
+        if not 0 < n <= network.dkd.n_limit
     }
-    parts = zip(*(values.split(counts) for values in (pixels, found_scores)), strict=True)
+    parts = zip(*(values.split(counts) for values in (pixels, keypoint_scores)), strict=True)
     descriptors = _described(network.desc_head, features, image, pixels, counts).split(counts)
     return [
-        alone.get(i, (at, described, scored))
+        exceptions.get(i, (at, described, scored))
         for i, ((at, scored), described) in enumerate(zip(parts, descriptors, strict=True))
     ]
 
 
-def found_plain(network: nn.Module, images: Tensor) -> list[Found]:
-    """Plain twin of `detect_and_describe`: kornia's own."""
+def detect_by_kornia(network: nn.Module, images: Tensor) -> list[Detection]:
+    """Detect and describe keypoints with kornia, image by image."""
     return [(each.keypoints, each.descriptors, each.keypoint_scores) for each in network(images)]
 
 
 def _detected(detector: Any, scores: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Strict maxima of maps of scores (B, 1, H, W), above the threshold and off the border: image, pixel and score.
+    """Strict maxima of score maps (B, 1, H, W) above the threshold and off the border: image, pixel and score.
 
     A maximum is moved by the mean of its window, weighted by the softmax of scores (ALIKED, Sec. III-C).
     """
@@ -57,13 +59,15 @@ def _detected(detector: Any, scores: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     step = torch.arange(-radius, radius + 1, device=scores.device)
     window = (step[:, None] * width + step).flatten()
     middle = (image * height + row) * width + column
-    around = scores.flatten()[middle[:, None] + window]
-    strict = (around == around.amax(1, keepdim=True)).sum(1) == 1  # of two equal ones neither is a maximum
+    window_scores = scores.flatten()[middle[:, None] + window]
+    strict = (window_scores == window_scores.amax(1, keepdim=True)).sum(
+        1
+    ) == 1  # of two equal ones neither is a maximum
     image = image[strict]
     row = row[strict]
     column = column[strict]
-    around = around[strict]
-    weights = ((around - around.amax(1, keepdim=True)) / detector.temperature).exp()
+    window_scores = window_scores[strict]
+    weights = ((window_scores - window_scores.amax(1, keepdim=True)) / detector.temperature).exp()
     offset = weights @ detector.hw_grid / weights.sum(1, keepdim=True)
     pixels = torch.stack([column, row], 1) + offset
     return image, pixels, _bilinear(scores, image, pixels)
@@ -77,9 +81,9 @@ def _bilinear(scores: Tensor, image: Tensor, pixels: Tensor) -> Tensor:
     y = y.clamp(0, height - 2)
     right, down = (pixels - torch.stack([x, y], 1)).unbind(1)
     corner = (image * height + y) * width + x
-    around = scores.flatten()[corner[:, None] + torch.tensor([0, 1, width, width + 1], device=scores.device)]
+    corners = scores.flatten()[corner[:, None] + torch.tensor([0, 1, width, width + 1], device=scores.device)]
     weights = torch.stack([(1 - right) * (1 - down), right * (1 - down), (1 - right) * down, right * down], 1)
-    return (around * weights).sum(1)
+    return (corners * weights).sum(1)
 
 
 def _described(head: Any, features: Tensor, image: Tensor, pixels: Tensor, counts: list[int]) -> Tensor:
@@ -89,24 +93,26 @@ def _described(head: Any, features: Tensor, image: Tensor, pixels: Tensor, count
     with a matrix for each position (ALIKED, Sec. III-B, SDDH).
     """
     n_images, depth, height, width = features.shape
-    most = max(counts)
+    max_count = max(counts)
     n = len(image)
-    place = torch.cat([torch.arange(count, device=image.device) for count in counts])
+    slot = torch.cat([torch.arange(count, device=image.device) for count in counts])
     start = (pixels.long() - head.kernel_size / 2 + 1).long()
     limit = torch.tensor([width, height], device=image.device) - 1 - head.kernel_size
     start = torch.minimum(start.clamp(min=0), limit)
     step = torch.arange(head.kernel_size, device=image.device)
     window = (step[:, None] * width + step).flatten()
-    flat = features.new_zeros((n_images, most, len(window)), dtype=torch.long)
-    flat[image, place] = (start[:, 1] * width + start[:, 0])[:, None] + window
+    flat = features.new_zeros((n_images, max_count, len(window)), dtype=torch.long)
+    flat[image, slot] = (start[:, 1] * width + start[:, 0])[:, None] + window
     patches = features.flatten(2).gather(2, flat.flatten(1)[:, None].expand(-1, depth, -1))
-    patches = patches.view(n_images, depth, most, -1)[image, :, place]
-    farthest = max(height, width) / 4
-    offsets = head.offset_conv(patches.view(n, depth, head.kernel_size, head.kernel_size)).clamp(-farthest, farthest)
+    patches = patches.view(n_images, depth, max_count, -1)[image, :, slot]
+    max_offset = max(height, width) / 4
+    offsets = head.offset_conv(patches.view(n, depth, head.kernel_size, head.kernel_size)).clamp(
+        -max_offset, max_offset
+    )
     positions = pixels[:, None] + offsets.view(n, 2, head.n_pos).transpose(1, 2)
     span = torch.tensor([width - 1, height - 1], device=image.device)
-    grid = features.new_zeros((n_images, most, head.n_pos, 2))
-    grid[image, place] = 2 * positions / span - 1
-    sampled = F.grid_sample(features, grid, mode="bilinear", align_corners=True)  # (B, D, most, positions)
-    sampled = torch.selu(head.sf_conv(sampled)).permute(0, 2, 3, 1)[image, place]
+    grid = features.new_zeros((n_images, max_count, head.n_pos, 2))
+    grid[image, slot] = 2 * positions / span - 1
+    sampled = F.grid_sample(features, grid, mode="bilinear", align_corners=True)  # (B, D, max_count, positions)
+    sampled = torch.selu(head.sf_conv(sampled)).permute(0, 2, 3, 1)[image, slot]
     return F.normalize(torch.einsum("npc,pcd->nd", sampled, head.agg_weights), dim=1)

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from wheretolook.features.registry import all_extractors, that_extract
+from wheretolook.features.registry import all_extractors, runnable_extractors
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import sha256
 
@@ -16,20 +16,20 @@ class ExtractorConfig:
     """Settings of the keypoint extractor.
 
     Args:
-        method: what finds keypoints: SIFT by opencv or colmap, or one of the learned aliked, disk and xfeat, which need
-            `pip install 'wheretolook[learned]'`. `opencv` finds nearly the same keypoints as `colmap`, COLMAP's own
-            extraction on the CPU, in 40 % of the time; on a GPU, Warp kernels find OpenCV's up to rounding.
-        first_octave: of SIFT: -1 doubles the image first, which gives about three times as many (and smaller)
+        method: extractor: SIFT by opencv or colmap, or the learned aliked, disk and xfeat, which need
+            `pip install 'wheretolook[learned]'`. `opencv` gives nearly the same keypoints as `colmap`, COLMAP's own
+            extraction on the CPU, in 40 % of the time; on a GPU, Warp kernels give OpenCV's up to rounding.
+        first_octave: first octave of SIFT: -1 doubles the image first, which gives about three times as many (and smaller)
             keypoints, for `colmap` at four times the cost; 0 starts at the image's own size. COLMAP's default is -1.
-        max_keypoints: largest number of keypoints for each image. `colmap` prefers large scales, `opencv` strong
+        max_keypoints: maximum number of keypoints per image. `colmap` prefers large scales, `opencv` strong
             contrast, learned ones high scores.
-        peak_threshold: of SIFT: least contrast (difference of Gaussians, grey values in [0, 1]). COLMAP's default is
+        peak_threshold: minimum contrast of SIFT keypoints (difference of Gaussians, grey values in [0, 1]). COLMAP's default is
             0.02 / 3.
-        weights: file of a learned extractor's network as its authors give it (aliked-n16rot.pth, depth-save.pth of
-            DISK, xfeat.pt). Without one, kornia's copy: from its cache, or else downloaded, which is said.
+        weights: weights file of a learned extractor as published by its authors (aliked-n16rot.pth, depth-save.pth of
+            DISK, xfeat.pt). By default kornia's copy, from its cache or downloaded.
 
     Attributes:
-        edge_threshold: largest ratio of principal curvatures: the value of Lowe 2004 (section 4.1), COLMAP and OpenCV.
+        edge_threshold: maximum ratio of principal curvatures: the value of Lowe 2004 (section 4.1), COLMAP and OpenCV.
     """
 
     method: str = "opencv"
@@ -40,8 +40,8 @@ class ExtractorConfig:
     edge_threshold: float = field(default=10.0, init=False)
 
     def __post_init__(self) -> None:
-        if self.method not in that_extract():
-            fix = f"Choose one of {', '.join(that_extract())}."
+        if self.method not in runnable_extractors():
+            fix = f"Choose one of {', '.join(runnable_extractors())}."
             raise ConfigError("unknown extractor method", value=self.method, fix=fix)
         if self.weights and not all_extractors()[self.method].weights:
             raise ConfigError("this extractor has no weights", value=self.weights, fix="Leave extractor.weights out.")
@@ -53,7 +53,7 @@ class ExtractorConfig:
             raise ConfigError("peak_threshold must be positive", value=self.peak_threshold)
 
     def record(self) -> dict[str, Any]:
-        """What decides which keypoints come out, as JSON values: of weights what is in them, not where they lie."""
+        """Settings that decide the keypoints, as JSON values; weights by their checksum."""
         record = asdict(self)
         path = record.pop("weights")
         if path:

@@ -1,4 +1,4 @@
-"""What the descriptors of an extractor are like: how many numbers, how they are stored, and how near is near."""
+"""Kinds of descriptors: dimension, storage format, and matching criterion."""
 
 from __future__ import annotations
 
@@ -9,40 +9,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 Stored = tuple[NDArray[np.float32], NDArray[Any]]
-"""Keypoints of an image as files hold them: pixels (K, 2), and descriptors (K, D) as `DescriptorKind.store` gives."""
+"""Keypoints of an image as stored in files: pixels (K, 2), and descriptors (K, D) as by `DescriptorKind.store`."""
 
 
 @dataclass(frozen=True)
 class DescriptorKind:
-    """Descriptors of one extractor, or of several that find the same. All are compared by their angle.
+    """Descriptors of one extractor, or of several equivalent ones. All are compared by their angle.
 
-    A kind is either stored as COLMAP stores SIFT's, 512 times unit descriptors without negatives, in bytes, and matched
-    with Lowe's ratio; or as halves of unit descriptors, as hloc stores learned ones, and matched where both are each
+    A kind is either stored as COLMAP stores SIFT, as bytes (512 times non-negative unit descriptors), and matched by
+    Lowe's ratio; or stored as float16 unit descriptors, as hloc stores learned ones, and matched where both are each
     other's nearest with at least `min_similarity`.
     """
 
     name: str  # in maps, weights and messages
     dimension: int  # numbers in a descriptor
     stored_as: Literal["uint8", "float16"]
-    min_similarity: float = 0.0  # cosine from which on mutual nearest neighbours match, where no ratio decides
+    min_similarity: float = 0.0  # minimum cosine of mutual nearest neighbours, if not matched by ratio
     colmap_type: int = -1  # its `FeatureExtractorType` in databases of COLMAP 4; -1 for none
 
     @property
     def in_bytes(self) -> bool:
-        """Whether descriptors are stored in bytes, and Lowe's ratio decides what matches."""
+        """Whether descriptors are stored as bytes and matched by Lowe's ratio."""
         return self.stored_as == "uint8"
 
     @property
     def columns(self) -> int:
-        """Bytes of a descriptor in a COLMAP database, which holds numbers that are not bytes in single precision."""
+        """Bytes of a descriptor in a COLMAP database, which stores floating-point numbers in single precision."""
         return self.dimension * (1 if self.in_bytes else 4)
 
     def store(self, descriptors: NDArray[np.floating[Any]]) -> NDArray[Any]:
-        """Unit descriptors (N, D) as files and matchers hold them."""
+        """Convert unit descriptors (N, D) to the format of files and matchers."""
         return quantize_descriptors(descriptors) if self.in_bytes else descriptors.astype(np.float16)
 
     def restore(self, stored: NDArray[Any]) -> NDArray[np.float32]:
-        """Descriptors (N, D) float32 that `store` gives these of; of unit length up to rounding."""
+        """Convert stored descriptors to (N, D) float32, of unit length up to rounding."""
         return (stored / 512).astype(np.float32) if self.in_bytes else stored.astype(np.float32)
 
     def none(self) -> NDArray[Any]:

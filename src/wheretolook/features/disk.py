@@ -17,7 +17,7 @@ _URLS = (
 def _build(config: ExtractorSettings, device: str) -> Extraction:
     from torch import Tensor, nn
 
-    from wheretolook.features.learned import Found, LearnedExtraction, kornia_feature, load_state
+    from wheretolook.features.learned import Detection, LearnedExtraction, kornia_feature, load_state
 
     class Disk(LearnedExtraction):
         dimension = DISK.dimension
@@ -25,7 +25,7 @@ def _build(config: ExtractorSettings, device: str) -> Extraction:
         def make(self) -> nn.Module:
             return load_state(kornia_feature().DISK(), config.weights, _FILE, _URLS, lambda state: state["extractor"])
 
-        def detect(self, images: Tensor) -> list[Found]:
+        def detect(self, images: Tensor) -> list[Detection]:
             found = self._network(images, n=config.max_keypoints, pad_if_not_divisible=True)
             # whole pixels, counted from the first
             return [(each.keypoints + 0.5, each.descriptors, each.detection_scores) for each in found]

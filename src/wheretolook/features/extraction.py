@@ -1,4 +1,4 @@
-"""Extraction of keypoints and descriptors, for the images of the map and for queries alike."""
+"""Extracts keypoints and descriptors from the images of the map and from queries."""
 
 from __future__ import annotations
 
@@ -18,40 +18,40 @@ from wheretolook.utils.processes import WorkerPool
 
 
 class KeypointExtractor:
-    """Extracts keypoints by any of `wheretolook.features.registry`, on a CPU core or a GPU.
+    """Extracts keypoints with any extractor of `wheretolook.features.registry`, on a CPU core or a GPU.
 
-    Raises a ConfigError if what the extractor needs is not there: kornia, a network's weights, a device.
+    Raises ConfigError if kornia, a network's weights or the device is missing.
     """
 
     def __init__(self, config: ExtractorConfig | None = None, device: str = "cpu") -> None:
         self.config = config or ExtractorConfig()
         build = all_extractors()[self.config.method].build
-        assert build is not None  # the settings refuse what does not extract
+        assert build is not None  # as checked by ExtractorConfig
         self._extraction: Extraction = build(self.config, device)
         self.on_gpu = self._extraction.batch > 1
 
     def batch_of(self, width: int, height: int) -> int:
-        """How many images of a size it works on at once: of larger ones fewer, for a GPU holds what is made of each."""
+        """Number of images of a size in a batch: fewer large ones, which take more GPU memory."""
         return max(1, self._extraction.batch * 640 * 480 // (width * height))
 
     def extract(self, rgb: NDArray[np.uint8]) -> Keypoints:
-        """At most `max_keypoints` keypoints of an image (H, W, 3) uint8, in an order that depends on the image alone.
+        """Extract at most `max_keypoints` keypoints from an image (H, W, 3) uint8; their order depends only on the image.
 
         Raises ValueError if it has another shape or type.
         """
         return self.extract_batch([rgb])[0]
 
     def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
-        """Extract keypoints of images (H, W, 3) uint8 of one size, on a GPU all at once. See `extract`."""
+        """Extract keypoints from images (H, W, 3) uint8 of one size, on a GPU in one batch. See `extract`."""
         return self._extraction.extract_batch(images)
 
     def extract_many(
         self, images: Iterable[NDArray[np.uint8]], workers: int | WorkerPool = 1
     ) -> Generator[Keypoints, None, None]:
-        """Keypoints of many images (H, W, 3) uint8, in their order, extracted in worker processes or in GPU batches.
+        """Yield keypoints of many images (H, W, 3) uint8 in their order, from worker processes or GPU batches.
 
-        Only a few images are read ahead. `workers` are processes, or how many to spawn (threads would wait for one
-        another, since pycolmap's extractor holds Python's lock); 1 stays in this process. The result is the same.
+        Only a few images are read ahead. `workers` is a pool or a number of processes (pycolmap's extractor holds the
+        interpreter lock, so threads do not help); 1 runs in this process. The result is the same.
         """
         if self.on_gpu:
             source = iter(images)

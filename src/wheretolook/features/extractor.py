@@ -1,4 +1,4 @@
-"""What an extractor is: one record that says how it is named, what its descriptors are like, and how it extracts."""
+"""The record of an extractor: its name, its descriptors, and how to build it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from wheretolook.features.keypoints import Keypoints
 
 
 class ExtractorSettings(Protocol):
-    """What an extractor is told, see `wheretolook.features.config.ExtractorConfig`, which knows all extractors."""
+    """Settings of an extractor (`wheretolook.features.config.ExtractorConfig`, which depends on all extractors)."""
 
     @property
     def first_octave(self) -> int:
@@ -28,12 +28,12 @@ class ExtractorSettings(Protocol):
 
     @property
     def peak_threshold(self) -> float:
-        """Least contrast of SIFT's keypoints."""
+        """Minimum contrast of SIFT keypoints."""
         ...
 
     @property
     def edge_threshold(self) -> float:
-        """Largest ratio of principal curvatures of SIFT's keypoints."""
+        """Maximum ratio of principal curvatures of SIFT keypoints."""
         ...
 
     @property
@@ -43,29 +43,29 @@ class ExtractorSettings(Protocol):
 
 
 class Extraction(Protocol):
-    """An extractor that is ready on its device."""
+    """An extractor on its device."""
 
-    batch: int  # images of 640 x 480 that it works on at once, as on a GPU; 1 where each is alone
+    batch: int  # images of 640 x 480 in a batch; 1 on a CPU
 
     def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
-        """At most `max_keypoints` keypoints of each of the images (H, W, 3) uint8 of one size.
+        """Extract at most `max_keypoints` keypoints from each image (H, W, 3) uint8; all images have one size.
 
-        Those of an image, and their order, do not depend on the others. ValueError for another shape or type.
+        The result for an image does not depend on the others. Raises ValueError for another shape or type.
         """
         ...
 
 
 @dataclass(frozen=True)
 class Extractor:
-    """A way to find keypoints, or, without `build`, one that is known from other programs' files alone.
+    """An extractor; without `build`, one whose keypoints are only read from files of other programs.
 
-    Its record stands in a module of `features/` that `registry.MODULES` names. What imports PyTorch, OpenCV or COLMAP
-    does so inside the functions given here.
+    Its record is in a module of `features/` that `registry.MODULES` names. PyTorch, OpenCV and COLMAP are imported only
+    inside the functions given here.
     """
 
     name: str  # in options: `map.extractor.method`
     about: str  # one sentence
     descriptors: DescriptorKind
     build: Callable[[ExtractorSettings, str], Extraction] | None = None  # from settings and a device, "cpu" or CUDA
-    weights: str = ""  # the file of a network's weights, as their authors call it; "" for none
-    lightglue: str = ""  # what kornia's LightGlue calls it; "" where there is none for it
+    weights: str = ""  # usual name of the file of a network's weights; "" for none
+    lightglue: str = ""  # name of the extractor in kornia's LightGlue; "" if unsupported

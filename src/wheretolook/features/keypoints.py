@@ -1,4 +1,4 @@
-"""What an extractor finds in an image: keypoints with their descriptors."""
+"""Keypoints of an image with their descriptors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Keypoints:
     pixels: NDArray[np.float32]  # (N, 2) (x, y) in pixels; (0.5, 0.5) is the centre of the top-left pixel
     # (N, D) of unit length; of SIFT (N, 128) RootSIFT (Arandjelovic and Zisserman, CVPR 2012)
     descriptors: NDArray[np.float32]
-    # (N,) standard deviation of the Gaussian at which the keypoint was found; 1 where the extractor knows no scales
+    # (N,) standard deviation of the Gaussian of the keypoint's scale; 1 if the extractor has no scales
     scales_px: NDArray[np.float32]
 
     def __len__(self) -> int:
@@ -23,5 +23,5 @@ class Keypoints:
 
     @classmethod
     def none(cls, dimension: int = 128) -> Keypoints:
-        """No keypoints, with descriptors of so many numbers."""
+        """No keypoints, with descriptors of a dimension."""
         return cls(np.zeros((0, 2), np.float32), np.zeros((0, dimension), np.float32), np.zeros(0, np.float32))

@@ -1,4 +1,4 @@
-"""What extractors that are networks have in common: kornia, their weights, and images in batches."""
+"""Base class of extractors that are networks of kornia: weights and batches of images."""
 
 from __future__ import annotations
 
@@ -20,17 +20,16 @@ from wheretolook.utils.errors import ConfigError, WeightsError
 
 INSTALL = "pip install 'wheretolook[learned]'"
 
-LEAST_SIDE = 16  # pixels: networks halve images four times, and in smaller ones nothing is to be found
+MIN_SIDE_PX = 16  # networks halve images four times
 
-Found = tuple[Tensor, Tensor, Tensor]
-"""Keypoints of an image: (N, 2) pixels, (0.5, 0.5) in the middle of the first; (N, D) unit descriptors; (N,) scores."""
+Detection = tuple[Tensor, Tensor, Tensor]
+"""Keypoints of an image: pixels (N, 2), (0.5, 0.5) is the centre of the first; unit descriptors (N, D); scores (N,)."""
 
 
 class LearnedExtraction(ABC):
-    """A network of kornia that finds keypoints: on a CPU core image by image, on a GPU in batches.
+    """A keypoint network of kornia: runs on a CPU core image by image, on a GPU in batches.
 
-    Keypoints come with the highest score first. Raises ConfigError without kornia, WeightsError if there are no
-    weights, or others than the network's.
+    Raises ConfigError without kornia, WeightsError if weights are missing or of another network.
     """
 
     dimension: int
@@ -38,7 +37,7 @@ class LearnedExtraction(ABC):
     def __init__(self, config: ExtractorSettings, device: str) -> None:
         self.config = config
         self.device = torch.device(device)
-        # in a batch of 16 an image takes an H100 a sixth of the time that it takes alone; more gain nothing
+        # an H100 needs a sixth of the time per image in a batch of 16; larger batches gain nothing
         self.batch = 1 if self.device.type == "cpu" else 16
         self._network = self.make().eval().to(self.device)
 
@@ -47,7 +46,7 @@ class LearnedExtraction(ABC):
         """The network with its weights, on a CPU."""
 
     @abstractmethod
-    def detect(self, images: Tensor) -> list[Found]:
+    def detect(self, images: Tensor) -> list[Detection]:
         """Keypoints of images (B, 3, H, W), RGB in 0..1, on the device."""
 
     def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
@@ -55,23 +54,23 @@ class LearnedExtraction(ABC):
         for rgb in images:
             if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
                 raise ValueError(f"expected an (H, W, 3) uint8 image, got {rgb.shape} {rgb.dtype}")
-        if len(images) and min(images[0].shape[:2]) < LEAST_SIDE:
+        if len(images) and min(images[0].shape[:2]) < MIN_SIDE_PX:
             return [Keypoints.none(self.dimension) for _ in images]
-        # on a CPU one by one: a batch would take no less time, but several times the memory
+        # on a CPU a batch takes as long, but several times the memory
         parts = [images] if self.batch > 1 else [[rgb] for rgb in images]
-        found: list[Keypoints] = []
+        keypoints: list[Keypoints] = []
         with torch.inference_mode(), one_thread():
             for part in parts:
                 if len(part):
                     whole = torch.from_numpy(np.stack(part)).to(self.device)
-                    found += self._keypoints(self.detect(whole.permute(0, 3, 1, 2).float() / 255))
-        return found
+                    keypoints += self._keypoints(self.detect(whole.permute(0, 3, 1, 2).float() / 255))
+        return keypoints
 
-    def _keypoints(self, found: list[Found]) -> Iterator[Keypoints]:
-        # those of all images come from the device at once: each time waits for it
-        together = (torch.cat(of_images).float().cpu().numpy() for of_images in zip(*found, strict=True))
-        ends = np.cumsum([len(scores) for _, _, scores in found])[:-1]
-        for pixels, descriptors, scores in zip(*(np.split(values, ends) for values in together), strict=True):
+    def _keypoints(self, detections: list[Detection]) -> Iterator[Keypoints]:
+        # one transfer from the device for all images
+        joined = (torch.cat(values).float().cpu().numpy() for values in zip(*detections, strict=True))
+        ends = np.cumsum([len(scores) for _, _, scores in detections])[:-1]
+        for pixels, descriptors, scores in zip(*(np.split(values, ends) for values in joined), strict=True):
             if len(pixels) == 0:
                 yield Keypoints.none(self.dimension)
                 continue
@@ -81,7 +80,7 @@ class LearnedExtraction(ABC):
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """One thread of PyTorch: workers have a core each, and sums do not depend on how many there are."""
+    """Limit PyTorch to one thread: workers have a core each, and sums do not depend on the number of cores."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -91,11 +90,11 @@ def one_thread() -> Iterator[None]:
 
 
 def kornia_feature() -> Any:
-    """The module `kornia.feature`. ConfigError if it is not installed."""
+    """The module `kornia.feature`. Raises ConfigError if it is not installed."""
     try:
         import kornia.feature
     except ImportError as error:
-        raise ConfigError("learned features are found by kornia, which is not installed", fix=f"{INSTALL}.") from error
+        raise ConfigError("learned features need kornia, which is not installed", fix=f"{INSTALL}.") from error
     return kornia.feature
 
 
@@ -107,11 +106,11 @@ def load_state(
     prepare: Callable[[dict[str, Any]], dict[str, Any]] = dict,
     option: str = "--map.extractor.weights",
 ) -> nn.Module:
-    """Load the weights of a network: from a file, or without one kornia's copy, from its cache or the network.
+    """Load the weights of a network from a file, or kornia's copy from its cache or the URLs.
 
-    A download is announced on standard error. `name` is what the file is usually called, `prepare` makes the network's
-    tensors by name from what the file holds. Raises WeightsError if the file is missing, damaged, or of another
-    network; or if none is given and none can be had.
+    A download is announced on standard error. `name` is the usual name of the file; `prepare` turns its content into
+    the network's tensors by name. Raises WeightsError if the file is missing, damaged, or of another network, or if
+    none is given and the download fails.
     """
     fix = f"Give the file {name}: {option} FILE."
     if weights and not Path(weights).is_file():
@@ -125,7 +124,7 @@ def load_state(
             state = load_state_dict_from_url(list(urls), map_location="cpu", timeout=30)
     except Exception as error:  # the unpickler and the network raise errors of many kinds
         reason = str(error).strip().partition("\n")[0].partition(" Cache path:")[0].rstrip(".") or type(error).__name__
-        if isinstance(error, UnpicklingError):  # PyTorch's own text tells how to load it nevertheless
+        if isinstance(error, UnpicklingError):  # PyTorch's own text suggests an unsafe way
             reason = "it holds more than tensors, or none"
         problem = f"cannot read the weights: {reason}" if weights else f"{name} cannot be downloaded: {reason}"
         raise WeightsError(problem, path=weights or None, fix=fix) from error
@@ -137,5 +136,5 @@ def load_state(
         problem = f"these weights are not those of {type(network).__name__} as in {name}"
         raise WeightsError(problem, path=weights or None, fix=fix) from error
     if not all(bool(tensor.isfinite().all()) for tensor in network.state_dict().values()):
-        raise WeightsError("these weights hold numbers that are not finite", path=weights or None, fix=fix)
+        raise WeightsError("some weights are not finite", path=weights or None, fix=fix)
     return network

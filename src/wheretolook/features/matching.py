@@ -1,4 +1,4 @@
-"""Matching of keypoints with landmarks: exact nearest neighbours among descriptors, by matrix products."""
+"""Matches keypoints with landmarks by Lowe's ratio test: exact nearest neighbours, by matrix products."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from torch import Tensor
 Matches = tuple[NDArray[np.int64], NDArray[np.int64]]
 """Rows of keypoints and rows of their landmarks, (M,) each, in ascending order of the keypoints."""
 
-GROUP = 32  # landmarks; the two best groups are found first, and in them the two best landmarks
-# of a block of products; products of few queries are slow. On a GPU each worker holds a block and what is made of it,
-# and blocks of 1 GiB are no faster
+GROUP = 32  # landmarks; the two best groups are selected first, and in them the two best landmarks
+# Size of a block of products. Products of few queries are slow; on a GPU, where each worker holds a block and its
+# intermediate results, blocks of 1 GiB are no faster.
 _PRODUCT_BYTES = {"cpu": 2**24, "cuda": 2**27}
 
 
 class DescriptorMatcher:
     """Finds nearest neighbours among the landmarks' descriptors (N, 128) uint8, on "cpu" or a CUDA device.
 
-    Descriptors are compared as COLMAP stores them, in whole numbers, by their scalar products. These are then exact, in
-    eight-bit integers on a CPU as in half precision with single-precision sums on a GPU: both give the same neighbours,
-    and those of one descriptor do not depend on what it is matched together with. `nearest_two_plain` is the twin. A
-    CPU whose byte products saturate or are slow works in single precision, where 128 * 255^2 < 2^24 is exact, too.
+    Descriptors are compared as COLMAP stores them, as whole numbers, by their scalar products. These are exact, in
+    eight-bit integers on a CPU and in half precision with single-precision sums on a GPU: both give the same
+    neighbours, and those of one descriptor do not depend on the other queries. A CPU whose byte products saturate or
+    are slow uses single precision, where 128 * 255^2 < 2^24 is exact, too.
     """
 
     def __init__(self, descriptors: NDArray[np.uint8], device: str = "cpu") -> None:
         self.device = torch.device(device)
         n, length = descriptors.shape
         self.n_landmarks = n
-        self._in_bytes = self.device.type == "cpu" and _byte_products_pay()
+        self._in_bytes = self.device.type == "cpu" and _byte_products_are_fast()
         padded = -(-max(n, 2 * GROUP) // GROUP) * GROUP
         whole = torch.zeros((padded, length), dtype=torch.int32)
         whole[:n] = torch.from_numpy(descriptors.astype(np.int32))
         if self._in_bytes:  # in signed bytes: q.d = (q - 128).(d - 128) + 128 (sum of d) + terms that depend on q only
             self._descriptors = (whole - 128).to(torch.int8).T
             self._bias = 128 * whole.sum(1, dtype=torch.int32)
-            self._bias[n:] = -(2**28)  # rows of padding are never near
+            self._bias[n:] = -(2**28)  # rows of padding are never nearest
         else:
             number = torch.float32 if self.device.type == "cpu" else torch.float16
             self._descriptors = whole.to(self.device, number).T
@@ -47,9 +47,9 @@ class DescriptorMatcher:
     def nearest_two(
         self, descriptors: NDArray[np.uint8]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Row of each descriptor's (K, 128) nearest landmark, and its products with the two nearest; (K,) each.
+        """Row of the nearest landmark of each descriptor (K, 128), and its products with the two nearest; (K,) each.
 
-        Of several landmarks equally near it is any. With fewer than two landmarks, a missing product is -2^28.
+        Ties are broken arbitrarily. With fewer than two landmarks, a missing product is -2^28.
         """
         # OpenMP's limit is per thread: without this, the first product in a new thread would start a thread per core.
         torch.set_num_threads(torch.get_num_threads())
@@ -83,11 +83,11 @@ class DescriptorMatcher:
 
 
 @cache
-def _byte_products_pay() -> bool:
-    """Whether this CPU adds up products of signed bytes fast and without saturation, as it does with VNNI instructions.
+def _byte_products_are_fast() -> bool:
+    """Whether this CPU sums products of signed bytes fast and without saturation, as with VNNI instructions.
 
-    Without them AVX-512 adds pairs of products in 16 bits, and large ones come out wrong. With AVX2 they are right, but
-    take PyTorch's plain loop, eighteen times as long as products in single precision.
+    Without them AVX-512 adds pairs of products in 16 bits, and large ones overflow. With AVX2 they are right, but
+    PyTorch's plain loop takes eighteen times as long as products in single precision.
     """
     if torch.backends.cpu.get_cpu_capability() == "AVX2":
         return False
@@ -102,18 +102,8 @@ def _byte_products_pay() -> bool:
     return torch.equal(product.long(), left @ right)
 
 
-def nearest_two_plain(
-    queries: NDArray[np.uint8], descriptors: NDArray[np.uint8]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Plain twin of `DescriptorMatcher.nearest_two`: all products, sorted."""
-    product = queries.astype(np.int64) @ descriptors.astype(np.int64).T
-    order = np.argsort(-product, axis=1, kind="stable")
-    best = np.take_along_axis(product, order[:, :2], axis=1)
-    return order[:, 0], best[:, 0], best[:, 1]
-
-
 def match(matcher: DescriptorMatcher, descriptors: Sequence[NDArray[np.uint8]], max_ratio: float) -> list[Matches]:
-    """2D-3D matches of several images at once, from their descriptors (K_i, 128) uint8.
+    """2D-3D matches of several images, from their descriptors (K_i, 128) uint8.
 
     A match passes Lowe's ratio test (IJCV 2004, Sec. 7.1): the nearest landmark's distance is less than `max_ratio` of
     the second nearest's. A landmark keeps only its nearest keypoint. With a single landmark, nothing matches.

@@ -11,7 +11,7 @@ from wheretolook.features.descriptors import DescriptorKind
 from wheretolook.features.extractor import Extractor
 
 MODULES = ("sift", "aliked", "disk", "xfeat", "superpoint")
-"""Modules of `wheretolook.features` whose `EXTRACTORS` there are."""
+"""Modules of `wheretolook.features` that define `EXTRACTORS`."""
 
 
 @cache
@@ -21,8 +21,8 @@ def all_extractors() -> Mapping[str, Extractor]:
     return MappingProxyType({extractor.name: extractor for module in modules for extractor in module.EXTRACTORS})
 
 
-def that_extract() -> tuple[str, ...]:
-    """Names of the extractors that extract here."""
+def runnable_extractors() -> tuple[str, ...]:
+    """Names of the extractors that can be run."""
     return tuple(name for name, extractor in all_extractors().items() if extractor.build is not None)
 
 

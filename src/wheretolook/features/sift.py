@@ -76,7 +76,7 @@ class ColmapSift:
         if len(keypoints) == 0:
             return Keypoints.none()
         table = np.array([(k.x, k.y, k.compute_scale()) for k in keypoints], dtype=np.float32)
-        # COLMAP keeps whole scale levels, from the largest down, so there can be more than the limit.
+        # COLMAP returns whole scale levels, from the largest down, so there can be more than the limit.
         keep = np.argsort(-table[:, 2], kind="stable")[: self.config.max_keypoints]
         return Keypoints(table[keep, :2], unit_descriptors(descriptors.data[keep]), table[keep, 2])
 
@@ -110,6 +110,6 @@ def _opencv(config: ExtractorSettings, device: str) -> Extraction:
 
 
 EXTRACTORS = (
-    Extractor("opencv", "SIFT as OpenCV finds it, and on a GPU Warp kernels up to rounding.", SIFT, _opencv),
-    Extractor("colmap", "SIFT as COLMAP finds it on a CPU.", SIFT, lambda config, device: ColmapSift(config)),
+    Extractor("opencv", "OpenCV's SIFT; on a GPU by Warp kernels, equal up to rounding.", SIFT, _opencv),
+    Extractor("colmap", "COLMAP's SIFT on a CPU.", SIFT, lambda config, device: ColmapSift(config)),
 )

@@ -16,7 +16,7 @@ _URLS = ("https://github.com/verlab/accelerated_features/raw/main/weights/xfeat.
 def _build(config: ExtractorSettings, device: str) -> Extraction:
     from torch import Tensor, nn
 
-    from wheretolook.features.learned import Found, LearnedExtraction, kornia_feature, load_state
+    from wheretolook.features.learned import Detection, LearnedExtraction, kornia_feature, load_state
 
     class XFeat(LearnedExtraction):
         dimension = XFEAT.dimension
@@ -26,7 +26,7 @@ def _build(config: ExtractorSettings, device: str) -> Extraction:
             load_state(network.net, config.weights, _FILE, _URLS)
             return network
 
-        def detect(self, images: Tensor) -> list[Found]:
+        def detect(self, images: Tensor) -> list[Detection]:
             height, width = images.shape[-2:]
             # whole pixels of the image reduced to multiples of 32, counted from the first
             ratio = images.new_tensor([width / max(32, width // 32 * 32), height / max(32, height // 32 * 32)])

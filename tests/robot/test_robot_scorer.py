@@ -1,4 +1,4 @@
-"""The exported scorer against the one it was exported from, whatever the weights, map, camera and poses."""
+"""The exported scorer equals the PyTorch scorer for any weights, map, camera and poses."""
 
 from __future__ import annotations
 
@@ -26,20 +26,21 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.robot import wheretolook_robot
 from wheretolook.robot.export import export_robot, pinhole_of
 from wheretolook.robot.wheretolook_robot import RobotScorer
-from wheretolook.scorers.set.network import ALL_TOLD, TOLD_ONCE, SetNetwork
+from wheretolook.scorers.set import network as set_network
+from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.training.landmark_views import AttributeStatistics
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.training_range import TrainingRange
 from wheretolook.utils.errors import CameraError, ConfigError, WeightsError
-from wheretolook.visibility.occlusion import MeshOcclusion, OcclusionModel
+from wheretolook.visibility.occlusion import MeshOcclusion
 from wheretolook.weights.resolve import load_scorer
 
 pytestmark = pytest.mark.filterwarnings("ignore::wheretolook.utils.errors.OutOfRangeWarning")
 
-RELEASED = Path("data/release/weights/set.safetensors")
-SAME = 1e-5  # what scores may differ by
-
+BUNDLED = Path("data/release/weights/set.safetensors")
+TOLERANCE = 1e-5  # of scores
+PLACES = np.array([[1.0, 1.0, 1.5], [3.0, 4.0, 1.2], [5.0, 3.0, 1.0]])
 CAMERAS = {
     "paper": PinholeCamera(),
     "narrow, off centre": PinholeCamera(1280, 720, 1400.0, 1380.0, (610.0, 377.5)),
@@ -48,7 +49,7 @@ CAMERAS = {
 
 
 def some_poses(n: int, seed: int = 0) -> Float:
-    """Poses about the middle of the box of `make_landmarks`, some with roll."""
+    """Make poses in the middle of the box of `make_landmarks`, some with roll."""
     rng = np.random.default_rng(seed)
     poses = poses_looking_along(rng.uniform((-2, -2, 0.5), (2, 2, 2), (n, 3)), rng.normal(size=(n, 3)))
     roll = Rotation.from_rotvec(rng.normal(scale=0.3, size=(n, 1)) * (0, 0, 1)).as_matrix()
@@ -56,7 +57,7 @@ def some_poses(n: int, seed: int = 0) -> Float:
 
 
 def walls(n: int, seed: int = 0) -> Landmarks:
-    """Landmarks on the walls of a room about the origin, of which some attributes are not known."""
+    """Make landmarks on the walls of a room, with some unknown attributes."""
     landmarks = make_landmarks(np.random.default_rng(seed), n)
     assert landmarks.mapping_focal_px is not None
     landmarks.points[:, :2] *= np.random.default_rng(seed).choice([-1, 1], (n, 2))
@@ -66,8 +67,10 @@ def walls(n: int, seed: int = 0) -> Landmarks:
     return landmarks
 
 
-def trained(seed: int, attributes: tuple[str, ...] = ATTRIBUTES, **options: object) -> TrainedNetwork[SetNetwork]:
-    """A network with random weights and statistics, as if it had learnt."""
+def random_network(
+    seed: int, attributes: tuple[str, ...] = ATTRIBUTES, **options: object
+) -> TrainedNetwork[SetNetwork]:
+    """Make a network with random weights and statistics."""
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
     mean = rng.normal(size=len(attributes))
@@ -79,116 +82,105 @@ def trained(seed: int, attributes: tuple[str, ...] = ATTRIBUTES, **options: obje
             module.running_var.uniform_(1, 4)
             module.weight.data.uniform_(0.3, 1)
             module.bias.data.normal_()
-    known = TrainingRange({"distance_m": (1.0, 2.6), "in_view": (20, 300), "across_deg": (30.0, 130.0)})
-    return TrainedNetwork("set", network, None, 0.8, -0.3, known)
+    training_range = TrainingRange({"distance_m": (1.0, 2.6), "in_view": (20, 300), "across_deg": (30.0, 130.0)})
+    return TrainedNetwork("set", network, None, 0.8, -0.3, training_range)
 
 
-def without(*names: str) -> tuple[str, ...]:
-    return tuple(name for name in ATTRIBUTES if name not in names)
-
-
+WITHOUT_PIXELS = tuple(name for name in ATTRIBUTES if "pixel" not in name)
 NETWORKS = {
-    "as learnt": {"hidden": ("distance", "mapped_distance", "mapped_pixel_size")},
-    "told all": {"told": ALL_TOLD, "width": 24, "head": 16},
-    "told what older weights are": {"told": TOLD_ONCE},
-    "attention": {"pooled": 5, "told": ALL_TOLD, "dropout": 0.5},
-    "before pixels": {"attributes": without("pixel_angle", "pixel_size_ratio", "mapped_pixel_size")},
-    "in another order": {"attributes": ATTRIBUTES[::-1], "told": ("axis_height", "log_visible", "log_variance_z")},
+    "default": {"hidden": ("distance", "mapped_distance", "mapped_pixel_size")},
+    "attention": {"pooled": 5, "told": set_network.ALL_TOLD, "dropout": 0.5, "width": 24, "head": 16},
+    "without pixels": {"attributes": WITHOUT_PIXELS},
+    "another order": {"attributes": ATTRIBUTES[::-1], "told": ("axis_height", "log_visible", "log_variance_z")},
 }
 
 
-@pytest.mark.parametrize("name", NETWORKS)
-@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+@pytest.mark.parametrize(
+    ("name", "camera"),
+    [*((name, CAMERAS["paper"]) for name in NETWORKS), *(("attention", camera) for camera in CAMERAS.values())],
+)
 def test_scores_are_those_of_pytorch(name: str, camera: Camera, tmp_path: Path) -> None:
     weights = tmp_path / "set.safetensors"
-    trained(len(name), **NETWORKS[name]).save(weights)
+    random_network(len(name), **NETWORKS[name]).save(weights)
     localization_map = LocalizationMap(walls(1500, len(name)), camera)
     poses = some_poses(120, len(name))
     scorer = load_scorer(weights, localization_map)
     expected = scorer.score(poses)
     robot = RobotScorer(export_robot(localization_map, weights, tmp_path / "robot"))
-    found = robot.views(poses)
-    np.testing.assert_allclose(found.score, expected, atol=SAME, rtol=0)
-    assert found.score.dtype == np.float64 and np.ptp(expected) > 100 * SAME
-    seen = localization_map.landmarks_in_view(poses)
-    np.testing.assert_array_equal(found.n_visible, np.diff(seen.starts))
-    np.testing.assert_array_equal(found.in_range, scorer.in_range(poses))
-    assert 0 < found.in_range.sum() < len(poses)
-    one = robot.score(poses[7])
-    np.testing.assert_allclose(one, expected[7:8], atol=SAME, rtol=0)
+    views = robot.views(poses)
+    np.testing.assert_allclose(views.score, expected, atol=TOLERANCE, rtol=0)
+    assert views.score.dtype == np.float64 and np.ptp(expected) > 100 * TOLERANCE
+    np.testing.assert_array_equal(views.n_visible, np.diff(localization_map.landmarks_in_view(poses).starts))
+    np.testing.assert_array_equal(views.in_range, scorer.in_range(poses))
+    assert 0 < views.in_range.sum() < len(poses)
+    np.testing.assert_allclose(robot.score(poses[7]), expected[7:8], atol=TOLERANCE, rtol=0)
 
 
-@pytest.mark.parametrize("n", [1, 3, 60, 25_000])
-def test_the_weights_that_ship(n: int, tmp_path: Path) -> None:
-    """From a map of a single landmark to one where views see more than are looked at, and some see none."""
+@pytest.mark.parametrize("n", [1, 60, 25_000])
+def test_bundled_weights_on_maps_of_any_size(n: int, tmp_path: Path) -> None:
+    """From views without landmarks to views with more than are sampled."""
     localization_map = LocalizationMap(walls(n, n), CAMERAS["wide, upright"])
     poses = some_poses(80, n)
-    expected = load_scorer(RELEASED, localization_map).score(poses)
-    found = RobotScorer(export_robot(localization_map, RELEASED, tmp_path)).views(poses)
-    np.testing.assert_allclose(found.score, expected, atol=SAME, rtol=0)
-    assert n < 25_000 or found.n_visible.max() > 2048
-    assert n > 100 or found.n_visible.min() == 0
+    expected = load_scorer(BUNDLED, localization_map).score(poses)
+    views = RobotScorer(export_robot(localization_map, BUNDLED, tmp_path)).views(poses)
+    np.testing.assert_allclose(views.score, expected, atol=TOLERANCE, rtol=0)
+    assert views.n_visible.max() > 2048 if n == 25_000 else views.n_visible.min() == 0
 
 
-def test_a_camera_right_at_a_wall(tmp_path: Path) -> None:
-    """One landmark a few centimetres away tells far more of the position than all others."""
+def test_a_camera_close_to_a_wall(tmp_path: Path) -> None:
+    """One landmark a few centimetres away has most of the information on the position."""
     landmarks = walls(4000, 1)
     localization_map = LocalizationMap(landmarks, PinholeCamera())
     at = landmarks.points[:200]
     poses = poses_looking_along(at * 0.985, at)
-    expected = load_scorer(RELEASED, localization_map).score(poses)
-    found = RobotScorer(export_robot(localization_map, RELEASED, tmp_path)).score(poses)
-    np.testing.assert_allclose(found, expected, atol=SAME, rtol=0)
+    expected = load_scorer(BUNDLED, localization_map).score(poses)
+    scores = RobotScorer(export_robot(localization_map, BUNDLED, tmp_path)).score(poses)
+    np.testing.assert_allclose(scores, expected, atol=TOLERANCE, rtol=0)
 
 
 @pytest.fixture(scope="module")
 def room_map() -> LocalizationMap:
-    """Landmarks on the walls of a room with a cabinet, which hides some of them."""
+    """Landmarks on the walls of a room with a cabinet, which occludes some of them."""
     rng = np.random.default_rng(5)
-    landmarks = make_landmarks(rng, 600)
     points = rng.uniform((0, 0, 0), ROOM, (600, 3))
     axis = rng.integers(0, 3, 600)
     points[np.arange(600), axis] = np.array(ROOM)[axis] * rng.integers(0, 2, 600)
     space = FreeSpace(furnished_room())
-    return LocalizationMap(replace(landmarks, points=points), CAMERA, MeshOcclusion(space.raycaster))
+    return LocalizationMap(replace(make_landmarks(rng, 600), points=points), CAMERA, MeshOcclusion(space.raycaster))
 
 
-PLACES = np.array([[1.0, 1.0, 1.5], [3.0, 4.0, 1.2], [5.0, 3.0, 1.0]])
+@pytest.fixture(scope="module")
+def folder(room_map: LocalizationMap, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return export_robot(room_map, BUNDLED, tmp_path_factory.mktemp("robot") / "robot", PLACES, progress=False)
 
 
-def test_what_is_unoccluded_is_that_of_the_nearest_place(room_map: LocalizationMap, tmp_path: Path) -> None:
-    scorer = load_scorer(RELEASED, room_map)
-    blind = RobotScorer(export_robot(room_map, RELEASED, tmp_path / "blind"))
-    robot = RobotScorer(export_robot(room_map, RELEASED, tmp_path / "robot", PLACES, progress=False))
+def test_occlusion_is_that_of_the_nearest_place(room_map: LocalizationMap, folder: Path, tmp_path: Path) -> None:
+    scorer = load_scorer(BUNDLED, room_map)
+    without = RobotScorer(export_robot(room_map, BUNDLED, tmp_path))
+    robot = RobotScorer(folder)
     axes = fibonacci_sphere(60)
     for at in PLACES:
         poses = poses_looking_along(np.tile(at, (60, 1)), axes)
         views = robot.views(poses)
-        np.testing.assert_allclose(views.score, scorer.score(poses), atol=SAME, rtol=0)
+        np.testing.assert_allclose(views.score, scorer.score(poses), atol=TOLERANCE, rtol=0)
         np.testing.assert_array_equal(views.n_visible, np.diff(room_map.landmarks_in_view(poses).starts))
         assert np.abs(views.place_m).max() < 1e-9
-        through = blind.views(poses)
-        assert np.isnan(through.place_m).all() and through.n_visible.sum() > views.n_visible.sum() + 50
-        # a robot that knows by itself what is free
-        free = room_map.occlusion.unoccluded(at[None], room_map.landmarks.points)[0]
-        np.testing.assert_array_equal(blind.views(poses, free).score, views.score)
-    beside = robot.views(poses_looking_along(PLACES[1] + (0.3, 0, -0.4), (0, 1, 0)))
-    np.testing.assert_allclose(beside.place_m, 0.5)
-    n_free = room_map.occlusion.unoccluded(PLACES[1:2], room_map.landmarks.points)[0]
-    np.testing.assert_array_equal(
-        beside.score, blind.score(poses_looking_along(PLACES[1] + (0.3, 0, -0.4), (0, 1, 0)), n_free)
-    )
+        through_walls = without.views(poses)
+        assert np.isnan(through_walls.place_m).all()
+        assert through_walls.n_visible.sum() > views.n_visible.sum() + 50
+        unoccluded = room_map.occlusion.unoccluded(at[None], room_map.landmarks.points)[0]
+        np.testing.assert_array_equal(without.views(poses, unoccluded).score, views.score)
+    np.testing.assert_allclose(robot.views(poses_looking_along(PLACES[1] + (0.3, 0, -0.4), (0, 1, 0))).place_m, 0.5)
 
 
-def test_the_best_view_at_a_place(room_map: LocalizationMap, tmp_path: Path) -> None:
-    robot = RobotScorer(export_robot(room_map, RELEASED, tmp_path, PLACES, progress=False))
+def test_the_best_view_at_a_location(room_map: LocalizationMap, folder: Path) -> None:
+    robot = RobotScorer(folder)
     axes = fibonacci_sphere(200)
-    scores = load_scorer(RELEASED, room_map).score(poses_looking_along(np.tile(PLACES[0], (200, 1)), axes))
+    scores = load_scorer(BUNDLED, room_map).score(poses_looking_along(np.tile(PLACES[0], (200, 1)), axes))
     view = robot.best(PLACES[0], directions=200)
     np.testing.assert_allclose(view.direction, axes[scores.argmax()], atol=1e-12)
-    assert abs(view.score - scores.max()) < SAME
+    assert abs(view.score - scores.max()) < TOLERANCE
     np.testing.assert_allclose(view.cam_from_world, poses_looking_along(PLACES[0], view.direction), atol=1e-12)
-    np.testing.assert_allclose(robot.score(view.cam_from_world), view.score, atol=1e-9)
     np.testing.assert_allclose(
         Rotation.from_quat(view.quaternion_xyzw).as_matrix(), invert_poses(view.cam_from_world)[:, :3], atol=1e-12
     )
@@ -196,22 +188,16 @@ def test_the_best_view_at_a_place(room_map: LocalizationMap, tmp_path: Path) -> 
     level = np.abs(np.degrees(np.arcsin(axes[:, 2]))) <= 10
     chosen = robot.best(PLACES[0], directions=axes, pitch_deg=(-10, 10))
     np.testing.assert_allclose(chosen.direction, axes[level][scores[level].argmax()], atol=1e-12)
-    with pytest.raises(ValueError, match="no direction"):
-        robot.best(PLACES[0], directions=[(0, 0, 2.0)], pitch_deg=(-10, 10))
-    with pytest.raises(ValueError, match="three finite numbers"):
-        robot.best((0.0, np.nan, 1.0))
 
 
-def test_poses_and_quaternions() -> None:
-    turns = Rotation.random(200, random_state=0)
-    turns = Rotation.concatenate(
-        [turns, Rotation.from_quat(np.eye(4)), Rotation.from_euler("z", [[180], [179.99]], True)]
-    )
-    for turn in turns:
-        quaternion = wheretolook_robot.quaternion_xyzw(turn.as_matrix())
-        np.testing.assert_allclose(quaternion, turn.as_quat(canonical=True), atol=1e-9)
+def test_rotations_and_quaternions() -> None:
+    random = Rotation.random(200, random_state=0)
+    special = [Rotation.from_quat(np.eye(4)), Rotation.from_euler("z", [[180], [179.99]], True)]
+    for rotation in Rotation.concatenate([random, *special]):
+        quaternion = wheretolook_robot.quaternion_xyzw(rotation.as_matrix())
+        np.testing.assert_allclose(quaternion, rotation.as_quat(canonical=True), atol=1e-9)
         pose = wheretolook_robot.cam_from_world_of((1, 2, 3), 2 * quaternion)
-        np.testing.assert_allclose(pose[:, :3], turn.as_matrix().T, atol=1e-9)
+        np.testing.assert_allclose(pose[:, :3], rotation.as_matrix().T, atol=1e-9)
         np.testing.assert_allclose(camera_centers(pose), (1, 2, 3), atol=1e-9)
     np.testing.assert_allclose(wheretolook_robot.fibonacci_sphere(77), fibonacci_sphere(77), atol=1e-12)
     along = [*fibonacci_sphere(50), (0, 0, 1), (0, 0, -3)]
@@ -219,15 +205,18 @@ def test_poses_and_quaternions() -> None:
     np.testing.assert_allclose(wheretolook_robot.rotations_looking_along(along), expected, atol=1e-12)
 
 
-def test_no_pose_and_poses_that_are_none(room_map: LocalizationMap, tmp_path: Path) -> None:
-    robot = RobotScorer(export_robot(room_map, RELEASED, tmp_path))
+def test_invalid_arguments(folder: Path) -> None:
+    robot = RobotScorer(folder)
     assert robot.score(np.empty((0, 3, 4))).shape == (0,)
-    with pytest.raises(ValueError, match="cam_from_world"):
-        robot.score(np.eye(4))
-    with pytest.raises(ValueError, match="cam_from_world"):
-        robot.score(np.full((1, 3, 4), np.nan))
-    with pytest.raises(ValueError, match="one bool for each landmark"):
-        robot.score(some_poses(1), np.ones(7, bool))
+    for call in (
+        lambda: robot.score(np.eye(4)),
+        lambda: robot.score(np.full((1, 3, 4), np.nan)),
+        lambda: robot.score(some_poses(1), np.ones(7, bool)),
+        lambda: robot.best(PLACES[0], directions=[(0, 0, 2.0)], pitch_deg=(-10, 10)),
+        lambda: robot.best((0.0, np.nan, 1.0)),
+    ):
+        with pytest.raises(ValueError, match=r"unoccluded|cam_from_world|direction|position"):
+            call()
 
 
 WITHOUT_PYTORCH = """
@@ -239,74 +228,44 @@ np.save("scores.npy", RobotScorer(".").score(np.load("poses.npy")))
 """
 
 
-def test_the_folder_runs_by_itself(room_map: LocalizationMap, tmp_path: Path) -> None:
-    folder = export_robot(room_map, RELEASED, tmp_path / "robot", PLACES, progress=False)
-    assert {path.name for path in folder.iterdir()} == {
-        "landmarks.npz", "robot.json", "scorer.onnx", "wheretolook_robot.py"
-    }  # fmt: skip
+def test_the_folder_runs_by_itself(folder: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "robot"
+    shutil.copytree(folder, copy)
     poses = some_poses(5)
-    np.save(folder / "poses.npy", poses)
-    subprocess.run([sys.executable, "-c", WITHOUT_PYTORCH], cwd=folder, check=True)
-    np.testing.assert_array_equal(np.load(folder / "scores.npy"), RobotScorer(folder).score(poses))
-
-
-def test_the_one_file_imports_numpy_and_onnxruntime_only() -> None:
-    tree = ast.parse(Path(wheretolook_robot.__file__).read_text())
+    np.save(copy / "poses.npy", poses)
+    subprocess.run([sys.executable, "-c", WITHOUT_PYTORCH], cwd=copy, check=True)
+    np.testing.assert_array_equal(np.load(copy / "scores.npy"), RobotScorer(folder).score(poses))
+    tree = ast.parse((copy / "wheretolook_robot.py").read_text())
     modules = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
     modules |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
-    others = {module.partition(".")[0] for module in modules} - {*sys.stdlib_module_names}
-    assert others == {"numpy", "onnxruntime"}
+    assert {module.partition(".")[0] for module in modules} - {*sys.stdlib_module_names} == {"numpy", "onnxruntime"}
 
 
-def test_a_damaged_folder_is_refused(room_map: LocalizationMap, tmp_path: Path) -> None:
-    folder = export_robot(room_map, RELEASED, tmp_path / "robot")
-    other = export_robot(LocalizationMap(walls(50), CAMERA), RELEASED, tmp_path / "other")
-    shutil.copy(other / "landmarks.npz", folder)
-    with pytest.raises(ValueError, match=r"landmarks\.npz: not the landmarks"):
-        RobotScorer(folder)
-    (other / "scorer.onnx").unlink()
-    with pytest.raises(FileNotFoundError, match=r"scorer\.onnx"):
-        RobotScorer(other)
+def test_damaged_folders(folder: Path, tmp_path: Path) -> None:
+    copies = [tmp_path / str(number) for number in range(3)]
+    for copy in copies:
+        shutil.copytree(folder, copy)
+    other = export_robot(LocalizationMap(walls(50), CAMERA), BUNDLED, tmp_path / "other")
+    shutil.copy(other / "landmarks.npz", copies[0])
     about = (folder / "robot.json").read_text()
-    (folder / "robot.json").write_text(about.replace('"format_version": 1', '"format_version": 9'))
-    with pytest.raises(ValueError, match="reads format 1"):
-        RobotScorer(folder)
+    (copies[1] / "robot.json").write_text(about.replace('"format_version": 1', '"format_version": 9'))
+    (copies[2] / "scorer.onnx").unlink()
+    for copy, error in zip(copies, (ValueError, ValueError, FileNotFoundError), strict=True):
+        with pytest.raises(error, match="Export again"):
+            RobotScorer(copy)
 
 
-def test_cameras_that_are_no_pinhole(room_map: LocalizationMap, tmp_path: Path) -> None:
+def test_invalid_exports(room_map: LocalizationMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opencv = ColmapCamera("OPENCV", 160, 120, (80.0, 81.0, 79.0, 60.5, -0.1, 0.01, 1e-3, -1e-3))
     assert pinhole_of(opencv) == PinholeCamera(160, 120, 80.0, 81.0, (79.0, 60.5))
     radial = ColmapCamera("SIMPLE_RADIAL", 160, 120, (80.0, 79.0, 60.5, -0.1))
     assert pinhole_of(radial) == PinholeCamera(160, 120, 80.0, center_px=(79.0, 60.5))
-    with pytest.raises(CameraError, match="no pinhole of its own"):
+    with pytest.raises(CameraError):
         pinhole_of(ColmapCamera("OPENCV_FISHEYE", 160, 120, (80.0, 80.0, 80.0, 60.0, 0.0, 0.0, 0.0, 0.0)))
-    with pytest.raises(CameraError, match="must be a pinhole"):
-        export_robot(room_map.of_camera(opencv), RELEASED, tmp_path)
-
-
-def test_weights_of_another_method_are_refused(room_map: LocalizationMap, tmp_path: Path) -> None:
-    with pytest.raises(WeightsError, match="not of set"):
-        export_robot(room_map, RELEASED.with_name("matchability.safetensors"), tmp_path)
-
-
-def test_a_custom_occlusion_is_asked_in_blocks(tmp_path: Path) -> None:
-    class Halves(OcclusionModel):
-        """East of the origin only the even landmarks are free, west of it the odd ones."""
-
-        def unoccluded(self, locations: Float, points: Float) -> np.ndarray:
-            return (np.arange(len(points)) % 2 == 0) == (np.asarray(locations)[:, :1] > 0)
-
-    localization_map = LocalizationMap(walls(301), CAMERA, Halves())
-    places = np.random.default_rng(0).uniform(-1, 1, (200, 3))
-    robot = RobotScorer(export_robot(localization_map, RELEASED, tmp_path, places, progress=False))
-    poses = poses_looking_along(places, np.tile((1.0, 0.5, 0), (200, 1)))
-    expected = np.diff(localization_map.landmarks_in_view(poses).starts)
-    np.testing.assert_array_equal(robot.views(poses).n_visible, expected)
-
-
-def test_without_onnx_it_is_said_what_to_install(
-    room_map: LocalizationMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    with pytest.raises(CameraError):
+        export_robot(room_map.of_camera(opencv), BUNDLED, tmp_path)
+    with pytest.raises(WeightsError):
+        export_robot(room_map, BUNDLED.with_name("matchability.safetensors"), tmp_path)
     monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(ConfigError, match=r"needs the package onnx.*wheretolook\[robot\]"):
-        export_robot(room_map, RELEASED, tmp_path)
+    with pytest.raises(ConfigError):
+        export_robot(room_map, BUNDLED, tmp_path)

@@ -1,4 +1,4 @@
-"""`wheretolook export`: a map and the weights as a robot needs them."""
+"""`wheretolook export`: write map and network for scoring views on a robot."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
     from wheretolook.space.free_space import FreeSpace
 
 SCORER = f"{WEIGHTS}/set.safetensors"
-MOST_PLACES = 20_000
+MAX_PLACES = 20_000
 
 _TEXT = """\
-Write what a robot needs to score views of a map with NumPy and onnxruntime, without PyTorch.
+Export a map and a network, so that a robot scores views with NumPy and onnxruntime, without PyTorch.
 
-The folder then holds the network (scorer.onnx), the landmarks (landmarks.npz), the camera (robot.json), and
-wheretolook_robot.py, which reads and explains them. Copy it to the robot; `pip install numpy onnxruntime` there."""
+The folder holds the network (scorer.onnx), the landmarks (landmarks.npz), the camera (robot.json), and
+wheretolook_robot.py, which reads and documents them. Copy it to the robot; `pip install numpy onnxruntime` there."""
 
 _MORE = """\
-A robot has no mesh to look for walls in. With --mesh it is stored which landmarks can be seen from each free place of a
-grid, and the robot takes those of the nearest place; without, it sees landmarks through walls.
+The robot does not compute occlusion. With --mesh the landmarks unoccluded from each free cell of a grid are stored, and
+the robot uses those of the nearest cell; without, landmarks are visible through walls.
 
 Example:
   wheretolook export --map sparse/0 --mesh house.glb --spacing 0.5 --out robot
@@ -35,30 +35,36 @@ Example:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run the command. Returns the exit code; raises a WhereToLookError on bad input."""
+    """Run the command. Returns the exit code 0; raises a WhereToLookError for invalid input."""
     parser = CommandParser("wheretolook export", description=_TEXT, epilog=_MORE)
     parser.add_argument("--map", type=Path, required=True, metavar="SPARSE", help="COLMAP model, in metres, z up")
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="where to write")
     parser.add_argument(
-        "--weights", type=Path, default=Path(SCORER), metavar="FILE", help="of the method set (those that ship)"
+        "--weights",
+        type=Path,
+        default=Path(SCORER),
+        metavar="FILE",
+        help="weights of the method set (the bundled ones)",
     )
     parser.add_argument(
         "--camera",
         metavar="CAMERA",
-        help="the robot's, as COLMAP writes a pinhole, 'PINHOLE,WIDTH,HEIGHT,FX,FY,CX,CY'; by default the map's own, "
-        "if it has but one, as the pinhole of its rectified images",
+        help="the robot's pinhole as COLMAP writes it, 'PINHOLE,WIDTH,HEIGHT,FX,FY,CX,CY'; by default the map's only "
+        "camera, or the pinhole of its rectified images",
     )
     parser.add_argument("--camera-id", type=int, metavar="ID", help="or the camera_id of one of the map's cameras")
     parser.add_argument(
-        "--database", type=Path, metavar="FILE", help="the map's: its descriptors tell which landmarks look alike"
+        "--database", type=Path, metavar="FILE", help="the map's database: descriptors measure ambiguity"
     )
     parser.add_argument("--mesh", type=Path, metavar="FILE", help="mesh of the scene, for occlusion")
-    parser.add_argument("--spacing", type=float, default=0.5, metavar="METRES", help="of that grid (%(default)s)")
+    parser.add_argument(
+        "--spacing", type=float, default=0.5, metavar="METRES", help="spacing of the grid (%(default)s)"
+    )
     given = parser.parse_args(arguments)
     if not 0 < given.spacing < float("inf"):
         raise ConfigError("the spacing must be positive", value=given.spacing, fix="Give it in metres.")
     if given.camera is not None and given.camera_id is not None:
-        raise ConfigError("a camera is described in two ways", value=given.camera, fix="Give --camera or --camera-id.")
+        raise ConfigError("give either --camera or --camera-id", value=given.camera)
     _export(given)
     return 0
 
@@ -75,30 +81,32 @@ def _export(given: argparse.Namespace) -> None:
     found = environment.localization_map
     camera = pinhole_of(found.camera)
     if camera != found.camera:
-        print("the map's camera has distortion, the robot's is the pinhole of its rectified images; or give --camera")
+        print(
+            "the map's camera has distortion: the robot's is the pinhole of its rectified images; to change it, use --camera"
+        )
     export_robot(found.of_camera(camera), or_shipped(given.weights), given.out, places)
     print(f"{len(found.landmarks):,} landmarks, a camera of {camera.width} x {camera.height} px: {given.out}")
     if places is None:
-        print("without --mesh the robot sees landmarks through walls")
+        print("without --mesh landmarks are visible through walls")
     else:
-        print(f"what is unoccluded is stored for {len(places):,} free places, {given.spacing:g} m apart")
+        print(f"occlusion is stored for {len(places):,} free places, {given.spacing:g} m apart")
 
 
 def _places(space: FreeSpace, spacing_m: float) -> Float:
-    """Free places (L, 3) m on a grid over the mesh. Raises ConfigError if there are none, or too many."""
+    """Return free locations (L, 3) m of a grid over the mesh. Raises ConfigError if there are none or too many."""
     import numpy as np
 
     low, high = space.bounds
     counts = np.maximum(1, np.ceil((high - low) / spacing_m)).astype(np.int64)
-    if counts.prod() > 100 * MOST_PLACES:
+    if counts.prod() > 100 * MAX_PLACES:
         raise ConfigError("the grid is too fine for this mesh", value=spacing_m, fix="Give a larger --spacing.")
-    # in the middle between both bounds
+    # centred between both bounds
     axes = [(a + b) / 2 + (np.arange(n) - (n - 1) / 2) * spacing_m for a, b, n in zip(low, high, counts, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     free = grid[space.is_free(grid)]
     if len(free) == 0:
         fix = "Give a smaller --spacing, or a mesh with free space above a floor (metres, z up)."
-        raise ConfigError("no place of the grid is free", value=spacing_m, fix=fix)
-    if len(free) > MOST_PLACES:
+        raise ConfigError("no location of the grid is free", value=spacing_m, fix=fix)
+    if len(free) > MAX_PLACES:
         raise ConfigError(f"the grid has {len(free):,} free places", value=spacing_m, fix="Give a larger --spacing.")
     return free

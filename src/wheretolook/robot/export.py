@@ -1,4 +1,4 @@
-"""Writes what a robot needs to score views of a map: the network, the landmarks, and the file that reads them."""
+"""Export the network, landmarks and camera that `wheretolook_robot.py` scores views with."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from wheretolook.utils.version import VERSION
 
 FORMAT_VERSION = 1  # of the folder, as in wheretolook_robot.py
 RECTIFIED = {"SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "FULL_OPENCV": 2}
-"""COLMAP's perspective models with distortion, and how many focal lengths their parameters begin with."""
-BLOCK = 64  # places whose occlusion is asked for at a time
+"""Number of focal lengths of COLMAP's perspective models with distortion."""
+BLOCK = 64  # locations per call of the occlusion model
 
 
 def export_robot(
@@ -39,11 +39,11 @@ def export_robot(
     """Write scorer.onnx, landmarks.npz, robot.json and wheretolook_robot.py, which documents them, into a folder.
 
     Args:
-        localization_map: landmarks and a pinhole camera; its occlusion model is asked at the places only.
-        weights: of the method `set`.
-        out: the folder; files of these names are replaced.
-        places: (L, 3) m, where it is computed and stored which landmarks nothing hides. None for no occlusion.
-        progress: whether to show a bar.
+        localization_map: landmarks and a pinhole camera.
+        weights: weights of the method `set`.
+        out: folder; existing files are replaced.
+        places: (L, 3) m, locations whose occlusion is stored; None for no occlusion.
+        progress: show a bar.
 
     Returns:
         The folder.
@@ -64,17 +64,16 @@ def export_robot(
     out = Path(out)
     weights = Path(weights)
     trained = TrainedNetwork.load(weights, SetNetwork, "set")
-    content = set_graph(trained).SerializeToString()
-    known = trained.training_range
-    known = TrainingRange.of_camera(trained.camera) if known is None else known
+    training_range = trained.training_range or TrainingRange.of_camera(trained.camera)
     landmarks = localization_map.landmarks
-    at = np.empty((0, 3)) if places is None else np.asarray(places, dtype=np.float64).reshape(-1, 3)
+    places = np.empty((0, 3)) if places is None else np.asarray(places, dtype=np.float64).reshape(-1, 3)
+    content = set_graph(trained).SerializeToString()
     arrays: dict[str, NDArray[Any]] = {
         "points": landmarks.points,
         "directions": landmarks.mapping_direction,
         "attributes": landmarks.attributes(),
-        "places": at,
-        "unoccluded": _unoccluded(localization_map, at, progress),
+        "places": places,
+        "unoccluded": _unoccluded(localization_map, places, progress),
     }
     about = {
         "format_version": FORMAT_VERSION,
@@ -85,8 +84,8 @@ def export_robot(
         "attributes": list(trained.network.attributes),
         "map_attributes": list(MAP_ATTRIBUTES),
         "most": MOST,
-        "range": known.record(),
-        "serves_camera": bool(known.contains(camera_quantities(camera)[None])[0]),
+        "range": training_range.record(),
+        "serves_camera": bool(training_range.contains(camera_quantities(camera)[None])[0]),
     }
     write_bytes(out / "scorer.onnx", content)
     save_npz(out / "landmarks.npz", arrays)
@@ -96,21 +95,21 @@ def export_robot(
 
 
 def pinhole_of(camera: Camera) -> PinholeCamera:
-    """The pinhole of a camera's rectified images: the same size, focal lengths and principal point.
+    """Return the pinhole of a camera's rectified images: same size, focal lengths and principal point.
 
-    Raises a CameraError if the model is a fisheye's or a panorama's, of which there is no such pinhole.
+    Raises CameraError for fisheyes and panoramas.
     """
     if isinstance(camera, PinholeCamera):
         return camera
     if isinstance(camera, ColmapCamera) and camera.model in RECTIFIED:
         focal = camera.params[: RECTIFIED[camera.model]]
         return PinholeCamera(camera.width, camera.height, focal[0], focal[-1], camera.principal_point)
-    fix = "Say which pinhole the robot's rectified images have, with --camera."
-    raise CameraError("this camera has no pinhole of its own", value=describe_camera(camera), fix=fix)
+    fix = "Give the pinhole of the robot's rectified images by --camera."
+    raise CameraError("this camera model has no pinhole", value=describe_camera(camera), fix=fix)
 
 
 def _unoccluded(localization_map: LocalizationMap, places: Float, progress: bool) -> np.ndarray:
-    """Bits (L, ceil(N / 8)) uint8 of what nothing hides from places (L, 3) m."""
+    """Compute bits (L, ceil(N / 8)) uint8 of the landmarks that are unoccluded from places (L, 3) m."""
     points = localization_map.landmarks.points
     packed = np.empty((len(places), (len(points) + 7) // 8), dtype=np.uint8)
     with tqdm(total=len(places), desc="occlusion", unit="place", disable=not progress or len(places) == 0) as bar:

@@ -1,46 +1,44 @@
-"""Where to point a camera so that it knows where it is: the scorer of wheretolook on a robot.
+"""Score camera views on a robot: where to point a camera so that it localizes.
 
-This one file needs NumPy and onnxruntime, nothing else of wheretolook and no PyTorch. It lies in the folder that
-`wheretolook export --map SPARSE --out FOLDER` writes, and reads the other files there:
+This file needs NumPy and onnxruntime, neither PyTorch nor the rest of wheretolook. `wheretolook export --map SPARSE
+--out FOLDER` writes it together with the files it reads:
 
-    scorer.onnx     the network: from the landmarks that a view sees to the probability that the view localizes
-    landmarks.npz   the map, N landmarks, all plain arrays:
+    scorer.onnx     network from the visible landmarks of a view to the probability that the view localizes
+    landmarks.npz   map with N landmarks:
         points      (N, 3) float64, metres in the world
         directions  (N, 3) float32, unit mean direction from the mapping cameras to the landmark, in the world
-        attributes  (N, M) float32, what the map knows of each landmark; NaN where it does not know
-        places      (L, 3) float64, where it was computed which landmarks can be seen; L = 0 if nowhere
-        unoccluded  (L, ceil(N / 8)) uint8, bits as `numpy.packbits` packs them: 1 where nothing stands between
-    robot.json      the camera, the names of the attributes, and the range of views that the network has learnt from
+        attributes  (N, M) float32, attributes of each landmark; NaN if unknown
+        places      (L, 3) float64, locations with known occlusion; L = 0 without
+        unoccluded  (L, ceil(N / 8)) uint8, bits packed by `numpy.packbits`: 1 if the landmark is unoccluded
+    robot.json      camera, names of the attributes, range of the training views
 
-In Python, from that folder:
+Usage, in that folder:
 
     from wheretolook_robot import RobotScorer
 
     scorer = RobotScorer("FOLDER")
-    view = scorer.best((1.0, 2.0, 1.5))     # of 500 directions at this place
-    view.direction, view.score              # where to look, and how probably it localizes
-    scorer.score(cam_from_world)            # (B,) of any poses (B, 3, 4)
+    view = scorer.best((1.0, 2.0, 1.5))     # of 500 directions at this location
+    view.direction, view.score              # where to look, and the probability to localize
+    scorer.score(cam_from_world)            # (B,) for poses (B, 3, 4)
 
-Frames and units. The world is the map's: metres, z up. A camera looks along its z, x is right and y down in the image
-(OpenCV, COLMAP, the optical frame of ROS). A pose is the matrix `cam_from_world` = [R | t], (3, 4): a point p of the
-world lies at R p + t in the camera, whose centre is -R^T t. Pixel (0.5, 0.5) is the centre of the top-left pixel.
-Focal lengths are in pixels, angles in degrees where a name says so, and quaternions are xyzw as in ROS.
+Frames and units. The world is the map's: metres, z up. The camera's x axis is right, y down, z forward (OpenCV, COLMAP,
+the optical frame of ROS). A pose is the matrix `cam_from_world` = [R | t], (3, 4): a world point p is at R p + t in the
+camera, whose centre is -R^T t. Pixel (0.5, 0.5) is the centre of the top-left pixel. Focal lengths are in pixels,
+quaternions are xyzw as in ROS. The camera is a pinhole; for a lens with distortion, that of its rectified images.
 
-The camera is a pinhole: of a lens with distortion, that of its rectified images.
+Occlusion is not computed here. With `places`, a view sees the landmarks that are unoccluded from the nearest of them
+(`Views.place_m` is the distance to it). Without, landmarks are visible through walls and scores behind walls are too
+high. A robot with a better estimate passes `unoccluded`, (N,) bool.
 
-Occlusion is not computed here: nothing is known of walls but what the export stored. With `places`, a view takes the
-landmarks that can be seen from the nearest of them (`Views.place_m` tells how far that is). Without, landmarks are seen
-through walls, and scores are too high where there are any. A robot that knows better gives `unoccluded`, (N,) bool.
-
-What is computed, in the order of this file: which landmarks lie in the image; what is known of each of them from here;
-and the network, which onnxruntime runs. Scores are those of wheretolook's PyTorch scorer to within 1e-5.
+The computation, in the order of this file: select the landmarks in the image, compute their attributes for the view,
+run the network. Scores equal those of wheretolook's PyTorch scorer within 1e-5.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -50,30 +48,30 @@ import onnxruntime
 from numpy.typing import ArrayLike, NDArray
 
 FORMAT_VERSION = 1  # of the folder
-MIN_DEPTH_M = 2.0**-10  # nothing nearer to the image plane than this is seen, or behind it
-BLOCK = 1 << 15  # landmarks that the network looks at in one call: they fit into the cache
+MIN_DEPTH_M = 2.0**-10  # landmarks with a smaller depth are not visible
+BLOCK = 1 << 15  # landmarks per call of the network, which fit into the cache
 
 Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
 class Views:
-    """What is known of B views."""
+    """Scores of B views."""
 
     score: Array  # (B,) float64, the probability that the view localizes
-    n_visible: Array  # (B,) int64, landmarks in view
-    expected_inliers: Array  # (B,) float32, of these how many can be expected to be matched, and right
-    in_range: Array  # (B,) bool, whether the view is like those that the network has learnt from
-    place_m: Array  # (B,) float64, metres to the place whose occlusion was taken; NaN if none was
+    n_visible: Array  # (B,) int64, visible landmarks
+    expected_inliers: Array  # (B,) float32, expected number of correctly matched landmarks
+    in_range: Array  # (B,) bool, whether the view is within the range of the training views
+    place_m: Array  # (B,) float64, metres to the place whose occlusion was used; NaN without
 
 
 @dataclass(frozen=True)
 class BestView:
-    """The best view at a place, and what is known of it as of `Views`."""
+    """The best view at a location; fields as in `Views`."""
 
-    direction: Array  # (3,) unit vector in the world along which the camera looks
-    cam_from_world: Array  # (3, 4) pose; the image's x axis is level
-    quaternion_xyzw: Array  # (4,) orientation of the camera (optical frame) in the world, as ROS wants it
+    direction: Array  # (3,) unit optical axis in the world
+    cam_from_world: Array  # (3, 4) pose without roll
+    quaternion_xyzw: Array  # (4,) orientation of the optical frame in the world, as in ROS
     score: float
     n_visible: int
     expected_inliers: float
@@ -82,15 +80,15 @@ class BestView:
 
 
 class RobotScorer:
-    """Scores views of a map, as `wheretolook export` wrote both into a folder.
+    """Scores views of a map exported by `wheretolook export`.
 
     Args:
         folder: with scorer.onnx, landmarks.npz and robot.json.
-        threads: cores that the network may use.
+        threads: number of threads of the network.
 
     Raises:
         OSError: a file is missing.
-        ValueError: the folder is of another version, or its files do not belong together.
+        ValueError: the folder has another format version, or its files do not match.
     """
 
     def __init__(self, folder: str | Path, threads: int = 1) -> None:
@@ -99,9 +97,9 @@ class RobotScorer:
         if about.get("format_version") != FORMAT_VERSION:
             raise ValueError(f"{folder / 'robot.json'}: this file reads format {FORMAT_VERSION}. Export again.")
         self.camera: dict[str, float] = about["camera"]  # width, height, fx, fy, cx, cy in pixels
-        self._names: list[str] = about["attributes"]  # that the network looks at, in its order
+        self._names: list[str] = about["attributes"]  # inputs of the network, in its order
         self._map_names: list[str] = about["map_attributes"]  # columns of `attributes` in landmarks.npz
-        self._most = int(about["most"])  # landmarks that are looked at in a view; of more, evenly spread ones
+        self._most = int(about["most"])  # landmarks per view; of more, an even sample
         self._range: dict[str, list[float]] = about["range"]
         self._serves_camera = bool(about["serves_camera"])
         with np.load(folder / "landmarks.npz") as stored:
@@ -110,27 +108,27 @@ class RobotScorer:
             self._attributes = stored["attributes"]
             self.places: Array = stored["places"]
             self._unoccluded = stored["unoccluded"]
-        self._columns = np.ascontiguousarray(self.points.T)  # (3, N): whole rows of x, y and z are faster
+        self._columns = np.ascontiguousarray(self.points.T)  # (3, N): contiguous coordinates are faster
         if len(self.points) != about["n_landmarks"]:
-            raise ValueError(f"{folder / 'landmarks.npz'}: not the landmarks that robot.json tells of. Export again.")
+            raise ValueError(f"{folder / 'landmarks.npz'}: not the landmarks of robot.json. Export again.")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads leave the core alone
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads release the core
         path = str(folder / "scorer.onnx")
         if not Path(path).is_file():
-            raise FileNotFoundError(f"{path}: there is no network. Export again.")
+            raise FileNotFoundError(f"{path}: no such file. Export again.")
         self._session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
 
     def score(self, cam_from_world: ArrayLike, unoccluded: ArrayLike | None = None) -> Array:
-        """Probabilities (B,) that poses (B, 3, 4) localize; see `views`."""
+        """Return the probabilities (B,) that poses (B, 3, 4) localize; see `views`."""
         return self.views(cam_from_world, unoccluded).score
 
     def views(self, cam_from_world: ArrayLike, unoccluded: ArrayLike | None = None) -> Views:
-        """What is known of poses (B, 3, 4), or of one (3, 4).
+        """Score poses (B, 3, 4), or one (3, 4).
 
-        `unoccluded` (N,) bool tells which landmarks nothing hides from these poses; without it the nearest of `places`
-        does, if there are any. Raises ValueError on other shapes, or a pose that is not finite.
+        `unoccluded` (N,) bool marks the landmarks that are unoccluded from these poses; by default those of the nearest
+        place. Raises ValueError for other shapes or a pose that is not finite.
         """
         poses = np.asarray(cam_from_world, dtype=np.float64)
         poses = poses[None] if poses.ndim == 2 else poses
@@ -138,11 +136,12 @@ class RobotScorer:
             raise ValueError(f"cam_from_world must be finite, (B, 3, 4), not {poses.shape}")
         rotations = poses[:, :, :3]
         centers = -np.einsum("bji,bj->bi", rotations, poses[:, :, 3])
-        # views at one place, one after the other, share what depends on the place
+        # consecutive views at one location share what depends on the location
         moved = (np.abs(np.diff(centers, axis=0)) > 1e-8).any(axis=1)
         firsts = [0, *(np.flatnonzero(moved) + 1).tolist(), len(poses)] if len(poses) else []
         parts = [self._views_at(centers[a], rotations[a:b], unoccluded) for a, b in pairwise(firsts)]
-        return _joined(parts)
+        parts = parts or [self._views_at(np.zeros(3), rotations, unoccluded)]
+        return Views(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Views)))
 
     def best(
         self,
@@ -151,11 +150,11 @@ class RobotScorer:
         unoccluded: ArrayLike | None = None,
         pitch_deg: tuple[float, float] = (-90.0, 90.0),
     ) -> BestView:
-        """The view with the highest score at a position (3,) m.
+        """Return the view with the highest score at a position (3,) m.
 
-        `directions` to look along are (D, 3), or so many spread evenly over the sphere; only those whose pitch, up from
-        level, is within `pitch_deg` count. For `unoccluded` see `views`. Raises ValueError if no direction is left, one
-        has no length, or one or the position is not finite.
+        `directions` are (D, 3), or a number of directions evenly spread over the sphere; only those with a pitch within
+        `pitch_deg` (0 is level, 90 up) count. For `unoccluded` see `views`. Raises ValueError if no direction is left,
+        or if the position or a direction is zero or not finite.
         """
         at = np.asarray(position, dtype=np.float64)
         if at.shape != (3,) or not np.isfinite(at).all():
@@ -174,72 +173,71 @@ class RobotScorer:
         first = int(np.argmax(views.score))
         pose = np.concatenate([rotations[first], -rotations[first] @ at[:, None]], axis=1)
         quaternion = quaternion_xyzw(rotations[first].T)
-        found = views.score[first], views.n_visible[first], views.expected_inliers[first]
-        rest = bool(views.in_range[first]), float(views.place_m[first])
-        return BestView(along[first], pose, quaternion, float(found[0]), int(found[1]), float(found[2]), *rest)
+        report = (getattr(views, field.name)[first].item() for field in fields(Views))
+        return BestView(along[first], pose, quaternion, *report)
 
     def _views_at(self, center: Array, rotations: Array, unoccluded: ArrayLike | None) -> Views:
-        """What is known of views from one place (3,) m with cam_from_world rotations (D, 3, 3)."""
-        free, place_m = self._free_from(center, unoccluded)
+        """Score views at one location (3,) m with cam_from_world rotations (D, 3, 3)."""
+        candidates, place_m = self._candidates(center, unoccluded)
         with np.errstate(over="ignore"):
-            from_center = self._columns if free is None else self._columns[:, free]
-            offsets = (from_center - center[:, None]).astype(np.float32)  # (3, F) m, in the world
-        seen = self._in_image(offsets, rotations)
-        n_visible = np.array([len(rows) for rows in seen], dtype=np.int64)
-        # of very many landmarks so many evenly spread ones stand for all
-        most = self._most
-        looked_at = [rows if len(rows) <= most else rows[np.arange(most) * len(rows) // most] for rows in seen]
-        # what does not depend on the direction is computed once for each landmark that any view looks at
-        described = looked_at[0] if len(looked_at) == 1 else _union(looked_at, offsets.shape[1])
-        number = np.empty(offsets.shape[1], dtype=np.int64)  # of each offset, its row in `values`
-        number[described] = np.arange(len(described))
-        values = self._values(offsets[:, described], described if free is None else free[described])
+            offsets = (self._columns[:, candidates] - center[:, None]).astype(np.float32)  # (3, F) m, in the world
+        visible = self._in_image(offsets, rotations)
+        n_visible = np.array([len(rows) for rows in visible], dtype=np.int64)
+        sampled = [rows if len(rows) <= self._most else rows[np.arange(self._most) * len(rows) // self._most]
+                   for rows in visible]  # fmt: skip
+        # attributes that do not depend on the direction are computed once per landmark
+        used = np.zeros(offsets.shape[1], dtype=bool)
+        for rows in sampled:
+            used[rows] = True
+        values = self._values(offsets[:, used], candidates[used])
+        row_of = np.cumsum(used) - 1  # in `values`, of each offset
         score = np.empty(len(rotations))
         inliers = np.empty(len(rotations), dtype=np.float32)
         distance_m = np.full(len(rotations), np.nan)
-        for block in self._blocks(looked_at):
-            taken = np.array([len(looked_at[view]) for view in block], dtype=np.int64)
-            padded = np.zeros((len(block), max(1, taken.max()), len(self._names)), dtype=np.float32)
-            for k, view in enumerate(block):
-                rows = looked_at[view]
-                own = padded[k, : len(rows)]
-                own[:] = values[number[rows]]
+        across, down, distance = (self._names.index(name) for name in ("across", "down", "distance"))
+        for block in self._blocks([len(rows) for rows in sampled]):
+            counts = np.array([len(sampled[view]) for view in block], dtype=np.int64)
+            padded = np.zeros((len(block), max(1, counts.max()), len(self._names)), dtype=np.float32)
+            for own, view in zip(padded, block, strict=True):
+                rows = sampled[view]
+                own = own[: len(rows)]
+                own[:] = values[row_of[rows]]
                 x, y, z = rotations[view] @ offsets[:, rows].astype(np.float64)
-                own[:, self._names.index("across")] = x / z
-                own[:, self._names.index("down")] = y / z
+                own[:, across] = x / z
+                own[:, down] = y / z
                 if len(rows):
-                    distance_m[view] = np.exp(own[:, self._names.index("distance")].mean())
-            given = {"values": padded, "taken": taken, "n_visible": n_visible[block]}
-            given["axis_height"] = rotations[block, 2, 2].astype(np.float32)
-            score[block], inliers[block] = self._session.run(["probability", "expected_inliers"], given)
+                    distance_m[view] = np.exp(own[:, distance].mean())
+            inputs = {"values": padded, "taken": counts, "n_visible": n_visible[block]}
+            inputs["axis_height"] = rotations[block, 2, 2].astype(np.float32)
+            score[block], inliers[block] = self._session.run(["probability", "expected_inliers"], inputs)
         in_range = self._serves_camera & self._within("distance_m", distance_m)
         in_range &= (n_visible == 0) | self._within("in_view", n_visible)
         return Views(score, n_visible, inliers, in_range, np.full(len(rotations), place_m))
 
-    def _free_from(self, center: Array, unoccluded: ArrayLike | None) -> tuple[Array | None, float]:
-        """Rows of the landmarks that nothing hides from a place (3,) m, None for all, and how far off that is known."""
+    def _candidates(self, center: Array, unoccluded: ArrayLike | None) -> tuple[Array, float]:
+        """Return rows of the landmarks unoccluded from a location (3,) m, and the distance to the place used."""
         if unoccluded is not None:
             mask = np.asarray(unoccluded, dtype=bool)
             if mask.shape != (len(self.points),):
                 raise ValueError(f"unoccluded must be one bool for each landmark, ({len(self.points)},)")
             return np.flatnonzero(mask), np.nan
         if len(self.places) == 0:
-            return None, np.nan
+            return np.arange(len(self.points)), np.nan
         distance = np.linalg.norm(self.places - center, axis=1)
         nearest = int(np.argmin(distance))
         bits = np.unpackbits(self._unoccluded[nearest], count=len(self.points))
         return np.flatnonzero(bits), float(distance[nearest])
 
     def _in_image(self, offsets: Array, rotations: Array) -> list[Array]:
-        """Rows of the offsets (3, F) m from the camera that lie in the image, for each of the rotations (D, 3, 3).
+        """Return rows of the offsets (3, F) m that are in the image, for each of the rotations (D, 3, 3).
 
-        A point is in the image if its pixel is: 0 <= u < width and 0 <= v < height. Instead of dividing by its depth,
-        it is compared with the four planes through the camera's centre and the image's sides. Normals and offsets are
-        in single precision and their products in double, as in wheretolook, so that both see the same landmarks.
+        A point is in the image if 0 <= u < width and 0 <= v < height. Instead of dividing by the depth, it is compared
+        with the four planes through the camera centre and the sides of the image. Normals and offsets are in single
+        precision and their products in double, as in wheretolook, so that both see the same landmarks.
         """
         c = self.camera
         precise = offsets.astype(np.float64)
-        seen = []
+        visible = []
         for right, down, forward in rotations:
             sides = np.stack([
                 c["fx"] * right + c["cx"] * forward,  # left
@@ -249,25 +247,23 @@ class RobotScorer:
                 forward,
             ])  # fmt: skip
             a, b, d, e, depth = sides.astype(np.float32).astype(np.float64) @ precise
-            seen.append(np.flatnonzero((a >= 0) & (b > 0) & (d >= 0) & (e > 0) & (depth > MIN_DEPTH_M)))
-        return seen
+            visible.append(np.flatnonzero((a >= 0) & (b > 0) & (d >= 0) & (e > 0) & (depth > MIN_DEPTH_M)))
+        return visible
 
     def _values(self, offsets: Array, rows: Array) -> Array:
-        """What the network looks at of landmarks `rows` (E,) of the map at offsets (3, E) m from the camera; (E, A).
+        """Compute the network's inputs (E, A) of landmarks `rows` (E,) at offsets (3, E) m from the camera.
 
-        In the order of the network's names. What the camera's direction decides is 0 here and follows later:
+        In the order of the network's names:
 
-            across, down      x / z and y / z in the camera
+            across, down      x / z and y / z in the camera; 0 here, since they depend on the direction
             distance          logarithm of the distance in metres
             mapped_angle      cosine between the ray from the camera and the mean direction it was mapped from
             distance_ratio    logarithm of the distance over the mean distance it was mapped from
             pixel_angle       logarithm of the angle that a pixel covers: 1 / focal length in pixels
             pixel_size_ratio  logarithm of the size that a pixel covers there, over that when it was mapped
-            all others        columns of `attributes` in landmarks.npz, as they are
+            all others        columns of `attributes` in landmarks.npz
         """
-        known = self._attributes[rows]
-        mapped_along = self._directions[rows].T
-        column = {name: known[:, place] for place, name in enumerate(self._map_names)}
+        column = dict(zip(self._map_names, self._attributes[rows].T, strict=True))
         distance = np.sqrt((offsets * offsets).sum(axis=0))
         log_distance = np.log(distance)
         zero = np.zeros_like(distance)
@@ -276,16 +272,15 @@ class RobotScorer:
             "across": zero,
             "down": zero,
             "distance": log_distance,
-            "mapped_angle": (offsets * mapped_along).sum(axis=0) / distance,
+            "mapped_angle": (offsets * self._directions[rows].T).sum(axis=0) / distance,
             "distance_ratio": log_distance - column["mapped_distance"],
             "pixel_angle": pixel_angle,
             "pixel_size_ratio": log_distance + pixel_angle - column["mapped_pixel_size"],
         }
         return np.stack([column[name] for name in self._names], axis=1)
 
-    def _blocks(self, looked_at: Sequence[Array]) -> Iterable[Array]:
-        """Numbers of the views that the network is given together: like many landmarks, so that few are padded."""
-        counts = np.array([len(rows) for rows in looked_at])
+    def _blocks(self, counts: Sequence[int]) -> Iterable[Array]:
+        """Yield numbers of views with similar counts of landmarks, for little padding, for one call of the network."""
         order = np.argsort(counts, kind="stable")[::-1]
         begin = 0
         while begin < len(order):
@@ -294,30 +289,14 @@ class RobotScorer:
             begin = end
 
     def _within(self, quantity: str, values: Array) -> Array:
-        """Which values (D,) the network has learnt from; what is not known is not outside."""
+        """Test which values (D,) are within the range of the training views; NaN counts as within."""
         low, high = self._range.get(quantity, (-np.inf, np.inf))
         with np.errstate(invalid="ignore"):
             return ~((values < low) | (values > high))
 
 
-def _union(sets: Sequence[Array], n: int) -> Array:
-    """Numbers below n that are in any of the sets, in order."""
-    used = np.zeros(n, dtype=bool)
-    for numbers in sets:
-        used[numbers] = True
-    return np.flatnonzero(used)
-
-
-def _joined(parts: Sequence[Views]) -> Views:
-    if not parts:
-        none = np.empty(0)
-        return Views(none, none.astype(np.int64), none.astype(np.float32), none.astype(bool), none)
-    names = ("score", "n_visible", "expected_inliers", "in_range", "place_m")
-    return Views(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
-
-
 def fibonacci_sphere(n: int) -> Array:
-    """n unit vectors (n, 3) from +z to -z, spread almost evenly over the sphere (spherical Fibonacci lattice)."""
+    """Return n unit vectors (n, 3) from +z to -z, almost evenly spread (spherical Fibonacci lattice)."""
     index = np.arange(n)
     z = 1 - (2 * index + 1) / n
     radius = np.sqrt(1 - z * z)
@@ -326,10 +305,9 @@ def fibonacci_sphere(n: int) -> Array:
 
 
 def rotations_looking_along(directions: ArrayLike) -> Array:
-    """cam_from_world rotations (D, 3, 3) of cameras that look along (D, 3) and do not roll.
+    """Return cam_from_world rotations (D, 3, 3) without roll of cameras that look along directions (D, 3).
 
-    The image's x axis is level and its y axis points down as far as it can. Of a camera that looks straight up or down,
-    the image's x axis is the world's.
+    For a camera that looks straight up or down, the image's x axis is the world's.
     """
     forward = np.asarray(directions, dtype=np.float64)
     forward = forward / np.linalg.norm(forward, axis=1, keepdims=True)
@@ -341,37 +319,33 @@ def rotations_looking_along(directions: ArrayLike) -> Array:
 
 
 def cam_from_world_of(position: ArrayLike, orientation_xyzw: ArrayLike) -> Array:
-    """The pose (3, 4) of a camera at a position (3,) m with an orientation (4,) in the world, as ROS tells it.
+    """Return the pose (3, 4) of a camera at a position (3,) m with an orientation (4,) in the world, as in ROS.
 
-    The orientation is that of the optical frame: it turns the camera's axes into the world's. The quaternion need not
-    be of unit length.
+    The orientation rotates the axes of the optical frame into the world; it need not be of unit length.
     """
     quaternion = np.asarray(orientation_xyzw, dtype=np.float64)
-    x, y, z, w = quaternion / np.linalg.norm(quaternion)
-    world_from_cam = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    quaternion = quaternion / np.linalg.norm(quaternion)
+    x, y, z, w = quaternion
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    world_from_cam = np.eye(3) + 2 * w * cross + 2 * cross @ cross
     rotation = world_from_cam.T
     return np.concatenate([rotation, -rotation @ np.asarray(position, dtype=np.float64)[:, None]], axis=1)
 
 
 def quaternion_xyzw(rotation: ArrayLike) -> Array:
-    """The unit quaternion (4,), w >= 0, of a rotation (3, 3), by Shepperd's method."""
+    """Return the unit quaternion (4,), w >= 0, of a rotation (3, 3), by Shepperd's method."""
     r = np.asarray(rotation, dtype=np.float64)
-    squares = np.array([r[0, 0], r[1, 1], r[2, 2], np.trace(r)])
-    largest = int(np.argmax(squares))
+    largest = int(np.argmax([r[0, 0], r[1, 1], r[2, 2], np.trace(r)]))
     if largest == 3:
-        found = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], 1 + squares[3]])
+        quaternion = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], 1 + np.trace(r)])
     else:
         i = largest
-        j = (largest + 1) % 3
-        k = (largest + 2) % 3
-        found = np.empty(4)
-        found[i] = 1 + r[i, i] - r[j, j] - r[k, k]
-        found[3] = r[k, j] - r[j, k]
-        found[j] = r[j, i] + r[i, j]
-        found[k] = r[k, i] + r[i, k]
-    found /= np.linalg.norm(found)
-    return found if found[3] >= 0 else -found
+        j = (i + 1) % 3
+        k = (i + 2) % 3
+        quaternion = np.empty(4)
+        quaternion[i] = 1 + r[i, i] - r[j, j] - r[k, k]
+        quaternion[j] = r[j, i] + r[i, j]
+        quaternion[k] = r[k, i] + r[i, k]
+        quaternion[3] = r[k, j] - r[j, k]
+    quaternion /= np.linalg.norm(quaternion)
+    return quaternion if quaternion[3] >= 0 else -quaternion

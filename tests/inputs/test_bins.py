@@ -12,7 +12,7 @@ from synthetic_dataset import make_landmarks
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import transform
 from wheretolook.inputs.bins import arrange, bin_views, bin_views_plain, count_bins
-from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, LANDMARK_CHANNELS, PAPER_VARIANTS
+from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, LANDMARK_CHANNELS
 from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
@@ -140,17 +140,6 @@ def test_blocks_do_not_change_the_bins(random_views: RandomViews) -> None:
     blocks = bin_views(arguments, bins=6, block_bytes=7 * 36 * 24)
     np.testing.assert_array_equal(whole.means, blocks.means)
     np.testing.assert_array_equal(whole.counts, blocks.counts)
-
-
-def test_input_sizes_are_those_of_the_variants(random_views: RandomViews) -> None:
-    v = random_views
-    binned = bin_views(PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows))
-    sizes = {name: binned.select(channels).means[0].size for name, channels in PAPER_VARIANTS.items()}
-    assert sizes == {"2d": 1800, "2d+z": 2700, "2d+3d": 4500}
-    assert len(ALL_CHANNELS) * 900 == 13500
-    np.testing.assert_array_equal(binned.select(("z",)).means[:, 0], binned.means[:, CHANNELS.index("z")])
-    with pytest.raises(ConfigError, match="unknown input channel"):
-        binned.select(("u", "colour"))
 
 
 def test_compact_layout_moves_filled_bins_to_the_front_in_order() -> None:

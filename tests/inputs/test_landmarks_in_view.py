@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -14,10 +12,8 @@ from wheretolook.geometry.poses import Float, poses_looking_along, transform
 from wheretolook.inputs.channels import ATTRIBUTES, POSE_ATTRIBUTES
 from wheretolook.inputs.landmark_features import LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
-from wheretolook.localization.labeller import LABELS
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.visibility.occlusion import StoredOcclusion
-from wheretolook_paper.scorers.pooled_features import POOLED, pool
 
 COLMAP = ColmapCamera("OPENCV", 160, 120, (80.0, 80.0, 80.0, 60.0, -0.1, 0.01, 1e-3, -1e-3))
 
@@ -74,76 +70,6 @@ def test_each_landmark_by_hand(localization_map: LocalizationMap) -> None:
         np.testing.assert_allclose(found, np.stack([*expected.values()], axis=1), rtol=1e-4, atol=1e-5)
 
 
-def test_pooled_by_numpy(localization_map: LocalizationMap) -> None:
-    views = some_views()
-    described = LandmarkDescriber(localization_map).describe(views)
-    pooled = pool(described, views, localization_map.camera).cpu().numpy()
-    assert pooled.shape == (50, len(POOLED)) and pooled.dtype == np.float32
-    binned = localization_map.bin_views(views)
-    np.testing.assert_allclose(pooled[:, 0], np.log1p(binned.n_visible), rtol=1e-6)
-    np.testing.assert_allclose(pooled[:, 1], np.log1p(binned.n_filled), rtol=1e-6)
-    coarse = localization_map.bin_views(views, bins=4).counts.reshape(50, -1)
-    np.testing.assert_allclose(pooled[:, 2], (coarse > 0).sum(1))
-    np.testing.assert_allclose(pooled[:, 3], np.log1p(np.sort(coarse, axis=1)[:, 8:]).sum(1), rtol=1e-5)
-    np.testing.assert_allclose(pooled[:, 4], views[:, 2, 2], atol=1e-6)
-    values = described.values.cpu().numpy()
-    starts = described.starts.cpu().numpy()
-    for view in range(50):
-        part = values[starts[view] : starts[view + 1]].astype(np.float64)
-        if len(part) == 0:
-            assert np.isnan(pooled[view, 5:]).all()
-            continue
-        rank = (np.array([0.1, 0.5, 0.9]) * (len(part) - 1) + 0.5).astype(int)
-        expected = np.concatenate([part.mean(0)[:, None], part.std(0)[:, None], np.sort(part, axis=0)[rank].T], axis=1)
-        np.testing.assert_allclose(pooled[view, 5:].reshape(len(ATTRIBUTES), 5), expected, rtol=1e-4, atol=1e-5)
-
-
-def test_a_views_numbers_are_its_own(localization_map: LocalizationMap) -> None:
-    views = some_views()
-    order = np.random.default_rng(2).permutation(50)
-    describer = LandmarkDescriber(localization_map)
-    camera = localization_map.camera
-    together = pool(describer.describe(views), views, camera).cpu()
-    shuffled = pool(describer.describe(views[order]), views[order], camera).cpu()
-    np.testing.assert_allclose(shuffled, together[order], rtol=1e-5, atol=1e-6)
-    alone = pool(describer.describe(views[3:4]), views[3:4], camera).cpu()
-    np.testing.assert_allclose(alone, together[3:4], rtol=1e-5, atol=1e-6)
-
-
-def test_without_descriptors_only_the_ambiguity_is_unknown() -> None:
-    landmarks = make_landmarks(np.random.default_rng(0), 300)
-    without = replace(landmarks, ambiguity=np.full(300, np.nan, np.float32))
-    views = some_views()
-    known, unknown = (
-        pool(LandmarkDescriber(one).describe(views), views, CAMERA).numpy()
-        for one in (LocalizationMap(landmarks, CAMERA), LocalizationMap(without, CAMERA))
-    )
-    of_ambiguity = np.array([name.startswith("ambiguity_") for name in POOLED])
-    assert of_ambiguity.sum() == 5 and np.isnan(unknown[:, of_ambiguity]).all()
-    np.testing.assert_allclose(unknown[:, ~of_ambiguity], known[:, ~of_ambiguity], equal_nan=True)
-
-
-def test_no_views_and_no_landmarks() -> None:
-    empty = LocalizationMap(make_landmarks(np.random.default_rng(0), 0), CAMERA)
-    described = LandmarkDescriber(empty).describe(some_views())
-    pooled = pool(described, some_views(), CAMERA)
-    assert pooled.shape == (50, len(POOLED)) and not pooled[:, :4].any() and pooled[:, 5:].isnan().all()
-    full = LocalizationMap(make_landmarks(np.random.default_rng(0), 30), CAMERA)
-    assert pool(LandmarkDescriber(full).describe(np.empty((0, 3, 4))), np.empty((0, 3, 4)), CAMERA).shape == (
-        0,
-        len(POOLED),
-    )
-
-
-def test_inputs_are_known_before_localization() -> None:
-    """Nothing that only localizing tells may enter a score."""
-    names = {*ATTRIBUTES, *POOLED}
-    assert not names & {*LABELS}
-    assert not [
-        name for name in names for word in ("status", "inlier", "matched_rows", "localiz", "label") if word in name
-    ]
-
-
 @pytest.mark.parametrize("most", [None, 1, 20, 10_000])
 def test_blocks_of_views_hold_all_or_evenly_spread_landmarks(
     localization_map: LocalizationMap, most: int | None, monkeypatch: pytest.MonkeyPatch
@@ -167,10 +93,6 @@ def test_blocks_of_views_hold_all_or_evenly_spread_landmarks(
             assert torch.equal(part.values[found], whole.values[whole.starts[at] : whole.starts[at + 1]][expected])
             at += 1
     assert at == len(views)
-
-
-def test_no_views_are_no_blocks(localization_map: LocalizationMap) -> None:
-    assert list(LandmarkDescriber(localization_map).in_blocks(some_views()[:0], 5)) == []
 
 
 def test_views_share_locations_in_whatever_order_they_come() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,15 +13,11 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
 from synthetic_dataset import make_dataset
 from wheretolook.evaluation.calibration import expected_calibration_error
-from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.scoring import scorers_of
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.planning.config import PlanConfig
-from wheretolook.planning.scene_map import planner_scorer
-from wheretolook.scorers.adapted.gp_correction import PRIOR, LocalizedViews, adapt, fit, folds_of, log_losses, splits
+from wheretolook.scorers.adapted.gp_correction import PRIOR, LocalizedViews, adapt, fit, log_losses, splits
 from wheretolook.scorers.adapted.kernel import Correction, nearness
 from wheretolook.scorers.adapted.network import AdaptedNetwork
 from wheretolook.scorers.set.network import SetNetwork
@@ -57,16 +52,6 @@ def test_the_correction_is_scikit_learns_gaussian_process() -> None:
     np.testing.assert_allclose(ours.log_odds(flat), latent, atol=5e-3)
 
 
-def test_a_scorer_that_is_sure_and_wrong_is_corrected() -> None:
-    """Where log-odds are far off, full steps of Newton's method would run away."""
-    views = random_views(60, shift=-8.0)
-    sure = LocalizedViews(views.log_odds + 8, views.good, views.centers, views.axes, views.group)
-    for amplitude in (1.0, 3.0):
-        adapted = fit(sure, 2.0, amplitude)
-        assert log_losses(adapted.log_odds(sure), sure.good).mean() < log_losses(sure.log_odds, sure.good).mean() / 4
-        assert 0 < adapted.scale < 2
-
-
 def test_calibration_alone_is_platts() -> None:
     from sklearn.linear_model import LogisticRegression
 
@@ -97,13 +82,6 @@ def test_chance_is_not_learnt() -> None:
     )
     held_out = adapt(honest).held_out
     assert log_losses(held_out, honest.good).mean() < log_losses(honest.log_odds, honest.good).mean() + 0.01
-
-
-def test_views_of_a_location_are_left_out_together() -> None:
-    group = np.repeat(np.arange(23), 7)
-    fold = folds_of(group)
-    assert all(len(np.unique(fold[group == number])) == 1 for number in range(23))
-    assert np.bincount(fold).min() >= 4 * 7
 
 
 def photographed(shift: float, seed: int = 0) -> LocalizedViews:
@@ -212,36 +190,3 @@ def test_they_are_refused_in_another_place_unless_forced(place: tuple[Localizati
         load_scorer(path, elsewhere)
     assert caught.value.path == path
     assert load_scorer(path, elsewhere, anywhere=True).name == "adapted"
-
-
-def test_evaluations_and_planners_may_insist_on_another_place(place: tuple[LocalizationMap, Path]) -> None:
-    around, path = place
-    points = around.landmarks.points + np.array([0.5, 0, 0])
-    moved = Landmarks(**{**around.landmarks.__dict__, "points": points})
-    elsewhere = LocalizationMap(moved, around.camera)
-    options = {"methods": ("adapted",), "weights": (path,)}
-    with pytest.raises(WeightsError, match=r"--plan\.anywhere true, --evaluate\.anywhere true"):
-        scorers_of(elsewhere, EvaluateConfig(**options), {path: "adapted"})
-    assert [*scorers_of(elsewhere, EvaluateConfig(**options, anywhere=True), {path: "adapted"})] == ["adapted"]
-    scene = SimpleNamespace(localization_map=elsewhere)
-    with pytest.raises(WeightsError, match="adapted to another place"):
-        planner_scorer(scene, None, "adapted", path)
-    assert planner_scorer(scene, None, "adapted", path, PlanConfig(anywhere=True).anywhere).name == "adapted"
-
-
-@pytest.mark.parametrize(
-    ("part", "name", "value"),
-    [
-        ("base", "scale", "nan"),
-        ("base", "offset", "inf"),
-        ("kernel", "length_m", "inf"),
-        ("kernel", "sharpness", "nan"),
-    ],
-)
-def test_kernels_and_calibrations_are_finite(part: str, name: str, value: str) -> None:
-    network = TrainedNetwork.load(SET, SetNetwork, "set").network
-    stored = AdaptedNetwork(network, 1.0, 0.0, 1.0, 4.0, 1, 1).description()
-    AdaptedNetwork.of_description(stored)
-    stored[part][name] = float(value)
-    with pytest.raises(ValueError, match=r"finite|no length"):
-        AdaptedNetwork.of_description(stored)

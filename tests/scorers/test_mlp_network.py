@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.inputs.bins import InputStatistics, arrange
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, LANDMARK_CHANNELS, PAPER_VARIANTS
 from wheretolook.scorers.mlp.network import BinnedInput, NetworkSpec, ViewpointNetwork, add_noise, move_to_front
-from wheretolook.training.trained_network import TrainedNetwork
-from wheretolook.training.weights import METADATA_KEY, read_training
-from wheretolook.utils.errors import WeightsError
 
 BINS = 6
 INPUTS = {**PAPER_VARIANTS, "2d+3d+landmark": ALL_CHANNELS}
@@ -43,10 +36,6 @@ def make_network(
     return ViewpointNetwork(spec).eval()
 
 
-def load(path: Path) -> ViewpointNetwork:
-    return TrainedNetwork.load(path, ViewpointNetwork, "mlp-2d+z", "mlp-2d+3d").network
-
-
 def test_statistics_are_over_filled_bins_of_the_given_views(views: tuple[torch.Tensor, torch.Tensor]) -> None:
     means, filled = views
     rows = torch.arange(10, 40)
@@ -55,12 +44,6 @@ def test_statistics_are_over_filled_bins_of_the_given_views(views: tuple[torch.T
         values = means[rows, index][filled[rows]].double()
         assert statistics.mean[statistics.channels.index(name)] == pytest.approx(values.mean().item(), rel=1e-6)
         assert statistics.std[index] == pytest.approx(values.std(correction=0).item(), rel=1e-5)
-
-
-def test_statistics_of_nothing_and_of_constants_are_harmless() -> None:
-    means = torch.zeros(3, len(CHANNELS), 2, 2)
-    filled = torch.zeros(3, 2, 2, dtype=torch.bool)
-    assert InputStatistics.of(means, filled, torch.arange(3)).std == (1.0,) * len(CHANNELS)
 
 
 @pytest.mark.parametrize("variant", INPUTS)
@@ -129,72 +112,3 @@ def test_paper_sizes() -> None:
             (300, 300),
             (1, 300),
         ]
-
-
-def test_weights_survive_the_disk(views: tuple[torch.Tensor, torch.Tensor], tmp_path: Path) -> None:
-    network = make_network(views, "2d+3d", input_dropout=0.3)
-    path = tmp_path / "weights" / "mlp.safetensors"
-    trained = TrainedNetwork("mlp-2d+3d", network, CAMERA)
-    trained.save(path, {"dataset_fingerprint": "abc"})
-    loaded = load(path)
-    assert loaded.spec == network.spec
-    assert not loaded.training
-    means = views[0][:, :5]
-    filled = views[1]
-    torch.testing.assert_close(loaded(means, filled), network(means, filled), rtol=0, atol=0)
-    assert read_training(path) == {"dataset_fingerprint": "abc"}
-    assert [file.name for file in path.parent.iterdir()] == ["mlp.safetensors"]
-    first = path.read_bytes()
-    trained.save(path, {"dataset_fingerprint": "abc"})
-    assert path.read_bytes() == first
-
-
-def test_unusable_weights_are_named(views: tuple[torch.Tensor, torch.Tensor], tmp_path: Path) -> None:
-    good = tmp_path / "good.safetensors"
-    TrainedNetwork("mlp-2d+z", make_network(views), CAMERA).save(good)
-    with pytest.raises(WeightsError, match=r"nowhere\.safetensors.*there are no weights"):
-        load(tmp_path / "nowhere.safetensors")
-
-    truncated = tmp_path / "truncated.safetensors"
-    truncated.write_bytes(good.read_bytes()[:-7])
-    with pytest.raises(WeightsError, match="not a readable safetensors file"):
-        load(truncated)
-
-    foreign = tmp_path / "foreign.safetensors"
-    save_file({"a": torch.zeros(3)}, foreign)
-    with pytest.raises(WeightsError, match="not written by wheretolook"):
-        load(foreign)
-
-    tensors = load_file(good)
-    header = {"format_version": 1, **json.loads(_header(good))}
-    other = tmp_path / "other.safetensors"
-    for change, message in (
-        ({"format_version": 99}, "reads weights of format 1"),
-        ({"hidden": [9, 9]}, "do not fit the network"),
-        ({"statistics": {"channels": ["w"], "mean": [0], "std": [1]}}, "unknown channel of the bins.*'w'"),
-        ({"method": "set"}, "not of mlp"),
-        ({"camera": {"width": 0}}, "camera needs a positive image size"),
-    ):
-        save_file(tensors, other, metadata={METADATA_KEY: json.dumps({**header, **change})})
-        with pytest.raises(WeightsError, match=message):
-            load(other)
-
-
-def test_weights_of_older_versions_are_read(views: tuple[torch.Tensor, torch.Tensor], tmp_path: Path) -> None:
-    path = tmp_path / "old.safetensors"
-    network = make_network(views)
-    TrainedNetwork("mlp-2d+z", network, CAMERA).save(path, {"variant": "2d+z"})
-    header = {**json.loads(_header(path)), "variant": "2d+z"}  # as it was, without the name of the method
-    for name in ("method", "scale", "offset"):
-        del header[name]
-    save_file(load_file(path), path, metadata={METADATA_KEY: json.dumps(header)})
-    found = TrainedNetwork.load(path, ViewpointNetwork, "mlp-2d+z")
-    assert (found.method, found.network.spec, found.camera) == ("mlp-2d+z", network.spec, CAMERA)
-    assert read_training(path) == {"method": "mlp-2d+z"}
-
-
-def _header(path: Path) -> str:
-    from safetensors import safe_open
-
-    with safe_open(path, framework="pt") as file:
-        return str(file.metadata()[METADATA_KEY])

@@ -25,7 +25,7 @@ from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.stages.train import train_methods as train
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.store import client
-from wheretolook.training.data import BatchLoader, ViewpointDataModule, balance_classes, hold_out_locations
+from wheretolook.training.data import BinnedBatches, ViewpointDataModule, balance_classes, hold_out_locations
 from wheretolook.training.fit import EpochRecord
 from wheretolook.training.provenance import training_fingerprint, was_trained_on
 from wheretolook.training.scenes import with_also
@@ -138,8 +138,8 @@ def test_processes_share_out_every_batch(dataset: Dataset, world_size: int) -> N
     data = data_of(dataset, SMALL)
     data.setup()
     rows = data.train_rows[:101]  # the last batch has one view: some processes get none
-    whole = list(BatchLoader(data.views, rows, 10, shuffle_seed=5))
-    loaders = [BatchLoader(data.views, rows, 10, 5, rank=rank, world_size=world_size) for rank in range(world_size)]
+    whole = list(BinnedBatches(data.views, rows, data.channels, 10, 5))
+    loaders = [BinnedBatches(data.views, rows, data.channels, 10, 5, (rank, world_size)) for rank in range(world_size)]
     shared_out = list(zip(*loaders, strict=True))
     assert len(shared_out) == len(whole) == 11
     for batch, shares in zip(whole, shared_out, strict=True):

@@ -11,8 +11,8 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from torchmetrics.functional.classification import binary_auroc, binary_average_precision, binary_calibration_error
 from torchmetrics.utilities.distributed import gather_all_tensors
 
+from wheretolook.training.batches import Batch
 from wheretolook.training.config import FittingConfig
-from wheretolook.training.data import Batch
 
 CALIBRATION_BINS = 15  # equal-width bins of the expected calibration error (Guo et al., ICML 2017)
 

@@ -31,7 +31,7 @@ from wheretolook.inputs.landmark_features import ATTRIBUTES
 from wheretolook.scorers.mlp.config import MlpConfig
 from wheretolook.scorers.set import learn as set_learner
 from wheretolook.scorers.set.config import SetConfig
-from wheretolook.scorers.set.learn import SetData, learn_set
+from wheretolook.scorers.set.learn import SetDataModule, learn_set
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.stages.train import train_methods as train
 from wheretolook.tracking.config import TrackingConfig
@@ -81,16 +81,16 @@ class Table:
 def seeds(dataset: Dataset, args: argparse.Namespace, tracking: TrackingConfig) -> None:
     """Train every learner with every seed."""
     table = Table(args.out / "seeds.csv")
-    described: dict[str, SetData] = {}
+    described: dict[str, SetDataModule] = {}
 
-    def described_once(task: Task) -> SetData:
+    def described_once(task: Task) -> SetDataModule:
         if not described:
-            described["all"] = SetData(task)
+            described["all"] = SetDataModule(task)
         described["all"].config = task.config
         described["all"].options = task.options
         return described["all"]
 
-    set_learner.SetData = described_once  # type: ignore[assignment,misc]
+    set_learner.SetDataModule = described_once  # type: ignore[assignment,misc]
     for seed in args.seeds:
         for method in args.methods:
             if table.has(method=method, seed=seed):
@@ -115,7 +115,7 @@ def of_set_network(dataset: Dataset, args: argparse.Namespace, tracking: Trackin
     table = Table(args.out / f"{args.part}.csv")
     log = RunLog(tracking, "")
     task = Task(dataset, "set", TrainConfig(methods=("set",)), SetConfig(), "set", args.progress, log)
-    data = SetData(task)
+    data = SetDataModule(task)
     whole = data.train_rows
     conditions: list[tuple[str, dict[str, Any], torch.Tensor]] = []
     if args.part == "attributes":

@@ -1,102 +1,77 @@
-"""Learning whether a landmark in view will be found by the localizer."""
+"""Train the probability that the localizer detects a visible landmark."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from math import ceil, log
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from wheretolook.scorers.matchability.network import MatchabilityNetwork
-from wheretolook.training.data import Batch
-from wheretolook.training.landmark_views import DISTANCES, LandmarkDataModule
+from wheretolook.training.batches import Batch, IndexBatches
+from wheretolook.training.landmark_views import DISTANCES, LandmarkDataModule, random_log_scales
 from wheretolook.training.learner import Learnt, Task, class_counts, fit_network, fit_platt, predict
 from wheretolook.training.trained_network import TrainedNetwork
 
 
-class LandmarkBatches:
-    """Batches of landmarks (E, len(ATTRIBUTES)) in `rows` (n,), and whether each was found; processes share each batch.
+class SingleLandmarkBatches(IndexBatches):
+    """Batches of landmarks (E, len(ATTRIBUTES)) in `rows` (n,), and whether each was detected (E,).
 
-    A `shuffle_seed` of None goes through them in order; shuffled landmarks come from 1 / enlarged to enlarged times as
-    far, see `wheretolook.training.landmark_views.LandmarkLoader`.
+    The scenes of shuffled landmarks are scaled as by `LandmarkBatches`.
     """
 
-    def __init__(
-        self,
-        values: Tensor,
-        found: Tensor,
-        rows: Tensor,
-        batch_size: int,
-        shuffle_seed: int | None = None,
-        rank: int = 0,
-        world_size: int = 1,
-        enlarged: float = 1.0,
-    ) -> None:
-        self.enlarged = enlarged
+    def __init__(self, values: Tensor, detected: Tensor, rows: Tensor, *options: Any, max_scale: float = 1.0) -> None:
+        super().__init__(rows.to(values.device), *options)
         self.values = values
-        self.found = found
-        self.rows = rows.to(values.device)
-        self.batch_size = batch_size
-        self.shuffle_seed = shuffle_seed
-        self.rank = rank
-        self.world_size = world_size
-        self._pass = 0
+        self.detected = detected
+        self.max_scale = max_scale
 
-    def __len__(self) -> int:
-        return ceil(len(self.rows) / self.batch_size)
-
-    def __iter__(self) -> Iterator[Batch]:
-        rows = self.rows
+    def collate(self, rows: Tensor, generator: torch.Generator) -> Batch:
+        """Return this process's share of the landmarks in `rows`."""
+        share = self.share_of(rows)
+        values = self.values[share].float()
+        log_scale = None
         if self.shuffle_seed is not None:
-            generator = torch.Generator(rows.device).manual_seed(1_000_003 * self.shuffle_seed + self._pass)
-            self._pass += 1  # another order every time
-            rows = rows[torch.randperm(len(rows), generator=generator, device=rows.device)]
-        for part in rows.split(self.batch_size):
-            share = part.tensor_split(self.world_size)[self.rank]
-            values = self.values[share].float()
-            if self.shuffle_seed is not None and self.enlarged > 1:
-                growth = torch.rand(len(part), generator=generator, device=rows.device) * 2 - 1
-                growth = growth.tensor_split(self.world_size)[self.rank]
-                values[:, DISTANCES] += log(self.enlarged) * growth[:, None]
-            yield Batch((values,), self.found[share].float(), len(part))
+            log_scale = random_log_scales(len(rows), self.max_scale, generator)
+        if log_scale is not None:
+            values[:, DISTANCES] += self.share_of(log_scale)[:, None]
+        return Batch((values,), self.detected[share].float(), len(rows))
 
 
-class MatchabilityData(LandmarkDataModule):
-    """Landmarks in view of a dataset's labelled viewpoints, whose matches are stored; a TableError if they are not."""
+class MatchabilityDataModule(LandmarkDataModule):
+    """Visible landmarks of a dataset's labelled viewpoints; a TableError if their matches are not stored."""
 
     def __init__(self, task: Task) -> None:
         super().__init__(task, task.options.landmarks, matches=True)
 
     @property
-    def found(self) -> Tensor:
-        """Whether the localizer found each entry's landmark, (E,) bool."""
-        assert self.views.found is not None
-        return self.views.found
+    def detected(self) -> Tensor:
+        """Whether the localizer detected each entry's landmark, (E,) bool."""
+        assert self.views.detected is not None
+        return self.views.detected
 
     def entries(self, rows: Tensor) -> Tensor:
-        """Entries (n,) of the landmarks of some views."""
+        """Return the entries (n,) of the landmarks of some views."""
         chosen = torch.zeros(len(self.views), dtype=torch.bool)
         chosen[rows] = True
         return torch.nonzero(chosen.repeat_interleave(self.views.starts.cpu().diff()))[:, 0]
 
-    def batches(self, rows: Tensor, shuffle_seed: int | None = None) -> LandmarkBatches:
-        """Batches of the landmarks of the views in `rows`, see `ViewsDataModule.batches`."""
+    def batches(self, rows: Tensor, shuffle_seed: int | None = None) -> SingleLandmarkBatches:
+        """See `ViewsDataModule.batches`."""
         size = self.options.batch_size * self.options.landmarks * (8 if shuffle_seed is None else 1)
-        entries = self.entries(rows)
-        enlarged = self.options.enlarged
-        return LandmarkBatches(self.views.values, self.found, entries, size, shuffle_seed, *self.share, enlarged)
+        data = (self.views.values, self.detected, self.entries(rows))
+        return SingleLandmarkBatches(*data, size, shuffle_seed, self.share, max_scale=self.options.enlarged)
 
 
 def learn_matchability(task: Task) -> Learnt:
-    """The probability of being found, from the matches that are stored with a dataset's labels.
+    """Train a `MatchabilityNetwork` on the matches that are stored with a dataset's labels.
 
     Raises a TableError if there is no train scene, no labels, or no stored matches.
     """
-    data = MatchabilityData(task)
+    data = MatchabilityDataModule(task)
     network = MatchabilityNetwork(data.statistics, task.options.width, task.options.hidden)
     metrics, history = fit_network(network, data, task)
-    logits, found = predict(network, data)
-    counts = class_counts(train=data.found.cpu()[data.entries(data.train_rows)].numpy(), val=found)
-    model = TrainedNetwork(task.method, network, task.camera, *fit_platt(logits, found), data.training_range)
+    logits, detected = predict(network, data)
+    counts = class_counts(train=data.detected.cpu()[data.entries(data.train_rows)].numpy(), val=detected)
+    model = TrainedNetwork(task.method, network, task.camera, *fit_platt(logits, detected), data.training_range)
     return Learnt(model, metrics, counts, history)

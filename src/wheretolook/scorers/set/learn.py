@@ -1,4 +1,4 @@
-"""Learning to score views by the set of landmarks they see."""
+"""Train the network over the set of visible landmarks."""
 
 from __future__ import annotations
 
@@ -12,61 +12,63 @@ from wheretolook.scorers.matchability.network import MatchabilityNetwork
 from wheretolook.scorers.set.config import SetConfig
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.data import check_classes
-from wheretolook.training.landmark_views import LandmarkDataModule, LandmarkLoader
+from wheretolook.training.landmark_views import LandmarkBatches, LandmarkDataModule
 from wheretolook.training.learner import Learnt, Task, class_counts, fit_network, fit_platt, predict
 from wheretolook.training.provenance import weights_path
 from wheretolook.training.scenes import training_scenes
 from wheretolook.training.trained_network import TrainedNetwork
 
+WINDOWS = 2  # landmarks stored of a view, over those in a training step's window
+MIN_BATCHES = 16  # that the training views are cut into
+MIN_BATCH_SIZE = 64
+MIN_STEPS = 600  # of all epochs
 
-class SetData(LandmarkDataModule):
-    """The labelled viewpoints of a dataset, by the landmarks they see; a TableError if labels are of one class only."""
+
+class SetDataModule(LandmarkDataModule):
+    """The labelled viewpoints of a dataset by their landmarks; a TableError if the labels of a split are of one class."""
 
     def __init__(self, task: Task) -> None:
         matches = task.options.landmark_loss > 0 and all(has_matches(s.table) for s in training_scenes(task.dataset))
-        super().__init__(task, MOST_OF_WINDOW * task.options.landmarks, matches)
+        super().__init__(task, WINDOWS * task.options.landmarks, matches)
         positive = (self.views.labels > 0).numpy()
         check_classes(task.dataset, self.config, positive[self.train_rows], positive[self.val_rows])
 
-    def batches(self, rows: Tensor, shuffle_seed: int | None = None) -> LandmarkLoader:
-        """Shuffled views, another sample of each one's landmarks every time; or in order, always with the same."""
+    def batches(self, rows: Tensor, shuffle_seed: int | None = None) -> LandmarkBatches:
+        """Return shuffled views, every time with other windows; or views in order, always with all landmarks stored."""
         options = self.options
-        limit_m = self.config.max_error_m
-        width = options.landmarks * (MOST_OF_WINDOW if shuffle_seed is None else 1)
-        return LandmarkLoader(
-            self.views, rows, options.batch_size, width, shuffle_seed, *self.share, options.enlarged, limit_m
+        width = options.landmarks * (WINDOWS if shuffle_seed is None else 1)
+        return LandmarkBatches(
+            self.views,
+            rows,
+            width,
+            options.batch_size,
+            shuffle_seed,
+            self.share,
+            max_scale=options.enlarged,
+            max_error_m=self.config.max_error_m,
         )
 
 
-MOST_OF_WINDOW = 2  # landmarks kept of a view, over those that a training step looks at
-
-
-LEAST_BATCHES = 16
-LEAST_BATCH = 64
-LEAST_STEPS = 600
-"""Batches that the training views are cut into at least, views of a batch at least, steps in all at least."""
-
-
 def of_size(options: SetConfig, n_train: int) -> SetConfig:
-    """Options for so many training views: few are gone through in smaller batches, and more often."""
-    batch_size = min(options.batch_size, max(LEAST_BATCH, n_train // LEAST_BATCHES))
-    enough = ceil(LEAST_STEPS / ceil(n_train / batch_size))
-    if n_train // LEAST_BATCHES >= options.batch_size:
+    """Return options with smaller batches and more epochs if there are few training views."""
+    batch_size = min(options.batch_size, max(MIN_BATCH_SIZE, n_train // MIN_BATCHES))
+    enough = ceil(MIN_STEPS / ceil(n_train / batch_size))
+    if n_train // MIN_BATCHES >= options.batch_size:
         return options
     return replace(options, batch_size=batch_size, epochs=max(options.epochs, enough))
 
 
-def learn_set(task: Task, data: SetData | None = None) -> Learnt:
-    """A set network from a dataset's labels, or from its views, if they have been described already.
+def learn_set(task: Task, data: SetDataModule | None = None) -> Learnt:
+    """Train a set network on a dataset's labels, or on views that are described already.
 
-    Whether landmarks are found it learns on the way: from the stored matches if all tables have them, so that these
-    chances stay true, and from the labels. If the dataset's `weights` folder has a matchability model of the same
-    width, it starts from that.
+    Detection of landmarks is trained with it: on stored matches, if all tables have them, and through the labels. If the
+    dataset's `weights` folder has a matchability model of the same width, training starts from that.
 
-    Raises a TableError if there is no train scene, no labels, or labels of one class only; a WeightsError if the
-    matchability model is damaged.
+    Raises:
+        TableError: there is no train scene, no labels, or the labels of a split are of one class.
+        WeightsError: the matchability model is damaged.
     """
-    data = data or SetData(task)
+    data = data or SetDataModule(task)
     options = data.options = of_size(task.options, len(data.train_rows))
     statistics = data.statistics
     path = weights_path(task.dataset, options.starts_from)

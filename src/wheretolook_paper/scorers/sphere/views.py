@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from math import ceil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,8 +19,9 @@ from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
 from wheretolook.mapping.colmap_model import CAMERAS_FILE
+from wheretolook.training.batches import Batch, IndexBatches, TensorViews
 from wheretolook.training.config import SharedConfig
-from wheretolook.training.data import Batch, TensorViews, ViewsDataModule, labelled_rows, labels_of
+from wheretolook.training.data import ViewsDataModule, labelled_rows, labels_of
 from wheretolook.utils.errors import MapError
 from wheretolook_paper.scorers.sphere.config import SphereConfig
 
@@ -132,54 +133,37 @@ def load_sphere_views(
     return SphereViews(padded, padding, row, axis, *labels_of(tables, config))
 
 
-class LocationLoader:
-    """Batches of whole locations of the views `chosen` (n,), so that each is encoded once for all of its views.
+class LocationBatches(IndexBatches):
+    """Batches of whole locations of the views `chosen` (n,), each encoded once for all of its views.
 
-    With several processes, every one cuts the same batches, of `batch_size` views on average, and keeps its share of
-    each, whole locations again; a share can be empty. With a `shuffle_seed` every pass has its own order of locations,
-    the same in every run; None keeps theirs.
+    A batch has `batch_size` views on average.
     """
 
-    def __init__(
-        self,
-        views: SphereViews,
-        chosen: NDArray[np.int64],
-        batch_size: int,
-        shuffle_seed: int | None = None,
-        rank: int = 0,
-        world_size: int = 1,
-    ) -> None:
-        self.views = views
-        self.shuffle_seed = shuffle_seed
-        self.rank = rank
-        self.world_size = world_size
+    def __init__(self, views: SphereViews, chosen: NDArray[np.int64], batch_size: int, *options: Any) -> None:
         rows = views.rows.cpu().numpy()[chosen]
+        self.views = views
         self._by_location = chosen[np.argsort(rows, kind="stable")]
         self._locations, self._counts = np.unique(rows, return_counts=True)
         self._starts = np.cumsum(self._counts) - self._counts
-        self._at_a_time = max(1, round(batch_size * len(self._locations) / max(1, len(chosen))))
-        self._passes = 0
+        per_batch = max(1, round(batch_size * len(self._locations) / max(1, len(chosen))))
+        super().__init__(torch.arange(len(self._locations)), per_batch, *options)
 
-    def __len__(self) -> int:
-        return ceil(len(self._locations) / self._at_a_time)
+    def permutation(self, generator: torch.Generator) -> Tensor:
+        """Return the order of the locations in this pass."""
+        assert self.shuffle_seed is not None
+        return torch.from_numpy(np.random.default_rng([self.shuffle_seed, self._passes]).permutation(len(self.rows)))
 
-    def __iter__(self) -> Iterator[Batch]:
-        order = np.arange(len(self._locations))
-        if self.shuffle_seed is not None:
-            order = np.random.default_rng([self.shuffle_seed, self._passes]).permutation(order)
-            self._passes += 1
+    def collate(self, rows: Tensor, generator: torch.Generator) -> Batch:
+        """Return this process's share of some locations, with all of their chosen views."""
         device = self.views.tokens.device
-        for begin in range(0, len(order), self._at_a_time):
-            batch = order[begin : begin + self._at_a_time]
-            share = np.array_split(batch, self.world_size)[self.rank]
-            counts = self._counts[share]
-            rows = np.repeat(np.arange(len(share)), counts)
-            place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-            views = torch.from_numpy(self._by_location[self._starts[share][rows] + place]).to(device)
-            at = torch.from_numpy(self._locations[share]).to(device)
-            of_location = self.views.tokens[at], self.views.padding[at]
-            inputs = (*of_location, torch.from_numpy(rows).to(device), self.views.axes[views])
-            yield Batch(inputs, self.views.labels[views], int(self._counts[batch].sum()))
+        share = self.share_of(rows).numpy()
+        counts = self._counts[share]
+        location = np.repeat(np.arange(len(share)), counts)
+        place = np.arange(len(location)) - np.repeat(np.cumsum(counts) - counts, counts)
+        views = torch.from_numpy(self._by_location[self._starts[share][location] + place]).to(device)
+        at = torch.from_numpy(self._locations[share]).to(device)
+        inputs = (self.views.tokens[at], self.views.padding[at], torch.from_numpy(location).to(device))
+        return Batch((*inputs, self.views.axes[views]), self.views.labels[views], int(self._counts[rows.numpy()].sum()))
 
 
 class SphereDataModule(ViewsDataModule):
@@ -193,6 +177,6 @@ class SphereDataModule(ViewsDataModule):
         self.train_rows = np.flatnonzero(~held_out)
         self.val_rows = np.flatnonzero(held_out)
 
-    def batches(self, rows: NDArray[np.int64], shuffle_seed: int | None = None) -> LocationLoader:
+    def batches(self, rows: NDArray[np.int64], shuffle_seed: int | None = None) -> LocationBatches:
         """See `ViewsDataModule.batches`; all are of one size here."""
-        return LocationLoader(self.views, rows, self.batch_size, shuffle_seed, *self.share)
+        return LocationBatches(self.views, rows, self.batch_size, shuffle_seed, self.share)

@@ -1,0 +1,254 @@
+"""The contract of all learned methods: trained, stored, loaded, scored and evaluated alike."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors import safe_open
+from safetensors.numpy import load_file, save_file
+
+from learning_options import changed, train_config
+from synthetic_dataset import CAMERA, make_dataset
+from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.viewpoint_table import poses
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.geometry.poses import Float
+from wheretolook.inputs.landmark_features import LandmarkDescriber
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.matchability.config import MatchabilityConfig
+from wheretolook.scorers.matchability.network import MatchabilityNetwork
+from wheretolook.scorers.registry import learned, make_scorer, scorers
+from wheretolook.scorers.set.config import SetConfig
+from wheretolook.stages.evaluate import evaluate_methods
+from wheretolook.stages.train import train_methods
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.store import client
+from wheretolook.training.provenance import TrainedModel
+from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook.training.weights import METADATA_KEY, method_of_weights, read_training
+from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, TableError, WeightsError
+from wheretolook.weights.resolve import load_scorer
+from wheretolook_paper.scorers.conv.config import ConvConfig
+from wheretolook_paper.scorers.sphere.config import SphereConfig
+from wheretolook_paper.scorers.trees.config import TreesConfig
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+FEW = train_config(
+    *learned(),
+    epochs=3,
+    batch_size=32,
+    hidden=(16,),
+    bins=6,
+    matchability=MatchabilityConfig(epochs=6, batch_size=8, learning_rate=5e-3),
+    set=SetConfig(epochs=4, batch_size=32, landmarks=32),
+    conv=ConvConfig(epochs=2, batch_size=64, widths=(4, 8), bins=8),
+    sphere=SphereConfig(points=48, cameras=8, width=16, heads=2, layers=1, epochs=2, batch_size=40),
+    trees=TreesConfig(max_trees=10, max_leaves=7, min_leaf=5),
+    accelerator="cpu",
+)
+SCORING = [name for name in learned() if name in scorers()]
+
+
+@pytest.fixture(scope="module")
+def tracking(tmp_path_factory: pytest.TempPathFactory) -> TrackingConfig:
+    return TrackingConfig(folder=str(tmp_path_factory.mktemp("mlruns")))
+
+
+@pytest.fixture(scope="module")
+def trained(dataset: Dataset, tracking: TrackingConfig) -> dict[str, TrainedModel]:
+    return {model.method: model for model in train_methods(dataset, FEW, tracking, progress=False)}
+
+
+@pytest.mark.parametrize("name", learned())
+def test_weights_and_run(name: str, trained: dict[str, TrainedModel], tracking: TrackingConfig) -> None:
+    model = trained[name]
+    assert not model.reused and np.isfinite(list(model.metrics.values())).all()
+    assert method_of_weights(model.path) == name == read_training(model.path)["method"]
+    record = json.loads(model.path.with_suffix(".json").read_text())
+    assert record["about"] == read_training(model.path) and record["run_id"] == model.run_id
+    run = client(tracking).get_run(model.run_id).data
+    assert run.params["method"] == name and int(run.params["n_train"]) > 0
+    assert run.metrics["kept_val_average_precision"] == pytest.approx(model.metrics["val_average_precision"])
+
+
+@pytest.mark.parametrize("name", SCORING)
+def test_a_stored_scorer_is_deterministic_and_finite(
+    name: str, trained: dict[str, TrainedModel], dataset: Dataset, tmp_path: Path
+) -> None:
+    scene = dataset.split("test")[0]
+    views = poses(scene.read_table())[:60]
+    localization_map = scene.localization_map(CAMERA)
+    scores = load_scorer(trained[name].path, localization_map).score(views)
+    assert np.isfinite(scores).all() and len(np.unique(scores)) > 2
+    copy = tmp_path / "copy.safetensors"
+    copy.write_bytes(trained[name].path.read_bytes())
+    np.testing.assert_array_equal(load_scorer(copy, localization_map).score(views), scores)
+    unknown = replace(localization_map.landmarks, ambiguity=np.full(len(localization_map.landmarks), np.nan, "f4"))
+    assert np.isfinite(load_scorer(copy, replace(localization_map, landmarks=unknown)).score(views)).all()
+
+
+def test_the_same_seed_gives_the_same_bytes_and_is_reused(
+    dataset: Dataset, trained: dict[str, TrainedModel], tracking: TrackingConfig
+) -> None:
+    assert all(model.reused for model in train_methods(dataset, FEW, tracking, progress=False))
+    names = ("matchability", "set", "mlp-2d+z", "conv", "sphere", "trees")
+    before = {name: trained[name].path.read_bytes() for name in names}
+    train_methods(dataset, changed(FEW, methods=names), tracking, progress=False, force=True)
+    assert {name: trained[name].path.read_bytes() for name in names} == before
+
+
+def test_all_are_evaluated(dataset: Dataset, trained: dict[str, TrainedModel], tracking: TrackingConfig) -> None:
+    config = EvaluateConfig(methods=("bins", *SCORING), top_n=(1,), resamples=20)
+    table = evaluate_methods(dataset, config, tracking, progress=False)
+    rows = table[table["scene"] == "all"].set_index("method")
+    assert {"bins", "oracle", *SCORING} == {*rows.index} and (rows["reference"] == "set").all()
+    assert rows.loc["set", "roc_auc"] > 0.8 and np.isfinite(rows.loc[SCORING, "ece"].astype(float)).all()
+
+
+def test_detection_is_learned_and_the_set_network_starts_from_it(
+    dataset: Dataset, trained: dict[str, TrainedModel]
+) -> None:
+    matchability = TrainedNetwork.load(trained["matchability"].path, MatchabilityNetwork, "matchability")
+    localization_map = dataset.split("test")[0].localization_map(CAMERA)
+    described = LandmarkDescriber(localization_map).describe(poses(dataset.split("test")[0].read_table())[:50])
+    p_detect = matchability.calibrated(matchability.network(described.values)).sigmoid().numpy()
+    ambiguity = localization_map.landmarks.ambiguity[described.rows.numpy()]
+    assert p_detect[ambiguity < 0.4].mean() > 0.8 and p_detect[ambiguity > 0.6].mean() < 0.2
+    assert read_training(trained["set"].path)["matchability_sha256"] is not None
+
+
+def header_of(path: Path) -> dict[str, Any]:
+    with safe_open(path, framework="np") as file:
+        return json.loads(file.metadata()[METADATA_KEY])
+
+
+@pytest.mark.parametrize("name", ["mlp-2d+z", "set"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"format_version": 99},
+        {"method": "bins"},
+        {"camera": {"width": 0}},
+        {"statistics": {"channels": ["w"], "mean": [0], "std": [1]}},
+        {"range": {"depth_m": [1], "in_view": [1]}},
+        {"scale": "x"},
+        {"training": []},
+        None,
+    ],
+)
+def test_damaged_weights(
+    name: str, change: dict[str, Any] | None, trained: dict[str, TrainedModel], tmp_path: Path
+) -> None:
+    path = tmp_path / "damaged.safetensors"
+    tensors = load_file(trained[name].path)
+    header = header_of(trained[name].path)
+    if change is None:
+        tensors.pop(sorted(tensors)[0])
+    save_file(tensors, path, metadata={METADATA_KEY: json.dumps(header | (change or {}))})
+    with pytest.raises(WeightsError) as error:
+        load_scorer(path, LocalizationMap(Landmarks.load(_landmarks(trained)), CAMERA))
+    assert str(path) in str(error.value)
+
+
+def _landmarks(trained: dict[str, TrainedModel]) -> Path:
+    return Dataset.load(trained["set"].path.parents[1]).scenes[0].landmarks
+
+
+def test_truncated_and_foreign_weights(trained: dict[str, TrainedModel], tmp_path: Path) -> None:
+    truncated = tmp_path / "truncated.safetensors"
+    truncated.write_bytes(trained["set"].path.read_bytes()[:-7])
+    foreign = tmp_path / "foreign.safetensors"
+    save_file({"a": np.zeros(3)}, foreign)
+    for path in (tmp_path / "missing.safetensors", truncated, foreign):
+        with pytest.raises(WeightsError):
+            TrainedNetwork.load(path, MatchabilityNetwork, "matchability")
+
+
+def warnings_of(scorer: Scorer, cam_from_world: Float) -> list[str]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        scorer.score(cam_from_world)
+    assert all(one.category is OutOfRangeWarning and one.filename == __file__ for one in caught)
+    return [str(one.message) for one in caught]
+
+
+@pytest.mark.parametrize("name", ["set", "conv", "trees", "expected-inliers"])
+def test_views_outside_the_training_range_warn_once(
+    dataset: Dataset, trained: dict[str, TrainedModel], name: str
+) -> None:
+    weights = trained[scorers()[name].weights].path
+    scene = dataset.split("train")[0]
+    localization_map = scene.localization_map(CAMERA)
+    views = poses(scene.read_table())
+    scorer = make_scorer(name, localization_map, weights=weights)
+    assert scorer.in_range(views).mean() >= 0.95 and not warnings_of(scorer, views)
+    landmarks = localization_map.landmarks
+    far = views.copy()
+    far[:, :, 3] *= 50
+    farther = replace(landmarks, points=50 * landmarks.points, mapping_distance_m=50 * landmarks.mapping_distance_m)
+    scorer = make_scorer(name, LocalizationMap(farther, CAMERA), weights=weights)
+    assert scorer.in_range(far).mean() < 0.9
+    assert len(warnings_of(scorer, far)) == 1 and not warnings_of(scorer, far)
+
+
+def test_landmark_channels_separate_what_positions_cannot(tmp_path: Path, tracking: TrackingConfig) -> None:
+    """One wall is ambiguous in every other scene, the other wall in the rest, and decides the labels."""
+    made = make_dataset(tmp_path / "tiny", ("train", "train", "val"), n_locations=14, n_landmarks=200)
+    for number, scene in enumerate(made.scenes):
+        landmarks = Landmarks.load(scene.landmarks)
+        one_wall = (landmarks.points[:, 0] > landmarks.points[:, 1]) ^ (number % 2 == 1)
+        ambiguity = (0.3 * landmarks.ambiguity + 0.6 * one_wall).astype(np.float32)
+        replace(landmarks, ambiguity=ambiguity).save(scene.landmarks)
+        label_by_ambiguity(made, number)
+    names = ("mlp-2d+3d", "mlp-2d+3d+landmark")
+    config = train_config(*names, epochs=8, batch_size=32, hidden=(32,), bins=6, accelerator="cpu")
+    without, with_channels = train_methods(made, config, tracking, progress=False)
+    assert with_channels.metrics["val_average_precision"] > 0.9 > 0.8 > without.metrics["val_average_precision"]
+
+
+def label_by_ambiguity(dataset: Dataset, number: int) -> None:
+    """Label views of a scene by the mean ambiguity of what they see; those that see nothing have no label."""
+    from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, UNLABELLED, write_table
+
+    scene = dataset.scenes[number]
+    table = scene.read_table()
+    binned = scene.localization_map(CAMERA).bin_views(poses(table), 1, landmark_channels=True)
+    filled = binned.n_filled > 0
+    values = binned.select(("ambiguity",)).means.sum((1, 2, 3))
+    good = values > np.median(values[filled])
+    errors = np.where(good, 0.001, np.nan)
+    status = np.select([~filled, good], [UNLABELLED, LOCALIZED], NO_POSE)
+    write_table(table.assign(status=status, error_m=errors, error_deg=errors), scene.table)
+
+
+def test_matches_must_be_stored(tmp_path: Path, tracking: TrackingConfig) -> None:
+    with pytest.raises(TableError):
+        train_methods(make_dataset(tmp_path), changed(FEW, methods=("matchability",)), tracking, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("config", "options"),
+    [
+        (SetConfig, {"hidden": ("colour",)}),
+        (SetConfig, {"pooled": -1}),
+        (SetConfig, {"epochs": 0}),
+        (MatchabilityConfig, {"width": 0}),
+        (MatchabilityConfig, {"enlarged": 0.5}),
+        (ConvConfig, {"widths": ()}),
+        (ConvConfig, {"dropout": 1.0}),
+        (SphereConfig, {"width": 30, "heads": 4}),
+        (TreesConfig, {"max_leaves": 1}),
+    ],
+)
+def test_invalid_options(config: type, options: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError):
+        config(**options)

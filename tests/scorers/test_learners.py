@@ -181,7 +181,7 @@ def warnings_of(scorer: Scorer, cam_from_world: Float) -> list[str]:
     return [str(one.message) for one in caught]
 
 
-@pytest.mark.parametrize("name", ["set", "conv", "trees", "expected-inliers"])
+@pytest.mark.parametrize("name", ["set", "trees", "expected-inliers"])
 def test_views_outside_the_training_range_warn_once(
     dataset: Dataset, trained: dict[str, TrainedModel], name: str
 ) -> None:

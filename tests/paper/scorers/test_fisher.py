@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -86,7 +88,7 @@ def test_all_nine_rows_and_the_two_probes_are_methods() -> None:
     localization_map = LocalizationMap(two_walls(np.random.default_rng(4), 200), CAMERA)
     rows = {(metric, approximation, False) for metric in METRICS for approximation in APPROXIMATIONS}
     turned = {(metric, approximation, True) for metric, approximation, _ in rows if metric != "logdet"}
-    found = {
+    found: dict[str, Any] = {
         name: make_scorer(name, localization_map) for name, method in scorers().items() if method.family == "fisher"
     }
     assert {(one.metric, one.approximation, one.about_origin) for one in found.values()} == rows | turned

@@ -45,7 +45,7 @@ from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh, save_glb
 from wheretolook.space.free_space import FreeSpace
-from wheretolook_paper.figures.look_film import still_figure, tell_looks
+from wheretolook_paper.figures.look_story import localize_views, story_figure
 from wheretolook_paper.figures.looks import looks_figure
 from wheretolook_paper.release.notebook import open_release
 from wheretolook_rooms.generator import generate_apartment
@@ -104,16 +104,16 @@ def two_looks(place):
 
 # %%
 pairs = [two_looks(place) for place in places]
-stories = [tell_looks(localizer, camera, poses, renderer.render(camera, poses).rgb) for poses in pairs]
-right = {f"look {number + 1} alone": sum(story.alone[number].right for story in stories) for number in (0, 1)}
-right["both together"] = sum(story.together.right for story in stories)
+stories = [localize_views(localizer, camera, poses, renderer.render(camera, poses).rgb) for poses in pairs]
+right = {f"look {number + 1} alone": sum(story.single[number].is_good for story in stories) for number in (0, 1)}
+right["both together"] = sum(story.joint.is_good for story in stories)
 display(pd.Series(right, name=f"of {len(stories)} places").to_frame())
 
 # %% [markdown]
 # Confidence of the joint pose, where it is correct and where it is not.
 
 # %%
-sure = pd.DataFrame([(story.together.right, story.together.chance) for story in stories], columns=["right", "sure"])
+sure = pd.DataFrame([(story.joint.is_good, story.joint.probability) for story in stories], columns=["right", "sure"])
 display(sure.groupby("right").describe().round(2))
 
 # %% [markdown]
@@ -123,9 +123,9 @@ display(sure.groupby("right").describe().round(2))
 # pose; points in the images: the matches that agree with it.
 
 # %%
-helped = [story for story in stories if story.together.right] or stories
-shown = max(helped, key=lambda story: story.alone[0].error_m if np.isfinite(story.alone[0].error_m) else 0.0)
-display(still_figure(shown, dollhouse(mesh, elevation_deg=62, cut_m=1.6)))
+helped = [story for story in stories if story.joint.is_good] or stories
+shown = max(helped, key=lambda story: story.single[0].error_m if np.isfinite(story.single[0].error_m) else 0.0)
+display(story_figure(shown, dollhouse(mesh, elevation_deg=62, cut_m=1.6)))
 
 # %% [markdown]
 # ## Results

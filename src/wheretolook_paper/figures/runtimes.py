@@ -1,4 +1,4 @@
-"""Times of the visibility check: compared with the paper's, and how time and memory grow with the size of the task."""
+"""Times of the visibility check: compared with the paper's, and growth of time and memory with the problem size."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from wheretolook.figures.style import BLUE, GREEN, INK, PURPLE, RC, SKY, VERMILI
 COUNTS = "counts alone"
 EVERYTHING = "occlusion, counts, best 100"
 TWIN = "NumPy twin, counts alone, scaled"
-"""Kinds of work that the runtime figure draws; it ignores all others. The twin is the plain NumPy implementation."""
+"""Kinds of work in the runtime figure. The twin is the plain NumPy implementation."""
 
 PAPER_LOCATIONS = 648
 PAPER_LANDMARKS = 24_919
@@ -34,7 +34,7 @@ _LOOK: dict[str, dict[str, Any]] = {
     _RELEASED: {"facecolor": "#dedede", "edgecolor": "#7a7a7a", "hatch": "...", "linewidth": 0.8},
     _OURS: {"facecolor": SKY, "edgecolor": SKY, "linewidth": 0.8},
 }
-"""Looks of bars by the source of their number; hatches tell them apart in greyscale."""
+"""Styles of bars by the source of their number; hatches distinguish them in greyscale."""
 
 _PANELS = {COUNTS: "counts alone: the work that the paper times"}
 _PANELS[EVERYTHING] = "occlusion, counts and best 100 directions:\nmore than the paper times"
@@ -42,7 +42,7 @@ _PANELS[EVERYTHING] = "occlusion, counts and best 100 directions:\nmore than the
 
 @dataclass(frozen=True)
 class _Bar:
-    """One bar: its label, median seconds, source of the number, text at its end, least and most seconds."""
+    """One bar: label, median seconds, source of the number, text at its end, minimum and maximum seconds."""
 
     label: str
     seconds: float
@@ -51,26 +51,25 @@ class _Bar:
     spread: tuple[float, float] | None = None
 
 
-_ELSEWHERE = (
+_FIXED_BARS = (
     _Bar("paper, CPU, 1 thread", 7387.0, _PAPER, "7,387 s"),
     _Bar("paper, GPU", 23.0, _PAPER, "23 s"),
     _Bar("released kernel, H200", 12.2, _RELEASED, "12.2 s"),
 )
-"""Bars that do not come from `runtime_figure`'s input: the paper's runtime figure ("initial sampling"), and the time of
-the authors' released CUDA kernel on an H200."""
+"""Fixed bars: the paper's runtime figure ("initial sampling"), and the authors' released CUDA kernel on an H200."""
 
 
 def runtime_figure(sizes: pd.DataFrame) -> Figure:
-    """The paper's runtime figure with this project's times beside it, at the paper's 648 locations x 24,919 landmarks.
+    """Draw the paper's runtime figure with this project's times, at 648 locations x 24,919 landmarks.
 
-    Bars on a logarithmic axis in seconds, whiskers from the shortest to the longest run. Above the counts alone, which
-    the paper times; below, if there are such rows, with the work that its time leaves out. `sizes` has a row for each
-    machine, kind of work and number of threads, with `what`, `threads`, `median_s`, `min_s`, `max_s`, `repeats`,
-    `device` ("cpu" or Warp's CUDA device), `name` and `cores` of the machine. Rows of other work are ignored, and the
-    NumPy twin of a machine with a GPU if there is one of a CPU.
+    Bars are on a logarithmic axis in seconds, with whiskers from the shortest to the longest run: above the counts
+    alone, which the paper times; below, if there are such rows, the complete work. `sizes` has a row for each machine,
+    work and number of threads, with `what`, `threads`, `median_s`, `min_s`, `max_s`, `repeats`, `device` ("cpu" or
+    Warp's CUDA device), `name` and `cores` of the machine. Rows of other work are ignored, and the NumPy twin of a
+    machine with a GPU if there is one of a CPU.
     """
     measured = _measured_bars(sizes)
-    bars = {COUNTS: [*_ELSEWHERE, *measured[COUNTS]], EVERYTHING: measured[EVERYTHING]}
+    bars = {COUNTS: [*_FIXED_BARS, *measured[COUNTS]], EVERYTHING: measured[EVERYTHING]}
     shown = [what for what in _PANELS if bars[what]]
     every = [bar for what in shown for bar in bars[what]]
     # A logarithmic bar has no zero to start from: all start at the same power of ten, well below the shortest.
@@ -97,7 +96,7 @@ def runtime_figure(sizes: pd.DataFrame) -> Figure:
 
 
 def runtime_table(sizes: pd.DataFrame) -> pd.DataFrame:
-    """The numbers of this project's times that `runtime_figure` draws: a row for each machine, work and threads."""
+    """Return the times that `runtime_figure` draws: a row for each machine, work and number of threads."""
     rows = sizes[sizes["what"].isin((TWIN, COUNTS, EVERYTHING))]
     columns = {"machine": rows["name"].map(machine_label), "work": rows["what"], "threads": rows["threads"]}
     columns |= {"median (s)": rows["median_s"], "least (s)": rows["min_s"], "most (s)": rows["max_s"]}
@@ -128,7 +127,7 @@ def _wrapped(label: str) -> str:
 
 
 def _measured_bars(sizes: pd.DataFrame) -> dict[str, list[_Bar]]:
-    """Bars of the rows that are drawn: the NumPy twin first, CPUs before GPUs, few threads before many."""
+    """Return the bars of each panel: the NumPy twin first, CPUs before GPUs, few threads before many."""
     bars: dict[str, list[_Bar]] = {COUNTS: [], EVERYTHING: []}
     rows = [row for row in sizes.to_dict("records") if row["what"] in (TWIN, *bars)]
     cpus = {row["name"] for row in rows if not _is_gpu(row)}
@@ -159,14 +158,14 @@ def _threads(row: dict[Any, Any]) -> str:
 
 
 def machine_label(name: str) -> str:
-    """A short name of a processor, without trade marks and clock; "CPU" if only the architecture is known."""
+    """Shorten a processor's name; "CPU" if only the architecture is known."""
     short = re.sub(r"\((R|TM|C)\)|\b\d+-Cores?\b|\b(Processor|CPU)\b|@.*$", " ", str(name), flags=re.IGNORECASE)
     short = shorten(short, 28, placeholder="…")
     return short if short not in ("", "x86_64", "AMD64", "aarch64", "arm64", "i386", "arm") else "CPU"
 
 
 def duration(seconds: float) -> str:
-    """A time with three digits: "3.58 ms", "149 s"."""
+    """Format a time with three digits: "3.58 ms", "149 s"."""
     value, unit = (seconds, "s") if float(f"{seconds:.3g}") >= 1 else (1e3 * seconds, "ms")
     digits = max(0, 2 - int(np.floor(np.log10(float(f"{value:.3g}")))))
     return f"{float(f'{value:.3g}'):,.{digits}f} {unit}"
@@ -179,11 +178,11 @@ def _ticked(seconds: float) -> str:
 _GROWING = ("landmarks", "locations", "directions")
 _MACHINES = ((BLUE, "o"), (VERMILION, "s"), (GREEN, "D"), (PURPLE, "^"))
 _WORK: dict[str, tuple[Any, bool]] = {"with occlusion": ("-", True), COUNTS: ((0, (4, 1.5)), False)}
-"""Dashes of a kind of work, and whether its markers are filled."""
+"""Dashes of each kind of work, and whether its markers are filled."""
 
 
 def scaling_figure(growth: pd.DataFrame) -> Figure:
-    """How time (above) and memory (below) grow with the number of landmarks, locations or directions, each alone.
+    """Draw how time (above) and memory (below) grow with the number of landmarks, locations or directions.
 
     All axes are logarithmic; a dotted line shows proportional growth. `growth` has a row for each run, with `axis`
     (which of the three grows), `landmarks`, `locations`, `directions`, `what` ("with occlusion", "counts alone"),
@@ -199,36 +198,45 @@ def scaling_figure(growth: pd.DataFrame) -> Figure:
         for column, axis in enumerate(shown):
             part = growth[growth["axis"] == axis]
             for (device, name), (color, marker) in zip(machines, cycle(_MACHINES), strict=False):
-                on_machine = part[(part["device"] == device) & (part["name"] == name)]
-                whiskers: Style = {"fmt": "none", "ecolor": color, "elinewidth": 1, "capsize": 2, "zorder": 1.9}
-                for what, (dashes, filled) in _WORK.items():
-                    rows = on_machine[on_machine["what"] == what].sort_values(axis)
-                    look: Style = {"color": color, "linestyle": dashes, "marker": marker, "markersize": 4.5}
-                    look["markerfacecolor"] = color if filled else "white"
-                    label = f"{machine_label(name)}, {what}"
-                    seconds = rows["median_s"].to_numpy(dtype=float)
-                    spread = [seconds - rows["min_s"], rows["max_s"] - seconds]
-                    panels[0, column].plot(rows[axis], seconds, label=label, **look)
-                    panels[0, column].errorbar(rows[axis], seconds, np.clip(spread, 0, None), **whiskers)
-                    measurable = rows[rows["peak_bytes"] > 0]
-                    panels[1, column].plot(measurable[axis], measurable["peak_bytes"] / 1e6, **look)
+                of_machine = part[(part["device"] == device) & (part["name"] == name)]
+                _draw_growth(panels[:, column], of_machine, axis, machine_label(name), color, marker)
             fixed = (f"{_numbers(part[other])} {other}" for other in _GROWING if other != axis)
             panels[0, column].set_title("\n".join(fixed), fontsize=9)
             panels[1, column].set_xlabel(axis)
         panels[0, 0].set_ylabel("time (s)")
         panels[1, 0].set_ylabel("peak memory (MB)")
         for axes in panels.flat:
-            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-            axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.10g}")
-            axes.xaxis.set_minor_formatter(NullFormatter())
-            axes.yaxis.set_minor_formatter(NullFormatter())
-            if np.ptp(np.log10(axes.get_ylim())) < 2:  # else the axis would have a single number
-                axes.yaxis.set_major_locator(LogLocator(10, subs=(1, 2, 5)))
-        for axes in panels.flat:  # once all limits are known
+            _format_log_axes(axes)
+        for axes in panels.flat:  # after all limits are set
             _draw_proportional(axes)
         handles, labels = panels[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=3, columnspacing=1.4, handlelength=2.6)
         return figure
+
+
+def _draw_growth(panels: Any, rows: pd.DataFrame, axis: str, machine: str, color: str, marker: str) -> None:
+    """Draw time and memory of a machine in a column of two panels."""
+    for what, (dashes, filled) in _WORK.items():
+        of_work = rows[rows["what"] == what].sort_values(axis)
+        style: Style = {"color": color, "linestyle": dashes, "marker": marker, "markersize": 4.5}
+        style["markerfacecolor"] = color if filled else "white"
+        seconds = of_work["median_s"].to_numpy(dtype=float)
+        spread = np.clip([seconds - of_work["min_s"], of_work["max_s"] - seconds], 0, None)
+        panels[0].plot(of_work[axis], seconds, label=f"{machine}, {what}", **style)
+        panels[0].errorbar(
+            of_work[axis], seconds, spread, fmt="none", ecolor=color, elinewidth=1, capsize=2, zorder=1.9
+        )
+        measurable = of_work[of_work["peak_bytes"] > 0]
+        panels[1].plot(measurable[axis], measurable["peak_bytes"] / 1e6, **style)
+
+
+def _format_log_axes(axes: Axes) -> None:
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.10g}")
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    if np.ptp(np.log10(axes.get_ylim())) < 2:  # otherwise the axis would have a single number
+        axes.yaxis.set_major_locator(LogLocator(10, subs=(1, 2, 5)))
 
 
 def _numbers(values: pd.Series) -> str:
@@ -236,7 +244,7 @@ def _numbers(values: pd.Series) -> str:
 
 
 def _draw_proportional(axes: Axes) -> None:
-    """A line of slope 1 through the middle of the panel, which does not change its limits."""
+    """Draw a line of slope 1 through the middle of the panel without changing its limits."""
     (left, right) = axes.get_xlim()
     limits = axes.get_ylim()
     slope = np.sqrt(limits[0] * limits[1] / (left * right))

@@ -15,11 +15,10 @@ from wheretolook.figures.overview import View
 from wheretolook.figures.style import save_figure
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere, released_lattice
-from wheretolook.geometry.poses import camera_centers, poses_looking_along, rotation_angle_deg
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.scorers.styles import method_style
 from wheretolook_paper.figures.inputs import BinnedImage, inputs_figure
 from wheretolook_paper.figures.lattices import covering_radius_deg, fibonacci_figure, nearest_angles_deg
-from wheretolook_paper.figures.look_film import turning_poses
 from wheretolook_paper.figures.looks import looks_figure
 from wheretolook_paper.figures.network_walkthrough import learning_figure
 from wheretolook_paper.figures.occlusion import occlusion_figure
@@ -165,14 +164,6 @@ def test_extrema_are_spread() -> None:
     assert cosines[~np.eye(len(peaks), dtype=bool)].max() <= np.cos(np.radians(40)) + 1e-12
     assert peaks[0] == 0 and np.all(np.diff(scores[peaks]) <= 0)
     assert spread_extrema(directions, scores, 1, 40.0, False).tolist() == [299]
-
-
-def test_turning_poses_interpolate_the_rotation_at_one_location() -> None:
-    poses = poses_looking_along([[0.5, 0.2, 1.2]] * 2, [[1.0, 0, 0], [0.3, 1.0, 0.1]])
-    (turn,) = turning_poses(poses, 3)
-    np.testing.assert_allclose(camera_centers(turn), camera_centers(poses[[0, 0, 0]]), atol=1e-9)
-    full = rotation_angle_deg(poses[0, :, :3], poses[1, :, :3])
-    np.testing.assert_allclose(rotation_angle_deg(turn[:, :, :3], poses[:1, :, :3]), full * np.arange(1, 4) / 4)
 
 
 def test_fisher_methods_share_a_marker_by_metric_and_a_colour_by_approximation() -> None:

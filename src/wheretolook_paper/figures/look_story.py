@@ -1,0 +1,162 @@
+"""Views of a camera at one location: what each localizes alone, and all of them jointly."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.style import context
+from numpy.typing import ArrayLike
+
+from wheretolook.dataset.thresholds import THRESHOLDS
+from wheretolook.figures.animation import Pixels
+from wheretolook.figures.dollhouse import Dollhouse, draw_house, draw_segments, frustum_segments
+from wheretolook.figures.style import BLUE, GREEN, RC, VERMILION, Style, new_figure
+from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.poses import Float, pose_error
+from wheretolook.localization.confidence import ConfidenceModel
+from wheretolook.localization.localizer import Localizer
+from wheretolook.localization.rig import Look, rig_of
+from wheretolook.localization.rig_localization import JointLocalization, JointLocalizer
+from wheretolook.utils.errors import PoseError
+
+MAX_ERROR_M, MAX_ERROR_DEG = THRESHOLDS[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The result of localizing one view, or several jointly.
+
+    Attributes:
+        cams_from_world: (N, 3, 4) estimated poses; None without one.
+        pixels: N arrays (I_k, 2) of the inliers' pixels.
+        probability: that the pose is within 5 cm and 0.4 degrees.
+        error_m: of the worst view; infinite without a pose.
+        error_deg: likewise.
+    """
+
+    cams_from_world: Float | None
+    pixels: tuple[Float, ...]
+    probability: float
+    error_m: float
+    error_deg: float
+
+    @property
+    def is_good(self) -> bool:
+        """Whether the pose is within 5 cm and 0.4 degrees."""
+        return self.error_m <= MAX_ERROR_M and self.error_deg <= MAX_ERROR_DEG
+
+    @property
+    def color(self) -> str:
+        """Color of the result in figures."""
+        return GREEN if self.is_good else VERMILION
+
+    @property
+    def n_inliers(self) -> int:
+        """Number of inliers."""
+        return sum(map(len, self.pixels))
+
+    @property
+    def summary(self) -> str:
+        """The result in a few words."""
+        if self.cams_from_world is None:
+            return "no pose found"
+        if self.is_good:
+            return f"{self.n_inliers} inliers, right, {100 * self.error_m:.1f} cm off"
+        off = f"{self.error_deg:.1f}°"
+        if self.error_m > MAX_ERROR_M:
+            off = f"{self.error_m:.1f} m" if self.error_m >= 1 else f"{100 * self.error_m:.0f} cm"
+        return f"{self.n_inliers} inliers, wrong, {off} off"
+
+
+@dataclass(frozen=True, eq=False)
+class LookStory:
+    """N views of a camera at one location, the result of each, and of all jointly."""
+
+    camera: Camera
+    cam_from_world: Float  # (N, 3, 4), true
+    images: Pixels  # (N, H, W, 3)
+    single: tuple[Estimate, ...]
+    joint: Estimate
+
+
+def localize_views(localizer: Localizer, camera: Camera, cam_from_world: ArrayLike, images: Pixels) -> LookStory:
+    """Localize images (N, H, W, 3) of views (N, 3, 4) at one location, each alone and all jointly.
+
+    Raises a PoseError if there are fewer than two views, or they are at different locations.
+    """
+    true = np.asarray(cam_from_world, dtype=np.float64)
+    if len(true) < 2:
+        raise PoseError("a story of views needs at least two", value=len(true))
+    joint = JointLocalizer(localizer.estimator)
+    single = [localizer.localize(image) for image in images]
+    views = [
+        Look(cam_from_rig, one.matched_pixels.astype(np.float64), one.matched_rows, camera)
+        for cam_from_rig, one in zip(rig_of(true), single, strict=True)
+    ]
+    estimates = tuple(
+        _estimate(joint.localize(views[k : k + 1]), views[k : k + 1], true[k : k + 1]) for k in range(len(views))
+    )
+    return LookStory(camera, true, images, estimates, _estimate(joint.localize_together(views), views, true))
+
+
+def _estimate(pose: JointLocalization, views: Sequence[Look], true: Float) -> Estimate:
+    pixels = tuple(view.pixels[inliers] for view, inliers in zip(views, pose.inliers, strict=True))
+    if pose.cams_from_world is None:
+        return Estimate(None, pixels, 0.0, np.inf, np.inf)
+    error_m, error_deg = pose_error(pose.cams_from_world, true)
+    probability = float(ConfidenceModel.bundled().of(pose))
+    return Estimate(pose.cams_from_world, pixels, probability, float(error_m.max()), float(error_deg.max()))
+
+
+def story_figure(story: LookStory, house: Dollhouse) -> Figure:
+    """Draw a column for each view, and one for all of them jointly: the estimated pose from above, and the inliers."""
+    with context(RC):
+        n = len(story.single)
+        figure = new_figure(4.2 * (n + 1), 4.6)
+        grid = figure.add_gridspec(2, n + 1, height_ratios=(1.5, 1.0))
+        for column, estimate in enumerate((*story.single, story.joint)):
+            above = figure.add_subplot(grid[0, column])
+            shown = slice(column, column + 1) if column < n else slice(None)
+            _draw_plan(above, story.camera, house, story.cam_from_world[shown], estimate)
+            name = f"look {column + 1}" if column < n else "together"
+            above.set_title(f"{name}: {estimate.summary}", color=estimate.color, fontsize=10)
+            below = grid[1, column].subgridspec(1, 1 if column < n else n)
+            for k, number in enumerate(range(n)[shown]):
+                axes = figure.add_subplot(below[k])
+                _draw_image(axes, story.images[number], estimate.pixels[k], estimate.color)
+        return figure
+
+
+def _draw_plan(axes: Axes, camera: Camera, house: Dollhouse, poses: Float, estimate: Estimate) -> None:
+    """Draw the scene from above with the true cameras (N, 3, 4) and the estimated ones."""
+    draw_house(axes, house, 0.45)
+    width_m = house.rgb.shape[1] / house.camera.fx * float(np.median(house.depth_m[house.depth_m > 0]))
+    depth_m = 0.09 * width_m
+    labels = [("where it is", BLUE)]
+    if estimate.cams_from_world is not None:
+        edges = frustum_segments(camera, estimate.cams_from_world, depth_m)
+        if estimate.is_good:  # the true camera is drawn inside its lines
+            draw_segments(axes, house, edges, colors=estimate.color, linewidths=5.5)
+        else:
+            draw_segments(axes, house, edges, colors="white", linewidths=3.5)
+            draw_segments(axes, house, edges, colors=estimate.color, linewidths=1.8, linestyles=(0, (4, 2)))
+        labels.append(("where it believes to be", estimate.color))
+    edges = frustum_segments(camera, poses, depth_m)
+    draw_segments(axes, house, edges, colors="white", linewidths=3.2)
+    draw_segments(axes, house, edges, colors=BLUE, linewidths=1.8)
+    place: Style = {"transform": axes.transAxes, "ha": "left", "va": "top"}
+    for row, (text, color) in enumerate(labels):
+        axes.text(0.0, -0.02 - 0.07 * row, text, color=color, fontsize=9, **place)
+
+
+def _draw_image(axes: Axes, image: Pixels, pixels: Float, color: str) -> None:
+    height, width = image.shape[:2]
+    axes.imshow(image)
+    axes.scatter(pixels[:, 0], pixels[:, 1], s=4, color=color, linewidths=0)
+    axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal", xticks=[], yticks=[])
+    axes.grid(False)
+    axes.spines[:].set(visible=True, color=color, linewidth=3)

@@ -21,7 +21,7 @@ from wheretolook.tracking.runs import finished_runs
 from wheretolook.tracking.store import client
 from wheretolook.utils.errors import ConfigError, PlanningError, SceneError
 from wheretolook_paper.figures.paths import paths_figure
-from wheretolook_paper.paths.path_comparison import ComparedPaths, Ways, draw_pairs, plan_pairs
+from wheretolook_paper.paths.path_comparison import ComparedPaths, Reachability, draw_pairs, plan_pairs
 from wheretolook_paper.paths.path_report import log_paths, summarize_paths
 
 QUICK = PathsConfig(
@@ -89,10 +89,10 @@ def test_ways_lead_round_walls_but_not_through_them() -> None:
 
     left = (0.5, 0.5, 0.5)
     right = (3.5, 0.5, 0.5)
-    assert Ways(Rooms(True), 0.25).joins(left, right)
-    closed = Ways(Rooms(False), 0.25)
-    assert closed.joins(left, (1.5, 1.5, 0.5)) and not closed.joins(left, right)
-    assert not closed.joins(left, (2.0, 0.5, 0.5))  # in the wall
+    assert Reachability(Rooms(True), 0.25).connects(left, right)
+    closed = Reachability(Rooms(False), 0.25)
+    assert closed.connects(left, (1.5, 1.5, 0.5)) and not closed.connects(left, right)
+    assert not closed.connects(left, (2.0, 0.5, 0.5))  # in the wall
 
 
 def test_scores_become_ranks() -> None:

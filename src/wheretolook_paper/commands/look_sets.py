@@ -1,4 +1,4 @@
-"""Sets of looks compared: chosen together, one by one, spread evenly, and so on; joined from stored matches."""
+"""Compare strategies that choose sets of views, localized jointly from stored matches."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LookConfig:
-    """What is compared: numbers of looks, strategies, how well turns are known, and the seed of what is drawn."""
+    """Compared numbers of views and strategies, noise of the rotations between views, and the seed."""
 
     numbers: tuple[int, ...] = NUMBERS
     strategies: tuple[str, ...] = tuple(STRATEGIES)
@@ -30,7 +30,7 @@ class LookConfig:
 
 
 def scenes_with_pixels(dataset: Dataset, split: str) -> list[SceneFolder]:
-    """Scenes of a split, looked at by one camera, whose labels keep where landmarks were matched."""
+    """Return the scenes of a split with one camera whose labels have the pixels of their matches."""
     scenes = [scene for scene in dataset.scenes if scene.split == split and not scene.cameras_file.is_file()]
     return [scene for scene in scenes if has_matches(scene.table, pixels=True)]
 
@@ -43,10 +43,10 @@ def evaluate_looks(
     progress: bool = True,
     device: str = "cpu",
 ) -> pd.DataFrame | None:
-    """`look_table` of a split's scenes, `looks.csv` and `looks.md` beside its scores, and an MLflow run.
+    """Compare view sets in a split's scenes; write `looks.csv` and `looks.md` next to its scores and log a run.
 
-    Views are scored by the first of `evaluate.weights`, or those that `weights.resolve.resolve_weights` finds. None
-    if no scene's labels keep where landmarks were matched (`--label.store_pixels true`).
+    Views are scored by the first of `evaluate.weights`, or those of `resolve_weights`. Returns `look_table`, or None
+    if no scene's labels have the pixels of their matches (`--label.store_pixels true`).
     """
     from wheretolook.evaluation.results import results_folder
     from wheretolook.weights.resolve import load_scorer, resolve_weights
@@ -56,11 +56,11 @@ def evaluate_looks(
     if not scenes or weights is None:
         return None
     maps = [scene.localization_map(device=device) for scene in scenes]
-    found = [
-        compare_looks(scene, load_scorer(str(weights), around, evaluate.anywhere), config, progress)
-        for scene, around in zip(scenes, maps, strict=True)
+    results = [
+        compare_looks(scene, load_scorer(str(weights), one, evaluate.anywhere), config, progress)
+        for scene, one in zip(scenes, maps, strict=True)
     ]
-    sets = pd.concat(found, ignore_index=True)
+    sets = pd.concat(results, ignore_index=True)
     folder = results_folder(dataset, evaluate)
     table = write_looks(folder, sets, f"Looks localized together on {dataset.name}, {evaluate.split} scenes")
     params = {"dataset": dataset.name, "split": evaluate.split, "weights": weights.name, **asdict(config)}
@@ -72,12 +72,12 @@ def evaluate_looks(
 def compare_looks(
     scene: SceneFolder, scorer: Scorer, config: LookConfig = LookConfig(), progress: bool = True
 ) -> pd.DataFrame:
-    """Sets of looks by every strategy at every labelled location of a scene, and how they were localized.
+    """Choose sets of views by every strategy at every labelled location of a scene, and localize them jointly.
 
-    Returns `labelling.look_sets.SET_COLUMNS` for each set, with `strategy`, `expected` (its score before),
-    `single_good` (whether the look that is best alone localizes alone) and `any_good` (whether one of the looks does).
+    Returns the columns of `label_sets` for each set, with `strategy`, `expected` (its predicted score), `single_good`
+    (whether the best single view localizes) and `any_good` (whether any view of the set does).
 
-    Raises a TableError if the labels do not keep where landmarks were matched.
+    Raises a TableError if the labels lack the pixels of their matches.
     """
     from wheretolook.localization.joint_labels import label_sets
     from wheretolook.looks.joint_visibility import candidate_views

@@ -1,4 +1,4 @@
-"""Sets of looks in tables: how many places they localize, by how they were chosen; how many looks are needed."""
+"""Tables of view sets: the share of locations localized by each selection strategy, and the number of views needed."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 
+from wheretolook.evaluation.bootstrap import ClusterBootstrap
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import BEST_TAG
 from wheretolook.utils.files import write_text
@@ -18,7 +19,7 @@ LOOKS_CSV = "looks.csv"
 LOOKS_MD = "looks.md"
 
 NUMBERS = (1, 2, 3, 5)
-"""Looks of a set that are compared."""
+"""Compared numbers of views in a set."""
 
 STRATEGIES = {
     "together": "chosen together, by what they see together",
@@ -31,30 +32,30 @@ STRATEGIES = {
 }
 
 TOGETHER = "together"
-"""What ships."""
+"""The product's strategy."""
 
 _NUMBERS = ("good", "gain", "any_good", "sure", "sure_right")
 
 
 def look_table(sets: pd.DataFrame, resamples: int = 2000, seed: int = 0) -> pd.DataFrame:
-    """Shares of locations whose looks localize together, by strategy and number of looks.
+    """Return the share of locations whose sets localize jointly, by strategy and number of views.
 
-    Columns: `good` and its 95 % interval by resampling locations; `gain` over the single best look of the same places,
-    paired, and its interval; `any_good`; `sure` (the share of poses called sure at 99 %) and `sure_right` (how many of
-    these are right).
+    Columns: `good` and its 95 % interval by resampling locations; `gain` over the best single view of the same
+    locations, paired, and its interval; `any_good`; `sure`, the share of poses with a confidence of at least 99 %, and
+    `sure_right`, the share of these that is right.
     """
-    rng = np.random.default_rng(seed)
     rows = []
     for (strategy, n), part in sets.groupby(["strategy", "n_looks"], sort=False):
         good = part["good"].to_numpy(float)
-        gain = (part["good"].astype(float) - part["single_good"]).to_numpy()
-        drawn = rng.integers(0, len(part), (resamples, len(part)))
-        low, high = np.quantile(good[drawn].mean(1), (0.025, 0.975))
-        gain_low, gain_high = np.quantile(gain[drawn].mean(1), (0.025, 0.975))
+        values = np.stack([good, good - part["single_good"].to_numpy(float)], axis=1)
+        bootstrap = ClusterBootstrap(np.arange(len(part)), resamples, seed)
+        low, high = bootstrap.ratio_interval(values, np.ones((len(part), 1)))
+        mean = values.mean(0)
         sure = part["confidence"] >= 0.99
         rows.append(
-            {"strategy": strategy, "n_looks": n, "n_locations": len(part), "good": good.mean()}
-            | {"good_low": low, "good_high": high, "gain": gain.mean(), "gain_low": gain_low, "gain_high": gain_high}
+            {"strategy": strategy, "n_looks": n, "n_locations": len(part)}
+            | {"good": mean[0], "good_low": low[0], "good_high": high[0]}
+            | {"gain": mean[1], "gain_low": low[1], "gain_high": high[1]}
             | {"any_good": part["any_good"].mean(), "sure": sure.mean()}
             | {"sure_right": part.loc[sure, "good"].mean() if sure.any() else np.nan}
         )
@@ -62,27 +63,28 @@ def look_table(sets: pd.DataFrame, resamples: int = 2000, seed: int = 0) -> pd.D
 
 
 def stopping_table(sets: pd.DataFrame, asked: Sequence[float] = (0.5, 0.8, 0.9, 0.95, 0.99)) -> pd.DataFrame:
-    """How many looks are needed if the camera looks on only while the confidence is below what is asked.
+    """Return how many views are needed if the camera stops once the confidence reaches a limit.
 
-    Of sets whose looks are added one after another ("in-turn", of every number that was compared). Columns: `asked`,
-    `looks` (mean), `good` (share of locations), `of_most` (of what the greatest number gives).
+    Uses sets whose views are added one after another ("in-turn"). Columns: `asked`, the limit; `looks`, the mean
+    number; `good`, the share of locations; `of_most`, relative to the share of the largest sets.
     """
-    wanted = sets[sets["strategy"] == "in-turn"].sort_values("n_looks", kind="stable")
-    ends: list[dict[str, float]] = []
-    places = [part for _, part in wanted.groupby(["scene", "location_id"])]
-    most = np.mean([part["good"].iloc[-1] for part in places]) if places else np.nan
+    in_turn = sets[sets["strategy"] == "in-turn"].sort_values("n_looks", kind="stable")
+    locations = [part for _, part in in_turn.groupby(["scene", "location_id"])]
+    most = np.mean([part["good"].iloc[-1] for part in locations]) if locations else np.nan
+    rows: list[dict[str, float]] = []
     for limit in asked:
-        stops = [int(np.argmax(np.append(part["confidence"].to_numpy()[:-1] >= limit, True))) for part in places]
-        looks = [part["n_looks"].iloc[stop] for part, stop in zip(places, stops, strict=True)]
-        good = np.mean([part["good"].iloc[stop] for part, stop in zip(places, stops, strict=True)])
-        ends.append(
-            {"asked": limit, "looks": float(np.mean(looks)), "good": float(good), "of_most": float(good / most)}
-        )
-    return pd.DataFrame(ends)
+        stops = [
+            part.iloc[int(np.argmax(np.append(part["confidence"].to_numpy()[:-1] >= limit, True)))]
+            for part in locations
+        ]
+        good = float(np.mean([stop["good"] for stop in stops]))
+        looks = float(np.mean([stop["n_looks"] for stop in stops]))
+        rows.append({"asked": limit, "looks": looks, "good": good, "of_most": float(good / most)})
+    return pd.DataFrame(rows)
 
 
 def write_looks(folder: Path, sets: pd.DataFrame, title: str) -> pd.DataFrame:
-    """Write `looks.csv` and `looks.md` of compared sets; returns `look_table`."""
+    """Write `looks.csv` and `looks.md` of compared sets; return `look_table`."""
     table = look_table(sets)
     stopping = stopping_table(sets)
     write_text(folder / LOOKS_CSV, table.to_csv(index=False))
@@ -114,16 +116,16 @@ def log_looks(
     files: Sequence[Path],
     tags: Mapping[str, str] | None = None,
 ) -> str:
-    """Log a table of `look_table` as a run with the files, and one nested in it for each row; returns its id.
+    """Log a `look_table` as a run with files and a nested run for each row; return the run's id.
 
-    The run has the metrics of the best choice of most looks.
+    The run has the metrics of the best strategy for the largest sets.
     """
     from wheretolook.tracking.runs import NestedRun, log, log_nested, start_run
 
     numbers = [name for name in _NUMBERS if name in table]
     best = table[table["n_looks"] == table["n_looks"].max()].nlargest(1, "good").iloc[0]
-    told = {**(tags or {}), "dataset": str(params["dataset"]), BEST_TAG: str(best["strategy"])}
-    with start_run(tracking, "all sets", "looks", dict(params), tags=told) as (client, run):
+    run_tags = {**(tags or {}), "dataset": str(params["dataset"]), BEST_TAG: str(best["strategy"])}
+    with start_run(tracking, "all sets", "looks", dict(params), tags=run_tags) as (client, run):
         log(client, run, metrics={name: float(best[name]) for name in numbers})
         for file in files:
             client.log_artifact(run, str(file))

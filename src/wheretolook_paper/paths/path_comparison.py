@@ -1,4 +1,4 @@
-"""Paths between the same starts and goals, planned by several methods, to be localized along (paper, Sec. 4.3)."""
+"""Plan paths between the same starts and goals by several methods (paper, Sec. 4.3)."""
 
 from __future__ import annotations
 
@@ -27,33 +27,32 @@ from wheretolook.utils.errors import PlanningError, SceneError
 
 PLANNED = "planned"
 GIVEN = "given"
-"""What a method may choose: places and views, or the views along a path that is given."""
+"""Tasks: a method chooses positions and views, or only the views along a given path."""
 
 Space = FreeSpace | MappedSpace
 Rule = Callable[[Float, TurnLimit], ViewSequence]
 
 RULES: dict[str, Rule] = {"": best_sequence, "greedy": greedy_sequence}
-"""How the views along a given path are chosen, exactly and by ActLoc's rule, by what is added to a method's name."""
+"""Selection of views along a given path, optimal and by ActLoc's rule, by the suffix of the method's name."""
 
-DRAWS = 50  # pairs drawn for each one wanted, before a scene is said to have too little room
+MAX_DRAWS = 50  # draws for each pair before giving up
 
-WAYS_M = 0.25
-MOST = 200_000
-"""Grid of places by which to find out whether there is a way from a start to a goal, and their largest number."""
+GRID_M = 0.25
+MAX_NODES = 200_000
+"""Step and size limit of the grid that decides whether a goal is reachable."""
 
-BLOCK = 10_000
-NEAREST = 8
-"""Places tested for free space at a time; those on the grid from which a way to a given point is tried."""
+BLOCK = 10_000  # points tested for free space at a time
+N_NEAREST = 8  # grid nodes tried as connections of a point
 
 
 @dataclass(frozen=True, eq=False)
 class ComparedPaths:
-    """What was planned in a scene.
+    """Planned paths of a scene and their views.
 
     `paths` has a row for each pair, task (`PLANNED`, `GIVEN`) and method: `planned`, whether there is a path, its
-    `length_m`, `turn_deg`, `n_views`, `promised`, the mean score of its views by the method's own map (NaN for
-    "forward"), and `found_by` (`PlannedPath.found_by`). `views` has a row for each view along them: pair, task, method,
-    waypoint, score, and `wheretolook.dataset.viewpoint_table.POSE_COLUMNS`.
+    `length_m`, `turn_deg`, `n_views`, `promised`, the mean score of its views by the method's map (NaN for "forward"),
+    and `found_by` (`PlannedPath.found_by`). `views` has a row for each view: pair, task, method, waypoint, score, and
+    `wheretolook.dataset.viewpoint_table.POSE_COLUMNS`.
     """
 
     paths: pd.DataFrame
@@ -61,22 +60,21 @@ class ComparedPaths:
 
 
 def draw_pairs(space: Space, config: PathsConfig) -> Float:
-    """Starts and goals (P, 2, 3) m in free space, far enough from each other, with a way between them.
+    """Draw starts and goals (P, 2, 3) m in free space, far enough apart and connected.
 
-    Above floors, heights are those asked for; without a mesh, they are drawn. Raises SceneError if there is too little
-    room.
+    Heights above floors are those of `config`; without a mesh they are random. Raises SceneError without enough room.
     """
     rng = np.random.default_rng(config.seed)
     low, high = space.bounds
-    ways = Ways(space, WAYS_M)
+    reachability = Reachability(space, GRID_M)
     found: list[Float] = []
-    for _ in range(DRAWS * config.pairs):
+    for _ in range(MAX_DRAWS * config.pairs):
         if len(found) == config.pairs:
             break
         ends = _free_points(space, rng.uniform(low, high, (400, 3)), config, rng)[:2]
         if len(ends) < 2 or np.linalg.norm(ends[1] - ends[0]) < config.min_distance_m:
             continue
-        if ways.joins(ends[0], ends[1]):  # not in parts of the scene between which there is no way
+        if reachability.connects(ends[0], ends[1]):
             found.append(ends)
     if len(found) < config.pairs:
         apart = f"{config.min_distance_m:g} m apart with a way between them"
@@ -93,56 +91,55 @@ def _free_points(space: Space, points: Float, config: PathsConfig, rng: np.rando
     return points
 
 
-class Ways:
-    """Whether a camera can get from one place to another: a graph of free places on a grid over `space`.
+class Reachability:
+    """Reachability in free space: connected components of a grid whose edges are free straight segments.
 
-    Its edges join neighbours between which a camera can go straight. The grid's step `step_m` is widened where there
-    would be more than `MOST` places.
+    The step `step_m` is enlarged if there would be more than `MAX_NODES` nodes.
     """
 
     def __init__(self, space: Space, step_m: float) -> None:
         self.space = space
         low, high = np.asarray(space.bounds, dtype=np.float64)
-        step_m = max(step_m, float(np.prod(high - low) / MOST) ** (1 / 3))
+        step_m = max(step_m, float(np.prod(high - low) / MAX_NODES) ** (1 / 3))
         axes = [np.arange(a + step_m / 2, max(b, a + step_m), step_m) for a, b in zip(low, high, strict=True)]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         number = np.full(points.shape[:3], -1)
         blocks = np.array_split(points.reshape(-1, 3), points.size // (3 * BLOCK) + 1)
         free = np.concatenate([space.is_free(block) for block in blocks]).reshape(number.shape)
         number[free] = np.arange(free.sum())
-        self._places: Float = points[free]
+        self._nodes: Float = points[free]
         pairs = []
         for axis in range(3):
             here, there = (np.moveaxis(number, axis, 0)[part].ravel() for part in (slice(None, -1), slice(1, None)))
             both = (here >= 0) & (there >= 0)
             pairs.append(np.stack([here[both], there[both]], axis=1))
         edges = np.concatenate(pairs)
-        edges = edges[space.segments_are_free(self._places[edges[:, 0]], self._places[edges[:, 1]])]
-        n = len(self._places)
+        edges = edges[space.segments_are_free(self._nodes[edges[:, 0]], self._nodes[edges[:, 1]])]
+        n = len(self._nodes)
         graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
         self._part = connected_components(graph, directed=False)[1] if n else np.empty(0, dtype=np.int32)
-        self._tree = cKDTree(self._places) if n else None
+        self._tree = cKDTree(self._nodes) if n else None
 
-    def joins(self, a: ArrayLike, b: ArrayLike) -> bool:
-        """Whether the grid has a way between points (3,) m."""
+    def connects(self, a: ArrayLike, b: ArrayLike) -> bool:
+        """Return whether points (3,) m are connected."""
         return bool(self._parts_near(a) & self._parts_near(b))
 
     def _parts_near(self, point: ArrayLike) -> set[int]:
         at = np.asarray(point, dtype=np.float64)
         if self._tree is None:
             return set()
-        near = np.atleast_1d(self._tree.query(at, k=min(NEAREST, len(self._places)))[1])
-        straight = self.space.segments_are_free(np.tile(at, (len(near), 1)), self._places[near])
+        near = np.atleast_1d(self._tree.query(at, k=min(N_NEAREST, len(self._nodes)))[1])
+        straight = self.space.segments_are_free(np.tile(at, (len(near), 1)), self._nodes[near])
         return {int(part) for part in self._part[near[straight]]}
 
 
 def plan_pairs(
     pairs: Float, space: Space, maps: Mapping[str, ViewpointMap], config: PathsConfig, progress: str | None = None
 ) -> ComparedPaths:
-    """Plan between pairs by every method; then choose views along the shortest paths by every method.
+    """Plan between pairs by every method, and choose views along the shortest paths by every method.
 
-    `pairs` are starts and goals (P, 2, 3) m, `maps` those of each method but "forward", with scores in [0, 1]. Raises
-    PlanningError if no path was found at all.
+    `pairs` are starts and goals (P, 2, 3) m, `maps` the viewpoint map of each method except "forward", with scores in
+    [0, 1]. Raises PlanningError if no path was found at all.
     """
     paths: list[dict[str, Any]] = []
     tables: list[pd.DataFrame] = []
@@ -175,28 +172,28 @@ def plan_pairs(
                 add(number, PLANNED, name, planned(ends, views))
                 bar.update()
             along = None if shortest is None else resample_path(shortest.positions, config.planner.spacing_m)
-            add(number, GIVEN, FORWARD, _looking_ahead(shortest, along))
+            add(number, GIVEN, FORWARD, _forward_views(shortest, along))
             for name, views in maps.items():
                 for rule, choose in RULES.items():
-                    path = None if along is None else _looking_about(along, views, limits[name], config, choose)
+                    path = None if along is None else _chosen_views(along, views, limits[name], config, choose)
                     add(number, GIVEN, f"{name} {rule}".strip(), path)
     if not tables:
         raise PlanningError("no path was found at all", value=f"{len(pairs)} pairs", fix="Raise paths.planner.time_s.")
     return ComparedPaths(pd.DataFrame(paths), pd.concat(tables, ignore_index=True))
 
 
-def _looking_ahead(shortest: PlannedPath | None, given: Float | None) -> PlannedPath | None:
-    """The path at its waypoints, with the axes of the nearest view of the shortest path."""
+def _forward_views(shortest: PlannedPath | None, given: Float | None) -> PlannedPath | None:
+    """Return the given waypoints with the axes of the nearest views of the shortest path."""
     if shortest is None or given is None:
         return None
     nearest = np.linalg.norm(given[:, None] - shortest.positions[None], axis=2).argmin(1)
     return PlannedPath(given, shortest.axes[nearest], np.full(len(given), np.nan), shortest.cost)
 
 
-def _looking_about(
+def _chosen_views(
     given: Float, viewpoint_map: ViewpointMap, limit: TurnLimit, config: PathsConfig, choose: Rule
 ) -> PlannedPath | None:
-    """The views along a given path that a rule chooses within the limits; None where it leads to where none is left."""
+    """Choose views along a given path by a rule within the limits; None if the rule reaches a dead end."""
     rows = viewpoint_map.rows(given)
     low, high = np.sin(np.radians(config.planner.pitch_deg))
     inside = (limit.directions[:, 2] >= low) & (limit.directions[:, 2] <= high)

@@ -1,4 +1,4 @@
-"""What a view can be expected to find: landmarks weighted by the probability that the localizer finds them."""
+"""Expected detections of a view: landmarks weighted by the probability that the localizer detects them."""
 
 from __future__ import annotations
 
@@ -17,18 +17,14 @@ from wheretolook.scorers.landmark_scorer import LandmarkScorer
 from wheretolook.scorers.matchability.network import MatchabilityNetwork, expected_parts
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.training_range import QUANTITIES, camera_quantities, view_quantities
-from wheretolook.utils.errors import ConfigError
 from wheretolook_paper.fisher.metrics import METRICS, metric_of
 from wheretolook_paper.scorers.pooled_features import image_cells
 
-BINS = 30  # bins along each side of the image, of which those expected to hold a found landmark are counted
-
-INLIERS = "inliers"
-FILLED = "bins"
+BINS = 30  # bins along each side of the image
 
 
 class Expectation:
-    """What the views of a map can be expected to find, shared by all scorers that are made of it."""
+    """Sums over the visible landmarks of a map's views, weighted by detection probability; shared by all scorers."""
 
     _of_maps: ClassVar[WeakKeyDictionary[LocalizationMap, dict[str, Expectation]]] = WeakKeyDictionary()
 
@@ -38,11 +34,11 @@ class Expectation:
         self.camera = localization_map.camera
         self._poses: Float = np.empty((0, 3, 4))
         self._sums: Float = np.empty((0, 17))
-        self.quantities: Float = np.empty((0, len(QUANTITIES)))  # of the views that `sums` was asked for last
+        self.quantities: Float = np.empty((0, len(QUANTITIES)))  # of the views of the last call of `sums`
 
     @classmethod
     def of_map(cls, localization_map: LocalizationMap, weights: str | Path) -> Expectation:
-        """What a map's views can be expected to find by a file of weights, made once for each map and file.
+        """Return the expectation of a map by a file of weights, made once for each map and file.
 
         Raises a WeightsError if the file cannot be used, or was trained for another field of view than the camera's.
         """
@@ -54,13 +50,13 @@ class Expectation:
         return known[str(weights)]
 
     def sums(self, describer: LandmarkDescriber, cam_from_world: Float) -> Float:
-        """What views (B, 3, 4) can be expected to find, (B, 17). The describer gives the attributes the model takes.
+        """Return the expected sums (B, 17) of views (B, 3, 4), whose landmarks the describer describes.
 
-        Landmarks expected to be found; their information on the pose, 15 numbers (see `wheretolook.geometry.pose_information`,
-        in the camera's axes); bins expected to hold one that is found.
+        Detected landmarks; their information on the pose, 15 numbers as in `wheretolook.geometry.pose_information`, in
+        the camera's axes; image bins with a detected landmark.
         """
         cam_from_world = check_poses(cam_from_world)
-        if not np.array_equal(cam_from_world, self._poses):  # several methods ask for the same block of views
+        if not np.array_equal(cam_from_world, self._poses):  # several methods score the same block of views
             sums = np.empty((len(cam_from_world), 17))
             quantities = np.empty((len(sums), len(QUANTITIES)))
             of_camera = camera_quantities(self.camera)
@@ -69,81 +65,53 @@ class Expectation:
                 log_odds = self.log_odds(described.values)
                 parts = expected_parts(described.values, log_odds, described.attributes)[:, :16].double()
                 sums[rows, :16] = torch.segment_reduce(parts, "sum", lengths=described.counts, initial=0.0).cpu()
-                sums[rows, 16] = self._filled(described, log_odds).cpu()
+                sums[rows, 16] = self._filled_bins(described, log_odds).cpu()
             self._poses = cam_from_world.copy()
             self._sums = sums
             self.quantities = quantities
         return self._sums
 
     def log_odds(self, values: Tensor) -> Tensor:
-        """Calibrated log-odds (E,) of being found of landmarks (E, A)."""
+        """Return the calibrated log-odds (E,) that landmarks (E, A) are detected."""
         with torch.inference_mode():
             return self.matchability.calibrated(self.matchability.network(values))
 
-    def _filled(self, described: ViewLandmarks, log_odds: Tensor) -> Tensor:
-        """Bins expected to hold at least one landmark that is found, each found or not on its own, (B,)."""
+    def _filled_bins(self, described: ViewLandmarks, log_odds: Tensor) -> Tensor:
+        """Return the expected number of bins with a detected landmark (B,), detections being independent."""
         cells = described.views * BINS**2 + image_cells(described, self.camera, BINS)
-        missed = torch.zeros(len(described) * BINS**2, dtype=torch.float64, device=cells.device)
-        missed.index_add_(0, cells, torch.nn.functional.logsigmoid(-log_odds).double())
-        return (1 - missed.exp()).view(len(described), -1).sum(1)
+        log_missed = torch.zeros(len(described) * BINS**2, dtype=torch.float64, device=cells.device)
+        log_missed.index_add_(0, cells, torch.nn.functional.logsigmoid(-log_odds).double())
+        return (1 - log_missed.exp()).view(len(described), -1).sum(1)
 
 
 class ExpectedScorer(LandmarkScorer):
-    """Landmarks in view, each by its learned chance of being found; or the bins of the image expected to hold one.
+    """Scores a view by an expected sum: "inliers", "bins", or a metric of Fisher information ("mineig", ...).
 
-    The kind "inliers" is the share of the map's landmarks expected to be found; "bins" the share of the image's bins
-    expected to hold one that is; a ConfigError of others. See `Expectation.of_map` for unfit weights.
+    "inliers" is the share of the map's landmarks that are expected to be detected, "bins" the share of image bins
+    expected to have a detected landmark. Raises as `Expectation.of_map`.
     """
 
     def __init__(self, localization_map: LocalizationMap, weights: str | Path, kind: str) -> None:
-        if kind not in (INLIERS, FILLED):
-            raise ConfigError("unknown expectation", value=kind, fix=f"There are {INLIERS} and {FILLED}.")
-        self._expectation = expectation = Expectation.of_map(localization_map, weights)
-        trained = expectation.matchability
+        self._expectation = Expectation.of_map(localization_map, weights)
+        trained = self._expectation.matchability
         super().__init__(localization_map, trained.network.attributes, trained.training_range, trained.camera)
         self.kind = kind
-        self.name = f"expected-{kind}"
-        self.local = kind == FILLED  # the share of the map's landmarks falls with every landmark that is added
+        self.name = f"fisher-{kind}-expected" if kind in METRICS else f"expected-{kind}"
+        self.local = kind != "inliers"  # that share falls with every landmark that is added
 
     def score(self, cam_from_world: Float) -> Float:
-        """(B,) in [0, 1]."""
+        """Return (B,) in [0, 1]; metrics of information are not bounded by 1."""
         sums = self._expectation.sums(self.describer, cam_from_world)
         self._watch.check(self.name, [self._expectation.quantities])
-        if self.kind == FILLED:
+        if self.kind == "bins":
             return sums[:, 16] / BINS**2
-        return sums[:, 0] / max(1, len(self.localization_map.landmarks))
+        if self.kind == "inliers":
+            return sums[:, 0] / max(1, len(self.localization_map.landmarks))
+        return metric_of(sums[:, 1:16], self.kind, device=self.localization_map.device)
 
     def expected_inliers(self, cam_from_world: Float) -> Float:
-        """(B,), the sum of the chances of being found over the landmarks in view."""
+        """Return (B,), the sum of the detection probabilities of the visible landmarks."""
         return self._expectation.sums(self.describer, cam_from_world)[:, 0]
-
-    def log_odds_of_detection(self, values: Tensor) -> Tensor:
-        """Return the calibrated log-odds (E,) that landmarks (E, A) are detected."""
-        return self._expectation.log_odds(values)
-
-
-class ExpectedFisherScorer(LandmarkScorer):
-    """Expected Fisher information of the pose, each landmark in view weighted by its learned chance of being found.
-
-    The metric is "mineig", "logdet" or "trace"; a ConfigError of others. See `Expectation.of_map` for unfit weights.
-    """
-
-    local = True
-
-    def __init__(self, localization_map: LocalizationMap, weights: str | Path, metric: str) -> None:
-        if metric not in METRICS:
-            raise ConfigError("unknown metric of information", value=metric, fix=f"There are {', '.join(METRICS)}.")
-        self._expectation = expectation = Expectation.of_map(localization_map, weights)
-        trained = expectation.matchability
-        super().__init__(localization_map, trained.network.attributes, trained.training_range, trained.camera)
-        self.metric = metric
-        self.name = f"fisher-{metric}-expected"
-
-    def score(self, cam_from_world: Float) -> Float:
-        """(B,), not bounded by 1."""
-        numbers = self._expectation.sums(self.describer, cam_from_world)[:, 1:16]
-        self._watch.check(self.name, [self._expectation.quantities])
-        return metric_of(numbers, self.metric, device=self.localization_map.device)
 
     def log_odds_of_detection(self, values: Tensor) -> Tensor:
         """Return the calibrated log-odds (E,) that landmarks (E, A) are detected."""

@@ -4,51 +4,38 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from wheretolook.scorers.method import Method, MethodStyle, ScorerOptions
+from wheretolook.scorers.method import Group, Method, MethodStyle, ScorerOptions
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.scorers.base import Scorer
 
 
-def _expected(kind: str, about: str, style: MethodStyle) -> Method:
+def _expected(name: str, kind: str, about: str, style: MethodStyle, group: Group) -> Method:
     def build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
         from wheretolook_paper.scorers.expected import ExpectedScorer
 
         assert options.weights is not None
         return ExpectedScorer(localization_map, options.weights, kind)
 
-    return Method(
-        f"expected-{kind}", about, style, "learned", build, weights="matchability", family="expected", position=70
-    )
+    return Method(name, about, style, group, build, weights="matchability", family="expected", position=70)
 
 
-def _expected_fisher(metric: str, name: str, marker: str) -> Method:
-    def build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
-        from wheretolook_paper.scorers.expected import ExpectedFisherScorer
+def _fisher(metric: str, label: str, marker: str) -> Method:
+    about = f"Expected Fisher information of the pose, each visible landmark weighted by its probability: {metric}."
+    style = MethodStyle(f"Fisher, {label}, expected", "#332288", marker, (0, (3, 1)))
+    return _expected(f"fisher-{metric}-expected", metric, about, style, "Fisher")
 
-        assert options.weights is not None
-        return ExpectedFisherScorer(localization_map, options.weights, metric)
 
-    weighted = "each landmark in view weighted by its learned chance of being found"
-    about = f"Expected Fisher information of the pose, {weighted}: {metric}."
-    style = MethodStyle(f"Fisher, {name}, expected", "#332288", marker, (0, (3, 1)))
-    name = f"fisher-{metric}-expected"
-    return Method(name, about, style, "Fisher", build, weights="matchability", family="expected", position=70)
-
+_INLIERS = "Visible landmarks, each weighted by its learned detection probability."
+_BINS = "Image bins, each by the learned probability that a landmark in it is detected."
 
 METHODS = (
     _expected(
-        "inliers",
-        "Landmarks in view, each by its learned chance of being found.",
-        MethodStyle("expected inliers", "#44AA99", "s", (0, (3, 1))),
+        "expected-inliers", "inliers", _INLIERS, MethodStyle("expected inliers", "#44AA99", "s", (0, (3, 1))), "learned"
     ),
-    _expected(
-        "bins",
-        "Bins of the image, each by the learned chance that a landmark in it is found.",
-        MethodStyle("expected bins", "#117733", "D", (0, (3, 1))),
-    ),
-    _expected_fisher("mineig", "min. eigenvalue", "P"),
-    _expected_fisher("logdet", "log det", "X"),
-    _expected_fisher("trace", "trace", "h"),
+    _expected("expected-bins", "bins", _BINS, MethodStyle("expected bins", "#117733", "D", (0, (3, 1))), "learned"),
+    _fisher("mineig", "min. eigenvalue", "P"),
+    _fisher("logdet", "log det", "X"),
+    _fisher("trace", "trace", "h"),
 )

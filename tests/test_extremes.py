@@ -12,6 +12,7 @@ from open3d_renderer import Open3DRenderer
 from planning.rooms import CAMERA, DIRECTIONS, GRID, room_landmarks
 from selection.room import WEIGHTS
 from synthetic_dataset import make_landmarks
+from twins.visibility import count_plain
 from wheretolook.cli import main
 from wheretolook.dataset.sampling import sample_viewpoints
 from wheretolook.dataset.sampling_config import SampleConfig
@@ -27,10 +28,10 @@ from wheretolook.scorers.registry import make_scorer, scorers
 from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils import memory
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.visibility.counting import FrustumCounter, count_plain
+from wheretolook.visibility.counting import FrustumCounter
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import NoOcclusion
-from wheretolook.visibility.survey import survey
+from wheretolook.visibility.survey import SurveyOptions, survey
 
 pytestmark = pytest.mark.filterwarnings("ignore::wheretolook.utils.errors.OutOfRangeWarning")
 
@@ -124,7 +125,7 @@ def test_seventy_thousand_directions() -> None:
     points = room_landmarks(60).points
     place = np.array([(3.0, 2.5, 1.5)])
     rotations = rotation_looking_along(axes)
-    counts = survey(CAMERA, rotations, place, points, NoOcclusion(), keep=5).counts
+    counts = survey(CAMERA, rotations, place, points, NoOcclusion(), SurveyOptions(keep=5)).counts
     some = np.arange(0, 70_000, 701)
     np.testing.assert_array_equal(
         counts[0, some], count_plain(CAMERA, rotations[some], place, points, np.ones((1, 60), dtype=bool))[0]

@@ -21,6 +21,7 @@ import os
 import platform
 import resource
 import statistics
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -42,9 +43,9 @@ from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.warp import start_warp
-from wheretolook.visibility.counting import FrustumCounter, count_plain
+from wheretolook.visibility.counting import FrustumCounter
 from wheretolook.visibility.occlusion import DevicePoints, MeshOcclusion, NoOcclusion
-from wheretolook.visibility.survey import survey
+from wheretolook.visibility.survey import SurveyOptions, survey
 from wheretolook_rooms.generator import generate_apartment
 
 CAMERA = PinholeCamera()
@@ -217,8 +218,8 @@ def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     shared = (CAMERA, rotations, setup.locations, landmarks)
     counts_only = {"keep": 1, "keep_occlusion": False}
     for threads in sorted({1, setup.threads}):
-        add(EVERYTHING, threads, partial(survey, *shared, setup.occlusion, keep=100, threads=threads))
-        add(COUNTS, threads, partial(survey, *shared, NoOcclusion(), **counts_only, threads=threads))
+        add(EVERYTHING, threads, partial(survey, *shared, setup.occlusion, SurveyOptions(keep=100, threads=threads)))
+        add(COUNTS, threads, partial(survey, *shared, NoOcclusion(), SurveyOptions(threads=threads, **counts_only)))
     if setup.on_gpu:
 
         def cast() -> Any:
@@ -231,11 +232,14 @@ def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     add("cells of the sphere (once)", 1, lambda: FrustumCounter(CAMERA, rotations, len(setup.points), device))
     some = setup.locations[setup.rng.choice(len(setup.locations), args.twin_locations, replace=False)]
     everything = np.ones((len(some), len(setup.points)), dtype=bool)
+    sys.path.append(str(Path(__file__).parents[1]))
+    from twins.visibility import count_plain
+
     twin = partial(count_plain, CAMERA, rotations, some, setup.points, everything)
     add(TWIN, 1, twin, args.twin_repeats, len(setup.locations) / len(some))
     print("counts equal the twin's:", np.array_equal(counter.count(some, landmarks.double).numpy(), twin()))
     mask = setup.occlusion.unoccluded(some, setup.points)
-    seen = survey(CAMERA, rotations, some, landmarks, setup.occlusion, keep=100)
+    seen = survey(CAMERA, rotations, some, landmarks, setup.occlusion, SurveyOptions(keep=100))
     masked = count_plain(CAMERA, rotations, some, setup.points, mask)
     print("counts with occlusion equal the twin's:", np.array_equal(seen.counts, masked))
     if setup.on_gpu:
@@ -260,8 +264,9 @@ def scaling(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
             landmarks = DevicePoints(setup.points[: size["landmarks"]], device)
             for what, model in (("with occlusion", setup.occlusion), (COUNTS, NoOcclusion())):
                 work = partial(
-                    survey, CAMERA, rotations, setup.locations[: size["locations"]], landmarks, model, keep=100,
-                    keep_occlusion=model is setup.occlusion, memory_bytes=round(args.memory_gb * 1e9),
+                    survey, CAMERA, rotations, setup.locations[: size["locations"]], landmarks, model,
+                    SurveyOptions(keep=100, keep_occlusion=model is setup.occlusion,
+                                  memory_bytes=round(args.memory_gb * 1e9)),
                 )  # fmt: skip
                 n_rays = size["locations"] * size["landmarks"] if model is setup.occlusion else 0
                 n_projections = size["locations"] * size["landmarks"] * size["directions"]
@@ -281,8 +286,14 @@ def bounded(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     occlusion = setup.occlusion if setup.on_gpu else NoOcclusion()
     start = time.perf_counter()
     with PeakMemory(device) as peak:
-        survey(CAMERA, rotations, setup.locations, setup.points, occlusion, keep=100, device=device,
-               progress="2 M landmarks", memory_bytes=round(args.memory_gb * 1e9))  # fmt: skip
+        survey(
+            CAMERA,
+            rotations,
+            setup.locations,
+            setup.points,
+            occlusion,
+            SurveyOptions(keep=100, device=device, progress="2 M landmarks", memory_bytes=round(args.memory_gb * 1e9)),
+        )
     row = {"what": "bounded", "occlusion": type(occlusion).__name__, "seconds": time.perf_counter() - start}
     row |= {"peak_bytes": peak.bytes, "peak_rss_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024}
     print(row)

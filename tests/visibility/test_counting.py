@@ -8,12 +8,13 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from conftest import RandomViews
+from twins.visibility import count_plain
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, rotation_looking_along, transform
 from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility import counting
-from wheretolook.visibility.counting import FrustumCounter, count_plain
+from wheretolook.visibility.counting import FrustumCounter
 from wheretolook.visibility.field_of_view import cell_centers, cells_of, octahedral_directions, tabulate
 from wheretolook.visibility.occlusion import DevicePoints
 
@@ -29,8 +30,6 @@ CAMERAS: dict[str, Camera] = {
     "panorama": PANORAMA,
 }
 
-PINHOLES = [name for name, camera in CAMERAS.items() if isinstance(camera, PinholeCamera)]
-
 
 def count(
     camera: Camera, rotations: Float, locations: Float, points: Float, mask: np.ndarray | None = None,
@@ -42,13 +41,8 @@ def count(
     return counter.count(locations, on_device.double, free).numpy()  # type: ignore[no-any-return]
 
 
-# with a COLMAP camera distinct pixels are counted by the plain twin itself
-@pytest.mark.parametrize(
-    ("name", "distinct_pixels"), [*((name, False) for name in CAMERAS), *((name, True) for name in PINHOLES)]
-)
-def test_counts_are_those_of_the_plain_twin(
-    name: str, distinct_pixels: bool, random_views: RandomViews, device: str
-) -> None:
+@pytest.mark.parametrize("name", CAMERAS)
+def test_counts_are_those_of_the_plain_twin(name: str, random_views: RandomViews, device: str) -> None:
     v = random_views
     camera = CAMERAS[name]
     rng = np.random.default_rng(5)
@@ -59,8 +53,8 @@ def test_counts_are_those_of_the_plain_twin(
     )  # fmt: skip
     mask = rng.random((len(v.locations), len(points))) < 0.7
     rotations = rotation_looking_along(v.directions)
-    counts = count(camera, rotations, v.locations, points, mask, device, distinct_pixels=distinct_pixels)
-    plain = count_plain(camera, rotations, v.locations, points, mask, distinct_pixels)
+    counts = count(camera, rotations, v.locations, points, mask, device)
+    plain = count_plain(camera, rotations, v.locations, points, mask)
     np.testing.assert_array_equal(counts, plain)
     assert plain.max() > 5 and (name == "panorama" or plain.min() < plain.max())
 
@@ -95,15 +89,6 @@ def test_counts_by_hand(device: str) -> None:
     assert count(camera, rotations, np.zeros((1, 3)), points, device=device).tolist() == [[2, 1, 2]]
     hidden = np.array([[True, False, True, True, True, True, True]])
     assert count(camera, rotations, np.zeros((1, 3)), points, hidden, device).tolist() == [[1, 1, 2]]
-
-
-def test_distinct_pixels_by_hand(device: str) -> None:
-    camera = PinholeCamera(4, 2, 2.0)
-    # pixels (3, 1), (3, 1) from twice as far, (2, 1), (0, 0), out of view
-    points = np.array([[0.6, 0.1, 1], [1.2, 0.2, 2], [0.1, 0.1, 1], [-0.9, -0.4, 1], [2, 0, 1.0]])
-    counts = count(camera, np.eye(3)[None], np.zeros((1, 3)), points, device=device, distinct_pixels=True)
-    assert counts.tolist() == [[3]]
-    assert count(camera, np.eye(3)[None], np.zeros((1, 3)), points, device=device).tolist() == [[4]]
 
 
 @pytest.mark.parametrize("name", ["wide", "distorted", "fisheye"])
@@ -190,24 +175,24 @@ def test_a_pinhole_of_colmap_counts_as_ours(random_views: RandomViews, device: s
     colmap = ColmapCamera(
         "SIMPLE_PINHOLE", v.camera.width, v.camera.height, (v.camera.focal_px, v.camera.cx, v.camera.cy)
     )
-    for distinct in (False, True):
-        ours = count(v.camera, rotations, v.locations, v.points, v.mask, device, distinct_pixels=distinct)
-        theirs = count(colmap, rotations, v.locations, v.points, v.mask, device, distinct_pixels=distinct)
-        assert np.abs(ours - theirs).max() <= 1 and (ours != theirs).mean() < 0.02  # rounding on the border
+    ours = count(v.camera, rotations, v.locations, v.points, v.mask, device)
+    theirs = count(colmap, rotations, v.locations, v.points, v.mask, device)
+    assert np.abs(ours - theirs).max() <= 1 and (ours != theirs).mean() < 0.02  # rounding on the border
 
 
-def test_what_cannot_be_counted_is_refused(random_views: RandomViews) -> None:
-    v = random_views
-    rotations = rotation_looking_along(random_views.directions)
-    for size in (0, -4, 7):
-        with pytest.raises(ConfigError, match=f"even number.*{size}"):
-            FrustumCounter(v.camera, rotations, 100, size=size)
-    with pytest.raises(ConfigError, match="finite"):
-        FrustumCounter(v.camera, rotations * np.nan, 100)
-    counter = FrustumCounter(v.camera, rotations, 100)
-    many = np.broadcast_to(0.0, (counter.max_locations(len(v.points)) + 1, 3))
-    with pytest.raises(ConfigError, match="too many locations at once"):
-        counter.count(many, DevicePoints(v.points).double)
+@pytest.mark.parametrize(
+    ("rotations", "size"), [(np.eye(3)[None], 0), (np.eye(3)[None], 7), (np.full((1, 3, 3), np.nan), None)]
+)
+def test_invalid_arguments(rotations: np.ndarray, size: int | None) -> None:
+    with pytest.raises(ConfigError):
+        FrustumCounter(PinholeCamera(), rotations, 100, size=size)
+
+
+def test_too_many_locations_at_once_are_rejected(random_views: RandomViews) -> None:
+    counter = FrustumCounter(random_views.camera, np.eye(3)[None], 100)
+    many = np.broadcast_to(0.0, (counter.max_locations(len(random_views.points)) + 1, 3))
+    with pytest.raises(ConfigError):
+        counter.count(many, DevicePoints(random_views.points).double)
 
 
 def test_lists_for_the_camera_that_run_over_change_nothing(
@@ -221,13 +206,3 @@ def test_lists_for_the_camera_that_run_over_change_nothing(
         short = {"scratch_bytes": 20 * entries}
         found = count(DISTORTED, rotations, v.locations, v.points, v.mask, device, **short)
         np.testing.assert_array_equal(found, expected)
-
-
-def test_little_room_for_bitmaps_changes_nothing(random_views: RandomViews, device: str) -> None:
-    v = random_views
-    rotations = rotation_looking_along(random_views.directions)
-    arguments = v.camera, rotations, v.locations, v.points, v.mask, device
-    for scratch in (1, 200_000):  # a view at a time, a few
-        np.testing.assert_array_equal(
-            count(*arguments, distinct_pixels=True, scratch_bytes=scratch), count(*arguments, distinct_pixels=True)
-        )

@@ -7,16 +7,16 @@ import pytest
 
 from box_scenes import box_quads, quads_mesh, random_texture
 from conftest import RandomViews
+from twins.visibility import count_plain
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
-from wheretolook.visibility.counting import FrustumCounter, count_plain
-from wheretolook.visibility.hidden_points import HiddenPointRemoval
+from wheretolook.visibility.counting import FrustumCounter
 from wheretolook.visibility.occlusion import DevicePoints, MeshOcclusion, NoOcclusion, OcclusionModel
-from wheretolook.visibility.survey import survey
+from wheretolook.visibility.survey import SurveyOptions, survey
 
 
 def boxes(*quads: np.ndarray) -> TexturedMesh:
@@ -39,8 +39,14 @@ class Given(OcclusionModel):
 def test_a_survey_is_what_its_plain_parts_say(random_views: RandomViews, threads: int, device: str) -> None:
     v = random_views
     rotations = rotation_looking_along(v.directions)
-    seen = survey(v.camera, rotations, v.locations, v.points, Given(v.locations, v.mask), keep=6, device=device,
-                  threads=threads)  # fmt: skip
+    seen = survey(
+        v.camera,
+        rotations,
+        v.locations,
+        v.points,
+        Given(v.locations, v.mask),
+        SurveyOptions(keep=6, device=device, threads=threads),
+    )
     plain = count_plain(v.camera, rotations, v.locations, v.points, v.mask)
     np.testing.assert_array_equal(seen.counts, plain)
     for row in range(len(v.locations)):
@@ -60,10 +66,12 @@ def test_masks_of_every_length_are_packed_as_numpy_packs_them(
     points = v.points[:n_points]
     rotations = rotation_looking_along(v.directions)
     for occlusion, expected in ((Given(v.locations, mask), mask), (NoOcclusion(), np.ones_like(mask))):
-        seen = survey(v.camera, rotations, v.locations, points, occlusion, device=device)
+        seen = survey(v.camera, rotations, v.locations, points, occlusion, SurveyOptions(device=device))
         assert seen.occlusion is not None
         np.testing.assert_array_equal(seen.occlusion.packed, np.packbits(expected, axis=1))
-    without = survey(v.camera, rotations, v.locations, points, NoOcclusion(), keep_occlusion=False, device=device)
+    without = survey(
+        v.camera, rotations, v.locations, points, NoOcclusion(), SurveyOptions(keep_occlusion=False, device=device)
+    )
     assert without.occlusion is None
 
 
@@ -74,7 +82,7 @@ def test_a_mesh_hides_what_is_behind_it_on_the_device_too(device: str) -> None:
     locations = rng.uniform(2, 4, (20, 3))
     occlusion = MeshOcclusion(raycaster)
     rotations = rotation_looking_along(fibonacci_sphere(30))
-    seen = survey(PinholeCamera(), rotations, locations, points, occlusion, device=device)
+    seen = survey(PinholeCamera(), rotations, locations, points, occlusion, SurveyOptions(device=device))
     mask = occlusion.unoccluded(locations, points)
     assert 0 < (~mask).sum() < mask.size / 2 and seen.occlusion is not None
     np.testing.assert_array_equal(seen.occlusion.mask, mask)
@@ -87,7 +95,7 @@ def test_blocks_keep_to_the_memory_allowed(
     v = random_views
     rotations = rotation_looking_along(random_views.directions)
     locations = np.random.default_rng(0).uniform(-2, 2, (40, 3))
-    whole = survey(v.camera, rotations, locations, v.points, NoOcclusion(), device=device)
+    whole = survey(v.camera, rotations, locations, v.points, NoOcclusion(), SurveyOptions(device=device))
     blocks: list[int] = []
     original = FrustumCounter.count
 
@@ -99,17 +107,21 @@ def test_blocks_keep_to_the_memory_allowed(
     one = FrustumCounter(v.camera, rotations, len(v.points), device).bytes_per_location(len(v.points)) + len(v.points)
     for threads, memory, longest in ((1, 7 * one + 5, 7), (2, 7 * one, 3), (8, one, 1)):
         blocks.clear()
-        part = survey(v.camera, rotations, locations, v.points, NoOcclusion(), device=device, threads=threads,
-                      memory_bytes=memory)  # fmt: skip
+        part = survey(
+            v.camera,
+            rotations,
+            locations,
+            v.points,
+            NoOcclusion(),
+            SurveyOptions(device=device, threads=threads, memory_bytes=memory),
+        )
         np.testing.assert_array_equal(part.counts, whole.counts)
         assert sum(blocks) == 40 and max(blocks) <= (7 if device != "cpu" and longest == 3 else longest)
-    for camera, distinct in ((v.camera, True), (ColmapCamera("RADIAL", 64, 48, (30.0, 32.0, 24.0, 0.1, 0.0)), False)):
-        seen = survey(camera, rotations, locations, v.points, NoOcclusion(), device=device, threads=2,
-                      distinct_pixels=distinct, memory_bytes=200_000)  # fmt: skip
-        everything = np.ones((40, len(v.points)), bool)
-        np.testing.assert_array_equal(
-            seen.counts, count_plain(camera, rotations, locations, v.points, everything, distinct)
-        )
+    camera = ColmapCamera("RADIAL", 64, 48, (30.0, 32.0, 24.0, 0.1, 0.0))
+    options = SurveyOptions(device=device, threads=2, memory_bytes=200_000)
+    seen = survey(camera, rotations, locations, v.points, NoOcclusion(), options)
+    everything = np.ones((40, len(v.points)), bool)
+    np.testing.assert_array_equal(seen.counts, count_plain(camera, rotations, locations, v.points, everything))
 
 
 def test_points_on_the_device_can_be_used_again(random_views: RandomViews, device: str) -> None:
@@ -117,9 +129,9 @@ def test_points_on_the_device_can_be_used_again(random_views: RandomViews, devic
     rotations = rotation_looking_along(v.directions)
     points = DevicePoints(v.points, device)
     for rows in (slice(0, 3), slice(3, 5)):
-        seen = survey(v.camera, rotations, v.locations[rows], points, NoOcclusion(), distinct_pixels=True)
+        seen = survey(v.camera, rotations, v.locations[rows], points, NoOcclusion())
         everything = np.ones((len(v.locations[rows]), len(points)), bool)
-        plain = count_plain(v.camera, rotations, v.locations[rows], v.points, everything, distinct_pixels=True)
+        plain = count_plain(v.camera, rotations, v.locations[rows], v.points, everything)
         np.testing.assert_array_equal(seen.counts, plain)
 
 
@@ -127,31 +139,30 @@ def test_a_distorted_camera_surveys(random_views: RandomViews, device: str) -> N
     v = random_views
     camera = ColmapCamera("RADIAL", 640, 480, (300.0, 320.0, 240.0, -0.2, 0.03))
     rotations = rotation_looking_along(v.directions)
-    seen = survey(camera, rotations, v.locations, v.points, Given(v.locations, v.mask), device=device)
+    seen = survey(camera, rotations, v.locations, v.points, Given(v.locations, v.mask), SurveyOptions(device=device))
     np.testing.assert_array_equal(seen.counts, count_plain(camera, rotations, v.locations, v.points, v.mask))
 
 
-def test_bad_input_is_refused_before_any_work(random_views: RandomViews) -> None:
-    v = random_views
-    rotations = rotation_looking_along(v.directions)
+class Untouchable(NoOcclusion):
+    def unoccluded_on_device(self, locations: Float, points: DevicePoints) -> None:
+        raise AssertionError("long work")
 
-    class Untouchable(NoOcclusion):
-        def unoccluded_on_device(self, locations: Float, points: DevicePoints) -> None:
-            raise AssertionError("long work")
 
-    with pytest.raises(MapError, match=r"no landmarks.*0"):
-        survey(v.camera, rotations, v.locations, np.empty((0, 3)), Untouchable())
-    with pytest.raises(SceneError, match="no locations"):
-        survey(v.camera, rotations, np.empty((0, 3)), v.points, Untouchable())
-    with pytest.raises(SceneError, match=r"not finite.*nan"):
-        survey(v.camera, rotations, [[0, np.nan, 0]], v.points, Untouchable())
-    with pytest.raises(ConfigError, match="one location with 800 landmarks"):
-        survey(v.camera, rotations, v.locations, v.points, Untouchable(), memory_bytes=1000)
-    with pytest.raises(ConfigError, match="must not be negative"):
-        survey(v.camera, rotations, v.locations, v.points, Untouchable(), keep=-1)
-    on_a_landmark = np.concatenate([v.locations, v.points[:1]])
-    with pytest.raises(SceneError, match="a landmark lies at the location"):
-        HiddenPointRemoval().check(on_a_landmark, v.points)
+@pytest.mark.parametrize(
+    ("error", "locations", "points", "options"),
+    [
+        (MapError, np.zeros((1, 3)), np.empty((0, 3)), {}),
+        (SceneError, np.empty((0, 3)), np.ones((5, 3)), {}),
+        (SceneError, [[0, np.nan, 0]], np.ones((5, 3)), {}),
+        (ConfigError, np.zeros((1, 3)), np.ones((5, 3)), {"memory_bytes": 100}),
+        (ConfigError, np.zeros((1, 3)), np.ones((5, 3)), {"keep": -1}),
+    ],
+)
+def test_invalid_input_is_rejected_before_any_work(
+    error: type[Exception], locations: Float, points: Float, options: dict[str, int]
+) -> None:
+    with pytest.raises(error):
+        survey(PinholeCamera(), np.eye(3)[None], locations, points, Untouchable(), SurveyOptions(**options))
 
 
 @pytest.mark.parametrize("two_sided", [False, True])
@@ -167,4 +178,4 @@ def test_a_location_inside_geometry_is_named(two_sided: bool, device: str) -> No
         occlusion.check(inside, np.ones((5, 3)))  # might be a room
     else:
         with pytest.raises(SceneError, match=r"inside geometry.*0\.4, 0\.5, 0\.6"):
-            survey(PinholeCamera(), np.eye(3)[None], inside, np.ones((5, 3)), occlusion, device=device)
+            survey(PinholeCamera(), np.eye(3)[None], inside, np.ones((5, 3)), occlusion, SurveyOptions(device=device))

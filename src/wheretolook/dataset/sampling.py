@@ -18,7 +18,7 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.memory import fitting
 from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
-from wheretolook.visibility.survey import Survey, survey
+from wheretolook.visibility.survey import Survey, SurveyOptions, survey
 
 BYTES_PER_VIEWPOINT = 600  # while a table of viewpoints is made and written
 
@@ -66,14 +66,15 @@ def sample_viewpoints(
     ids = np.sort(_subset(np.asarray(location_ids, dtype=np.int64), config.max_locations, rng))
     locations = grid.centers()[ids]
     directions = config.axes()
-    options: dict[str, Any] = {"keep": config.keep, "distinct_pixels": config.distinct_pixels, "progress": progress}
-    options |= {"device": device, "memory_bytes": round(config.memory_gb * 1e9)}
+    options = SurveyOptions(
+        keep=config.keep, device=device, memory_bytes=round(config.memory_gb * 1e9), progress=progress
+    )
     several = cameras if isinstance(cameras, Mapping) else {0: cameras}
     numbers = np.array(list(several))[np.arange(len(ids)) % len(several)]
     if len(several) > 1:
         rng.shuffle(numbers)
     around = (rotation_looking_along(directions), locations, landmarks.points, occlusion)
-    seen = _survey_by_camera(several, numbers, *around, **options)
+    seen = _survey_by_camera(several, numbers, *around, options)
     counts = seen.counts
     rank = np.full(seen.counts.shape, -1, dtype=np.int32)
     np.put_along_axis(rank, seen.best, np.arange(seen.best.shape[1])[None], axis=1)
@@ -115,14 +116,14 @@ def _survey_by_camera(
     locations: Float,
     points: Float,
     occlusion: OcclusionModel,
-    **options: Any,
+    options: SurveyOptions,
 ) -> Survey:
     """`survey` of locations (L, 3), each looked from with the camera of its number (L,)."""
     if len(cameras) == 1:
-        return survey(next(iter(cameras.values())), rotations, locations, points, occlusion, **options)
+        return survey(next(iter(cameras.values())), rotations, locations, points, occlusion, options)
     groups = [np.flatnonzero(numbers == number) for number in cameras]
     parts = [
-        survey(camera, rotations, locations[rows], points, occlusion, **options)
+        survey(camera, rotations, locations[rows], points, occlusion, options)
         for camera, rows in zip(cameras.values(), groups, strict=True)
         if len(rows)
     ]

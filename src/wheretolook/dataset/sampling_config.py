@@ -25,10 +25,9 @@ class SampleConfig(ViewLattice):
         seed: seed of what is drawn at random.
         cameras: cameras that look in a scene, each at its own locations: drawn from the scene's seed over fields of
             view, sizes and proportions, to learn from all of them; with 0 the experiment's camera looks.
-        distinct_pixels: rank by the number of distinct pixels with a landmark, as the released code counts, instead of
-            the number of landmarks.
 
     Attributes:
+        distinct_pixels: recorded with samples; landmarks are counted, and `wheretolook_paper.visibility` counts pixels.
         memory_gb: bound on the memory that counting takes on its device, in 10^9 bytes; two million landmarks fit.
     """
 
@@ -38,7 +37,7 @@ class SampleConfig(ViewLattice):
     max_directions: int | dict[Split, int] = 0
     seed: int = 0
     cameras: int = 0
-    distinct_pixels: bool = False
+    distinct_pixels: bool = field(default=False, init=False)
     memory_gb: float = field(default=2.0, init=False)
 
     def __post_init__(self) -> None:

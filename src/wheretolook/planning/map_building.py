@@ -19,7 +19,7 @@ from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
 from wheretolook.scorers.base import Scorer
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
-from wheretolook.visibility.survey import survey
+from wheretolook.visibility.survey import SurveyOptions, survey
 
 Text = str | None  # text of progress bars; None shows none
 
@@ -125,9 +125,9 @@ def _score_and_count(
     """Ranked ids, scores and numbers of landmarks in view, each (L, D), of all directions at locations (L, 3) m."""
     around = scorer.localization_map
     rotations = rotation_looking_along(directions)
-    options: dict[str, Any] = {"keep": 1, "keep_occlusion": False, "device": around.device}
-    options["progress"] = progress and f"{progress}: count"
-    counted = survey(around.camera, rotations, locations, around.landmarks.points, around.occlusion, **options)
+    text = progress and f"{progress}: count"
+    options = SurveyOptions(keep=1, keep_occlusion=False, device=around.device, progress=text)
+    counted = survey(around.camera, rotations, locations, around.landmarks.points, around.occlusion, options)
     ranked = np.empty((len(locations), len(directions)), dtype=np.uint16)
     scores = np.empty(ranked.shape, dtype=np.float32)
     block = max(1, VIEWS_AT_ONCE // len(directions))

@@ -12,7 +12,7 @@ from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.warp import start_warp
-from wheretolook.visibility import counting_kernel, frustum, pixel_kernel
+from wheretolook.visibility import counting_kernel, frustum
 from wheretolook.visibility.field_of_view import tabulate
 from wheretolook.visibility.sphere_cells import SphereCells, choose_size
 
@@ -28,11 +28,9 @@ class FrustumCounter:
     view counts with all its landmarks; landmarks are tested one by one only in cells on the border of the view.
 
     `rotations` (D, 3, 3) are cam_from_world; `device` is "cpu" or a CUDA device. `n_points`, about how many landmarks
-    will be counted, sets the number of cells, unless `size` gives the cells along a side of the sphere's map. With
-    `distinct_pixels` it counts the pixels that some landmark falls on instead, as the released code does; for a COLMAP
-    camera this is done in NumPy, thousands of times slower. `scratch_bytes` is the memory for bitmaps of pixels, or for
-    lists of landmarks to ask a COLMAP camera about. Raises a ConfigError if there is no such device, the size is not
-    even, or rotations are not finite or of another shape.
+    will be counted, sets the number of cells, unless `size` gives the cells along a side of the sphere's map.
+    `scratch_bytes` is the memory for lists of landmarks that a COLMAP camera itself must project. Raises ConfigError if
+    there is no such device, the size is not even, or rotations are not finite or of another shape.
     """
 
     def __init__(
@@ -41,12 +39,10 @@ class FrustumCounter:
         rotations: Float,
         n_points: int,
         device: str = "cpu",
-        distinct_pixels: bool = False,
         size: int | None = None,
         scratch_bytes: int = 1 << 28,
     ) -> None:
         self.camera = camera
-        self.distinct_pixels = distinct_pixels
         self.scratch_bytes = scratch_bytes
         self.rotations = np.asarray(rotations, dtype=np.float32)
         if self.rotations.shape[1:] != (3, 3) or not np.isfinite(self.rotations).all():
@@ -54,14 +50,11 @@ class FrustumCounter:
         if size is not None and (size < 2 or size % 2):
             raise ConfigError("the sphere's map needs an even number of cells along a side", value=size)
         self.device = start_warp(device)
-        for module in (counting_kernel, *([pixel_kernel] if distinct_pixels else [])):
-            wp.load_module(module, device=self.device)  # only one thread may do that
+        wp.load_module(counting_kernel, device=self.device)  # only one thread may do that
         self.lanes = GPU_LANES if wp.get_device(self.device).is_cuda else 1
-        on_host = isinstance(camera, ColmapCamera) and distinct_pixels
-        self._field = tabulate(camera) if isinstance(camera, ColmapCamera) and not on_host else None
+        self._field = tabulate(camera) if isinstance(camera, ColmapCamera) else None
         self.size = size or choose_size(n_points, len(self.rotations))
-        if not on_host:
-            self.cells = SphereCells.of(camera, rotations, self.size, self.device)
+        self.cells = SphereCells.of(camera, rotations, self.size, self.device)
         self._axes: Any = wp.array(self.rotations, dtype=wp.mat33, device=self.device)
         self._near = 0.0
         if isinstance(camera, PinholeCamera):
@@ -79,7 +72,7 @@ class FrustumCounter:
     @property
     def fixed_bytes(self) -> int:
         """Memory in bytes that `count` takes for any number of locations."""
-        return self.scratch_bytes if self.distinct_pixels or isinstance(self.camera, ColmapCamera) else 0
+        return self.scratch_bytes if isinstance(self.camera, ColmapCamera) else 0
 
     def max_locations(self, n_points: int) -> int:
         """The most locations that `count` takes at a time: entries are numbered by int32."""
@@ -94,16 +87,14 @@ class FrustumCounter:
         at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
         if len(at) > (most := self.max_locations(points.shape[0])):
             raise ConfigError("too many locations at once", value=len(at), fix=f"Give at most {most}, or use survey.")
-        if isinstance(self.camera, ColmapCamera) and self.distinct_pixels:
-            mask = np.ones((len(at), points.shape[0]), bool) if unoccluded is None else unoccluded.numpy()
-            host_counts = count_plain(self.camera, self.rotations, at, points.numpy(), mask, distinct_pixels=True)
-            return wp.array(host_counts, dtype=wp.int32, device=self.device)
         counts: Any = wp.zeros((len(at), len(self.rotations)), dtype=wp.int32, device=self.device)
         landmarks, _ = self._sorted(at, points, unoccluded)
-        if isinstance(self.camera, ColmapCamera):
+        return self._count_sorted(landmarks, counts)
+
+    def _count_sorted(self, landmarks: Any, counts: Any) -> Any:
+        """Add what is in view to counts (L, D) of zeros, by landmarks sorted into cells."""
+        if self._field is not None:
             return self._count_by_field(landmarks, counts)
-        if self.distinct_pixels:
-            return self._count_pixels(landmarks, counts)
         inputs = [self._sides, landmarks, self._rounding, wp.float64(frustum.MIN_DEPTH_M), self.lanes]
         wp.launch(counting_kernel.count_kernel, (*counts.shape, self.lanes), inputs, [counts], device=self.device)
         return counts
@@ -133,22 +124,6 @@ class FrustumCounter:
         landmarks.border_starts = self.cells.border.starts
         landmarks.border = self.cells.border.cells
         return landmarks, places
-
-    def _count_pixels(self, landmarks: Any, counts: Any) -> Any:
-        assert isinstance(self.camera, PinholeCamera)
-        camera = self.camera
-        n_views = counts.shape[0] * counts.shape[1]
-        words = (camera.width * camera.height + 31) // 32
-        block = min(n_views, max(1, self.scratch_bytes // (words * 4)))
-        bits: Any = wp.empty((block, words), dtype=wp.uint32, device=self.device)
-        pinhole = [wp.vec2d(camera.fx, camera.fy), wp.vec2d(camera.cx, camera.cy)]
-        inputs = [self._sides, self._axes, landmarks, *pinhole, camera.width, camera.height, frustum.MIN_DEPTH_M]
-        for first in range(0, n_views, block):
-            bits.zero_()
-            shape = (min(block, n_views - first), self.lanes)
-            views = [*inputs, first, self.lanes]
-            wp.launch(pixel_kernel.count_pixels_kernel, shape, views, [bits, counts], device=self.device)
-        return counts
 
     def _count_by_field(self, landmarks: Any, counts: Any) -> Any:
         assert self._field is not None
@@ -190,28 +165,3 @@ class FrustumCounter:
             seen = self.camera.sees(frustum.rotate(self.rotations[orientation], offsets[start : start + ASKED_AT_ONCE]))
             np.add.at(more, (location[seen], orientation[seen]), 1)
         wp.copy(counts, wp.array(counts.numpy() + more, dtype=wp.int32, device=self.device))
-
-
-def count_plain(
-    camera: Camera,
-    rotations: ArrayLike,
-    locations: ArrayLike,
-    points: ArrayLike,
-    unoccluded: NDArray[np.bool_],
-    distinct_pixels: bool = False,
-) -> NDArray[np.int32]:
-    """What `FrustumCounter.count` computes, (L, D), in NumPy: every landmark (N, 3) against every orientation."""
-    rotations = np.asarray(rotations)
-    points = np.asarray(points)
-    counts = np.zeros((len(unoccluded), len(rotations)), dtype=np.int32)
-    for row, location in enumerate(np.asarray(locations)):
-        offsets = frustum.offsets_from(location, points[unoccluded[row]])
-        seen = frustum.in_view(camera, rotations, offsets)
-        if not distinct_pixels:
-            counts[row] = seen.sum(-1)
-            continue
-        for orientation, rotation in enumerate(rotations.astype(np.float32)):
-            pixels = np.floor(frustum.pixels_of(camera, frustum.rotate(rotation, offsets[seen[orientation]])))
-            column, line = np.clip(pixels, 0, (camera.width - 1, camera.height - 1)).T
-            counts[row, orientation] = len(np.unique(line * camera.width + column))
-    return counts

@@ -28,10 +28,26 @@ CPU_BLOCK_BYTES = 1 << 24  # on a CPU a block of locations should fit into the c
 class Survey:
     """What L locations see in D directions."""
 
-    counts: NDArray[np.int32]  # (L, D) landmarks in view (or distinct pixels, if so asked)
+    counts: NDArray[np.int32]  # (L, D) landmarks in view, or what another counter counts
     best: NDArray[np.int32]  # (L, K) the K directions that see most: by falling count, then by rising direction
-    # which landmarks each location has a free line of sight to; None if it was not to be kept.
-    occlusion: StoredOcclusion | None
+    occlusion: StoredOcclusion | None  # landmarks with a free line of sight from each location, if kept
+
+
+@dataclass(frozen=True)
+class SurveyOptions:
+    """How a survey is computed."""
+
+    keep: int = 0  # directions returned in `Survey.best` for each location; 0 for all
+    keep_occlusion: bool = True  # return the mask of unoccluded landmarks
+    device: str = "cpu"
+    threads: int = 0  # on a CPU; 0 for all cores
+    memory_bytes: int = 2 << 30  # bound on the memory that counting takes on the device
+    progress: str | None = None  # text of the progress bar; None shows none
+    counter: type[FrustumCounter] = FrustumCounter  # what is counted
+
+    def __post_init__(self) -> None:
+        if self.keep < 0 or self.threads < 0:
+            raise ConfigError("keep and threads must not be negative", value=(self.keep, self.threads))
 
 
 def survey(
@@ -40,78 +56,83 @@ def survey(
     locations: ArrayLike,
     points: ArrayLike | DevicePoints,
     occlusion: OcclusionModel,
-    *,
-    keep: int = 0,
-    distinct_pixels: bool = False,
-    keep_occlusion: bool = True,
-    device: str = "cpu",
-    threads: int = 0,
-    memory_bytes: int = 2 << 30,
-    progress: str | None = None,
+    options: SurveyOptions = SurveyOptions(),
 ) -> Survey:
-    """Find the landmarks (N, 3) m that are unoccluded from each of locations (L, 3) m, and count those in view.
+    """Count the unoccluded landmarks (N, 3) m in view from locations (L, 3) m (paper, Sec. 3.2).
 
-    They are counted (paper, Sec. 3.2) for each of rotations (D, 3, 3) cam_from_world, or with `distinct_pixels` the
-    pixels that see one; of the directions the best `keep` are returned for each location, 0 for all. Works through the
-    locations in blocks, which take at most `memory_bytes` on the device at a time, so that memory does not grow with
-    their number (except for the result: a bit for each location and landmark, if occlusion is kept). On a CPU with as
-    many threads as said, 0 for all cores. The progress bar has a text; None shows none.
+    They are counted for each of rotations (D, 3, 3) cam_from_world, and the best directions of each location are
+    returned. Locations are processed in blocks that fit into `options.memory_bytes`; only the result grows with their
+    number, by a bit for each location and landmark if occlusion is kept.
 
-    Raises a MapError if there are no landmarks; a SceneError if there are no locations, or `OcclusionModel.check`
-    refuses one; a ConfigError if a single location takes more memory than allowed, or the counts more than there is.
+    Raises:
+        MapError: there are no landmarks.
+        SceneError: there are no locations, or `OcclusionModel.check` refuses one.
+        ConfigError: a single location takes more memory than allowed, or the counts more than there is.
     """
     at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
     if len(at) == 0:
         raise SceneError("there are no locations to look from", value=0, fix="Refine the grid or check the bounds.")
-    if keep < 0 or threads < 0:
-        raise ConfigError("keep and threads must not be negative", value=(keep, threads))
     positions = points.positions if isinstance(points, DevicePoints) else np.asarray(points, np.float64).reshape(-1, 3)
     occlusion.check(at, positions)
-    landmarks = points if isinstance(points, DevicePoints) else DevicePoints(positions, device)
+    landmarks = points if isinstance(points, DevicePoints) else DevicePoints(positions, options.device)
     n_points = len(landmarks)
     on_gpu = wp.get_device(landmarks.device).is_cuda
-    workers = 1 if on_gpu or occlusion.uses_all_cores else (threads or len(os.sched_getaffinity(0)))
-    scratch = max(1, memory_bytes // (4 * workers))
-    orientations = np.asarray(rotations)
-    counter = FrustumCounter(camera, orientations, n_points, landmarks.device, distinct_pixels, scratch_bytes=scratch)
+    workers = 1 if on_gpu or occlusion.uses_all_cores else (options.threads or len(os.sched_getaffinity(0)))
+    scratch = max(1, options.memory_bytes // (4 * workers))
+    counter = options.counter(camera, np.asarray(rotations), n_points, landmarks.device, scratch_bytes=scratch)
     n_directions = len(counter.rotations)
-    keep = min(keep or n_directions, n_directions)
-    if len(at) * n_directions > (most := fitting(4 + 4 + BYTES_TO_RANK)):
-        problem = f"{n_directions:,} directions at {len(at):,} locations are more than there is memory for"
-        fix = f"{most // len(at):,} directions would fit, or fewer locations."
-        raise ConfigError(problem, value=len(at) * n_directions, fix=fix)
-    per_location = counter.bytes_per_location(n_points) + n_points  # and its mask
-    least = per_location + counter.fixed_bytes
-    if least > memory_bytes:
-        problem = f"one location with {n_points:,} landmarks takes {least:,} bytes"
-        raise ConfigError(problem, value=memory_bytes, fix=f"Allow at least {least} bytes.")
-    workers = min(workers, memory_bytes // least)
-    share = memory_bytes // workers - counter.fixed_bytes
-    if not on_gpu and not occlusion.uses_all_cores:
-        share = min(share, CPU_BLOCK_BYTES)
-    block = min(max(1, share // per_location), counter.max_locations(n_points), -(-len(at) // workers))
-    if occlusion.uses_all_cores:
-        block = min(block, 16 * len(os.sched_getaffinity(0)))  # enough for all cores, and the progress bar moves
+    _check_counts(len(at), n_directions)
+    workers, block = _workers_and_block(counter, len(at), n_points, workers, options.memory_bytes, occlusion)
 
+    keep = min(options.keep or n_directions, n_directions)
     counts = np.empty((len(at), n_directions), dtype=np.int32)
     best = np.empty((len(at), keep), dtype=np.int32)
     all_free = np.packbits(np.ones(n_points, dtype=bool))
-    packed = np.empty((len(at) if keep_occlusion else 0, len(all_free)), dtype=np.uint8)
+    packed = np.empty((len(at) if options.keep_occlusion else 0, len(all_free)), dtype=np.uint8)
 
     def work(rows: slice) -> int:
         mask = occlusion.unoccluded_on_device(at[rows], landmarks)
         counted = counter.count(at[rows], landmarks.double, mask)
         best[rows] = _best(counted, keep, on_gpu)
         counts[rows] = counted.numpy()
-        if keep_occlusion:
+        if options.keep_occlusion:
             packed[rows] = all_free if mask is None else _pack(mask, landmarks)
         return rows.stop - rows.start
 
     blocks = [slice(start, min(start + block, len(at))) for start in range(0, len(at), block)]
-    with tqdm(total=len(at), desc=progress, unit="location", disable=progress is None) as bar:
+    with tqdm(total=len(at), desc=options.progress, unit="location", disable=options.progress is None) as bar:
         for done in _each(work, blocks, workers):
             bar.update(done)
-    return Survey(counts, best, StoredOcclusion(at, packed, n_points, occlusion.name) if keep_occlusion else None)
+    stored = StoredOcclusion(at, packed, n_points, occlusion.name) if options.keep_occlusion else None
+    return Survey(counts, best, stored)
+
+
+def _check_counts(n_locations: int, n_directions: int) -> None:
+    """Raise ConfigError if the counts of all views do not fit into memory."""
+    most = fitting(4 + 4 + BYTES_TO_RANK)
+    if n_locations * n_directions > most:
+        problem = f"{n_directions:,} directions at {n_locations:,} locations are more than there is memory for"
+        fix = f"{most // n_locations:,} directions would fit, or fewer locations."
+        raise ConfigError(problem, value=n_locations * n_directions, fix=fix)
+
+
+def _workers_and_block(
+    counter: FrustumCounter, n_locations: int, n_points: int, workers: int, memory_bytes: int, occlusion: OcclusionModel
+) -> tuple[int, int]:
+    """Number of threads, at most `workers`, and of locations in a block, so that the memory suffices."""
+    per_location = counter.bytes_per_location(n_points) + n_points  # and its mask
+    required = per_location + counter.fixed_bytes
+    if required > memory_bytes:
+        problem = f"one location with {n_points:,} landmarks takes {required:,} bytes"
+        raise ConfigError(problem, value=memory_bytes, fix=f"Allow at least {required} bytes.")
+    workers = min(workers, memory_bytes // required)
+    share = memory_bytes // workers - counter.fixed_bytes
+    if counter.device == "cpu" and not occlusion.uses_all_cores:
+        share = min(share, CPU_BLOCK_BYTES)
+    block = min(max(1, share // per_location), counter.max_locations(n_points), -(-n_locations // workers))
+    if occlusion.uses_all_cores:
+        block = min(block, 16 * len(os.sched_getaffinity(0)))  # enough for all cores, and the progress bar moves
+    return workers, block
 
 
 def _each(work: Callable[[slice], int], blocks: list[slice], workers: int) -> Iterator[int]:

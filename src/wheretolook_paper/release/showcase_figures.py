@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +20,7 @@ from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.binned_network import BinnedNetworkScorer
 from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility.frustum import pixels_of
-from wheretolook.visibility.survey import Survey, survey
+from wheretolook.visibility.survey import Survey, SurveyOptions, survey
 from wheretolook_paper.figures.inputs import BinnedImage
 from wheretolook_paper.figures.peaks import spread_extrema
 from wheretolook_paper.figures.pipeline import Pipeline
@@ -181,5 +181,5 @@ def planned_views(
 def _survey(showcase: Showcase, locations: Float) -> Survey:
     rotations = rotation_looking_along(showcase.directions)
     points = showcase.landmarks.points
-    options: dict[str, Any] = {"keep": showcase.keep, "keep_occlusion": False, "device": showcase.device}
-    return survey(showcase.camera, rotations, locations, points, showcase.occlusion, **options)
+    options = SurveyOptions(keep=showcase.keep, keep_occlusion=False, device=showcase.device)
+    return survey(showcase.camera, rotations, locations, points, showcase.occlusion, options)

@@ -1,0 +1,1 @@
+"""Visibility as the paper's released code counts it."""

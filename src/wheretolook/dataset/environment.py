@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.dataset.layout import SceneFolder
 from wheretolook.geometry.camera import Camera, cameras_by_id, only_camera
 from wheretolook.geometry.lattices import ViewLattice, VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers
@@ -23,7 +22,8 @@ from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.visibility.config import OCCLUSION_MODELS, OcclusionConfig, check_occlusion_names
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # pandas and Warp are imported when first needed
+    from wheretolook.dataset.layout import SceneFolder
     from wheretolook.geometry.mesh import TexturedMesh
     from wheretolook.geometry.tsdf import DepthImage, TsdfVolume
     from wheretolook.inputs.localization_map import LocalizationMap

@@ -64,7 +64,6 @@ def export_robot(
     out = Path(out)
     weights = Path(weights)
     trained = TrainedNetwork.load(weights, SetNetwork, "set")
-    training_range = trained.training_range or TrainingRange.of_camera(trained.camera)
     landmarks = localization_map.landmarks
     places = np.empty((0, 3)) if places is None else np.asarray(places, dtype=np.float64).reshape(-1, 3)
     content = set_graph(trained).SerializeToString()
@@ -75,11 +74,20 @@ def export_robot(
         "places": places,
         "unoccluded": _unoccluded(localization_map, places, progress),
     }
-    about = {
+    about = {"n_landmarks": len(landmarks), "weights_sha256": sha256(weights), **_description(trained, camera)}
+    write_bytes(out / "scorer.onnx", content)
+    save_npz(out / "landmarks.npz", arrays)
+    copy_file(Path(__file__).with_name("wheretolook_robot.py"), out / "wheretolook_robot.py")
+    write_json(out / "robot.json", about)
+    return out
+
+
+def _description(trained: TrainedNetwork[SetNetwork], camera: PinholeCamera) -> dict[str, Any]:
+    """Describe camera, inputs and training range of a network for robot.json."""
+    training_range = trained.training_range or TrainingRange.of_camera(trained.camera)
+    return {
         "format_version": FORMAT_VERSION,
         "wheretolook": VERSION,
-        "weights_sha256": sha256(weights),
-        "n_landmarks": len(landmarks),
         "camera": {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
         "attributes": list(trained.network.attributes),
         "map_attributes": list(MAP_ATTRIBUTES),
@@ -87,11 +95,6 @@ def export_robot(
         "range": training_range.record(),
         "serves_camera": bool(training_range.contains(camera_quantities(camera)[None])[0]),
     }
-    write_bytes(out / "scorer.onnx", content)
-    save_npz(out / "landmarks.npz", arrays)
-    copy_file(Path(__file__).with_name("wheretolook_robot.py"), out / "wheretolook_robot.py")
-    write_json(out / "robot.json", about)
-    return out
 
 
 def pinhole_of(camera: Camera) -> PinholeCamera:

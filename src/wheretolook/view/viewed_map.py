@@ -9,13 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from wheretolook.dataset.environment import (
+    ColmapEnvironment,
+    ColmapFiles,
+    Environment,
+    EnvironmentConfig,
+    SceneEnvironment,
+)
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError
 from wheretolook.view import drawing
 from wheretolook.view.weights import AvailableWeights, given_weights, map_weights, scene_weights
-from wheretolook.visibility.config import OcclusionConfig
 
 if TYPE_CHECKING:  # torch and Warp are imported when first needed: the page opens before them
     import pandas as pd
@@ -24,12 +30,9 @@ if TYPE_CHECKING:  # torch and Warp are imported when first needed: the page ope
     from wheretolook.geometry.mesh import TexturedMesh
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.mapping.landmarks import Landmarks
-    from wheretolook.rendering.warp_renderer import WarpRenderer
     from wheretolook.select.where_to_look import WhereToLook
-    from wheretolook.space.free_space import FreeSpace
     from wheretolook.view.photographs import Photographs
     from wheretolook.view.scores import VisibleLandmarks
-    from wheretolook.visibility.occlusion import OcclusionModel
 
 MAX_SCORERS = 8  # kept in memory; those of large maps take 100 MB each
 DIRECTIONS = 500  # scored at a location, as by `wheretolook select`
@@ -38,25 +41,55 @@ OCCLUSION_BYTES = 1 << 26  # memory for cached lines of sight
 
 @dataclass(eq=False)
 class ViewedMap:
-    """A map with everything that the viewer shows of it; world in metres, z up. Methods are not thread-safe."""
+    """An environment with everything else that the viewer shows. Methods are not thread-safe."""
 
     name: str
-    landmarks: Landmarks
-    camera: Camera
-    mapping_poses: Float | None  # cam_from_world (M, 3, 4)
+    environment: Environment
     weights: AvailableWeights
-    mesh: TexturedMesh | None = None
-    camera_space: Any = None  # where a camera can be, if not defined by mesh or map
     labels: pd.DataFrame | None = None  # labelled viewpoints
     photographs: Photographs | None = None
-    device: str = "cpu"
     _maps: dict[str, LocalizationMap] = field(default_factory=dict, init=False)
     _selectors: dict[tuple[str, str, int], WhereToLook] = field(default_factory=dict, init=False)
 
     @property
+    def landmarks(self) -> Landmarks:
+        """The map's landmarks."""
+        return self.environment.landmarks
+
+    @property
+    def camera(self) -> Camera:
+        """The camera whose views are shown."""
+        return self.environment.camera
+
+    @property
+    def mesh(self) -> TexturedMesh | None:
+        """The mesh; None without one."""
+        return self.environment.mesh if self.environment.has_mesh else None
+
+    @property
+    def mapping_poses(self) -> Float | None:
+        """Poses cam_from_world (M, 3, 4) of the mapping cameras; None if unknown."""
+        return self.environment.mapping_poses
+
+    @property
+    def mapping_centers(self) -> Float:
+        """Centres of the mapping cameras (M, 3), metres; empty if unknown."""
+        return camera_centers(np.empty((0, 3, 4)) if self.mapping_poses is None else self.mapping_poses)
+
+    @cached_property
+    def space(self) -> Any:
+        """Where a camera can be: `bounds` (2, 3) m and `is_free`."""
+        return self.environment.space if self.environment.has_mesh else self.environment.mapped_space
+
+    @property
     def occlusions(self) -> tuple[str, ...]:
         """Names of available occlusion models, the most accurate first."""
-        return (*(("mesh",) if self.mesh is not None else ()), "hidden-points", "none")
+        return tuple(name for name in self.environment.available_occlusion if name != "tsdf")  # slow to make
+
+    @cached_property
+    def methods(self) -> tuple[str, ...]:
+        """Names of the methods that can score here, that of the best weights first."""
+        return self.weights.methods
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
@@ -66,45 +99,9 @@ class ViewedMap:
         warnings: tuple[str, ...] = ()
         if self.mapping_poses is not None and len(self.mapping_poses) > 0:
             warnings = frame_doubts(self.landmarks.mapping_distance_m, self.mapping_poses)
-        doubt = "" if self.mesh is None else mesh_doubt(self.landmarks.points, self._mesh_space.raycaster)
-        return (*warnings, f"The mesh: {doubt}") if doubt else warnings
-
-    @cached_property
-    def methods(self) -> tuple[str, ...]:
-        """Names of the methods that can score here, that of the best weights first."""
-        return self.weights.methods
-
-    @property
-    def mapping_centers(self) -> Float:
-        """Centres of the mapping cameras (M, 3), metres; empty if unknown."""
-        return camera_centers(np.empty((0, 3, 4)) if self.mapping_poses is None else self.mapping_poses)
-
-    @cached_property
-    def _mesh_space(self) -> FreeSpace:
-        from wheretolook.space.free_space import FreeSpace
-
-        assert self.mesh is not None
-        return FreeSpace(self.mesh, device=self.device)
-
-    @cached_property
-    def space(self) -> Any:
-        """Where a camera can be: `bounds` (2, 3) m and `is_free`."""
-        if self.camera_space is not None:
-            return self.camera_space
-        if self.mesh is not None:
-            return self._mesh_space
-        from wheretolook.space.mapped_space import MappedSpace
-
-        return MappedSpace(self.landmarks.points, self.mapping_centers)
-
-    @cached_property
-    def renderer(self) -> WarpRenderer | None:
-        """Renders the mesh; None without one."""
-        if self.mesh is None:
-            return None
-        from wheretolook.rendering.warp_renderer import WarpRenderer
-
-        return WarpRenderer(self.mesh, self.device)
+        if self.mesh is not None and (doubt := mesh_doubt(self.landmarks.points, self.environment.raycaster)):
+            warnings = (*warnings, f"The mesh: {doubt}")
+        return warnings
 
     def picture(self, pose: Float, visible: VisibleLandmarks) -> tuple[drawing.Rgb, str]:
         """Return an image (H, W, 3) of a view (3, 4) and its caption.
@@ -113,8 +110,8 @@ class ViewedMap:
         drawn in the colours of their probabilities, except on photographs, which show another view.
         """
         marks = (self.camera, visible.pixels, visible.probabilities)
-        if self.renderer is not None:
-            rgb = self.renderer.render(drawing.small_camera(self.camera), pose[None]).rgb[0]
+        if self.environment.has_mesh:
+            rgb = self.environment.renderer.render(drawing.small_camera(self.camera), pose[None]).rgb[0]
             return drawing.picture(rgb, *marks), "rendered; landmarks by detection probability"
         if self.photographs is not None:
             number = self.photographs.nearest(pose)
@@ -125,13 +122,19 @@ class ViewedMap:
     def localization_map(self, occlusion: str) -> LocalizationMap:
         """Return the map with an occlusion model. Raises ConfigError if the model is not available."""
         from wheretolook.inputs.localization_map import LocalizationMap
+        from wheretolook.visibility.cached_occlusion import CachedOcclusion
 
         if occlusion not in self.occlusions:
             fix = f"Use {', '.join(self.occlusions)}."
             raise ConfigError("this occlusion model is not available here", value=occlusion, fix=fix)
         if occlusion not in self._maps:
-            model = self._occlusion_model(occlusion)
-            self._maps[occlusion] = LocalizationMap(self.landmarks, self.camera, model, self.device, self.mapping_poses)
+            environment = self.environment
+            model = environment.occlusion_model(occlusion)
+            if occlusion != "none":
+                model = CachedOcclusion(model, OCCLUSION_BYTES)
+            self._maps[occlusion] = LocalizationMap(
+                self.landmarks, self.camera, model, environment.device, self.mapping_poses
+            )
         return self._maps[occlusion]
 
     def selector(self, method: str = "", occlusion: str = "", directions: int = DIRECTIONS) -> WhereToLook:
@@ -154,21 +157,6 @@ class ViewedMap:
         self._selectors[key] = selector
         return selector
 
-    def _occlusion_model(self, name: str) -> OcclusionModel:
-        from wheretolook.visibility.cached_occlusion import CachedOcclusion
-        from wheretolook.visibility.hidden_points import HiddenPointRemoval
-        from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion
-
-        config = OcclusionConfig()
-        if name == "none":
-            return NoOcclusion()
-        if name == "mesh":
-            space = self._mesh_space
-            model: OcclusionModel = MeshOcclusion(space.raycaster, config.margin_m, space.two_sided)
-        else:
-            model = HiddenPointRemoval(config.radius, config.margin_m)
-        return CachedOcclusion(model, OCCLUSION_BYTES)
-
 
 def open_map(
     path: Path,
@@ -189,32 +177,25 @@ def open_map(
         ConfigError: there is no such camera.
         WeightsError: the weights cannot be used.
     """
-    from wheretolook.mapping.opened_map import open_colmap
     from wheretolook.mapping.sanity import warn_of_mesh
     from wheretolook.mapping.sources import photographs_of
-    from wheretolook.scenes.loading import load_mesh
     from wheretolook.view.photographs import Photographs
 
-    landmarks, camera, poses = open_colmap(path, camera)
+    environment = ColmapEnvironment(ColmapFiles(path, mesh), camera, device=device)
+    landmarks = environment.landmarks
     if len(landmarks) == 0:
         raise MapError("the map has no landmarks", path=path, fix="Map it again.")
-    folder = images or photographs_of(path)
-    place = path.resolve()
-    viewed = ViewedMap(
-        place.parent.name if place.name in ("0", "sparse", "map") else place.name,
-        landmarks,
-        camera,
-        poses,
-        map_weights(path, data, landmarks.points, landmarks.features)
-        if weights is None
-        else given_weights(weights, landmarks.features),
-        None if mesh is None else load_mesh(mesh, colored=False),
-        photographs=None if folder is None else Photographs.of_model(path, folder),
-        device=device,
-    )
+    if weights is None:
+        available = map_weights(path, data, landmarks.points, landmarks.features)
+    else:
+        available = given_weights(weights, landmarks.features)
     if mesh is not None:
-        warn_of_mesh(mesh, landmarks.points, viewed.space.raycaster)
-    return viewed
+        warn_of_mesh(mesh, landmarks.points, environment.raycaster)
+    folder = images or photographs_of(path)
+    photographs = None if folder is None else Photographs.of_model(path, folder)
+    model = path.resolve()
+    name = model.parent.name if model.name in ("0", "sparse", "map") else model.name
+    return ViewedMap(name, environment, available, photographs=photographs)
 
 
 def open_scene(
@@ -225,8 +206,6 @@ def open_scene(
     By default views are scored by the scene's own weights (`scene_weights`), or by bundled ones. Raises MapError or
     TableError if the scene has not been mapped, WeightsError if the weights cannot be used.
     """
-    from wheretolook.dataset.environment import EnvironmentConfig, SceneEnvironment
-    from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED
     from wheretolook.mapping.colmap_model import holds_model
     from wheretolook.mapping.sources import photographs_of
     from wheretolook.view.photographs import Photographs
@@ -234,33 +213,33 @@ def open_scene(
     if not files.landmarks.is_file():
         raise MapError("this scene has no map yet", path=files.map, fix="Run `wheretolook map` for its dataset.")
     number, own_camera = next(iter(files.cameras().items()))
-    scene = SceneEnvironment(files, camera or own_camera, EnvironmentConfig(assume_metric=True), device)
-    mesh = scene.mesh if files.mesh.is_file() else None
-    if mesh is None and scene.mapping_poses is None:
+    environment = SceneEnvironment(files, camera or own_camera, EnvironmentConfig(assume_metric=True), device)
+    if not environment.has_mesh and environment.mapping_poses is None:
         raise SceneError("neither a mesh nor the map's cameras are known", path=files.folder, fix="Map it again.")
-    labels = None
-    if files.table.is_file() and camera is None:
-        table = files.read_table()
-        if CAMERA_ID in table:
-            table = table[table[CAMERA_ID] == number]
-        table = table[table["status"] != UNLABELLED].reset_index(drop=True)
-        labels = None if table.empty else table
+    landmarks = environment.landmarks
+    if weights is None:
+        available = scene_weights(files, landmarks.points, landmarks.features)
+    else:
+        available = given_weights(weights, landmarks.features)
     folder = photographs_of(files.map)
-    landmarks = scene.landmarks
-    return ViewedMap(
-        files.name,
-        landmarks,
-        scene.camera,
-        scene.mapping_poses,
-        scene_weights(files, landmarks.points, landmarks.features)
-        if weights is None
-        else given_weights(weights, landmarks.features),
-        mesh,
-        scene.scanned_space if mesh is not None and files.is_scanned else None,
-        labels,
-        Photographs.of_model(files.map, folder) if folder is not None and holds_model(files.map) else None,
-        scene.device,
-    )
+    photographs = None
+    if folder is not None and holds_model(files.map):
+        photographs = Photographs.of_model(files.map, folder)
+    labels = _labels(files, number) if camera is None else None
+    return ViewedMap(files.name, environment, available, labels, photographs)
+
+
+def _labels(files: SceneFolder, camera: int) -> pd.DataFrame | None:
+    """Read the labelled viewpoints of a camera; None without any."""
+    from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED
+
+    if not files.table.is_file():
+        return None
+    table = files.read_table()
+    if CAMERA_ID in table:
+        table = table[table[CAMERA_ID] == camera]
+    table = table[table["status"] != UNLABELLED].reset_index(drop=True)
+    return None if table.empty else table
 
 
 def open_named_scene(

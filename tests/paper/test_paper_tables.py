@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from synthetic_scores import EVERY_METHOD, KEYS, make_scores, older
+from synthetic_scores import KEYS, make_scores
 from wheretolook_paper.evaluation.paper_tables import PAPER, paper_tables, write_paper_tables
 
 PRINTED = {
@@ -63,38 +63,6 @@ def test_ours_stand_beside_them(scores: pd.DataFrame) -> None:
                 assert line[f"released_{key}"] == pytest.approx(100 * row[f"raw_{key}"] / 0.527)
 
 
-def test_what_is_missing_stays_blank(scores: pd.DataFrame) -> None:
-    few = older(make_scores((*EVERY_METHOD[:4], "mlp-2d+z"), reference=""))
-    table = paper_tables(few)["vs_others"].set_index("paper_row")
-    assert table.loc["proposed", "method"] == "MLP, 2d + z (in place of 2d+3d)"
-    assert table.loc[["random", "proposed"], f"score_{KEYS[0]}"].notna().all()
-    assert table.loc["FIF det app", [f"score_{key}" for key in KEYS]].isna().all()
-    assert table[f"released_{KEYS[0]}"].isna().all()
-    variants = paper_tables(few)["input_variants"].set_index("paper_row")
-    assert [*variants[f"score_{KEYS[0]}"].notna()] == [False, True, False]
-    assert [*variants[f"paper_{KEYS[0]}"].notna()] == [True] * 3
-    rules = paper_tables(make_scores(EVERY_METHOD[:4], reference="", top_n=(5,)))["vs_others"]
-    assert rules[f"score_{KEYS[0]}"].isna().all()  # the paper's tables are of the best view
-
-
-def test_files_say_where_the_numbers_are_from(scores: pd.DataFrame, tmp_path: Path) -> None:
-    paths = write_paper_tables(scores, tmp_path / "new")
-    names = [f"table_{name}.{ending}" for name in PAPER for ending in ("csv", "tex", "md")]
-    assert [path.name for path in paths] == names
-    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == sorted(names)
-    for path in paths:
-        text = path.read_text()
-        for said in ("other scenes", "12 Habitat-Matterport meshes", "one constant, 0.527, at all thresholds"):
-            assert said in text
-        assert "nan" not in text
-    read = pd.read_csv(paths[0])
-    expected = paper_tables(scores)["vs_others"]
-    pd.testing.assert_frame_equal(read, expected, atol=0.0051, rtol=0)
-    before = [path.read_bytes() for path in paths]
-    write_paper_tables(scores, tmp_path / "new")
-    assert [path.read_bytes() for path in paths] == before
-
-
 @pytest.mark.parametrize("name", PAPER)
 def test_latex_is_well_formed(scores: pd.DataFrame, tmp_path: Path, name: str) -> None:
     write_paper_tables(scores, tmp_path)
@@ -123,13 +91,3 @@ def test_latex_is_well_formed(scores: pd.DataFrame, tmp_path: Path, name: str) -
     line = next(row for row in rows if row.startswith("MLP, 2d + 3d"))
     assert line.split(" & ")[3] == "72.9"
     assert re.fullmatch(r"\$\d+\.\d_\{\d+\.\d\}\^\{\d+\.\d\}\$", line.split(" & ")[1])
-
-
-def test_markdown_tables_are_narrow(scores: pd.DataFrame, tmp_path: Path) -> None:
-    write_paper_tables(scores, tmp_path)
-    lines = [line for line in (tmp_path / "table_vs_others.md").read_text().splitlines() if line.startswith("|")]
-    assert len(lines) == 2 * (14 + 2)
-    assert {line.count("|") - 1 for line in lines} == {8}
-    cells = [cell.strip() for cell in next(line for line in lines if "FIF trace exact" in line)[1:-1].split("|")]
-    assert cells[1] == "Fisher, trace, exact"
-    assert [cells[4], cells[7]] == ["–", "–"]

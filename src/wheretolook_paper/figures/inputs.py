@@ -1,4 +1,4 @@
-"""How an image becomes the network's input: landmarks in view, bins, channels."""
+"""Figure of the network's input: visible landmarks, bins, channels."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _EMPTY = "#e8e8e8"
 
 @dataclass(frozen=True, eq=False)
 class BinnedImage:
-    """One view and the input that a network gets for it. Rows of bins go down the image, columns right.
+    """One view and its binned network input. Rows of bins go down the image, columns right.
 
     `means` (bins, bins) are those of each channel over a bin's landmarks, by the channel's name; NaN in empty bins.
     """
@@ -35,7 +35,7 @@ class BinnedImage:
 
 
 def inputs_figure(image: BinnedImage, variants: Mapping[str, tuple[str, ...]] = PAPER_VARIANTS) -> Figure:
-    """The image with its landmarks, their number in each bin, and the channels of each input variant.
+    """Draw the image with its landmarks, their number in each bin, and the channels of each input variant.
 
     Right, a row for each of `variants` (names of channels, all of which `image` must have); empty bins are grey.
     """
@@ -67,7 +67,7 @@ def inputs_figure(image: BinnedImage, variants: Mapping[str, tuple[str, ...]] = 
 
 
 def draw_landmarks(axes: Axes, image: BinnedImage) -> None:
-    """The image with its landmarks."""
+    """Draw the image with its landmarks."""
     height, width = image.rgb.shape[:2]
     axes.imshow(image.rgb, extent=(0, width, height, 0))
     axes.scatter(image.pixels[:, 0], image.pixels[:, 1], s=1.5, color=ORANGE, linewidths=0, rasterized=True)
@@ -76,12 +76,12 @@ def draw_landmarks(axes: Axes, image: BinnedImage) -> None:
 
 
 def n_landmarks(image: BinnedImage) -> str:
-    """How many landmarks are in view, in words."""
+    """Format the number of visible landmarks."""
     return f"{len(image.pixels):,} landmark{'s' * (len(image.pixels) != 1)}"
 
 
 def draw_counts(axes: Axes, image: BinnedImage) -> None:
-    """Number of landmarks in each bin, in logarithmic colours, over the pale image."""
+    """Draw the number of landmarks in each bin, in logarithmic colours, over the pale image."""
     height, width = image.rgb.shape[:2]
     axes.imshow(255 - (255 - image.rgb) // 3, extent=(0, width, height, 0))
     counts = np.ma.masked_equal(image.counts, 0)
@@ -94,7 +94,7 @@ def draw_counts(axes: Axes, image: BinnedImage) -> None:
 
 
 def draw_channel(axes: Axes, image: BinnedImage, name: str) -> None:
-    """One channel, dark at its least and light at its greatest value; the range stands below."""
+    """Draw one channel from dark (minimum) to light (maximum), with its range below."""
     values = np.ma.masked_invalid(np.asarray(image.means[name], dtype=np.float64))
     axes.set_facecolor(_EMPTY)
     low, high = (float(values.min()), float(values.max())) if values.count() else (0.0, 0.0)

@@ -1,4 +1,4 @@
-"""The lattices of directions, side by side."""
+"""Figure of the lattices of directions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from wheretolook.geometry.poses import Float
 
 
 def covering_radius_deg(directions: Float) -> float:
-    """Largest angle from any direction of the sphere to the nearest of (n, 3) unit vectors, in degrees.
+    """Return the largest angle in degrees from any direction to the nearest of (n, 3) unit vectors.
 
     Exact: the farthest direction is the normal of a face of the convex hull. The vectors must not all lie in one
     half-space.
@@ -23,13 +23,13 @@ def covering_radius_deg(directions: Float) -> float:
 
 
 def nearest_angles_deg(directions: Float) -> Float:
-    """Angle from each of (n, 3) unit vectors to the nearest other one, (n,) degrees."""
+    """Return the angle (n,) in degrees from each of (n, 3) unit vectors to its nearest neighbour."""
     chord = cKDTree(directions).query(directions, k=2)[0][:, 1]
     return np.degrees(2 * np.arcsin(np.clip(chord / 2, 0, 1)))
 
 
 def fibonacci_figure(n: int = 500) -> Figure:
-    """The spherical Fibonacci lattice, the azimuth-elevation lattice and that of the paper's released code.
+    """Draw the spherical Fibonacci lattice, the azimuth-elevation lattice and that of the paper's released code.
 
     Each has about `n` directions and is drawn as a sphere seen from 25 degrees above the equator, directions on the far
     side pale.
@@ -53,7 +53,7 @@ def fibonacci_figure(n: int = 500) -> Figure:
 
 
 def _draw_sphere(axes: Axes, directions: Float, color: str) -> None:
-    """Orthographic view of directions on a sphere."""
+    """Draw directions on a sphere, in orthographic projection."""
     tilt = np.radians(25)
     # rows: right, up and towards a viewer 25 degrees above the equator in the direction of -y
     view = np.array([[1, 0, 0], [0, np.sin(tilt), np.cos(tilt)], [0, -np.cos(tilt), np.sin(tilt)]])

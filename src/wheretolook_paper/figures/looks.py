@@ -1,4 +1,4 @@
-"""How many places several looks localize together, by how they were chosen."""
+"""Figure of the locations that sets of views localize jointly, by selection strategy."""
 
 from __future__ import annotations
 
@@ -20,18 +20,17 @@ _STYLES: dict[str, tuple[str, str, str]] = {
     "even": ("evenly spread", SKY, "v"),
     "random": ("drawn at random", GREY, "x"),
 }
-"""Label, colour and mark of those ways to choose that are drawn."""
+"""Label, colour and marker of the drawn strategies."""
 
 _TITLES = {"val": "validation scenes", "test": "test scenes, some by others"}
 
 
 def looks_figure(table: pd.DataFrame) -> Figure:
-    """Places whose looks localize together, in %, over the number of looks; a panel for each split.
+    """Draw the share of locations localized jointly over the number of views, a panel for each split.
 
-    `table` has the columns of `evaluation.looks.look_table`, of which `strategy`, `n_looks`, `n_locations`, `good` and
-    `any_good` are drawn; `split` if there are several, and the interval of what was chosen together if it is told. The
-    dashed line is the share of places at which one of the most looks chosen together localizes alone: a robot that
-    knew which would get so far.
+    `table` has the columns of `look_table`, of which `strategy`, `n_looks`, `n_locations`, `good` and `any_good` are
+    drawn, `split` if there are several, and the interval of the product's strategy if present. The dashed line is the
+    share of locations at which any view of the largest sets localizes alone, an upper bound for choosing one of them.
     """
     splits = [(_TITLES.get(str(name), str(name)), rows) for name, rows in table.groupby("split", sort=False)] \
         if "split" in table else [("", table)]  # fmt: skip

@@ -1,4 +1,4 @@
-"""The paper's figure of the network, with real values: a view, its bins, the hidden layers, the score."""
+"""The paper's figure of the network with real values: a view, its bins, the hidden layers, the score."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _WIDE = 10  # letters below the score
 
 
 def learning_figure(image: BinnedImage, activations: Sequence[Float], channels: Sequence[str], outcome: str) -> Figure:
-    """The image with its landmarks, landmarks by bin, standardized channels, hidden layers (dark: 0), and the score.
+    """Draw the image with landmarks, landmarks by bin, standardized channels, hidden layers (dark: 0) and the score.
 
     `activations` are those of `wheretolook_paper.release.mlp_architecture.activations`; `outcome` is put below the score.
     """
@@ -62,7 +62,7 @@ def learning_figure(image: BinnedImage, activations: Sequence[Float], channels: 
 
 
 def _connect(figure: Figure, before: list[Axes], inputs: list[Axes], after: list[Axes]) -> None:
-    """Arrows from each panel to the next; the channels, one below the other, count as one panel."""
+    """Draw arrows from each panel to the next; the column of channels counts as one panel."""
     middle = inputs[len(inputs) // 2]
     at = 0.5 if len(inputs) % 2 else 1.0  # with an even number, the middle is between two panels
     arrow: Style = {

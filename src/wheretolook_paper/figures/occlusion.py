@@ -1,4 +1,4 @@
-"""How well each method does with each occlusion model."""
+"""Figure of each method's scores by occlusion model."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MARKERS = ("o", "s", "^", "D")
 
 
 def occlusion_figure(scores: pd.DataFrame) -> Figure:
-    """Average precision and share of good best views of each method, by occlusion model.
+    """Draw the average precision and the share of good best views of each method by occlusion model.
 
     The share is that at the finest threshold, in % of the oracle's, with bootstrap intervals. A row for each method, a
     mark for each occlusion model; the random choice and the oracle are lines. Shown are the methods that
@@ -65,17 +65,17 @@ def occlusion_figure(scores: pd.DataFrame) -> Figure:
 
 
 def _depends(rows: pd.DataFrame) -> bool:
-    """Whether a method's scores are others with another occlusion model: those of some know no landmarks in view."""
+    """Return whether a method's scores depend on the occlusion model."""
     return rows["average_precision"].nunique(dropna=False) > 1
 
 
 def _begin(axes: Axes, step: float) -> float:
-    """Where an axis begins: at the whole step below all that is drawn, and not below 0."""
+    """Return the start of an axis: the multiple of `step` below the data, at least 0."""
     return max(0.0, float(step * np.floor(axes.dataLim.x0 / step)))
 
 
 def _mark(number: int, color: str) -> dict[str, Any]:
-    """Look of the mark of an occlusion model, by its number; the first is filled."""
+    """Return the marker style of an occlusion model by its number; the first is filled."""
     fill = color if number == 0 else "white"
     return {"marker": _MARKERS[number % len(_MARKERS)], "color": color, "markersize": 6, "markerfacecolor": fill}
 
@@ -83,7 +83,7 @@ def _mark(number: int, color: str) -> dict[str, Any]:
 def _draw(
     axes: Axes, pooled: pd.DataFrame, models: list[str], y: dict[str, float], column: str, scale: float, *ends: str
 ) -> None:
-    """A method's marks, joined by a line, or with whiskers, one below the other, if `ends` names their columns."""
+    """Draw a method's markers, joined by a line, or with whiskers if `ends` names their columns."""
     for method, place in y.items():
         style = method_style(method)
         rows = pooled[pooled["method"] == method]

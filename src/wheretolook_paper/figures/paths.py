@@ -1,4 +1,4 @@
-"""The figure of planned paths: how much of each localizes."""
+"""Figure of the share of views along planned paths that localize."""
 
 from __future__ import annotations
 
@@ -14,19 +14,18 @@ from wheretolook.figures.style import INK, RC, Style, new_figure, scene_label
 from wheretolook.scorers.styles import method_style
 
 FILLED = {"greedy": "full", "with stops": "left"}
-"""How markers are filled, by what follows a method's name."""
+"""Fill of markers by the suffix of a method's name."""
 
 TITLES = {"planned": "each method plans places and views", "given": "each method turns the camera along given paths"}
 NAMES = {"forward": "looking ahead", "greedy": "by ActLoc's greedy rule"}
-"""What is called otherwise here than in tables: methods, and what follows their names."""
+"""Labels that differ from tables: of methods and of suffixes."""
 
 
 def paths_figure(summary: pd.DataFrame) -> Figure:
-    """Share of the views along paths that localize, from `wheretolook_paper.paths.path_report.summarize_paths`.
+    """Draw the share of views along paths that localize, from the table of `summarize_paths`.
 
-    A panel for each task, in it a row for each scene, all of them together on top, and in each a mark for each method,
-    with 95 % intervals; open where views were chosen by ActLoc's rule, half filled where several views were localized
-    together.
+    A panel for each task has a row for each scene, all scenes first, and a marker for each method with its 95 %
+    interval: open for views chosen by ActLoc's rule, half filled for jointly localized views.
     """
     with context(RC):
         tasks = list(dict.fromkeys(summary["task"]))

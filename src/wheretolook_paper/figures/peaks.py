@@ -1,4 +1,4 @@
-"""What a network looks for: its score over the sphere of directions, and the views of its highest and lowest scores."""
+"""Figure of a scorer over the sphere of directions, and the views with its highest and lowest scores."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _WIDE = 27  # letters below a view
 def spread_extrema(
     directions: ArrayLike, scores: ArrayLike, n: int, apart_deg: float = 40.0, highest: bool = True
 ) -> NDArray[np.int64]:
-    """Rows of at most n unit directions (D, 3) with the highest (or lowest) scores, at least `apart_deg` apart."""
+    """Return rows of up to n unit directions (D, 3) with the highest (or lowest) scores, at least `apart_deg` apart."""
     axes = np.asarray(directions, dtype=np.float64)
     values = np.asarray(scores, dtype=np.float64)
     found: list[int] = []
@@ -42,7 +42,7 @@ def peaks_figure(
     pits: Sequence[View],
     tried: tuple[Float, NDArray[np.bool_]] | None = None,
 ) -> Figure:
-    """The scores (D,) of all unit axes (D, 3) at one location (Hammer projection, equal area), and views from there.
+    """Draw the scores (D,) of unit axes (D, 3) at one location (Hammer projection, equal area), and views from there.
 
     `peaks` are views of high scores, the highest first, with numbers; `pits` of low scores, the lowest first, with
     letters; `tried` axes (B, 3) of labelled views and whether each of them localizes, (B,): rings if so, else crosses.

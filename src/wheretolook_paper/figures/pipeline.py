@@ -1,4 +1,4 @@
-"""The paper's first figure: from a map over sampled and ranked viewpoints to the camera that is chosen."""
+"""The paper's first figure: map, sampled viewpoints, ranked viewpoints, chosen camera."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _GLYPH = 32  # directions drawn of a location
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """What `pipeline_figure` draws."""
+    """Data of `pipeline_figure`."""
 
     house: Dollhouse  # the scene from above
     landmarks: Float  # (N, 3) of the map, metres
@@ -60,9 +60,9 @@ class Pipeline:
 
 
 def pipeline_figure(pipeline: Pipeline) -> Figure:
-    """Map, sampled viewpoints, ranked viewpoints and the chosen camera, all drawn on the same picture of the scene.
+    """Draw map, sampled viewpoints, ranked viewpoints and the chosen camera on the same picture of the scene.
 
-    Landmarks that lie on nothing in the picture, such as those of walls that are cut off, are left out.
+    Landmarks on surfaces outside the picture, such as cut-off walls, are omitted.
     """
     with context(PRINT):
         top, bottom = _rows_drawn(pipeline.house)
@@ -101,7 +101,7 @@ def _draw_samples(axes: Axes, pipeline: Pipeline) -> None:
 
 
 def ranked_figure(house: Dollhouse, locations: Float, best_axes: Float, best_scores: Float) -> Figure:
-    """The ranked viewpoints alone, one column and a half wide; arguments as in `Pipeline`."""
+    """Draw the ranked viewpoints alone, one and a half columns wide; arguments as in `Pipeline`."""
     with context(PRINT):
         top, bottom = _rows_drawn(house)
         figure = new_figure(1.5 * ONE_COLUMN_IN, 1.5 * ONE_COLUMN_IN * (bottom - top) / house.rgb.shape[1])
@@ -150,14 +150,14 @@ def _draw_choice(axes: Axes, pipeline: Pipeline) -> None:
 
 
 def _rows_drawn(house: Dollhouse) -> tuple[float, float]:
-    """First and last row of the picture with any surface, with some room above for what is drawn over walls."""
+    """Return the first and last row of the picture with any surface, with a margin above."""
     rows = np.flatnonzero((house.depth_m > 0).any(1))
     height = len(house.depth_m)
     return max(0.0, float(rows[0]) - 0.07 * height), min(float(height), float(rows[-1]) + 0.02 * height)
 
 
 def _spacing(locations: Float) -> float:
-    """Median distance from a location to its nearest neighbour, metres."""
+    """Return the median distance in metres from a location to its nearest neighbour."""
     if len(locations) < 2:
         return 0.5
     return float(np.median(cKDTree(locations).query(locations, k=2)[0][:, 1]))

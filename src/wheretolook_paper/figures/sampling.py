@@ -1,4 +1,4 @@
-"""How viewpoints are sampled: free voxels, the directions that see most landmarks, and occlusion."""
+"""Figure of viewpoint sampling: free voxels, directions with the most visible landmarks, and occlusion."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _MARGIN_PX = 0.04
 
 @dataclass(frozen=True, eq=False)
 class Sampling:
-    """What `sampling_figure` draws."""
+    """Data of `sampling_figure`."""
 
     plan: Dollhouse  # the scene from straight above
     grid: VoxelGrid  # of the scene
@@ -41,7 +41,7 @@ class Sampling:
 
 
 def sampling_figure(sampling: Sampling) -> Figure:
-    """Locations, directions and occlusion.
+    """Draw locations, directions and occlusion.
 
     Left: one layer of voxels from above, the free ones shaded, the others hatched. Middle: the sphere of directions at
     one location (Hammer projection, equal area), the kept ones coloured by their number of landmarks in view. Right:
@@ -62,12 +62,12 @@ def _draw_voxels(axes: Axes, sampling: Sampling) -> None:
     centers = sampling.grid.centers()[sampling.layer]
     corners = sampling.plan.pixels(np.stack([centers - half, centers + half], axis=1))
     free_look: Style = {"facecolor": (*to_rgb(SKY), 0.45), "edgecolor": BLUE, "linewidth": 0.5}
-    taken_look: Style = {"edgecolor": "#777777", "linewidth": 0.3, "hatch": "/////"}
-    for chosen, look in ((sampling.free, free_look), (~sampling.free, {"facecolor": (1, 1, 1, 0.35), **taken_look})):
+    blocked_look: Style = {"edgecolor": "#777777", "linewidth": 0.3, "hatch": "/////"}
+    for chosen, look in ((sampling.free, free_look), (~sampling.free, {"facecolor": (1, 1, 1, 0.35), **blocked_look})):
         squares = [Rectangle((float(a[0]), float(a[1])), *map(float, b - a)) for a, b in corners[chosen]]
         axes.add_collection(PatchCollection(squares, **look))
     draw_points(axes, sampling.plan, centers[sampling.free], s=2, color=BLUE)
-    _mark_place(axes, sampling)
+    _mark_location(axes, sampling)
     low = corners.reshape(-1, 2).min(0)
     high = corners.reshape(-1, 2).max(0)
     margin = _MARGIN_PX * (high - low)
@@ -75,8 +75,8 @@ def _draw_voxels(axes: Axes, sampling: Sampling) -> None:
     axes.set_anchor("N")
     axes.set_title("a  Locations", loc="left")
     free = Patch(label=f"{sampling.free.sum()} free", **free_look)
-    taken = Patch(label=f"{(~sampling.free).sum()} not", facecolor="white", **taken_look)
-    _legend_below(axes, [free, taken])
+    blocked = Patch(label=f"{(~sampling.free).sum()} not", facecolor="white", **blocked_look)
+    _legend_below(axes, [free, blocked])
 
 
 def _draw_directions(figure: Figure, axes: Axes, sampling: Sampling) -> None:
@@ -101,7 +101,7 @@ def _draw_occlusion(axes: Axes, sampling: Sampling) -> None:
     draw_segments(axes, sampling.plan, lines, color=ORANGE, linewidth=0.3, alpha=0.7)
     draw_points(axes, sampling.plan, hidden, s=1.0, color=BLUE, rasterized=True)
     draw_points(axes, sampling.plan, unoccluded, s=1.0, color=ORANGE, rasterized=True)
-    _mark_place(axes, sampling)
+    _mark_location(axes, sampling)
     axes.set_anchor("N")
     axes.set_title("c  Occlusion", loc="left")
     handles = []
@@ -111,7 +111,7 @@ def _draw_occlusion(axes: Axes, sampling: Sampling) -> None:
     _legend_below(axes, handles)
 
 
-def _mark_place(axes: Axes, sampling: Sampling) -> None:
+def _mark_location(axes: Axes, sampling: Sampling) -> None:
     star: Style = {"s": 75, "marker": "*", "color": VERMILION, "edgecolors": "white", "linewidths": 0.6}
     draw_points(axes, sampling.plan, sampling.place, zorder=4, **star)
 

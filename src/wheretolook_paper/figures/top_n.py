@@ -29,7 +29,7 @@ _PAPER_MARKS = {"proposed": ("D", "paper, proposed"), "random": ("s", "paper, ra
 
 
 def top_n_figure(scores: pd.DataFrame, methods: Sequence[str] = ()) -> Figure:
-    """Scores over the number N of best viewpoints, at each threshold.
+    """Draw scores over the number N of best viewpoints at each threshold.
 
     Above, the share of good viewpoints among the best N of all locations, in % of the oracle's; below, the share of
     locations with a good one among N, the oracle's as lines. Whiskers are 95 % bootstrap intervals. Open grey marks are
@@ -67,7 +67,7 @@ def top_n_figure(scores: pd.DataFrame, methods: Sequence[str] = ()) -> Figure:
 
 
 def top_n_table(scores: pd.DataFrame, methods: Sequence[str] = ()) -> pd.DataFrame:
-    """What `top_n_figure` draws at the finest threshold, in %, and the oracle's: a row a method, columns by N."""
+    """Return the numbers of `top_n_figure` at the finest threshold, in %, and the oracle's: a row per method."""
     scores = main_rows(scores)
     pooled = scores[scores["scene"] == ALL]
     key = threshold_keys(scores)[0]
@@ -84,7 +84,7 @@ def top_n_table(scores: pd.DataFrame, methods: Sequence[str] = ()) -> pd.DataFra
 
 
 def _the_few(pooled: pd.DataFrame) -> list[str]:
-    """Those of a table's methods that a figure of a few shows (`Method.of_the_few`), the last registered first."""
+    """Return the methods of a table that summary figures show (`Method.of_the_few`), the last registered first."""
     first: dict[str, str] = {}
     for name in methods_of(pooled):
         known = find(name)
@@ -95,7 +95,7 @@ def _the_few(pooled: pd.DataFrame) -> list[str]:
 
 
 def _present(pooled: pd.DataFrame, methods: Sequence[str]) -> list[str]:
-    """Those of the methods that a table has; a family stands for the first of its methods that is there."""
+    """Return the methods present in a table; a family name stands for its first method there."""
     first: dict[str, str] = {}
     for name in methods_of(pooled):
         known = find(name)
@@ -104,7 +104,7 @@ def _present(pooled: pd.DataFrame, methods: Sequence[str]) -> list[str]:
 
 
 def _draw(axes: Axes, pooled: pd.DataFrame, methods: Sequence[str], top_n: Sequence[int], column: str) -> None:
-    """Marks of all methods over N; `column` with "low_", "high_" or nothing inserted names the table's columns."""
+    """Draw markers of all methods over N; `column` with "low_", "high_" or "" inserted names the columns."""
     places = np.arange(len(top_n), dtype=float)
     for number, method in enumerate(methods):
         rows = pooled[pooled["method"] == method].set_index("top_n").reindex(list(top_n))

@@ -1,4 +1,4 @@
-"""Learning curves."""
+"""Figure of learning curves."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from wheretolook.scorers.styles import method_style
 
 
 def training_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:
-    """Loss and average precision over the epochs (the first is 1), a ring at the best validation average precision.
+    """Draw loss and average precision over epochs (from 1), with a ring at the best validation average precision.
 
     `histories` have, for each method, a row for each epoch with `epoch`, `train_bce`, `val_bce`,
     `train_average_precision` and `val_average_precision`.
@@ -33,7 +33,7 @@ def training_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:
             panels[1].plot(1 + best["epoch"], best["val_average_precision"], linestyle="none", **ring)
         panels[0].set(xlabel="epoch (log)", ylabel="weighted cross-entropy")
         panels[1].set(xlabel="epoch (log)", ylabel="average precision")
-        for panel in panels:  # logarithmic: some methods learn for eight epochs, others for hundreds
+        for panel in panels:  # some methods train for eight epochs, others for hundreds
             panel.set_xscale("log")
             panel.xaxis.set_major_formatter("{x:g}")
         handles, labels = panels[1].get_legend_handles_labels()

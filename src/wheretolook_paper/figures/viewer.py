@@ -28,7 +28,7 @@ def scene_geometries(
     camera: PinholeCamera = PinholeCamera(),
     cut_m: float | None = None,
 ) -> list[dict[str, Any]]:
-    """What Open3D's viewer draws: a list of `name`, `geometry` and `material` for `open3d.visualization.draw`.
+    """Return the `name`, `geometry` and `material` of each part of a scene, for `open3d.visualization.draw`.
 
     There is a geometry for each texture of the mesh (metres, z up), of which what lies above `cut_m` is left out; for
     landmarks (N, 3) m; for `cameras`, cam_from_world (B, 3, 4), with intrinsics `camera`; and for the path (P, 3) m.

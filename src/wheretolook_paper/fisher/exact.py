@@ -1,4 +1,4 @@
-"""The information in what a view really sees: its field of view and occlusion as they are."""
+"""Exact Fisher information of views: summed over the landmarks in the field of view that are not occluded."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ CPU_VIEWS = 128  # views that a CPU thread takes at a time: some ten millisecond
 
 
 def exact_information(views: PosedViews, device: str = "cpu") -> Float:
-    """Information on the pose of each of B views, summed over the landmarks it sees: (B, 15), see `information`.
+    """Return the information (B, 15) on the pose of each view, summed over its visible landmarks.
 
-    The CPU works with all its cores, on cameras with distortion in NumPy and slowly.
+    The CPU uses all cores. Cameras with distortion are computed in NumPy, slowly.
     """
     if isinstance(views.camera, ColmapCamera):
         return exact_information_plain(views)
@@ -55,7 +55,7 @@ def exact_information(views: PosedViews, device: str = "cpu") -> Float:
 
 
 def exact_information_plain(views: PosedViews) -> Float:
-    """What `exact_information` computes, in NumPy."""
+    """Compute `exact_information` in NumPy."""
     seen = landmarks_in_view_plain(views)
     centers = camera_centers(views.cam_from_world)
     numbers = np.zeros((len(centers), N_NUMBERS))

@@ -1,4 +1,4 @@
-"""The Fisher Information Field: factors for every location from which one product gives the information of any view."""
+"""The Fisher Information Field: factors per location whose product with a view's axis is its information."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class FisherField:
     ) -> FisherField:
         """Sum the information of all landmarks (N, 3) m at each of locations (L, 3) m.
 
-        The mask (L, N) is True where the line of sight is free; None if all are. The CPU works with all its cores.
+        The mask (L, N) is True where the line of sight is free; None if all are. The CPU uses all cores.
 
         Raises:
             ConfigError: no such device.
@@ -46,11 +46,11 @@ class FisherField:
         return cls(at, visibility, visibility.finish(field_sums(at, landmarks, visibility, unoccluded, device)))
 
     def information(self, row: int, axes: ArrayLike) -> Float:
-        """Information at location `row` along optical axes (D, 3) of unit length; (D, 15)."""
+        """Return the information (D, 15) at location `row` along unit optical axes (D, 3)."""
         return np.asarray(self.visibility.of_axes(np.asarray(axes, dtype=np.float64)) @ self.factors[row])
 
     def information_of_views(self, rows: NDArray[np.int64], axes: Float) -> Float:
-        """Information (B, 15) of views at locations `rows` (B,) along optical axes (B, 3) of unit length."""
+        """Return the information (B, 15) of views at locations `rows` (B,) along unit optical axes (B, 3)."""
         order = np.argsort(rows, kind="stable")
         starts = np.searchsorted(rows[order], np.arange(len(self.locations) + 1))
         numbers = np.empty((len(rows), N_NUMBERS))
@@ -60,7 +60,7 @@ class FisherField:
         return numbers
 
     def metric(self, row: int, axes: ArrayLike, metric: str, about_origin: bool = False) -> Float:
-        """A metric (see `metric_of`) of the information at location `row` along unit optical axes (D, 3); (D,).
+        """Return a metric (D,) (see `metric_of`) of the information at location `row` along unit axes (D, 3).
 
         With `about_origin` rotations are about the world's origin, as in the released code of the field.
         """
@@ -70,12 +70,12 @@ class FisherField:
 
 
 def worst_axis_of_trace(field: FisherField, row: int, axes: ArrayLike) -> Float:
-    """The axis (3,) of (D, 3) with the least trace. It tests the field; nobody would choose this view."""
+    """Return the axis (3,) of (D, 3) with the smallest trace, as a probe of the field."""
     return np.asarray(axes, dtype=np.float64)[np.argmin(field.metric(row, axes, "trace"))]
 
 
 def stationary_axis_of_trace(field: FisherField, row: int) -> Float:
-    """The axis at which the gradient of a quadratic field's trace is zero, (3,), scaled to unit length afterwards.
+    """Return the unit axis (3,) along which the gradient of a quadratic field's trace is zero.
 
     The trace is z^T Q z + q . z + constant, so its gradient is zero at z = -Q^-1 q / 2. If Q is positive, this axis
     points away from the landmarks: the released code calls it the direction of the minimum and negates it to get the

@@ -1,4 +1,4 @@
-"""Metrics that turn the information on a pose into a single number."""
+"""Scalar metrics of the information on a pose."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ROWS_AT_ONCE = 4096  # matrices that a thread of a CPU takes at a time: a few mi
 
 
 def metric_of(numbers: ArrayLike, metric: str, pivots: ArrayLike | None = None, device: str = "cpu") -> Float:
-    """A metric (B,) of information matrices kept as numbers (B, 15), about pivots (B, 3) as in `information_matrices`.
+    """Return a metric (B,) of information matrices (B, 15), about pivots (B, 3) as in `information_matrices`.
 
     More is better. The metric is "trace"; "logdet", the logarithm of one plus the determinant (log(1 + d), and
     -log(1 - d) where an approximation makes d negative), so that it is finite without landmarks and keeps the
@@ -41,7 +41,7 @@ def metric_of(numbers: ArrayLike, metric: str, pivots: ArrayLike | None = None, 
 
 
 def metric_of_eigenvalues(values: Float, metric: str) -> Float:
-    """As `metric_of`, (B,), from eigenvalues (B, 6)."""
+    """Return a metric (B,) of eigenvalues (B, 6), see `metric_of`."""
     if metric == "trace":
         return np.asarray(values.sum(-1))
     if metric == "mineig":
@@ -52,7 +52,7 @@ def metric_of_eigenvalues(values: Float, metric: str) -> Float:
 
 
 def eigenvalues(numbers: ArrayLike, pivots: ArrayLike | None = None, device: str = "cpu") -> Float:
-    """Eigenvalues (B, 6), in no order, of what `metric_of` takes; their errors are about 1e-16 of the matrix's norm."""
+    """Return unordered eigenvalues (B, 6) of information matrices; errors are about 1e-16 of the norm."""
     numbers = np.ascontiguousarray(numbers, dtype=np.float64).reshape(-1, N_NUMBERS)
     arms = np.empty((0, 3)) if pivots is None else np.ascontiguousarray(pivots, dtype=np.float64).reshape(-1, 3)
     device = start_warp(device)

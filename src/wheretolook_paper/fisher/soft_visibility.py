@@ -1,4 +1,4 @@
-"""Whether a landmark is in view, approximated by a product of a function of the camera's axis and one of the landmark.
+"""Soft visibility of landmarks, a product of a function of the camera's axis and one of the landmark.
 
 Zhang and Scaramuzza, Fisher Information Field, 2020, Sec. V: the visibility v of a landmark from a camera with the
 optical axis z is taken to depend only on the angle between z and the landmark's bearing f, and approximated by
@@ -47,8 +47,8 @@ class QuadraticVisibility(SoftVisibility):
         half_angle_rad: of the cone that stands for the field of view.
         boundary: v at the cone's edge.
         boundary_to_mid: v at the cone's edge as a share of v straight ahead. 0.8, as in the Fisher field's experiment
-            on orientations. (Its library's default is 0.5, for which v falls to -0.33 beside the camera. Then sums are
-            indefinite, and log det and min. eigenvalue choose worse views on our validation scene.)
+            on orientations. (Its library's default is 0.5, for which v falls to -0.33 next to the camera. Then sums are
+            indefinite, and log det and min. eigenvalue choose worse views on the validation scene.)
     """
 
     half_angle_rad: float
@@ -150,7 +150,7 @@ def _fitted(half_angle_rad: float, n_factors: int, steepness: float) -> Gaussian
 
 
 def cone_half_angle(camera: Camera) -> float:
-    """Half the opening angle, in radians, of the cone with the same solid angle as a camera's field of view."""
+    """Return half the opening angle in radians of the cone with the solid angle of a camera's field of view."""
     if isinstance(camera, ColmapCamera):
         directions = fibonacci_sphere(20_000)
         share = float(np.mean(camera.sees(directions)))

@@ -1,4 +1,4 @@
-"""Logs times of the visibility check, measured by `tests/benchmarks/bench_visibility.py`, as an MLflow run."""
+"""Log times of the visibility check, measured by `tests/benchmarks/bench_visibility.py`, as an MLflow run."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
 
 RUNTIMES_CSV = "runtimes.csv"
 SCALING_CSV = "scaling.csv"
-"""Tables for `wheretolook_paper.figures.runtimes`: times at the paper's size, and how time and memory grow."""
+"""Tables of `figures.runtimes`: times at the paper's size, and growth of time and memory."""
 
 
 def log_runtimes(
     tracking: TrackingConfig, sizes: pd.DataFrame, growth: pd.DataFrame, tags: Tags = None, file: Path | None = None
 ) -> str:
-    """Log measured times as a run of the stage "benchmark", with both tables and their figures; returns its id.
+    """Log measured times as a run of the stage "benchmark" with both tables and their figures; return its id.
 
-    The tables are those of `runtime_figure` and `scaling_figure` (may be empty) in `wheretolook_paper.figures.runtimes`. The
-    file from which `sizes` were read, if given, is logged unchanged.
+    `sizes` is the table of `runtime_figure`, `growth` that of `scaling_figure` (may be empty). The file from which
+    `sizes` were read, if given, is logged unchanged.
     """
     metrics = {}
     for row in sizes.dropna(subset="median_s").to_dict("records"):

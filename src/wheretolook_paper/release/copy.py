@@ -1,7 +1,7 @@
-"""A release: a labelled dataset small enough to travel with the code, weights trained on it, and a card about both.
+"""A release: a compact copy of a labelled dataset, weights trained on it, and a card.
 
-A release is a dataset folder of its own. It has neither meshes nor COLMAP models nor descriptors, so it cannot be
-labelled anew, but it is read, trained on and evaluated as any other.
+A release is a dataset folder without meshes, COLMAP models and descriptors: it cannot be labelled again, but it is
+read, trained on and evaluated like any other.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ from wheretolook.visibility.occlusion import StoredOcclusion
 CARD = "README.md"
 
 SHELF = "others"
-"""Folder beside the shipped weights for those of other methods. Only their records ship."""
+"""Folder next to the shipped weights for those of other methods. Only their records ship."""
 
 MAX_BYTES = 16_000_000  # a release is smaller than this
 
 
 def is_release(dataset: Dataset) -> bool:
-    """Whether a dataset is a release."""
+    """Return whether a dataset is a release."""
     return (dataset.root / RELEASE_FILE).is_file()
 
 
 def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> Dataset:
-    """Write a compact copy of a labelled dataset. The same dataset gives the same bytes.
+    """Write a compact copy of a labelled dataset; equal datasets give equal bytes.
 
-    It holds compact tables (`viewpoints.table.COMPACT_SCHEMA`) without matches, landmarks in half precision without
-    descriptors, the mapping images' poses if they are known, what labels were made with but for the list of shards, and
-    the dataset's settings as JSON values. Weights and results that lie at `root`, `<data>/<release_name>`, stay; if the
-    data changed, the card and the scores of networks that do not ship are removed.
+    It holds compact tables without matches, landmarks in half precision without descriptors, the poses of mapping
+    images if known, the manifests of labels without their shards, and the dataset's settings as JSON values. Weights
+    and results at `root` are kept; if the data changed, the card and the scores of networks that do not ship are
+    removed.
 
     Raises:
         ConfigError: the release's folder holds another dataset, or a release of another one.
@@ -55,7 +55,7 @@ def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> D
     before = _release_of(root, dataset.name)
     fingerprint = None if before is None else before.fingerprint()
     for scene in before.scenes if before is not None else ():
-        scene.stage_cache("label").clear()  # until all is copied, nothing may learn from what is there
+        scene.stage_cache("label").clear()  # until all is copied, nothing may train on it
     copied = [
         (scene, SceneFolder(safe_child(root, scene.name, "a scene's name"), scene.split, scene.camera))
         for scene in dataset.scenes
@@ -87,16 +87,16 @@ def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> D
 
 @dataclass(frozen=True)
 class Choice:
-    """What of the weights in a release's folder ships, by the validation average precision of each."""
+    """Which weights in a release's folder ship, by validation average precision."""
 
     network: Path  # the best of the paper's networks
-    best: Path  # the best of all, used where none are named; may be the network
+    best: Path  # the best of all, the default; may be the network
     shelved: tuple[Path, ...]  # the rest
     precision: dict[str, float]  # of all, by their file's name without its ending
 
 
 def trained_weights(release: Dataset) -> dict[Path, Method]:
-    """The weights in a release's folder of methods that score views by themselves, and these methods."""
+    """Return the weights in a release's folder that score views by themselves, and their methods."""
     from wheretolook.training.provenance import weights_path
 
     paths = {weights_path(release, name): method for name, method in learned().items() if name in scorers()}
@@ -134,10 +134,10 @@ def choose_weights_to_ship(release: Dataset) -> Choice:
 
 
 def ship_weights(release: Dataset) -> Choice:
-    """Choose what ships; store the weights of the paper's network in half precision, put the rest on the shelf.
+    """Choose the weights that ship; convert the paper's network to half precision, move the rest to `weights/others/`.
 
-    The shelf is `weights/others/`, where no evaluation finds them. A matchability model stays where it is: methods that
-    weight landmarks need it. Done again, nothing changes. Raises as `choose_weights_to_ship`.
+    A matchability model stays, because methods that weight landmarks need it. Repeating this changes nothing. Raises as
+    `choose_weights_to_ship`.
     """
     from wheretolook.training.weights import read_record
 
@@ -165,10 +165,9 @@ def convert_to_float16(path: Path) -> None:
 
 
 def sizes(root: Path, weights: bool = True) -> dict[str, int]:
-    """Bytes of what ships of the release at `root`, by kind of file. Figures and shelved weights do not ship.
+    """Return the bytes of the release at `root` by kind of file, without figures and weights of other methods.
 
-    Without `weights` none are counted, for as long as it is not chosen which of them ship. Raises StorageError if the
-    release is not smaller than `MAX_BYTES`.
+    Without `weights`, no weights are counted. Raises StorageError if the release is not smaller than `MAX_BYTES`.
     """
     kinds = {"viewpoints.parquet": "tables", "landmarks.npz": "landmarks", CAMERAS_FILE: "cameras"}
     kinds["occlusion.npz"] = "occlusion"
@@ -186,12 +185,12 @@ def sizes(root: Path, weights: bool = True) -> dict[str, int]:
 
 
 def size_text(parts: Mapping[str, int]) -> str:
-    """Sizes for people: "tables 4.81 MB, ..., in all 13.20 MB"."""
+    """Format sizes: "tables 4.81 MB, ..., in all 13.20 MB"."""
     return ", ".join(f"{name} {size / 1e6:.2f} MB" for name, size in {**parts, "in all": sum(parts.values())}.items())
 
 
 def read_about(release: Dataset) -> dict[str, Any]:
-    """What a release was made from: source, source_fingerprint, code_version and settings.
+    """Return source, source_fingerprint, code_version and settings of a release.
 
     Raises ConfigError if the file is missing or damaged.
     """
@@ -205,7 +204,7 @@ def read_about(release: Dataset) -> dict[str, Any]:
 
 
 def _release_of(root: Path, source: str) -> Dataset | None:
-    """The release that lies at `root`, which must be of the same source; None if there is nothing yet."""
+    """Return the existing release at `root`, which must have the same source; None without one."""
     if not (root / "dataset.json").is_file():
         return None
     release = Dataset.load(root)
@@ -214,12 +213,12 @@ def _release_of(root: Path, source: str) -> Dataset | None:
         raise ConfigError("this dataset is no release and would be overwritten", path=root, fix=fix)
     found = read_about(release)["source"]
     if found != source:
-        raise ConfigError(f"here lies the release of another dataset than {source}", path=root, value=found, fix=fix)
+        raise ConfigError(f"this is the release of another dataset than {source}", path=root, value=found, fix=fix)
     return release
 
 
 def _manifest(path: Path) -> dict[str, Any]:
-    """What labels were made with, but for the shards, of which there are thousands, and the matches, which stay."""
+    """Return a manifest of labels without its shards and matches."""
     try:
         content = read_json_object(path)
         return {

@@ -19,7 +19,7 @@ SEED = 7  # of the rooms
 
 @dataclass(frozen=True)
 class ExampleModel:
-    """The folder of a COLMAP model (metres, z up), and a textured mesh of the same rooms (GLB)."""
+    """Folder of a COLMAP model (metres, z up), and the textured mesh of the same rooms (GLB)."""
 
     model: Path
     scan: Path
@@ -28,8 +28,7 @@ class ExampleModel:
 def make_example_model(folder: str | Path) -> ExampleModel:
     """Generate three rooms and map them from 30 images along a walk, in 15 seconds on one core.
 
-    A model that was made in this folder before is replaced. Raises MapError if the images give no landmark, or
-    something else is in the model's place.
+    An earlier model in this folder is replaced. Raises MapError without any landmark.
     """
     Path(folder).mkdir(parents=True, exist_ok=True)
     example = ExampleModel(Path(folder) / "model", Path(folder) / "scan.glb")

@@ -1,4 +1,4 @@
-"""What the paper's network is made of, read off the module itself, and what passes through it."""
+"""Layers of the paper's network, read from the module, and its activations."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ from wheretolook.scorers.mlp.network import BinnedInput, ViewpointNetwork
 
 
 def architecture_table(network: ViewpointNetwork) -> pd.DataFrame:
-    """The layers of a network (paper, Tab. 1), a row each from the input to the score, and their sum.
+    """Return the layers of a network (paper, Tab. 1) from the input to the score, and their sum.
 
-    Columns: `layer`, what it is; `in` and `out`, how many values it takes and gives; `parameters`, how many it has
-    learnt.
+    Columns: `layer`; `in` and `out`, numbers of values; `parameters`, number of trained parameters.
     """
     spec = network.spec
     rows: list[tuple[str, int, int, int]] = []
@@ -31,10 +30,9 @@ def architecture_table(network: ViewpointNetwork) -> pd.DataFrame:
 
 
 def activations(network: ViewpointNetwork, view: BinnedViews) -> list[Float]:
-    """What a trained network makes of one view (a batch of one, with at least its channels), on the way to its score.
+    """Return the activations of a trained network for one view (a batch of one, with at least its channels).
 
-    The standardized input (C, bins, bins); the values (width,) of each hidden layer behind its nonlinearity; and last
-    the probability, (1,).
+    The standardized input (C, bins, bins), each hidden layer (width,) after its nonlinearity, and the probability (1,).
     """
     spec = network.eval().spec
     chosen = view.select(spec.channels)

@@ -1,4 +1,4 @@
-"""How notebooks find the release and the tracking store, from any folder inside a checkout."""
+"""Find the release and the tracking store from any folder inside a checkout, for notebooks."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from wheretolook.utils.errors import ConfigError
 
 RELEASE_VARIABLE = "WHERETOLOOK_RELEASE"
 STORE_VARIABLE = "WHERETOLOOK_MLRUNS"
-"""Environment variables with the folders of a release and of a store, which are searched for if not given."""
+"""Environment variables with the folders of a release and of a store."""
 
 
 def open_release() -> Dataset:
-    """The released dataset: the folder in `WHERETOLOOK_RELEASE`, or the nearest `data/release` here or above.
+    """Open the release in `WHERETOLOOK_RELEASE`, or the nearest `data/release` here or above.
 
     Raises ConfigError if there is none, TableError if it is damaged.
     """
@@ -31,7 +31,7 @@ def open_release() -> Dataset:
 
 
 def find_store() -> TrackingConfig:
-    """The store in `WHERETOLOOK_MLRUNS`, or the nearest folder `mlruns` here or above, even if it is empty."""
+    """Return the store in `WHERETOLOOK_MLRUNS`, or the nearest folder `mlruns` here or above, even if empty."""
     here = Path.cwd()
     named = os.environ.get(STORE_VARIABLE)
     folders = [folder / "mlruns" for folder in (here, *here.parents)]
@@ -40,7 +40,7 @@ def find_store() -> TrackingConfig:
 
 
 def open_store(release: Dataset | None = None) -> TrackingConfig:
-    """The store of `find_store`; the runs of a release (`open_release` by default) are logged if it lacks them.
+    """Return the store of `find_store`, after logging missing runs of a release (`open_release` by default).
 
     Raises ConfigError if there is no release, TableError if it is damaged.
     """

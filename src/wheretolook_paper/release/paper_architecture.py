@@ -1,4 +1,4 @@
-"""The paper's table of the network's layers, beside the layers of a network trained here."""
+"""The paper's table of network layers, next to the layers of a network trained here."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from wheretolook.inputs.channels import PAPER_VARIANTS
 
 
 def paper_architecture_table(params: Mapping[str, str]) -> pd.DataFrame:
-    """The paper's Table 1 with the layers of a network of this project, given MLflow's parameters of its train run.
+    """Return the paper's Table 1 with the layers of a network, given the MLflow parameters of its train run.
 
     A row for each layer: `layer` (its number in the paper's table), `paper` and `here`.
     """

@@ -1,4 +1,4 @@
-"""The content of the figures of one scene, computed from a `wheretolook_paper.release.showcase.Showcase`."""
+"""Compute the data of figures of one scene, given its `Showcase`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from wheretolook_paper.release.showcase import EYE_M, Showcase
 
 
 class Peaks(NamedTuple):
-    """The arguments of `wheretolook_paper.figures.peaks.peaks_figure`."""
+    """Arguments of `peaks_figure`."""
 
     directions: Float
     scores: Float
@@ -40,7 +40,7 @@ class Peaks(NamedTuple):
 
 
 class Learning(NamedTuple):
-    """The arguments of `wheretolook_paper.figures.network_walkthrough.learning_figure`."""
+    """Arguments of `learning_figure`."""
 
     image: BinnedImage
     activations: tuple[Float, ...]
@@ -49,10 +49,10 @@ class Learning(NamedTuple):
 
 
 def pipeline_of(showcase: Showcase, scorer: Scorer, location_id: int, height_m: float = EYE_M) -> Pipeline:
-    """From the scene's map to the best labelled view of the location `location_id`.
+    """Return the steps from the scene's map to the best labelled view of a location.
 
-    At each location only the K directions that see most landmarks are scored (paper, Sec. 3.2), by a scorer whose
-    scores are probabilities. Locations are those of the layer at a height above the floor.
+    At each location of the layer at a height above the floor, only the K directions with the most visible landmarks are
+    scored (paper, Sec. 3.2), by a scorer whose scores are probabilities.
     """
     localization_map = showcase.localization_map
     locations = showcase.grid.centers()[np.intersect1d(showcase.layer(height_m), showcase.free)]
@@ -85,7 +85,7 @@ def pipeline_of(showcase: Showcase, scorer: Scorer, location_id: int, height_m: 
 
 
 def sampling_of(showcase: Showcase, location_id: int) -> Sampling:
-    """The layer of voxels that holds a location, and what is in view and unoccluded from there."""
+    """Return the layer of voxels of a location, and the landmarks visible and unoccluded from there."""
     localization_map = showcase.localization_map
     place = showcase.center(location_id)
     nz = showcase.grid.shape[2]
@@ -109,7 +109,7 @@ def sampling_of(showcase: Showcase, location_id: int) -> Sampling:
 
 
 def binned_image_of(showcase: Showcase, cam_from_world: ArrayLike, bins: int = 30) -> BinnedImage:
-    """The view of a pose cam_from_world (3, 4), rendered and binned."""
+    """Render and bin the view of a pose cam_from_world (3, 4)."""
     localization_map = showcase.localization_map
     pose = np.asarray(cam_from_world, dtype=np.float64)[None]
     points = localization_map.landmarks.points[localization_map.landmarks_in_view(pose)[0]]
@@ -121,7 +121,7 @@ def binned_image_of(showcase: Showcase, cam_from_world: ArrayLike, bins: int = 3
 
 
 def learning_of(showcase: Showcase, scorer: BinnedNetworkScorer, location_id: int, best: bool = True) -> Learning:
-    """What the paper's network makes of the labelled view of a location that it scores highest, or else lowest."""
+    """Return the activations of the paper's network for the best, or the worst, labelled view of a location."""
     from wheretolook_paper.release.mlp_architecture import activations
 
     candidates = showcase.viewpoints(location_id)
@@ -134,7 +134,7 @@ def learning_of(showcase: Showcase, scorer: BinnedNetworkScorer, location_id: in
 
 
 def mistaken_location(showcase: Showcase, scorer: Scorer, height_m: float = EYE_M) -> int:
-    """The location of a layer with the largest mean difference between predicted probabilities and labels.
+    """Return the location of a layer with the largest mean difference between predictions and labels.
 
     Raises ConfigError if the layer has no viewpoint.
     """
@@ -147,8 +147,10 @@ def mistaken_location(showcase: Showcase, scorer: Scorer, height_m: float = EYE_
 
 
 def peaks_of(showcase: Showcase, scorer: Scorer, location_id: int, n: int = 3, apart_deg: float = 40.0) -> Peaks:
-    """The scores of all directions at a location with viewpoints, and its n labelled views with the highest and with
-    the lowest scores, at least `apart_deg` apart. Scores must be probabilities."""
+    """Return the scores of all directions at a location, and its n labelled views with the highest and lowest scores.
+
+    The views are at least `apart_deg` apart. Scores must be probabilities.
+    """
     rows = showcase.viewpoints(location_id)
     looked = poses(rows)
     scores = scorer.score(poses(rows))
@@ -171,7 +173,7 @@ def planned_views(
     methods: Sequence[str] = PathsConfig.methods,
     config: PlanConfig = PlanConfig(grid=(8, 8, 4), directions=200),
 ) -> dict[str, list[PathView]]:
-    """The views along several methods' paths, by the dataset's weights, between the farthest of ten random pairs."""
+    """Return the views along several methods' paths between the farthest of ten random pairs."""
     pairs = draw_pairs(showcase.space, PathsConfig(pairs=10))
     start, goal = pairs[np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=1).argmax()]
     paths = plan_by_methods(showcase, dataset, methods, start, goal, config)

@@ -1,4 +1,4 @@
-"""The paper's tables for notebooks: this project's numbers, with intervals, beside the printed ones."""
+"""The paper's tables for notebooks: this project's numbers with intervals next to the printed ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DIVIDED = f"/{RELEASED_DIVISOR}"  # name of the column of shares divided by the 
 
 
 def latest_paper_table(tracking: TrackingConfig, name: str, dataset: str = "") -> pd.DataFrame:
-    """The paper's table "vs_others" or "input_variants", from the newest evaluation of a dataset, or of any ("").
+    """Read the paper's table "vs_others" or "input_variants" from the newest evaluation of a dataset, or of any ("").
 
     Raises MissingRunError if there is none.
     """
@@ -27,7 +27,7 @@ def latest_paper_table(tracking: TrackingConfig, name: str, dataset: str = "") -
 
 
 def paper_cells(table: pd.DataFrame) -> pd.DataFrame:
-    """The text of a table of `wheretolook_paper.evaluation.paper_tables.paper_tables`.
+    """Format the cells of a table of `paper_tables`.
 
     A row for each of the paper's methods, by its names there and here; for each threshold the columns "ours" (% of the
     oracle's share), "95 %" (its interval), "/0.527" and "paper", with a dash for missing numbers.
@@ -47,7 +47,7 @@ def paper_cells(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def paper_styler(table: pd.DataFrame) -> Styler:
-    """`paper_cells` for a notebook: best numbers, ours and the paper's, in bold; intervals and "/0.527" in grey."""
+    """Style `paper_cells` for a notebook: best numbers in bold, intervals and "/0.527" in grey."""
     cells = paper_cells(table)
     bold = pd.DataFrame("", index=cells.index, columns=cells.columns)
     for key in KEYS:

@@ -1,4 +1,4 @@
-"""The baseline of the Active Localization Benchmark (ActLoc, 2025), as it ships and mended."""
+"""The baseline of the Active Localization Benchmark (ActLoc, 2025), as released and fixed."""
 
 from __future__ import annotations
 
@@ -20,11 +20,10 @@ VIEWS_AT_ONCE = 512
 
 
 class MaxVisibilityScorer(Scorer):
-    """Landmarks in view within 3 m of depth, seen through walls, as a share of the map's.
+    """Landmarks in view within 3 m of depth, ignoring occlusion, as a share of the map's.
 
-    The benchmark looks for the best of 6 x 18 pitches and yaws by this count. Its code then gives pitch and yaw to a
-    function that takes yaw and pitch; see `SwappedMaxVisibilityScorer`. Here every candidate is ranked by its own
-    count, on the lattice or off it, while the swapped one knows a single axis.
+    The benchmark chooses the best of 6 x 18 pitches and yaws by this count, and its code then exchanges the two angles;
+    see `SwappedMaxVisibilityScorer`. Here every candidate is ranked by its own count.
     """
 
     name = "max-visibility"
@@ -52,9 +51,9 @@ class MaxVisibilityScorer(Scorer):
 
 
 class SwappedMaxVisibilityScorer(Scorer):
-    """What the benchmark's code does: the best of 6 x 18 pitches and yaws, with the two exchanged in what it returns.
+    """The released code: the best of 6 x 18 pitches and yaws, returned with the two angles exchanged.
 
-    A view scores the higher, the nearer its optical axis is to the direction returned.
+    A view's score grows as its optical axis approaches the returned direction.
     """
 
     name = "max-visibility-swapped"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -10,21 +9,13 @@ import pandas as pd
 import pytest
 
 from planning.rooms import CAMERA, room_landmarks
-from wheretolook.dataset.viewpoint_table import pose_columns, poses
-from wheretolook.geometry.poses import pose_error, poses_looking_along, rotation_angle_deg
+from wheretolook.dataset.viewpoint_table import pose_columns
+from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.localization.estimation import PoseEstimator
 from wheretolook.localization.joint_labels import label_sets
 from wheretolook.planning.config import PathsConfig, StopConfig
-from wheretolook.utils.errors import ConfigError
 from wheretolook_paper.figures.paths import paths_figure
-from wheretolook_paper.paths.joint_localization import (
-    KEY,
-    OUTCOME,
-    check_joint,
-    joint_paths,
-    localize_last_views,
-    localize_stops,
-)
+from wheretolook_paper.paths.joint_localization import OUTCOME, joint_paths, localize_last_views, localize_stops
 from wheretolook_paper.paths.odometry import chained, noisy_steps, rig_of_last
 from wheretolook_paper.paths.path_comparison import ComparedPaths
 from wheretolook_paper.paths.path_report import path_markdown, summarize_paths
@@ -114,25 +105,6 @@ def test_odometry_without_noise_is_the_way_itself() -> None:
         assert len(rig) == min(n, view + 1)
         for back, mount in enumerate(rig):
             np.testing.assert_allclose(chained(mount, way[view]), way[view - back], atol=1e-9)
-
-
-def test_odometry_is_off_by_a_share_of_each_step() -> None:
-    way = poses_looking_along([(0, 0, 0), (2.0, 0, 0)], [(1, 0, 0), (np.cos(0.5), np.sin(0.5), 0)])
-    rng = np.random.default_rng(1)
-    true = noisy_steps(way, 0, 0, rng)[0]
-    told = np.array([noisy_steps(way, 0.01, 0.02, rng)[0] for _ in range(1500)])
-    np.testing.assert_allclose((told[:, :, 3] - true[:, 3]).std(0), 0.02, rtol=0.1)
-    angle = rotation_angle_deg(told[:, :, :3], true[:, :3])
-    assert np.sqrt((angle**2).mean()) == pytest.approx(np.sqrt(3) * 0.02 * np.degrees(0.5), rel=0.1)
-
-
-def test_stops_are_refused_where_no_method_can(compared: tuple) -> None:
-    check_joint(CONFIG)
-    check_joint(replace(CONFIG, methods=("forward", "visible"), stops=StopConfig()))
-    with pytest.raises(ConfigError):
-        check_joint(replace(CONFIG, methods=("forward", "visible")))
-    assert {*KEY} <= {*compared[0].views}
-    assert len(poses(compared[1])) == 1
 
 
 def test_without_stops_nothing_changes(compared: tuple) -> None:

@@ -7,7 +7,6 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from synthetic_dataset import make_landmarks, make_mapping_poses
@@ -17,11 +16,9 @@ from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.viewpoint_table import (
     LOCALIZED,
     NO_POSE,
-    UNLABELLED,
     outcome_in_brief,
     outcome_in_words,
     poses,
-    shares_good,
     write_table,
 )
 from wheretolook.geometry.camera import PinholeCamera
@@ -34,7 +31,6 @@ from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.binned_network import BinnedNetworkScorer
 from wheretolook.scorers.mlp.network import NetworkSpec, ViewpointNetwork
-from wheretolook.scorers.visible import VisibleScorer
 from wheretolook.space.config import FreeSpaceConfig
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.training.trained_network import TrainedNetwork
@@ -42,14 +38,7 @@ from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.visibility.config import OcclusionConfig
 from wheretolook.visibility.occlusion import MeshOcclusion
 from wheretolook_paper.release.showcase import Showcase, open_showcase
-from wheretolook_paper.release.showcase_figures import (
-    binned_image_of,
-    learning_of,
-    mistaken_location,
-    peaks_of,
-    pipeline_of,
-    sampling_of,
-)
+from wheretolook_paper.release.showcase_figures import learning_of, peaks_of, pipeline_of, sampling_of
 from wheretolook_rooms.generator import generate_apartment
 
 CAMERA = PinholeCamera(96, 72, 48.0)
@@ -138,19 +127,6 @@ def test_another_scene_than_the_one_that_was_labelled_is_refused(release: Datase
         open_showcase(Dataset(tmp_path, ()))
 
 
-def test_locations_are_found(showcase: Showcase) -> None:
-    layer = showcase.layer(1.45)
-    heights = showcase.grid.centers()[layer][:, 2]
-    assert len(layer) == 5 * 4 and np.ptp(heights) == 0
-    assert abs(heights[0] - 1.45) <= showcase.grid.voxel_m[2] / 2
-    chosen = showcase.instructive_location()
-    ids, shares = shares_good(showcase.table[showcase.table["location_id"].isin(layer)])
-    assert abs(shares[ids == chosen][0] - 0.5) == np.abs(shares - 0.5).min()
-    assert showcase.nearest_location(showcase.center(chosen) + 0.01) == chosen
-    with pytest.raises(ConfigError, match="no viewpoint"):
-        showcase.viewpoints(-1)
-
-
 def test_pipeline_takes_the_best_views(showcase: Showcase) -> None:
     scorer = UpScorer(showcase.localization_map)
     location = showcase.instructive_location()
@@ -184,21 +160,6 @@ def test_sampling_counts_what_the_table_counts(showcase: Showcase) -> None:
     assert sampling.unoccluded[seen].all() and not sampling.unoccluded.all()
 
 
-def test_a_binned_image_shows_its_landmarks(showcase: Showcase) -> None:
-    row = showcase.table.iloc[int(showcase.table["n_visible"].argmax())]
-    pose = poses(pd.DataFrame([row]))[0]
-    image = binned_image_of(showcase, pose, bins=6)
-    assert len(image.pixels) == row["n_visible"] == image.counts.sum()
-    assert CAMERA.in_image(image.pixels).all()
-    cells = np.zeros((6, 6), int)
-    np.add.at(cells, tuple((image.pixels[:, ::-1] / (72 / 6, 96 / 6)).astype(int).T), 1)
-    np.testing.assert_array_equal(cells, image.counts)
-    np.testing.assert_array_equal(np.isnan(image.means["z"]), image.counts == 0)
-    filled = image.counts > 0
-    total = float((image.means["u"][filled] * image.counts[filled]).sum())
-    assert total == pytest.approx(image.pixels[:, 0].sum(), rel=1e-5)
-
-
 def test_peaks_are_labelled_views_with_what_came_of_them(showcase: Showcase) -> None:
     scorer = UpScorer(showcase.localization_map)
     location = showcase.instructive_location()
@@ -214,15 +175,6 @@ def test_peaks_are_labelled_views_with_what_came_of_them(showcase: Showcase) -> 
     np.testing.assert_array_equal(found.tried[1], (rows["error_m"] < 0.05).to_numpy())
 
 
-def test_the_mistaken_location_is_where_scores_are_farthest_from_labels(showcase: Showcase) -> None:
-    scorer = VisibleScorer(showcase.localization_map)
-    mistaken = mistaken_location(showcase, scorer)
-    rows = showcase.table[showcase.table["location_id"].isin(showcase.layer())]
-    good = (rows["status"] == LOCALIZED) & (rows["error_m"] < 0.05) & (rows["error_deg"] < 0.4)
-    off = np.abs(scorer.score(poses(rows)) - good).groupby(rows["location_id"]).mean()
-    assert mistaken == off.idxmax()
-
-
 def test_learning_follows_the_best_and_the_worst_view(showcase: Showcase) -> None:
     statistics = InputStatistics(("u", "v"), (48.0, 36.0), (20.0, 20.0))
     network = TrainedNetwork("mlp-2d", ViewpointNetwork(NetworkSpec(statistics, bins=6)), CAMERA)
@@ -235,20 +187,6 @@ def test_learning_follows_the_best_and_the_worst_view(showcase: Showcase) -> Non
         assert learning.activations[-1] == pytest.approx(score)
         assert learning.channels == ("u", "v") and learning.image.counts.shape == (6, 6)
         assert learning.outcome == outcome_in_brief(rows.iloc[int(np.argmin(np.abs(scores - score)))])
-
-
-@pytest.mark.parametrize(
-    ("status", "error_m", "error_deg", "words", "brief"),
-    [
-        (LOCALIZED, 0.0123, 0.456, "pose found, 1.2 cm and 0.46° off", "1.2 cm, 0.46° off"),
-        (LOCALIZED, 2.34, 56.7, "wrong pose found, 2.3 m and 57° off", "2.3 m, 57° off"),
-        (NO_POSE, np.nan, np.nan, "no pose", "no pose"),
-        (UNLABELLED, np.nan, np.nan, "", ""),
-    ],
-)
-def test_outcomes_are_told_in_words(status: str, error_m: float, error_deg: float, words: str, brief: str) -> None:
-    label = pd.Series({"status": status, "error_m": error_m, "error_deg": error_deg})
-    assert (outcome_in_words(label), outcome_in_brief(label)) == (words, brief)
 
 
 def _poses_at(showcase: Showcase, location: int) -> Float:

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 from synthetic_dataset import make_landmarks
-from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.pose_information import information_matrices
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.scorers.registry import make_scorer, scorers
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_paper.fisher.exact import exact_information_plain
@@ -82,21 +78,6 @@ def test_exact_scores_are_numpys_of_the_sums(about_origin: bool) -> None:
         scores = FisherScorer(seen, metric, "exact", about_origin).score(poses)
         np.testing.assert_allclose(scores, values, rtol=1e-6, atol=1e-6)
         assert np.ptp(values) > 0.1
-
-
-def test_all_nine_rows_and_the_two_probes_are_methods() -> None:
-    localization_map = LocalizationMap(two_walls(np.random.default_rng(4), 200), CAMERA)
-    rows = {(metric, approximation, False) for metric in METRICS for approximation in APPROXIMATIONS}
-    turned = {(metric, approximation, True) for metric, approximation, _ in rows if metric != "logdet"}
-    found: dict[str, Any] = {
-        name: make_scorer(name, localization_map) for name, method in scorers().items() if method.family == "fisher"
-    }
-    assert {(one.metric, one.approximation, one.about_origin) for one in found.values()} == rows | turned
-    for name, scorer in found.items():
-        assert isinstance(scorer, FisherScorer) and scorer.name == name
-        assert scorers()[name].only_if_named == scorer.about_origin == (name not in EvaluateConfig().methods)
-    probes = [name for name, method in scorers().items() if method.group == "probes"]
-    assert probes == ["fisher-worst-trace", "fisher-stationary-trace"] and {*probes} < {*EvaluateConfig().methods}
 
 
 def test_probes_look_away_from_the_landmarks() -> None:

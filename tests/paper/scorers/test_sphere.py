@@ -56,19 +56,6 @@ def test_the_lattice_has_its_own_values_at_its_directions_and_means_between() ->
     torch.testing.assert_close(found[0], 0.75 * values[0, 3, 10] + 0.25 * values[0, 3, 11])
 
 
-def test_yaw_wraps_round_and_pitch_ends() -> None:
-    values = torch.randn(1, PITCHES, YAWS, dtype=torch.float64)
-    axes = at_angles((170, 20), (-190, 20), (180, 20), (30, 80), (30, 40), (-70, -90), (-70, -60))
-    found = on_lattice(values, torch.zeros(len(axes), dtype=torch.int64), axes)
-    torch.testing.assert_close(found[0], (values[0, 4, 17] + values[0, 4, 0]) / 2)
-    torch.testing.assert_close(found[1], found[0])
-    torch.testing.assert_close(found[2], values[0, 4, 0])
-    torch.testing.assert_close(found[3], found[4])
-    assert found[5].isfinite()
-    near = on_lattice(values, torch.zeros(2, dtype=torch.int64), at_angles((180 - 1e-9, 0), (-180 + 1e-9, 0)))
-    torch.testing.assert_close(near[0], near[1], rtol=0, atol=1e-7)
-
-
 def test_tokens_tell_of_landmarks_in_free_sight_and_of_cameras(localization_map: LocalizationMap) -> None:
     points = localization_map.landmarks.points
     locations = np.array([[0.5, -0.5, 1.2], [0.0, 1.0, 1.0], [1.0, 1.0, 2.0]])
@@ -114,25 +101,6 @@ def test_turning_a_location_turns_all_that_has_a_direction() -> None:
     angle = angle.remainder(2 * torch.pi)
     torch.testing.assert_close(angle, angle[:, :1].expand(-1, 9), rtol=1e-4, atol=1e-4)
     assert angle[:, 0].diff().abs().min() > 1e-3  # each by its own
-
-
-def test_padding_does_not_count(localization_map: LocalizationMap, model: TrainedNetwork[SphereNetwork]) -> None:
-    (tokens,) = LocationDescriber(localization_map, FEW).describe(np.array([[0.3, 0.2, 1.0]]))
-    alone = model.network.encode(tokens[None])
-    padded = torch.cat([tokens, torch.full((5, len(FEATURES)), 7.0)])[None]
-    padding = torch.arange(padded.shape[1])[None] >= len(tokens)
-    torch.testing.assert_close(model.network.encode(padded, padding), alone, rtol=1e-4, atol=1e-5)
-    assert (model.network.encode(padded) - alone).abs().max() > 1e-3
-
-
-def test_an_empty_share_of_a_batch_has_gradients(model: TrainedNetwork[SphereNetwork]) -> None:
-    network = SphereNetwork(FEW)
-    tokens = torch.empty(0, 4, len(FEATURES))
-    padding = torch.empty(0, 4, dtype=torch.bool)
-    logits = network(tokens, padding, torch.empty(0, dtype=torch.int64), torch.empty(0, 3))
-    assert logits.shape == (0,)
-    logits.sum().backward()  # other processes wait for them
-    assert all(parameter.grad is not None and not parameter.grad.any() for parameter in network.parameters())
 
 
 def test_a_pose_has_its_own_score(localization_map: LocalizationMap, model: TrainedNetwork[SphereNetwork]) -> None:

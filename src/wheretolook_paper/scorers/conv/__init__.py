@@ -9,8 +9,7 @@ METHODS = (
     Method(
         position=90,
         name="conv",
-        about="A convolutional network on the binned landmarks and how they were mapped: the probability that a view "
-        "localizes.",
+        about="Probability that a view localizes, by a convolutional network on binned landmarks and their attributes.",
         style=MethodStyle("convolutional, landmark attributes", "#AA4499", "8", (0, (3, 1))),
         group="learned",
         build=network_scorer(

@@ -1,4 +1,4 @@
-"""Scores by the Fisher information of the pose, and by probes of the Fisher Information Field, see the package."""
+"""Scores by the Fisher information of the pose, and by probes of the Fisher Information Field."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PROBE_AXES = 2000  # axes among which the worst view is sought
 
 
 class PoseInformation:
-    """Information of the views of a map, shared by all scorers that are made of it."""
+    """Information of the views of a map, shared by all of its scorers."""
 
     _of_maps: ClassVar[WeakKeyDictionary[LocalizationMap, PoseInformation]] = WeakKeyDictionary()
 
@@ -44,20 +44,20 @@ class PoseInformation:
 
     @classmethod
     def of_map(cls, localization_map: LocalizationMap) -> PoseInformation:
-        """The information of a map's views, made once a map."""
+        """Return the information of a map's views, made once per map."""
         if localization_map not in cls._of_maps:
             cls._of_maps[localization_map] = cls(localization_map)
         return cls._of_maps[localization_map]
 
     def numbers(self, cam_from_world: Float, approximation: Approximation) -> Float:
-        """(B, 15) of poses (B, 3, 4), see `wheretolook.geometry.pose_information`."""
+        """Return the information (B, 15) of poses (B, 3, 4), see `wheretolook.geometry.pose_information`."""
         self._look_at(cam_from_world)
         if approximation not in self._known:
             self._known[approximation] = self._numbers(approximation)
         return np.asarray(self._known[approximation])
 
     def eigenvalues(self, cam_from_world: Float, approximation: Approximation, about_origin: bool) -> Float:
-        """(B, 6) of the informations of poses (B, 3, 4)."""
+        """Return the eigenvalues (B, 6) of the information of poses (B, 3, 4)."""
         numbers = self.numbers(cam_from_world, approximation)
         name = f"{approximation} eigenvalues about {'the origin' if about_origin else 'the camera'}"
         if name not in self._known:
@@ -66,7 +66,7 @@ class PoseInformation:
         return np.asarray(self._known[name])
 
     def field(self, cam_from_world: Float, approximation: Approximation) -> tuple[FisherField, NDArray[np.int64]]:
-        """The field at the locations of poses (B, 3, 4), and each pose's row in it, (B,)."""
+        """Return the field at the locations of poses (B, 3, 4), and each pose's row in it, (B,)."""
         self._look_at(cam_from_world)
         name = f"{approximation} field"
         if name not in self._known:
@@ -78,12 +78,12 @@ class PoseInformation:
 
     def _look_at(self, cam_from_world: Float) -> None:
         poses = check_poses(cam_from_world)
-        if not np.array_equal(poses, self._poses):  # several methods ask for the same block of views
+        if not np.array_equal(poses, self._poses):  # several methods score the same block of views
             self._poses = poses.copy()
             self._known = {}
 
     def _locations(self) -> tuple[Float, NDArray[np.int64], NDArray[np.bool_]]:
-        """Locations (L, 3) of the poses, each pose's row, and the landmarks (L, N) with a free line of sight."""
+        """Return locations (L, 3) of the poses, each pose's row, and the mask (L, N) of unoccluded landmarks."""
         if "locations" not in self._known:
             locations, rows = shared_locations(self._poses)
             self._known["locations"] = locations, rows, self.occlusion.unoccluded(locations, self.points)
@@ -100,15 +100,14 @@ class PoseInformation:
 
 
 class FisherScorer(Scorer):
-    """A metric ("mineig", "logdet" or "trace") of the information that a view has on its own pose.
+    """Scores a view by a metric ("mineig", "logdet" or "trace") of the information on its pose.
 
     The approximation "exact" sums over the landmarks in view; "quadratic" (10 factors) and "gp" (70) over all that have
     a free line of sight, weighted by a soft visibility of the optical axis, as a field stores them.
 
-    With `about_origin` turns of the pose are taken about the world's origin, as the released code of the Fisher
-    Information Field does, instead of about the camera. The determinant stays the same. About the camera is the default
-    as the better one for the paper's rows on our validation scene (by trace 85 to 88 % of the oracle's score against 63
-    to 69; by min. eigenvalue alike, but for the quadratic's 51 against 75).
+    With `about_origin`, rotations are about the world's origin, as in the released code of the Fisher Information
+    Field, instead of about the camera. The determinant is the same. The camera is the default because it gives better
+    rows of the paper's table on the validation scene.
     """
 
     local = True
@@ -128,7 +127,7 @@ class FisherScorer(Scorer):
         self._information = PoseInformation.of_map(localization_map)
 
     def score(self, cam_from_world: Float) -> Float:
-        """(B,), not bounded by 1."""
+        """Return (B,), not bounded by 1."""
         if self.metric == "trace" and not self.about_origin:
             return metric_of(self._information.numbers(cam_from_world, self.approximation), "trace")
         values = self._information.eigenvalues(cam_from_world, self.approximation, self.about_origin)
@@ -136,7 +135,7 @@ class FisherScorer(Scorer):
 
 
 class ProbeScorer(Scorer):
-    """Views by how near their axis is to a certain axis of each location; such a method chooses without comparing."""
+    """Scores a view by the angle between its axis and a certain axis of its location."""
 
     local = True
 
@@ -145,7 +144,7 @@ class ProbeScorer(Scorer):
         self._information = PoseInformation.of_map(localization_map)
 
     def score(self, cam_from_world: Float) -> Float:
-        """(B,) in [0, 1]: half of one plus the cosine between the two axes."""
+        """Return (B,) in [0, 1]: half of one plus the cosine between the two axes."""
         cam_from_world = check_poses(cam_from_world)
         field, rows = self._information.field(cam_from_world, "quadratic")
         axes = np.array([self.axis(field, row) for row in range(len(field.locations))]).reshape(-1, 3)
@@ -154,16 +153,16 @@ class ProbeScorer(Scorer):
 
     @abstractmethod
     def axis(self, field: FisherField, row: int) -> Float:
-        """The axis (3,) at location `row`."""
+        """Return the axis (3,) at location `row`."""
 
 
 class WorstTraceScorer(ProbeScorer):
-    """The view with the least trace by the quadratic field ("trace app worst"): what the field says not to do."""
+    """The view with the smallest trace by the quadratic field ("trace app worst")."""
 
     name = "fisher-worst-trace"
 
     def axis(self, field: FisherField, row: int) -> Float:
-        """(3,)."""
+        """Return the axis (3,)."""
         return worst_axis_of_trace(field, row, fibonacci_sphere(PROBE_AXES))
 
 
@@ -173,5 +172,5 @@ class StationaryTraceScorer(ProbeScorer):
     name = "fisher-stationary-trace"
 
     def axis(self, field: FisherField, row: int) -> Float:
-        """(3,)."""
+        """Return the axis (3,)."""
         return stationary_axis_of_trace(field, row)

@@ -9,8 +9,7 @@ METHODS = (
     Method(
         position=110,
         name="sphere",
-        about="In the manner of ActLoc: one pass over a location's landmarks and the mapping cameras scores 6 x 18 "
-        "directions.",
+        about="Like ActLoc: one pass over a location's landmarks and the mapping cameras scores 6 x 18 directions.",
         style=MethodStyle("whole sphere (manner of ActLoc)", "#6699CC", "H", (0, (3, 1))),
         group="learned",
         build=network_scorer(

@@ -1,7 +1,7 @@
-"""A network that scores the whole sphere of directions at a location at once, in the manner of ActLoc (2025).
+"""A network that scores all directions at a location at once, like ActLoc (2025).
 
-Landmarks and mapping cameras go in as tokens, the logits of 6 pitches x 18 yaws come out. A pose's logit is read off
-between them, at the direction it looks in; roll does not count.
+Landmarks and mapping cameras are input tokens, logits of 6 pitches x 18 yaws the output. A pose's logit is interpolated
+at its direction; roll is ignored.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ def on_lattice(values: Tensor, rows: Tensor, axes: Tensor) -> Tensor:
 
 
 class SphereNetwork(StoredNetwork):
-    """Tokens attend to each other; then the directions of the lattice to each other and to the tokens.
+    """Attention among tokens, then among the directions of the lattice and from these to the tokens.
 
-    The directions of tokens and of the lattice are told alike, so that each can find the other.
+    The directions of tokens and of the lattice share one encoding.
     """
 
     lattice: Tensor
@@ -95,7 +95,7 @@ class SphereNetwork(StoredNetwork):
         return on_lattice(self.encode(tokens, padding), rows, axes)
 
     def augment(self, options: FittingConfig, tokens: Tensor, padding: Tensor, rows: Tensor, axes: Tensor) -> Any:
-        """Each location and its views, turned about the vertical by an angle of its own."""
+        """Rotate each location and its views about the vertical by a random angle."""
         angle = 2 * torch.pi * torch.rand(len(tokens), device=tokens.device)
         cos = angle.cos()
         sin = angle.sin()

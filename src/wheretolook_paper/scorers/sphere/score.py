@@ -1,4 +1,4 @@
-"""The score of a network that sees a location's landmarks and mapping cameras all around."""
+"""The score of the network for all directions at a location."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from wheretolook_paper.scorers.sphere.views import LocationDescriber
 
 
 class SphereScorer(Scorer):
-    """In the manner of ActLoc: one pass over a location's landmarks and the mapping cameras scores 6 x 18 directions.
+    """Like ActLoc: one pass over a location's landmarks and the mapping cameras scores 6 x 18 directions.
 
     A pose's score is the probability that it localizes, interpolated between those directions; roll does not count.
     Raises a WeightsError if it was trained for another field of view than the map's camera, a MapError if the map has
@@ -31,7 +31,7 @@ class SphereScorer(Scorer):
         self._describer = LocationDescriber(localization_map, self.network.config)
 
     def score(self, cam_from_world: Float) -> Float:
-        """(B,) probabilities in [0, 1]."""
+        """Return probabilities (B,) in [0, 1]."""
         cam_from_world = check_poses(cam_from_world)
         if not len(cam_from_world):
             return np.empty(0)
@@ -46,7 +46,7 @@ class SphereScorer(Scorer):
     def _log_odds(self, tokens: Tensor) -> Tensor:
         """Calibrated log-odds (PITCHES, YAWS) float64 of all directions at the location of tokens (T, len(FEATURES)).
 
-        A location is encoded alone: beside others its logits would differ in their last digits.
+        Locations are encoded one by one, because batching changes the last digits of logits.
         """
         with torch.inference_mode():
             return self.trained.calibrated(self.network.encode(tokens[None])[0].double())

@@ -24,8 +24,7 @@ METHODS = (
     Method(
         position=80,
         name="trees",
-        about="Boosted trees on where the landmarks in view lie and how they were mapped: the probability that a view "
-        "localizes.",
+        about="Probability that a view localizes, by boosted trees on positions and attributes of its visible landmarks.",
         style=MethodStyle("boosted trees, landmark attributes", "#882255", "*", "-"),
         group="learned",
         build=_build,

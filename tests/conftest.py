@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -78,12 +78,10 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Shards are labelled here one after the other: quicker, for what the workers have no part in."""
     threads = torch.get_num_threads(), cv2.getNumThreads()
 
-    def run(
-        shards: Sequence[Shard], workers: int, tick: Callable[[int], None]
-    ) -> Iterator[tuple[Shard, LabelledShard]]:
+    def run(shards: Sequence[Shard], workers: int) -> Iterator[tuple[Shard, LabelledShard]]:
         worker = ShardWorker()
         for shard in shards:
-            yield shard, worker.label(shard.job, shard.rows, tick)
+            yield shard, worker.label(shard.job, shard.rows)
 
     monkeypatch.setattr(local_engine, "run_local", run)
     yield

@@ -1,11 +1,11 @@
-"""Labels tables of viewpoints in shards, which are kept when the work is interrupted."""
+"""Labels tables of viewpoints in shards, so that interrupted work is resumed."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import cache
@@ -26,18 +26,18 @@ from wheretolook.utils.files import fingerprint, sha256, write_json
 from wheretolook.utils.version import VERSION
 
 MANIFEST = "manifest.json"
-"""File in the folder of shards that says what the labels are made with; later `labels.json` beside the table."""
+"""File in the folder of shards with the settings of the labels; later `labels.json` next to the table."""
 
-VIEWS_OF_A_CAMERA = 16
-"""Least views of each of several cameras in a shard, as a mean, where a GPU labels it."""
+MIN_VIEWS_PER_CAMERA = 16
+"""Minimum mean number of views of each of several cameras in a shard on a GPU: a batch is of one camera."""
 
 LABELS = ("status", "error_m", "error_deg", "n_inliers")
-"""Columns of a table that labelling fills in."""
+"""Columns that labelling fills in."""
 
 
 @dataclass(frozen=True, eq=False)
 class LabelTask:
-    """A scene to label: its name, what workers need, its viewpoints (`viewpoints.table.SCHEMA`), folder of shards."""
+    """A scene to label: its name, the workers' input, its viewpoints (`viewpoint_table.SCHEMA`), folder of shards."""
 
     name: str
     job: SceneJob
@@ -50,12 +50,11 @@ class LabelledScene:
     """A scene all of whose viewpoints are labelled.
 
     Attributes:
-        task: the scene that was to be labelled.
-        table: the viewpoints with status, error_m, error_deg and n_inliers; the paper's label y follows from them by
-            `viewpoints.table.is_good`. If the job stores matches, also `viewpoints.table.MATCH_FIELDS`, and if
-            it stores pixels `PIXEL_FIELD`.
-        manifest: versions, settings and fingerprints of what made the labels, and each shard's name and SHA-256.
-        seconds: the workers' time in each step, for shards made in this run.
+        task: the scene.
+        table: the viewpoints with status, error_m, error_deg and n_inliers, and with `viewpoint_table.MATCH_FIELDS` and
+            `PIXEL_FIELD` if the job stores them; the paper's label y is `viewpoint_table.is_good`.
+        manifest: versions, settings and fingerprints of the inputs, and each shard's name and SHA-256.
+        seconds: the workers' time in each step, for shards labelled in this run.
     """
 
     task: LabelTask
@@ -69,15 +68,14 @@ def label_scenes(
 ) -> Generator[LabelledScene, None, None]:
     """Render every viewpoint, localize its image against the map and measure the error (paper, Sec. 3.3).
 
-    Work is cut into shards. A finished shard is a file named by a hash of all that decides its labels (viewpoints,
-    mesh, landmarks, settings, versions). A run that was interrupted or killed therefore goes on where it stopped and
-    ends with the same table, for any engine and any number of workers, which go from one scene to the next without
-    pause. `description` is the title of the progress bar, one for all scenes. Yields scenes as they are finished; the
-    caller stores their tables, and may then remove their shards.
+    Work is split into shards. A finished shard is a file named by a hash of everything that decides its labels
+    (viewpoints, mesh, landmarks, settings, versions). So an interrupted run resumes and ends with the same table, for
+    any engine and number of workers. `description` is the title of the progress bar. Yields scenes as they are
+    finished; the caller stores their tables, and may then remove their shards.
 
-    Raises a SceneError or MapError if a mesh or landmarks cannot be used; a TableError if a table is empty; a
-    WorkerError if workers were killed repeatedly, or something failed in one; a StorageError if a shard or its manifest
-    cannot be written, as when the disk is full; a ConfigError if the Ray engine cannot be used.
+    Raises SceneError or MapError if a mesh or landmarks cannot be used, TableError if a table is empty, WorkerError if
+    workers fail or are killed repeatedly, StorageError if a shard cannot be written, ConfigError if the Ray engine
+    cannot be used.
     """
     scenes = [_SceneInProgress.of(task, config.shard_size) for task in tasks]
     scene_of_shard = {shard: scene for scene in scenes for shard in scene.missing}
@@ -85,7 +83,7 @@ def label_scenes(
     total = sum(len(task.table) for task in tasks)
     left = sum(len(shard.rows) for shard in missing)
     bar = tqdm(total=total, initial=total - left, desc=description, unit="view", disable=not progress, smoothing=0.05)
-    with bar, closing(_run(missing, config, bar.update)) as results:  # closing: an error here ends the workers
+    with bar, closing(_run(missing, config)) as results:  # an error here ends the workers
         for scene in scenes:
             if not scene.missing:
                 yield scene.result()
@@ -96,6 +94,7 @@ def label_scenes(
             for step, seconds in labelled.seconds.items():
                 scene.seconds[step] = scene.seconds.get(step, 0.0) + seconds
             bar.set_postfix_str(scene.task.name, refresh=False)
+            bar.update(len(shard.rows))
             if not scene.missing:
                 yield scene.result()
 
@@ -103,13 +102,13 @@ def label_scenes(
 @cache
 def versions() -> dict[str, str]:
     """Versions of the packages that decide a label."""
-    found = {"wheretolook": VERSION}
+    result = {"wheretolook": VERSION}
     for package in ("poselib", "pycolmap", "opencv-python-headless", "warp-lang", "numpy", "torch"):
         try:
-            found[package] = version(package)
+            result[package] = version(package)
         except PackageNotFoundError:  # installed some other way
-            found[package] = "unknown"
-    return found
+            result[package] = "unknown"
+    return result
 
 
 @dataclass(eq=False)
@@ -133,23 +132,26 @@ class _SceneInProgress:
         if Landmarks.load(job.landmarks).descriptors is None:
             fix = "Build the map again."
             raise MapError("landmarks without descriptors cannot be matched", path=job.landmarks, fix=fix)
-        settings: dict[str, Any] = {"versions": versions()}
-        settings |= {"localizer": job.localizer.record(), "extractor": job.extractor.record()}
-        settings["camera"] = job.camera.record()
-        settings |= {"renderer": _renderer_name(job.device)}
-        settings |= {"mesh": fingerprint(job.mesh), "landmarks": fingerprint(job.landmarks)}
+        settings: dict[str, Any] = {
+            "versions": versions(),
+            "localizer": job.localizer.record(),
+            "extractor": job.extractor.record(),
+            "camera": job.camera.record(),
+            "renderer": _renderer_name(job.device),
+            "mesh": fingerprint(job.mesh),
+            "landmarks": fingerprint(job.landmarks),
+        }
         if job.cameras:
             settings["cameras"] = {number: camera.record() for number, camera in job.cameras}
-        if job.store_matches:  # only then, so that shards without matches keep their names from earlier versions
+        if job.store_matches:  # only then: the record decides the names of shards
             settings["store_matches"] = True
         if job.store_pixels:
             settings["store_pixels"] = True
         text = json.dumps(settings, sort_keys=True).encode()
-        # a shard's file holds them all
         inputs = [name for name in (*SCHEMA.names, CAMERA_ID) if name not in LABELS and name in table]
         shards = []
-        if job.device != "cpu":  # a batch is of one camera, and a GPU wants large ones
-            shard_size = max(shard_size, VIEWS_OF_A_CAMERA * len(job.cameras))
+        if job.device != "cpu":
+            shard_size = max(shard_size, MIN_VIEWS_PER_CAMERA * len(job.cameras))
         for begin in range(0, len(table), shard_size):
             rows = table.iloc[begin : begin + shard_size]
             content = pd.util.hash_pandas_object(rows[inputs], index=False).to_numpy()
@@ -168,7 +170,7 @@ class _SceneInProgress:
         for shard in self.shards:
             rows = _finished(shard)
             if rows is None:
-                fix = "Run again: it is made anew."
+                fix = "Run again: it is labelled again."
                 raise StorageError("a finished shard was damaged or removed", path=shard.path, fix=fix)
             parts.append(rows)
         contents = {shard.path.name: {"n": len(shard.rows), "sha256": sha256(shard.path)} for shard in self.shards}
@@ -177,28 +179,26 @@ class _SceneInProgress:
 
 
 def _renderer_name(device: str) -> str:
-    """Kind of device and rendering method: they differ in the rounding of some pixels."""
+    """Kind of device and rendering method, which round some pixels differently."""
     from wheretolook.rendering.warp_renderer import method_on
 
     kind = device.partition(":")[0]
     return f"{kind} {method_on(kind)}"
 
 
-def _run(
-    shards: Sequence[Shard], config: LabelConfig, tick: Callable[[int], Any]
-) -> Generator[tuple[Shard, LabelledShard], None, None]:
+def _run(shards: Sequence[Shard], config: LabelConfig) -> Generator[tuple[Shard, LabelledShard], None, None]:
     if config.engine == "ray" and shards:
         from wheretolook.localization.ray_engine import run_ray
 
-        yield from run_ray(shards, config.ray_address, tick)
+        yield from run_ray(shards, config.ray_address)
     elif shards:
         from wheretolook.localization.local_engine import run_local
 
-        yield from run_local(shards, config.workers or len(os.sched_getaffinity(0)), tick)
+        yield from run_local(shards, config.workers or len(os.sched_getaffinity(0)))
 
 
 def _finished(shard: Shard) -> pd.DataFrame | None:
-    """A shard's labelled rows, or None if its file is missing or of other viewpoints; a damaged file is removed."""
+    """Read a shard's labelled rows; None if the file is missing, damaged (then it is removed) or of other viewpoints."""
     if not shard.path.exists():
         return None
     try:

@@ -1,11 +1,11 @@
-"""Labels the viewpoints of one shard: what every worker does, whichever engine runs it."""
+"""Labels the viewpoints of one shard, in any engine's worker."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -27,32 +27,29 @@ if TYPE_CHECKING:
     from wheretolook.rendering.types import Renderer
 
 BATCH = 8
-"""Viewpoints of 640 x 480 that are rendered, extracted and matched together, unless the extractor wants more.
-
-Fewer of a larger camera: many workers share a GPU, and each holds its batches' images and scale spaces there.
+"""Viewpoints of 640 x 480 per batch, unless the extractor wants more; fewer of a larger camera. Many workers share a GPU,
+and each holds its batches' images and scale spaces there.
 """
-
-Tick = Callable[[int], None]
 
 
 @dataclass(frozen=True)
 class SceneJob:
-    """All that a worker needs to label viewpoints of a scene; files of its mesh, and of landmarks with descriptors."""
+    """Everything that a worker needs to label viewpoints of a scene: files of mesh and landmarks, and settings."""
 
     mesh: Path
     landmarks: Path
     camera: Camera = PinholeCamera()
     localizer: LocalizerConfig = LocalizerConfig()
-    extractor: ExtractorConfig = ExtractorConfig()  # what the map was made with
-    device: str = "cpu"  # with "cuda", workers spread over all GPUs
-    store_matches: bool = False  # whether labelled rows get the columns of `viewpoints.table.MATCH_FIELDS`
-    cameras: tuple[tuple[int, Camera], ...] = ()  # by number, where viewpoints say with which of several they look
-    store_pixels: bool = False  # whether they also get `viewpoints.table.PIXEL_FIELD`
+    extractor: ExtractorConfig = ExtractorConfig()  # of the map
+    device: str = "cpu"  # with "cuda", workers are distributed over all GPUs
+    store_matches: bool = False  # add `viewpoint_table.MATCH_FIELDS`
+    cameras: tuple[tuple[int, Camera], ...] = ()  # by number, if viewpoints have a `camera_id`
+    store_pixels: bool = False  # add `viewpoint_table.PIXEL_FIELD`, too
 
 
 @dataclass(frozen=True, eq=False)
 class Shard:
-    """Some viewpoints of one scene, and the file their labels go to."""
+    """Some viewpoints of one scene, and the file for their labels."""
 
     job: SceneJob
     path: Path
@@ -61,16 +58,16 @@ class Shard:
 
 @dataclass(frozen=True, eq=False)
 class LabelledShard:
-    """The viewpoints of a shard with their labels, and the time the worker spent in each step; steps overlap."""
+    """The viewpoints of a shard with labels, and the seconds spent in each step; steps overlap."""
 
     rows: pd.DataFrame
     seconds: dict[str, float] = field(default_factory=dict)
 
 
 class ShardWorker:
-    """Labels shards in this process; the renderer and map stay loaded until a shard of another scene comes.
+    """Labels shards in this process; renderer and map stay loaded until a shard of another scene comes.
 
-    Its number among its engine's workers, from 0, decides the GPU that it uses.
+    Its number among its engine's workers, from 0, selects the GPU.
     """
 
     def __init__(self, number: int = 0) -> None:
@@ -81,30 +78,29 @@ class ShardWorker:
         self.number = number
         self._scene: tuple[SceneJob, Renderer, Localizer] | None = None
 
-    def label(self, job: SceneJob, rows: pd.DataFrame, tick: Tick = lambda n: None) -> LabelledShard:
-        """Label viewpoints of a scene; `tick` is called with the number of viewpoints just finished.
+    def label(self, job: SceneJob, rows: pd.DataFrame) -> LabelledShard:
+        """Label viewpoints of a scene.
 
-        Raises a SceneError or MapError if mesh or landmarks cannot be used, a WorkerError if anything else fails.
+        Raises SceneError or MapError if mesh or landmarks cannot be used, WorkerError if anything else fails.
         """
         try:
             seconds: dict[str, float] = {}
             renderer, localizer = self._open(job)
             cameras = dict(job.cameras) or job.camera
-            options = (seconds, tick, job.store_matches, job.store_pixels)
-            labelled = label_rows(rows, renderer, localizer, cameras, *options)
+            labelled = label_rows(rows, renderer, localizer, cameras, seconds, job.store_matches, job.store_pixels)
             return LabelledShard(labelled, seconds)
         except WhereToLookError:
             raise
         except Exception as error:
             problem = f"labelling failed: {type(error).__name__}: {error}"
             viewpoints = f"viewpoints {rows['viewpoint_id'].iloc[0]} to {rows['viewpoint_id'].iloc[-1]}"
-            fix = "Finished shards are kept: mend the cause and run again."
+            fix = "Fix the cause and run again; finished shards are kept."
             raise WorkerError(problem, path=job.mesh, value=viewpoints, fix=fix) from error
 
     def _open(self, job: SceneJob) -> tuple[Renderer, Localizer]:
         from wheretolook.localization.localizer import Localizer
         from wheretolook.mapping.landmarks import Landmarks
-        from wheretolook.rendering.registry import make_renderer
+        from wheretolook.rendering.warp_renderer import WarpRenderer
         from wheretolook.scenes.loading import load_mesh
 
         if self._scene is None or self._scene[0] != job:
@@ -114,9 +110,10 @@ class ShardWorker:
             device = job.device
             if device == "cuda":
                 device = f"cuda:{self.number % max(1, torch.cuda.device_count())}"
-            renderer = make_renderer(load_mesh(job.mesh), device)
-            looked = (job.camera, job.localizer, job.extractor, device, job.landmarks.parent)
-            localizer = Localizer(Landmarks.load(job.landmarks), *looked)
+            renderer = WarpRenderer(load_mesh(job.mesh), device)
+            landmarks = Landmarks.load(job.landmarks)
+            map_dir = job.landmarks.parent
+            localizer = Localizer(landmarks, job.camera, job.localizer, job.extractor, device, map_dir)
             self._scene = job, renderer, localizer
         return self._scene[1:]
 
@@ -127,63 +124,69 @@ def label_rows(
     localizer: Localizer,
     cameras: Camera | Mapping[int, Camera],
     seconds: dict[str, float] | None = None,
-    tick: Tick = lambda n: None,
     store_matches: bool = False,
     store_pixels: bool = False,
 ) -> pd.DataFrame:
-    """Render viewpoints, localize the images and measure the errors, in batched steps that overlap in this process.
+    """Render viewpoints, localize the images and measure the errors, in batched steps that overlap.
 
-    Of several cameras, each viewpoint's `camera_id` says which looks. The time spent in each step (render, extract,
-    match, pose) is added to `seconds`, and `tick` is called with the number of viewpoints just finished. Returns the
-    table with status, error_m, error_deg and n_inliers filled in, and with `viewpoints.table.MATCH_FIELDS` if
-    `store_matches`, and also `PIXEL_FIELD` if `store_pixels`; those of earlier labels are dropped.
+    With several cameras, `camera_id` selects that of a viewpoint. The seconds spent in each step (render, extract,
+    match, pose) are added to `seconds`. Returns the table with new status, error_m, error_deg and n_inliers,
+    `viewpoint_table.MATCH_FIELDS` if `store_matches`, and also `PIXEL_FIELD` if `store_pixels`.
     """
     true_poses = poses(table)
-    if not isinstance(cameras, Mapping):
-        groups = [(cameras, np.arange(len(table)))]
-    else:
+    if isinstance(cameras, Mapping):
         numbers = table[CAMERA_ID].to_numpy()
         groups = [(cameras[number], np.flatnonzero(numbers == number)) for number in np.unique(numbers).tolist()]
-    together = max(BATCH, localizer.extractor.batch_of(640, 480))
-    batches = [(camera, part) for camera, rows in groups for part in _batches(camera, rows, together)]
+    else:
+        groups = [(cameras, np.arange(len(table)))]
+    batch_size = max(BATCH, localizer.extractor.batch_of(640, 480))
+    batches = [(camera, rows) for camera, group in groups for rows in _batches(camera, group, batch_size)]
 
-    def poses_of(batch: tuple[Camera, list[tuple[Keypoints, Matches]]]) -> list[Localization]:
+    def estimate(batch: tuple[Camera, list[tuple[Keypoints, Matches]]]) -> list[Localization]:
         camera, matched = batch
         return [localizer.estimate(keypoints, rows, landmarks, camera) for keypoints, (rows, landmarks) in matched]
 
-    steps = [  # a batch is of one camera, which goes with it from step to step
+    steps = [  # the camera of a batch goes with it from step to step
         Step("render", lambda batch: (batch[0], renderer.render(batch[0], true_poses[batch[1]]).rgb)),
         Step("extract", lambda batch: (batch[0], localizer.extract(batch[1]))),
         Step("match", lambda batch: (batch[0], list(zip(batch[1], localizer.match(batch[1], batch[0]), strict=True)))),
-        Step("pose", poses_of),
+        Step("pose", estimate),
     ]
-    found: list[Localization] = []
-    for batch in run_pipeline(batches, steps, seconds):
-        found += batch
-        tick(len(batch))
-    results = [found[row] for row in np.argsort(np.concatenate([rows for _, rows in groups]))]
-    none: Float = np.full((3, 4), np.nan)
-    estimates = np.stack([none if result.cam_from_world is None else result.cam_from_world for result in results])
+    localizations = [result for batch in run_pipeline(batches, steps, seconds) for result in batch]
+    order = np.argsort(np.concatenate([rows for _, rows in groups]))
+    results = [localizations[row] for row in order]
+    labelled = _with_errors(table, true_poses, results)
+    return _with_matches(labelled, results, store_pixels) if store_matches or store_pixels else labelled
+
+
+def _batches(camera: Camera, rows: NDArray[np.int64], batch_size: int) -> list[NDArray[np.int64]]:
+    """Split rows of views of one camera into batches, of `batch_size` if it is 640 x 480."""
+    size = min(batch_size, max(1, batch_size * 640 * 480 // (camera.width * camera.height)))
+    return [rows[i : i + size] for i in range(0, len(rows), size)]
+
+
+def _with_errors(table: pd.DataFrame, true_poses: Float, results: Sequence[Localization]) -> pd.DataFrame:
+    no_pose: Float = np.full((3, 4), np.nan)
+    estimates = np.stack([no_pose if result.cam_from_world is None else result.cam_from_world for result in results])
     error_m, error_deg = pose_error(estimates, true_poses)
-    labelled = table.drop(columns=[*MATCH_FIELDS.names, *PIXEL_FIELD.names], errors="ignore").assign(
+    return table.drop(columns=[*MATCH_FIELDS.names, *PIXEL_FIELD.names], errors="ignore").assign(
         status=[result.status for result in results],
         error_m=error_m.astype(np.float32),
         error_deg=error_deg.astype(np.float32),
         n_inliers=np.array([len(result.inlier_rows) for result in results], dtype=np.int32),
     )
-    if not (store_matches or store_pixels):
-        return labelled
-    order = [np.argsort(result.matched_rows, kind="stable") for result in results]
-    ragged: dict[str, Any] = {
-        "matched_rows": [one.matched_rows[by].astype(np.int32) for one, by in zip(results, order, strict=True)],
-        "inlier_rows": [np.sort(result.inlier_rows).astype(np.int32) for result in results],
-    }
-    if store_pixels:
-        ragged[PIXELS] = [one.matched_pixels[by].ravel() for one, by in zip(results, order, strict=True)]
-    return labelled.assign(**ragged)
 
 
-def _batches(camera: Camera, rows: NDArray[np.int64], together: int) -> list[NDArray[np.int64]]:
-    """Rows of views of one camera that go together, so many of 640 x 480."""
-    size = min(together, max(1, together * 640 * 480 // (camera.width * camera.height)))
-    return [rows[i : i + size] for i in range(0, len(rows), size)]
+def _with_matches(table: pd.DataFrame, results: Sequence[Localization], store_pixels: bool) -> pd.DataFrame:
+    """Add matched landmarks and inliers, in ascending order of the landmarks, and optionally pixels."""
+    orders = [np.argsort(result.matched_rows, kind="stable") for result in results]
+    table = table.assign(
+        matched_rows=[
+            result.matched_rows[order].astype(np.int32) for result, order in zip(results, orders, strict=True)
+        ],
+        inlier_rows=[np.sort(result.inlier_rows).astype(np.int32) for result in results],
+    )
+    if not store_pixels:
+        return table
+    pixels = [result.matched_pixels[order].ravel() for result, order in zip(results, orders, strict=True)]
+    return table.assign(**{PIXELS: pixels})

@@ -22,8 +22,6 @@ from wheretolook.utils.errors import WorkerError
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-PROGRESS_INTERVAL_S = 0.5
-
 _PR_SET_PDEATHSIG = 1  # sys/prctl.h
 _M_TRIM_THRESHOLD = -1  # malloc.h
 _M_MMAP_THRESHOLD = -3
@@ -39,7 +37,6 @@ class WorkerPool:
         self.workers = workers
         self._executor: ProcessPoolExecutor | None = None
         self._stop: Connection | None = None  # workers exit when it is closed
-        self._progress: Any = ()  # what each worker has reported of its current item
 
     def __enter__(self) -> WorkerPool:
         return self
@@ -73,28 +70,22 @@ class WorkerPool:
                 future.cancel()
 
     def map_unordered(
-        self,
-        function: Callable[[Item], Result],
-        items: Iterable[Item],
-        retries: int = 2,
-        on_progress: Callable[[int], None] = lambda in_flight: None,
+        self, function: Callable[[Item], Result], items: Iterable[Item], retries: int = 2
     ) -> Generator[tuple[Item, Result], None, None]:
         """Apply a module-level function to items in worker processes and yield items with results as they finish.
 
         If a process is killed, all unfinished items start again; after `retries` such restarts without a finished item
-        between them, WorkerError is raised. `on_progress` gets the sum of what `report_progress` reported for
-        unfinished items.
+        between them, WorkerError is raised.
         """
         waiting = deque(items)
         running = dict[Future[Result], Item]()
         restarts = 0
         while waiting or running:
-            done: set[Future[Result]] = set()
             try:
                 while waiting and len(running) < 2 * self.workers:
                     future = self._submit(function, waiting[0])
                     running[future] = waiting.popleft()
-                done, _ = wait(running, PROGRESS_INTERVAL_S, FIRST_COMPLETED)
+                done, _ = wait(running, return_when=FIRST_COMPLETED)
                 results = [(future, future.result()) for future in done]
             except BrokenProcessPool as error:
                 restarts += 1
@@ -104,7 +95,6 @@ class WorkerPool:
                 running.clear()
                 self._close(kill=True)
                 continue
-            on_progress(sum(self._progress))
             for future, result in results:
                 restarts = 0
                 yield running.pop(future), result
@@ -115,12 +105,11 @@ class WorkerPool:
             numbers = context.SimpleQueue()
             for number in range(self.workers):
                 numbers.put(number)
-            self._progress = context.RawArray("q", self.workers)
             stopped, self._stop = context.Pipe(duplex=False)
-            start = (numbers, self._progress, stopped, in_main_thread())
+            start = (numbers, stopped, in_main_thread())
             self._executor = ProcessPoolExecutor(self.workers, context, _start_worker, start)
         with ignoring_sigint():
-            return self._executor.submit(_run_item, function, item)
+            return self._executor.submit(function, item)
 
     def _close(self, kill: bool) -> None:
         if self._executor is None or self._stop is None:
@@ -155,7 +144,6 @@ def in_main_thread() -> bool:
 
 
 _number = 0
-_progress: Any = [0]
 
 
 def worker_number() -> int:
@@ -163,32 +151,19 @@ def worker_number() -> int:
     return _number
 
 
-def report_progress(amount: int) -> None:
-    """Add an amount to the progress of this worker's current item (see `WorkerPool.map_unordered`)."""
-    _progress[_number] += amount
-
-
-def _run_item(function: Callable[[Item], Result], item: Item) -> Result:
-    try:
-        return function(item)
-    finally:
-        _progress[_number] = 0
-
-
-def _start_worker(numbers: Any, progress: Any, stopped: Connection, started_by_main_thread: bool) -> None:
+def _start_worker(numbers: Any, stopped: Connection, started_by_main_thread: bool) -> None:
     """Initialize a worker process.
 
     On Linux the kernel kills it when the thread that started it ends, even inside a compiled function that holds the
     interpreter lock (prctl(2)); that is used only if this thread is the main thread, which lives as long as its
     process. Elsewhere a thread ends the worker.
     """
-    global _number, _progress
+    global _number
     if started_by_main_thread:
         with suppress(OSError, AttributeError):
             ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     threading.Thread(target=_exit_when_stopped, args=(stopped,), daemon=True).start()
     _number = numbers.get()
-    _progress = progress
     use_one_core()
 
 

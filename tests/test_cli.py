@@ -1,139 +1,222 @@
-"""What the command line says without a dataset."""
+"""The command line: options from files and arguments, errors and exit codes, help, and which package imports which."""
 
 from __future__ import annotations
 
-import gc
+import ast
 import json
 import os
-import signal
 import subprocess
 import sys
-import threading
-import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from wheretolook import cli
-from wheretolook.cli import main
-from wheretolook.scorers.registry import describe_methods, scorers
+from wheretolook.cli import main, parse_command
+from wheretolook.commands.options import Experiment
+from wheretolook.mapping.config import MapConfig
+from wheretolook.scenes.scenes_config import MeshSource
+from wheretolook.scorers.registry import describe_methods
+from wheretolook.utils import devices
+from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.nearest import nearest
+
+ROOT = Path(__file__).parents[1]
+CONFIGS = ROOT / "configs"
 
 
-def test_methods_are_listed_without_a_dataset(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    "path", sorted({*CONFIGS.glob("*.yaml")} - {CONFIGS / "own-meshes.yaml"}), ids=lambda path: path.stem
+)
+@pytest.mark.parametrize("command", ["train", "release"])
+def test_a_shipped_configuration_serves_every_command(path: Path, command: str) -> None:
+    assert parse_command(command, ["--config", str(path)]).name == path.stem
+
+
+def test_arguments_override_the_file() -> None:
+    options = parse_command(
+        "demo", ["--sample.grid", "[4,5,6]", "--config", str(CONFIGS / "demo.yaml"), "--label.localizer.seed=7"]
+    )
+    assert options.sample.grid == (4, 5, 6)
+    assert options.label.localizer.seed == 7
+    assert options.scenes.train == 3
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "name", "value"),
+    [
+        ("scenes", ["--up", "-y", "--rgbd", "a"], "scenes.rgbd.up", "-y"),
+        ("scenes", ["--scenes.meshes", "[{path: a/b.glb, up: y}]"], "scenes.meshes", (MeshSource(Path("a/b.glb"), up="y"),)),
+        ("map", ["--map.camera.fov_deg", "60"], "map.camera.fov_deg", 60.0),
+        ("plan", ["--start", "[-4, -3, 1.4]"], "plan.start", (-4.0, -3.0, 1.4)),
+        ("plan", ["--stops", "3"], "plan.stops.looks", 3),
+        ("evaluate", ["--evaluate.weights", "[data/release/weights/set.safetensors]"], "evaluate.weights", None),
+        ("select", ["--map", "m", "--out", "o.csv", "--at", "1,2,1.5", "-0.5,2,1.5"], "at", ("1,2,1.5", "-0.5,2,1.5")),
+        ("select", ["--map", "m", "--out", "o.csv", "--at", "a.csv", "--pitch", "-30", "30"], "pitch_deg", (-30.0, 30.0)),
+        ("select", ["--map", "m", "--out", "o.csv", "--grid", "1", "--camera-id", "3", "--skip"], "skip", True),
+        ("benchmark", ["a", "b", "--methods", "best", "set"], "scenes", (Path("a"), Path("b"))),
+        ("adapt", ["--map", "m", "--map.photographs.assume_metric", "true"], "adapt.map", Path("m")),
+    ],
+)  # fmt: skip
+def test_ways_to_write_options(command: str, arguments: list[str], name: str, value: object) -> None:
+    found: Any = parse_command(command, arguments)
+    for part in name.split("."):
+        found = getattr(found, part)
+    assert found == value or value is None
+
+
+def test_python_and_the_command_line_mean_the_same() -> None:
+    arguments = ["--name", "a", "--map.n_images", "5", "--camera.fov_deg", "60"]
+    parsed = parse_command("release", arguments)
+    assert parsed.map == MapConfig(n_images=5)
+    assert parsed.root == Experiment(name="a").root
+    assert parsed.sample == Experiment().sample
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["frobnicate"],
+        ["map", "--config", "nowhere.yaml"],
+        ["map", "--config"],
+        ["map", "--map.n_images", "many"],
+        ["map", "--map.n_images", "3", "4"],
+        ["map", "--map.n_image", "3"],  # no abbreviations
+        ["train", "--map.n_images", "3"],  # of another command
+        ["map", "--map.partners", "1"],  # a constant
+        ["map", "--list-methods"],
+        ["scenes", "--device", "gpu"],
+        ["scenes", "--camera.width", "0"],
+        ["scenes", "--config", str(CONFIGS / "own-meshes.yaml")],  # no scene
+        ["demo", "--config", str(CONFIGS / "own-meshes.yaml"), "--scenes.meshes", "[{path: a/b.glb}]"],  # no weights
+        ["sample", "--sample.lattice", "spiral"],
+        ["plan", "--start", "[.nan, 1, 1]"],
+        ["plan", "--plan.planner.time_s", ".inf"],
+        ["select", "--map", "m", "--out", "o.csv"],
+        ["release", "--name", "mine", "--release_name", "mine"],
+    ],
+)
+def test_wrong_arguments_exit_with_two(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments) == 2
+    errors = capsys.readouterr().err
+    assert errors.startswith("wheretolook: error: ") and "Traceback" not in errors
+
+
+@pytest.mark.parametrize(
+    "text", ["map: 3\n", "map: {n_imagess: 3}\n", "mapp: {n_images: 3}\n", "camera: {width: -1}\n", "[1]\n", "a: [\n"]
+)
+def test_an_error_in_a_file_names_the_file(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "settings.yaml"
+    path.write_text(text)
+    assert main(["map", "--config", str(path)]) == 2
+    assert str(path) in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        (["mapp"], "map"),
+        (["map", "--n_images=3"], "--map.n_images"),
+        (["plan", "--metod", "set"], "--method"),
+        (["map", "--config", str(CONFIGS / "demo.yml")], "configs/demo.yaml"),
+    ],
+)
+def test_the_nearest_name_is_suggested(arguments: list[str], meant: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments) == 2
+    assert f"Did you mean {meant}?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("wrong", "meant"),
+    [("max_ratio", "label.localizer.max_ratio"), ("sample.gird", "sample.grid"), ("frobnicate", None)],
+)
+def test_nearest(wrong: str, meant: str | None) -> None:
+    assert nearest(wrong, ["map.n_images", "label.localizer.max_ratio", "sample.grid"]) == meant
+
+
+@pytest.mark.parametrize(("name", "gpus"), [("cuda", 0), ("cuda:3", 1)])
+def test_a_missing_gpu_is_an_error_before_any_work(
+    name: str, gpus: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(devices, "_driver_gpus", lambda: gpus)
+    monkeypatch.setattr(devices, "_torch_gpus", lambda: gpus)
+    with pytest.raises(ConfigError):
+        parse_command("label", ["--data", str(tmp_path), "--device", name]).run()
+    assert parse_command("label", ["--engine", "ray", "--device", name]).warp_device == name  # a cluster may have it
+
+
+def test_devices(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(devices, "_driver_gpus", lambda: 2)
+    monkeypatch.setattr(devices, "_torch_gpus", lambda: 2)
+    names = ("auto", "cpu", "cuda", "cuda:1")
+    assert [devices.usable_device(name) for name in names] == ["cuda", "cpu", "cuda", "cuda:1"]
+    monkeypatch.setattr(devices, "_torch_gpus", lambda: 0)
+    assert devices.usable_device("auto") == "cpu"
+    with pytest.raises(ConfigError):
+        devices.usable_device("cuda")
+
+
+def test_an_interrupt_exits_with_130(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(arguments: list[str]) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "run_command", interrupted)
+    assert main(["scenes"]) == 130
+
+
+def test_debug_shows_the_traceback(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scenes", "--camera.width", "0", "--debug"]) == 2
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_methods_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", "--list-methods"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == [*scorers()]
-    assert not [*tmp_path.iterdir()]
-    texts = dict(line.split(maxsplit=1) for line in lines)
-    assert texts == describe_methods()
-    assert texts["bins"].startswith("Share of the image's bins")
-    assert texts["fisher-logdet-gp"].endswith(": logdet, gp.")
-    assert "probability" in texts["mlp-2d+z"]
-    assert len(set(texts.values())) == len(texts)
-    assert all(20 < len(text) < 140 for text in texts.values())
+    assert dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()) == describe_methods()
 
 
-def test_only_evaluate_lists_methods(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["map", "--list-methods"]) == 2
-    assert "list-methods" in capsys.readouterr().err
+@pytest.mark.parametrize("command", cli.command_targets())
+def test_help_explains_every_option(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "--help"]) == 0
+    text = capsys.readouterr().out
+    missing = [name for name in cli.option_types(cli.load_command(command)) if f"--{name}" not in text]
+    assert missing == [] and f"wheretolook {command} " in text
 
 
-@pytest.mark.parametrize(
-    ("stage", "says"),
-    [
-        (
-            "viewpoint-map",
-            ["--scenes.mapped_space.clearance_m", "--map.photographs.assume_metric", "photographs has no"],
-        ),
-        ("plan", ["--plan.start", "--plan.film", "wheretolook plan --config", "--tracking.folder", "model tsdf"]),
-    ],
-)
-def test_help_names_what_a_stage_reads(stage: str, says: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([stage, "--help-all"]) == 0
-    said = capsys.readouterr().out
-    assert [text for text in says if text not in said] == [] and "--evaluate" not in said
+def test_usage_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    text = capsys.readouterr().out
+    assert all(f"\n  {command} " in text for command in cli.command_targets())
 
 
-@pytest.mark.parametrize(
-    ("option", "value", "message"),
-    [
-        ("--start", "[.nan, 1, 1]", "plan.start must be finite"),
-        ("--goal", "[1, 1, .inf]", "plan.goal must be finite"),
-        ("--plan.planner.time_s", ".inf", "time_s must be positive and finite"),
-    ],
-)
-def test_a_plan_with_numbers_that_are_not_finite_is_refused(
-    option: str, value: str, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["plan", option, value]) == 2
-    assert message in capsys.readouterr().err
+HEAVY = ("torch", "warp", "scipy", "matplotlib", "mlflow", "pandas", "sklearn", "lightning", "cv2")
 
 
-def test_ctrl_c_stays_one_where_it_is_lost_or_made_another_error_of(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """As Python does while it removes an object, and safetensors while it reads a tensor."""
-
-    def reads(*_: object) -> int:
-        gc.collect()  # one in the next moment would swallow the interrupt, as hypothesis listens to collections
-        try:
-            signal.raise_signal(signal.SIGINT)
-        except KeyboardInterrupt as error:
-            raise ValueError("could not determine the shape") from error
-        return 0
-
-    class Removed:
-        def __del__(self) -> None:
-            signal.raise_signal(signal.SIGINT)
-
-    def goes_on(*_: object) -> int:
-        Removed()
-        time.sleep(60)
-        return 0
-
-    monkeypatch.setattr(cli, "_run", goes_on)
-    start = time.monotonic()
-    assert main(["scenes"]) == 130
-    began = threading.Thread.start
-
-    def starts_slowly(thread: threading.Thread) -> None:
-        began(thread)
-        time.sleep(0.1)
-
-    monkeypatch.setattr(threading.Thread, "start", starts_slowly)  # as on a busy machine
-    assert main(["scenes"]) == 130
-    monkeypatch.setattr(threading.Thread, "start", began)
-    assert time.monotonic() - start < 30
-    assert "Traceback" not in capsys.readouterr().err
-    monkeypatch.setattr(cli, "_run", reads)
-    assert main(["scenes"]) == 130
-    assert "wheretolook: interrupted" in capsys.readouterr().err
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+@pytest.mark.parametrize("arguments", [["--help"], ["train", "--train.epoch", "10"], ["check", "--scene", "cellar"]])
+def test_help_and_early_errors_import_nothing_heavy(arguments: list[str], tmp_path: Path) -> None:
+    (tmp_path / "data" / "mine" / "hall").mkdir(parents=True)
+    dataset = {"camera": {"width": 64, "height": 48, "focal_px": 32.0}, "scenes": [{"name": "hall", "split": "test"}]}
+    (tmp_path / "data" / "mine" / "dataset.json").write_text(json.dumps(dataset))
+    code = "import sys; from wheretolook.cli import main; main(sys.argv[2:]); "
+    code += "print(*[name for name in sys.argv[1].split() if name in sys.modules], file=sys.stderr)"
+    run = [sys.executable, "-c", code, " ".join(HEAVY), *arguments]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
+    done = subprocess.run(run, capture_output=True, text=True, check=True, cwd=tmp_path, env=environment)
+    assert done.stderr.splitlines()[-1] == ""
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["check", "--scene", "cellar"], "There are hall."),
-        (["check", "--scene", "hall", "--name", "other"], "this folder is no dataset"),
-        (["view", "--scene", "cellar", "--port", "0"], "There are hall."),
-        (["release", "--name", "mine", "--release_name", "mine"], "the name of the dataset that it is a copy of"),
-    ],
-)
-def test_what_can_be_refused_is_before_long_imports(arguments: list[str], says: str, tmp_path: Path) -> None:
-    scenes = [{"name": "hall", "split": "test"}]
-    camera = {"width": 64, "height": 48, "focal_px": 32.0}
-    (tmp_path / "mine" / "hall").mkdir(parents=True)
-    (tmp_path / "mine" / "dataset.json").write_text(json.dumps({"camera": camera, "scenes": scenes}))
-    before = sorted(tmp_path.rglob("*"))
-    code = "import sys; from wheretolook.cli import main; end = main(sys.argv[1:]); "
-    code += "print(*({'pandas', 'torch', 'mlflow', 'lightning'} & {*sys.modules}), file=sys.stderr); "
-    code += "sys.exit(end)"
-    run = [sys.executable, "-c", code, *arguments, "--data", str(tmp_path)]
-    ended = subprocess.run(run, env={**os.environ, "PYTHONPATH": "src"}, capture_output=True, text=True, check=False)
-    lines = ended.stderr.splitlines()
-    assert ended.returncode == 2 and says in lines[0] and [line for line in lines[1:] if line] == []
-    assert sorted(tmp_path.rglob("*")) == before
+def test_packages_import_only_what_is_below_them() -> None:
+    allowed = {
+        "wheretolook": {"wheretolook"},
+        "wheretolook_rooms": {"wheretolook", "wheretolook_rooms"},
+        "wheretolook_paper": {"wheretolook", "wheretolook_paper", "wheretolook_rooms"},
+    }
+    upward = []
+    for package, below in allowed.items():
+        for path in (ROOT / "src" / package).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+                names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+                tops = {name.partition(".")[0] for name in names}
+                upward += [f"{path}: {top}" for top in tops if top.startswith("wheretolook") and top not in below]
+    assert upward == []

@@ -108,7 +108,7 @@ def test_commands_run_in_an_empty_folder(installed: Path, tmp_path: Path) -> Non
     assert "usage: wheretolook demo" in ran([*command, "demo", "--help"], tmp_path, installed)
     printed = ran([*command, "scenes", "--config", "configs/small.yaml", "--help"], tmp_path, installed)
     assert "usage: wheretolook scenes" in printed
-    experiment = "from wheretolook.cli import parse_experiment; print(parse_experiment('demo', []).root)"
+    experiment = "from wheretolook.cli import parse_command; print(parse_command('demo', []).root)"
     assert ran(["-c", experiment], tmp_path, installed).strip() == "data/demo"
     assert not [*tmp_path.iterdir()]
 

@@ -1,77 +1,69 @@
-"""The command line: `wheretolook STAGE --config configs/demo.yaml`, one sub-command for each stage."""
+"""The command line: `wheretolook COMMAND [--config FILE.yaml] [--OPTION VALUE ...]`."""
 
 from __future__ import annotations
 
-import logging
+import json
 import os
-import signal
 import sys
-import threading
 import time
 import traceback
-import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from functools import cache
-from importlib import import_module
-from itertools import pairwise
+from importlib.metadata import entry_points
 from pathlib import Path
-from types import FrameType
-from typing import TYPE_CHECKING, Any
+from pkgutil import resolve_name
+from typing import Any, get_args, get_origin, get_type_hints
 
-from wheretolook.commands import OWN, STAGES, USAGE
-from wheretolook.utils.errors import (
-    ConfigError,
-    LockWarning,
-    MapWarning,
-    OutOfRangeWarning,
-    TrackingWarning,
-    WhereToLookError,
-)
+from wheretolook.utils.errors import ConfigError, WhereToLookError
 from wheretolook.utils.images import MAX_PIXELS
-from wheretolook.utils.options import Option, all_options, check_names, grouped, names_in, nearest, short_lines
+from wheretolook.utils.logs import quiet_libraries
+from wheretolook.utils.nearest import nearest
 from wheretolook.utils.shipped import or_shipped, shipped, shipped_configs
 from wheretolook.utils.version import VERSION
 
-if TYPE_CHECKING:
-    from wheretolook.config import Experiment
+COMMANDS = {
+    "scenes": "wheretolook.commands.scenes:Scenes",
+    "map": "wheretolook.commands.map:Map",
+    "sample": "wheretolook.commands.sample:Sample",
+    "label": "wheretolook.commands.label:Label",
+    "train": "wheretolook.commands.train:Train",
+    "evaluate": "wheretolook.commands.evaluate:Evaluate",
+    "adapt": "wheretolook.commands.adapt:Adapt",
+    "viewpoint-map": "wheretolook.commands.viewpoint_map:BuildViewpointMap",
+    "plan": "wheretolook.commands.plan:Plan",
+    "demo": "wheretolook.commands.demo:Demo",
+    "select": "wheretolook.commands.select:Select",
+    "check": "wheretolook.commands.check:Check",
+    "view": "wheretolook.commands.view:View",
+    "export": "wheretolook.commands.export:Export",
+}
+"""Dataclass of each command's options, whose `run()` does the work. Packages add theirs as entry points of this group."""
+
+GROUP = "wheretolook.commands"
+
+ENVIRONMENT = {
+    "OMP_WAIT_POLICY": "PASSIVE",  # idle threads leave the core to other processes
+    "OPENCV_IO_MAX_IMAGE_PIXELS": str(MAX_PIXELS),  # also of formats that Pillow does not read
+    "GLOG_logtostderr": "1",  # COLMAP leaves no log files in the folder of temporary files
+}
 
 
-_SHORT = {"--engine": "--label.engine", "--images": "--map.photographs.images"}  # flags of every stage
-_SIGNED = ("--up", "--scenes.rgbd.up", "--map.existing.mesh_up")  # flags whose value may begin with a minus sign
-_COMMON = "name data device"  # the options that matter to every stage
-
-
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line. Returns the exit code: 0, 2 for bad input, 130 when interrupted."""
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads leave the core to other processes
-    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))  # also of images that Pillow does not know
-    os.environ.setdefault("GLOG_logtostderr", "1")  # COLMAP leaves no log files in the folder of temporary files
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    debug = "--debug" in arguments
-    arguments = [argument for argument in arguments if argument != "--debug"]
-    if not arguments or arguments[0] in ("-h", "--help", "help"):
-        stages = "\n".join(f"  {name:<15}{stage.text}" for name, stage in STAGES.items())
-        own = "\n".join(f"  {name:<15}{text}" for name, (_, text) in OWN.items())
-        print(USAGE.format(stages=stages, own=own))
-        return 0
-    if arguments[0] == "--version":
-        print(f"wheretolook {VERSION}")
-        return 0
-    interrupts: list[int] = []
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+    given = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    debug = "--debug" in given
+    if not debug:
+        quiet_libraries()
     try:
-        with _noting(interrupts):
-            if not debug:
-                _quieten()
-            return _run(arguments[0], arguments[1:])
-    except (Exception, KeyboardInterrupt) as error:
-        if interrupts or isinstance(error, KeyboardInterrupt):
-            said = "interrupted; what is finished is kept, run the same command to go on"
-            print(f"\nwheretolook: {said}", file=sys.stderr)
-            return 130
-        if not isinstance(error, WhereToLookError | OSError):
-            raise
+        run_command([argument for argument in given if argument != "--debug"])
+        return 0
+    except KeyboardInterrupt:
+        print("\nwheretolook: interrupted; finished work is kept, run the same command to continue", file=sys.stderr)
+        return 130
+    except (WhereToLookError, OSError) as error:
         if debug:
             traceback.print_exc()
         text = f"{error.filename or 'a file'}: {error.strerror or error}" if isinstance(error, OSError) else str(error)
@@ -79,237 +71,216 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
 
 
-@contextmanager
-def _noting(interrupts: list[int]) -> Iterator[None]:
-    """Note each Ctrl-C in this block: compiled libraries, such as the one that reads weights, make errors of it."""
-    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler or not _in_main_thread():
-        yield
-        return
-
-    def note(number: int, frame: FrameType | None) -> None:
-        interrupts.append(number)
-        signal.default_int_handler(number, frame)
-
-    def interrupt_again(lost: sys.UnraisableHookArgs) -> None:
-        if lost.exc_type is KeyboardInterrupt:  # it came while an object was removed, where Python drops errors
-            threading.Thread(target=send_again, daemon=True).start()
-        else:
-            usual(lost)
-
-    def send_again() -> None:
-        main_thread = threading.main_thread().ident or 0
-        while not ended.wait(0.005):
-            frame = sys._current_frames().get(main_thread)
-            while frame is not None and frame.f_code is not interrupt_again.__code__:
-                frame = frame.f_back
-            if frame is None:  # within that function it would be dropped once more
-                signal.pthread_kill(main_thread, signal.SIGINT)  # a real signal, which also ends what waits
-                return
-
-    ended = threading.Event()
-    usual, sys.unraisablehook = sys.unraisablehook, interrupt_again
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        sys.unraisablehook = usual
-        ended.set()
-
-
-def _in_main_thread() -> bool:
-    return threading.current_thread() is threading.main_thread()
-
-
-def _run(command: str, arguments: list[str]) -> int:
-    if command in OWN:
-        return int(import_module(OWN[command][0]).run(arguments))
-    if command not in STAGES:
-        near = nearest(command, [*STAGES, *OWN])
-        fix = f"Did you mean {near}?" if near else f"Use one of {', '.join([*STAGES, *OWN])}."
-        raise ConfigError("unknown stage", value=command, fix=fix)
-    if command == "evaluate" and "--list-methods" in arguments:
-        from wheretolook.scorers.registry import describe_methods
-
-        texts = describe_methods()
-        width = max(map(len, texts))
-        print("\n".join(f"{name:<{width}}  {text}" for name, text in texts.items()))
-        return 0
-    if command == "figures" and "--list" in arguments:
-        from wheretolook_paper.release.catalog import catalog_text
-
-        print(catalog_text())
-        return 0
-    experiment = parse_experiment(command, arguments)
-    if experiment is None:
-        return 0
-    if experiment.device != "auto":
-        _ = experiment.warp_device  # refused now if it is not there, not after hours of other work
-    if STAGES[command].refuses:
-        import_module(STAGES[command].refuses).check(experiment)
-    from wheretolook import stages
-
-    if command == "demo":
-        from wheretolook.stages.demo import run_demo
-
-        run_demo(experiment)
+def run_command(arguments: list[str]) -> None:
+    """Run the command that the first argument names with the options that follow it."""
+    name, *rest = arguments
+    if name in ("-h", "--help", "help"):
+        print_commands()
+    elif name == "--version":
+        print(f"wheretolook {VERSION}")
+    elif {"-h", "--help"} & {*rest}:
+        build_parser(name).print_help()
     else:
         start = time.monotonic()
-        getattr(stages, STAGES[command].function)(experiment)
-        where = f": {experiment.root}" if experiment.root.is_dir() else ""  # of a map alone there is no dataset
-        print(f"done in {time.monotonic() - start:.0f} s{where}")
-    return 0
+        command = parse_command(name, rest)
+        command.run()
+        if hasattr(command, "root") and command.root.is_dir():
+            print(f"done in {time.monotonic() - start:.0f} s: {command.root}")
 
 
-def parse_experiment(command: str, arguments: list[str]) -> Experiment | None:
-    """The experiment that a YAML file and the command line's overrides describe; None if only help was asked for.
+@cache
+def command_targets() -> dict[str, str]:
+    """Return `module:Class` of every command by its name, those of installed packages included."""
+    return COMMANDS | {entry.name: entry.value for entry in entry_points(group=GROUP)}
 
-    Raises ConfigError if a file is missing, or a key or value does not fit.
+
+def load_command(name: str) -> Any:
+    """Return the dataclass of a command. Raises ConfigError if there is none of this name."""
+    targets = command_targets()
+    if name not in targets:
+        near = nearest(name, targets)
+        fix = f"Did you mean {near}?" if near else f"Use one of {', '.join(targets)}."
+        raise ConfigError("unknown command", value=name, fix=fix)
+    return resolve_name(targets[name])
+
+
+def print_commands() -> None:
+    """Print the name and the one-line summary of every command."""
+    print(
+        "wheretolook: choose camera views that localize\n\nusage: wheretolook COMMAND [--config FILE.yaml] [--OPTION VALUE ...] [--debug]\n"
+    )
+    for name in command_targets():
+        print(f"  {name:<15}{load_command(name).__doc__.splitlines()[0]}")
+    print("\n`wheretolook COMMAND --help` lists the options of a command, `wheretolook --version` prints the version.")
+
+
+def build_parser(name: str) -> Any:
+    """Return the jsonargparse parser of a command's options."""
+    from argparse import RawDescriptionHelpFormatter
+
+    from jsonargparse import ArgumentParser, DefaultHelpFormatter
+
+    class HelpFormatter(RawDescriptionHelpFormatter, DefaultHelpFormatter):
+        """Keeps the line breaks of a command's description."""
+
+    command = load_command(name)
+    option_types(command)
+    about, _, _ = command.__doc__.partition("\n    Args:")
+    short = ", ".join(f"--{short} for --{option}" for short, option in command.SHORT.items())
+    parser = ArgumentParser(
+        prog=f"wheretolook {name}",
+        usage=f"wheretolook {name} [--config FILE.yaml] [--OPTION VALUE ...]",
+        description=about.replace("\n    ", "\n"),
+        epilog=f"Short forms: {short}." if short else None,
+        formatter_class=HelpFormatter,
+        exit_on_error=False,
+    )
+    parser.add_argument("--config", action="config", help="YAML file with a section for each group of options")
+    parser.add_class_arguments(command)
+    return parser
+
+
+def parse_command(name: str, arguments: Sequence[str]) -> Any:
+    """Return the command with the options that YAML files (`--config`) and then the arguments set.
+
+    Raises ConfigError for an option that does not exist, or a value of the wrong kind or out of range.
     """
-    from wheretolook.config import MOVED, Experiment
+    from jsonargparse import ArgumentError
 
-    options = all_options(Experiment)
-    short = {**_SHORT, **STAGES[command].short}
-    arguments = list(arguments)
-    places = [place for place, name in enumerate(arguments) if name in _SIGNED and place + 1 < len(arguments)]
-    for place in reversed(places):  # a value such as -y looks like an option
-        arguments[place : place + 2] = [f"{arguments[place]}={arguments[place + 1]}"]
-    given = [argument.partition("=") for argument in arguments]
-    arguments = [short.get(name, name) + equals + value for name, equals, value in given]
-    if {"-h", "--help", "--help-all"} & {*arguments}:
-        print(_help(command, options, everything="--help-all" in arguments))
-        return None
-    names = [argument.partition("=")[0] for argument in arguments if argument.startswith("--")]
-    names = [name.removeprefix("--").removesuffix("+") for name in names]
-    known = {**options, **{name: Option(name, "") for name in ("config", "print_config", "help-all", "debug")}}
-    known |= {flag.removeprefix("--"): Option(flag, "") for flag in short}
-    check_names(names, known, MOVED, "--")
-    if "config" not in names and STAGES[command].config:
-        arguments = ["--config", str(shipped(f"configs/{STAGES[command].config}.yaml")), *arguments]
-    arguments = [part for one in arguments for part in (one.split("=", 1) if one.startswith("--config=") else [one])]
-    places = [number for number, flag in enumerate(arguments[:-1], 1) if flag == "--config"]
-    for place in places:
-        arguments[place] = str(or_shipped(arguments[place]))
-        _check_file(Path(arguments[place]), options)
-    for flag, value in _groups_given(arguments, options):
-        if not value.lstrip().startswith("{"):  # settings themselves, written out
-            _check_file(Path(value), options, f"{flag.removeprefix('--')}.")
-    return _with_shipped_weights(_parsed(command, arguments, ", ".join(arguments[place] for place in places) or None))
+    command = load_command(name)
+    types = option_types(command)
+    given = list(named_values(command, types, arguments))
+    files = [value for option, value in given if option == "config"]
+    if not files and command.CONFIG:
+        files = [str(shipped(f"configs/{command.CONFIG}.yaml"))]
+    set_by_files = [setting for file in files for setting in read_settings(or_shipped(file), types)]
+    settings = [*set_by_files, *((option, value) for option, value in given if option != "config")]
+    parser = build_parser(name)
+    try:
+        parsed = vars(parser.instantiate(parser.parse_args([f"--{option}={value}" for option, value in settings])))
+        parsed.pop("config")
+        return command(**parsed)
+    except (ArgumentError, WhereToLookError) as error:
+        raise explained(error, name, ", ".join(files) or None) from error
 
 
-def _with_shipped_weights(experiment: Experiment) -> Experiment:
-    """The experiment with weights that are named as they lie in the project's folder found from any other."""
-    found: dict[str, Any] = {"evaluate": tuple(map(or_shipped, experiment.evaluate.weights))}
-    for name in ("adapt", "viewpoint_map", "plan", "paths"):
-        weights = getattr(experiment, name).weights
-        found[name] = weights and or_shipped(weights)
-    return replace(experiment, **{name: replace(getattr(experiment, name), weights=w) for name, w in found.items()})
+def explained(error: BaseException, name: str, files: str | None) -> WhereToLookError:
+    """Return the error of this project that the parser's error hides, or a ConfigError of its text."""
+    help_text = f"`wheretolook {name} --help` explains the options."
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, WhereToLookError):
+            return type(cause)(cause.problem, path=cause.path or files, value=cause.value, fix=cause.fix or help_text)
+        cause = cause.__cause__ or cause.__context__
+    return ConfigError(" ".join(str(error).split()), path=files, fix=help_text)
 
 
-def _groups_given(arguments: list[str], options: Mapping[str, Option]) -> list[tuple[str, str]]:
-    """The flags of whole groups of options, such as --map, each with its value: a file of the group's settings."""
-    split = [one.split("=", 1) if one.startswith("--") else [one] for one in arguments]
-    words = [part for parts in split for part in parts]
-    groups = {f"--{name}" for name, option in options.items() if option.is_group}
-    return [(flag, value) for flag, value in pairwise(words) if flag in groups]
+def option_types(command: Any, prefix: str = "") -> dict[str, Any]:
+    """Return the types of all options of a dataclass of dataclasses by dotted name."""
+    types = {}
+    hints = get_type_hints(command)
+    command.__init__.__annotations__.update(hints)  # or the parser would import modules that only type checkers need
+    for field in fields(command):
+        kind = hints[field.name]
+        if field.init and is_dataclass(kind):
+            types |= option_types(kind, f"{prefix}{field.name}.")
+        elif field.init:
+            types[f"{prefix}{field.name}"] = kind
+    return types
 
 
-def _check_file(path: Path, options: Mapping[str, Option], group: str = "") -> None:
-    """Raise ConfigError, with the file's path, unless it can be read and every key in it is an option's, or a group's.
+def named_values(command: Any, types: Mapping[str, Any], arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Yield full name and value of each option in the arguments; several values become a list, none becomes true.
 
-    A group's name ends on a dot.
+    Values before the first option are those of the command's option `POSITIONAL`.
     """
-    from wheretolook.config import MOVED
+    words: list[list[str]] = [[f"--{command.POSITIONAL}"]]
+    for argument in arguments:
+        if argument.startswith("--"):
+            option, equals, value = argument.partition("=")
+            words.append([option, value] if equals else [option])
+        else:
+            words[-1].append(argument)
+    if len(words[0]) == 1:
+        words = words[1:]
+    known = [*types, "config", "print_config"]
+    for option, *values in words:
+        name = option.removeprefix("--").replace("-", "_")
+        name = command.SHORT.get(name.replace("_", "-"), name)
+        if not is_option(name, known):
+            near = nearest(name, [*known, *command.SHORT])
+            raise ConfigError("unknown option", value=option, fix=f"Did you mean --{near}?" if near else None)
+        if is_sequence(types.get(name)) and values[:1] != ["null"] and not "".join(values[:1]).startswith("["):
+            yield name, f"[{', '.join(value if is_number(value) else json.dumps(value) for value in values)}]"
+        elif len(values) > 1:
+            raise ConfigError("this option takes one value", value=" ".join([option, *values]))
+        elif not values and types.get(name) is not bool and name != "print_config":
+            raise ConfigError("this option needs a value", value=option)
+        else:
+            yield name, values[0] if values else "true"
+
+
+def is_option(name: str, known: Sequence[str]) -> bool:
+    """Return whether a dotted name is an option's, or that of a key within an option's value."""
+    return any(name == option or name.startswith(f"{option}.") for option in known)
+
+
+def is_sequence(kind: Any) -> bool:
+    """Return whether a type is a tuple, or an optional one."""
+    return tuple in (get_origin(kind), *map(get_origin, get_args(kind)))
+
+
+def is_number(text: str) -> bool:
+    """Return whether a text is a number."""
+    try:
+        float(text)
+        return True
+    except ValueError:
+        return False
+
+
+def read_settings(path: Path, types: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Read the options of one command from a YAML file that may hold those of all commands.
+
+    Raises ConfigError, naming the file, if it cannot be read or sets an option that no command has.
+    """
     from wheretolook.utils.reading import read_yaml
 
     try:
         content = read_yaml(path) or {}
     except FileNotFoundError as error:
         near = nearest(str(path), shipped_configs())
-        there = ", ".join(shipped_configs())
-        fix = f"Did you mean {near}?" if near else f"Give the path of a YAML file, or one that ships: {there}."
+        fix = f"Did you mean {near}?" if near else f"Bundled configurations: {', '.join(shipped_configs())}."
         raise ConfigError("there is no such file", path=path, fix=fix) from error
     except (OSError, ValueError) as error:
-        raise ConfigError(f"this is no YAML: {error}", path=path) from error
-    try:
-        if not isinstance(content, dict):
-            raise ConfigError("a file of settings is a mapping", fix="Write settings, such as `name: demo`.")
-        check_names(names_in(content, options, group), options, MOVED)
-    except ConfigError as error:
-        raise ConfigError(error.problem, path=path, value=error.value, fix=error.fix) from error
+        raise ConfigError(f"not a YAML file: {error}", path=path) from error
+    if not isinstance(content, dict):
+        raise ConfigError("a configuration is a mapping", path=path, fix="Write settings, such as `name: demo`.")
+    settings = []
+    for name, value in flattened(content, types):
+        if is_option(name, list(types)):
+            settings.append((name, value if isinstance(value, str) else json.dumps(value, default=str)))
+        elif not is_option(name, known := configurable_options()):
+            near = nearest(name, known)
+            raise ConfigError("unknown option", path=path, value=name, fix=f"Did you mean {near}?" if near else None)
+    return settings
+
+
+def flattened(content: Mapping[str, Any], types: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield dotted names and values of nested mappings, down to the options."""
+    for key, value in content.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, dict) and value and name not in types:
+            yield from flattened(value, types, f"{name}.")
+        else:
+            yield name, value
 
 
 @cache
-def _parser(command: str) -> Any:
-    """What parses the options of a stage. It takes a fifth of a second to make."""
-    from jsonargparse import ArgumentParser
-
-    from wheretolook.config import Experiment
-
-    parser = ArgumentParser(prog=f"wheretolook {command}", exit_on_error=False, add_help=False, allow_abbrev=False)
-    parser.add_argument("--config", action="config")
-    parser.add_class_arguments(Experiment)
-    return parser
-
-
-def _parsed(command: str, arguments: list[str], file: str | None) -> Experiment:
-    from jsonargparse import ArgumentError
-
-    from wheretolook.config import Experiment
-
-    parser = _parser(command)
-    try:
-        settings = vars(parser.instantiate(parser.parse_args(arguments)))
-        settings.pop("config")
-        return Experiment(**settings)
-    except (ArgumentError, WhereToLookError) as error:
-        cause: BaseException | None = error
-        while cause is not None:
-            if isinstance(cause, WhereToLookError):
-                explained = f"`wheretolook {command} --help-all` explains it."
-                fix = cause.fix or f"Correct it there or on the command line; {explained}"
-                path = cause.path or file
-                raise type(cause)(cause.problem, path=path, value=cause.value, fix=fix) from error
-            cause = cause.__cause__ or cause.__context__
-        problem = " ".join(str(error).split())
-        path = None if problem.startswith("unrecognized arguments") else file
-        raise ConfigError(problem, path=path, fix=f"`wheretolook {command} --help-all` lists the options.") from error
-
-
-def _help(command: str, options: Mapping[str, Option], everything: bool) -> str:
-    """The options that matter to a stage, or all that it reads; a file may hold those of every other stage too."""
-    stage = STAGES[command]
-    parts = [f"usage: wheretolook {command} [--config FILE.yaml] [--GROUP.OPTION VALUE ...]", stage.text]
-    if everything:
-        roots = {group.partition(".")[0] for other in STAGES.values() for group in other.groups}
-        read = []
-        for name, option in options.items():
-            within = any(f"{name}.".startswith(f"{group}.") for group in stage.groups)
-            if within or not stage.groups or name.partition(".")[0] not in roots:
-                read.append(option)
-        parts.append(grouped(read))
-    else:
-        shown = {"--config": Option("config", "YAML file of options, such as configs/demo.yaml")}
-        for name in f"{_COMMON} {stage.matter}".split():
-            long = {**_SHORT, **stage.short}.get(f"--{name}", name).removeprefix("--")
-            shown[f"--{name}"] = options[long]
-        more = sum(not (option.is_group or option.is_fixed) for option in options.values())
-        parts.append(short_lines(shown))
-        parts.append(f"wheretolook {command} --help-all explains every option it reads, of {more} in all.")
-    parts.append(f"Example:\n  wheretolook {command} {stage.example}")
-    return "\n\n".join([*parts, *([stage.notes] if stage.notes else [])])
-
-
-def _quieten() -> None:
-    """Keep libraries' chatter out of the progress; --debug brings it back."""
-    os.environ.setdefault("GLOG_minloglevel", "2")
-    os.environ.setdefault("PYTHONWARNINGS", "ignore")  # for worker processes
-    warnings.simplefilter("ignore")
-    for kind in (OutOfRangeWarning, MapWarning, LockWarning, TrackingWarning):  # the user's own things, not chatter
-        warnings.simplefilter("default", kind)
-    warnings.formatwarning = lambda message, *_, **__: f"wheretolook: warning: {message}\n"
-    for name in ("lightning", "lightning.pytorch", "lightning.fabric", "mlflow", "alembic"):
-        logging.getLogger(name).setLevel(logging.ERROR)
+def configurable_options() -> list[str]:
+    """Return the dotted names of the options of all commands that read configurations: those that have a dataset."""
+    commands = [command for command in map(load_command, command_targets()) if hasattr(command, "root")]
+    return [option for command in commands for option in option_types(command)]
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from common import open_scene, random_viewpoints, use_one_thread
 
+from wheretolook.commands.preconditions import extractor_of
 from wheretolook.dataset.layout import SceneFolder
 from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.features import aliked_batch
@@ -32,7 +33,6 @@ from wheretolook.localization.shard import SceneJob
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
-from wheretolook.stages.preconditions import extractor_of
 
 
 class Stopwatch:

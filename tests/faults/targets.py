@@ -18,7 +18,7 @@ from mapping.test_landmarks import hand_written_model, random_descriptors, write
 from mapping.test_own_models import rig_model, written
 from scenes.test_loading import MTL, OBJ, ply, textured
 from synthetic_dataset import make_scene
-from wheretolook.cli import parse_experiment
+from wheretolook.cli import parse_command
 from wheretolook.dataset.viewpoint_table import has_matches, read_table, write_table
 from wheretolook.geometry.camera import read_cameras
 from wheretolook.geometry.lattices import direction_lattice
@@ -178,7 +178,7 @@ TARGETS = {
     "ply": Target(_ply, ("colors.ply", "binary.ply"), load_mesh),
     "obj": Target(_obj, ("a.obj", "a.mtl", "my texture.png"), lambda path: load_mesh(path.with_name("a.obj"))),
     "settings": Target(
-        _settings, ("demo.yaml", "alias.yaml"), lambda path: parse_experiment("map", ["--config", str(path)])
+        _settings, ("demo.yaml", "alias.yaml"), lambda path: parse_command("map", ["--config", str(path)])
     ),
     "waypoints": Target(_waypoints, ("a.csv", "a.tum"), read_waypoints),
     "cameras": Target(_cameras, ("cameras.txt",), read_cameras),

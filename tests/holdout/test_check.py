@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from holdout.corridor import ALONE, N, corridor_poses, write_corridor
 from holdout.rendered_room import write_rendered_room
 from selection.room import WEIGHTS
+from wheretolook.cli import parse_command
 from wheretolook.geometry.poses import camera_centers
-from wheretolook.holdout.command import run
 from wheretolook.holdout.holdout import without
 from wheretolook.holdout.holdout_blocks import KEPT, MIN_REST, choose_blocks, landmarks_kept, observation_matrix
 from wheretolook.holdout.photo_map import open_map
@@ -27,6 +27,10 @@ from wheretolook.scorers.adapted.network import AdaptedNetwork
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import ConfigError, MapError, WeightsError
+
+
+def run(arguments: list[str]) -> None:
+    parse_command("check", arguments).run()
 
 
 @pytest.fixture(scope="module")

@@ -12,18 +12,17 @@ import pytest
 
 from holdout.corridor import write_corridor
 from synthetic_dataset import make_dataset
-from wheretolook.cli import main
+from wheretolook.cli import main, parse_command
+from wheretolook.commands.evaluate import evaluate_methods
 from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.report import score_markdown
 from wheretolook.evaluation.results import latest_scores, runs_of_rows
-from wheretolook.holdout.command import run
 from wheretolook.holdout.holdout import left_out_blocks
 from wheretolook.holdout.holdout_views import evaluated_photographs
 from wheretolook.holdout.photo_map import WORK, open_map
 from wheretolook.scorers.adapted.network import AdaptedNetwork
 from wheretolook.scorers.set.network import SetNetwork
-from wheretolook.stages.evaluate import evaluate_methods
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import finished_runs
 from wheretolook.training.trained_network import TrainedNetwork
@@ -33,6 +32,10 @@ from wheretolook.visibility.occlusion import NoOcclusion
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 SET = shipped(WEIGHTS) / "set.safetensors"
+
+
+def run(arguments: list[str]) -> None:
+    parse_command("check", arguments).run()
 
 
 @pytest.fixture(scope="module")

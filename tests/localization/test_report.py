@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 
 from synthetic_dataset import make_dataset
+from wheretolook.commands.label import log_labels
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.thresholds import ALL
 from wheretolook.dataset.viewpoint_table import (
@@ -23,7 +24,6 @@ from wheretolook.dataset.viewpoint_table import (
 )
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.localization.report import POSITIVE, label_markdown, label_summary, threshold_sentence
-from wheretolook.stages.label import log_labels
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import artifact, newest_run
 from wheretolook.utils.errors import TableError

@@ -12,9 +12,12 @@ import numpy as np
 import pycolmap
 import pytest
 
+from all_options import AllOptions, run
 from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room, take_photographs
-from wheretolook import stages
-from wheretolook.config import Experiment, ScenesConfig
+from wheretolook.commands.label import Label
+from wheretolook.commands.map import Map
+from wheretolook.commands.sample import Sample
+from wheretolook.commands.viewpoint_map import BuildViewpointMap
 from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.viewpoint_table import UNLABELLED, poses
 from wheretolook.geometry.poses import camera_centers
@@ -25,6 +28,7 @@ from wheretolook.mapping.georeference import fit_similarity
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.photograph_map import map_photographs
 from wheretolook.planning.config import ViewpointMapConfig
+from wheretolook.scenes.scenes_config import ScenesConfig
 from wheretolook.scorers.visible import VisibleScorer
 from wheretolook.space.config import MappedSpaceConfig
 from wheretolook.utils.errors import MapError, SceneError
@@ -140,9 +144,9 @@ def test_photographs_that_do_not_overlap_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def experiment(mapped, photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Experiment:
+def experiment(mapped, photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> AllOptions:
     """The map stage done, without a scale, from keypoints and matches found before."""
-    experiment = Experiment(
+    experiment = AllOptions(
         name="photos",
         data=tmp_path_factory.mktemp("data"),
         device="cpu",
@@ -152,20 +156,20 @@ def experiment(mapped, photographs: Path, tmp_path_factory: pytest.TempPathFacto
     )
     shutil.copytree(mapped[0] / "work", experiment.root / "room" / "photographs")
     said: list[str] = []
-    stages.make_maps(experiment, said.append)
+    run(Map, experiment, said.append)
     assert any("scale UNKNOWN" in line for line in said) and any("photo-99.png" in line for line in said)
     return experiment
 
 
 @pytest.mark.slow
-def test_a_scene_of_photographs_is_sampled_and_scored_but_not_labelled(experiment: Experiment) -> None:
+def test_a_scene_of_photographs_is_sampled_and_scored_but_not_labelled(experiment: AllOptions) -> None:
     scale = ScaleConfig(marker_size_m=MARKERS[0].size_m)
     photographs = replace(experiment.map.photographs, scale=scale)
     metric = replace(experiment, map=replace(experiment.map, photographs=photographs))
     said: list[str] = []
-    stages.make_maps(metric, said.append)
+    run(Map, metric, said.append)
     assert any("scale from markers" in line for line in said)
-    dataset = stages.sample(metric, said.append)
+    dataset = run(Sample, metric, said.append)
     assert any("occlusion by hidden-points" in line for line in said)
     (scene,) = dataset.scenes
     table = scene.read_table()
@@ -179,13 +183,13 @@ def test_a_scene_of_photographs_is_sampled_and_scored_but_not_labelled(experimen
     shares = VisibleScorer(localization_map).score(views)
     np.testing.assert_allclose(shares * len(localization_map.landmarks), table["n_visible"], atol=2)
     with pytest.raises(SceneError):
-        stages.label(metric)
+        run(Label, metric)
     said.clear()
     views_of_map = ViewpointMapConfig(grid=(6, 4, 3), directions=40, method="visible")
-    (found,) = stages.viewpoint_map(replace(metric, viewpoint_map=views_of_map), said.append).values()
+    (found,) = run(BuildViewpointMap, replace(metric, viewpoint_map=views_of_map), said.append).values()
     assert found.origin.occlusion == "hidden-points" and set(found.voxel_of_row) <= set(table["location_id"])
     best = found.best(camera_centers(views)[0])
     assert best is not None and best.n_visible > 0
-    stages.make_maps(metric, said.append)
-    stages.sample(metric, said.append)
+    run(Map, metric, said.append)
+    run(Sample, metric, said.append)
     assert sum("reusing" in line for line in said) == 2

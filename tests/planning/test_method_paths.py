@@ -12,7 +12,7 @@ import pytest
 
 from box_scenes import furnished_room
 from planning.rooms import occlusion, patiently, room_landmarks
-from wheretolook.cli import parse_experiment
+from wheretolook.cli import parse_command
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
@@ -23,8 +23,6 @@ from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.scenes.loading import save_glb
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
-from wheretolook.stages.plan import plan
-from wheretolook.stages.viewpoint_map import viewpoint_map
 from wheretolook.utils.files import write_json
 
 LANDMARKS = room_landmarks(300)
@@ -38,7 +36,7 @@ GOAL = (2.8, 1.6, 1.4)
 @pytest.fixture(autouse=True)
 def untracked(monkeypatch: pytest.MonkeyPatch) -> None:
     """A new tracking store takes seconds to make."""
-    monkeypatch.setattr(import_module("wheretolook.stages.plan"), "_log", lambda *given: None)
+    monkeypatch.setattr(import_module("wheretolook.commands.plan"), "_log", lambda *given: None)
 
 
 def options(folder: Path, camera: Camera) -> list[str]:
@@ -61,12 +59,12 @@ def planned(folder: Path, camera: Camera, method: str, film: str = "none") -> tu
     lattice = ["--plan.grid", "[3, 3, 2]", "--plan.directions", "40", "--plan.planner.spacing_m", "0.8"]
     chosen = ["--scene", "room", "--method", method, "--film", film]
     chosen += ["--plan.weights", str(WEIGHTS)] if method == "set" else []
-    experiment = parse_experiment("plan", [*options(folder, camera), *ends, *lattice, *chosen])
+    experiment = parse_command("plan", [*options(folder, camera), *ends, *lattice, *chosen])
     assert experiment is not None
 
     def within(seconds: float) -> PlannedPath:
         planner = replace(experiment.plan.planner, time_s=seconds)
-        return plan(replace(experiment, plan=replace(experiment.plan, planner=planner)))
+        return replace(experiment, plan=replace(experiment.plan, planner=planner)).run()
 
     path = patiently(within)
     scorer = make_scorer(method, LocalizationMap(LANDMARKS, camera, occlusion()), weights=experiment.plan.weights)
@@ -95,11 +93,11 @@ def test_a_fisheye_is_planned_for_and_shown(tmp_path: Path) -> None:
     assert scorer.localization_map.camera == FISHEYE and len(table) > 2
     np.testing.assert_allclose(table["score"], scorer.score(poses(table)), rtol=1e-9)
     assert {file.name for file in (tmp_path / "way").iterdir()} == {"path.csv", "path.png", "path.gif"}
-    given = parse_experiment("viewpoint-map", ["--config", str(tmp_path / "rooms.yaml"), "--data",
+    given = parse_command("viewpoint-map", ["--config", str(tmp_path / "rooms.yaml"), "--data",
         str(tmp_path / "data"), "--device", "cpu", "--method", "bins", "--viewpoint_map.grid", "[3, 3, 2]",
         "--viewpoint_map.directions", "20"])  # fmt: skip
     assert given is not None
-    viewpoint_map(given)
+    given.run()
     views = ViewpointMap.load(tmp_path / "data" / "rooms" / "room" / "viewpoint-map")
     assert views.origin.camera["model"] == "OPENCV_FISHEYE"
     at = poses_looking_along(np.repeat(views.locations[:1], 20, axis=0), views.directions)

@@ -12,13 +12,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from wheretolook import stages
-from wheretolook.cli import parse_experiment
-from wheretolook.config import ScenesConfig
+from all_options import run
+from wheretolook.cli import parse_command
+from wheretolook.commands.label import Label
+from wheretolook.commands.map import Map
+from wheretolook.commands.sample import Sample
+from wheretolook.commands.scenes import Scenes
 from wheretolook.dataset.layout import SceneFolder
 from wheretolook.dataset.viewpoint_table import poses as poses_of
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
+from wheretolook.scenes.scenes_config import ScenesConfig
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook_rooms.building import MAX_DIFFERENCE, Copy, Module, draw_building
@@ -156,10 +160,10 @@ def test_views_of_unmapped_copies_localize_in_mapped_ones(tmp_path: Path) -> Non
     """Images are taken on the mapped floor only; views off it are found metres away, with many inliers."""
     (tmp_path / "small.yaml").write_text(SMALL)
     options = ["--config", str(tmp_path / "small.yaml"), "--data", str(tmp_path), "--device", "cpu"]
-    experiment = parse_experiment("label", options)
+    experiment = parse_command("demo", options)
     assert experiment is not None
-    for stage in (stages.make_scenes, stages.make_maps, stages.sample, stages.label):
-        dataset = stage(experiment)
+    for stage in (Scenes, Map, Sample, Label):
+        dataset = run(stage, experiment)
     (scene,) = dataset.scenes
     part = np.array(scene.mapped_floor())
     poses = scene.mapping_poses()

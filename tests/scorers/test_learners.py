@@ -15,6 +15,8 @@ from safetensors.numpy import load_file, save_file
 
 from learning_options import changed, train_config
 from synthetic_dataset import CAMERA, make_dataset
+from wheretolook.commands.evaluate import evaluate_methods
+from wheretolook.commands.train import train_methods
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.evaluation.config import EvaluateConfig
@@ -27,8 +29,6 @@ from wheretolook.scorers.matchability.config import MatchabilityConfig
 from wheretolook.scorers.matchability.network import MatchabilityNetwork
 from wheretolook.scorers.registry import learned, make_scorer, scorers
 from wheretolook.scorers.set.config import SetConfig
-from wheretolook.stages.evaluate import evaluate_methods
-from wheretolook.stages.train import train_methods
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.store import client
 from wheretolook.training.provenance import TrainedModel

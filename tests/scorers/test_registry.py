@@ -116,13 +116,12 @@ from matplotlib.figure import Figure
 from box_scenes import box_quads, quads_mesh, random_texture
 from planning.rooms import patiently
 from synthetic_dataset import make_dataset
-from wheretolook.cli import parse_experiment
+from wheretolook.cli import parse_command
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.figures.scores import score_figure
 from wheretolook.scenes.loading import save_glb
-from wheretolook.stages.evaluate import evaluate_methods
-from wheretolook.stages.plan import plan
-from wheretolook.stages.train import train_methods
+from wheretolook.commands.evaluate import evaluate_methods
+from wheretolook.commands.train import train_methods
 from wheretolook.utils.files import write_json
 from wheretolook.tracking.runs import newest_run
 from wheretolook.tracking.config import TrackingConfig
@@ -135,7 +134,7 @@ for scene in dataset.scenes:
     save_glb(quads_mesh(room, [random_texture(np.random.default_rng(0), 8, 8)]), scene.mesh)
     write_json(scene.folder / "stages.json", {"scenes": "made", "map": "made"})
 tracking = TrackingConfig(str(folder / "mlruns"))
-experiment = parse_experiment("train", ["--train.methods", "[linear]", "--train.linear.slope", "0.2"])
+experiment = parse_command("train", ["--train.methods", "[linear]", "--train.linear.slope", "0.2"])
 assert experiment.train.linear.slope == 0.2
 (model,) = train_methods(dataset, experiment.train, tracking, progress=False)
 assert model.path == dataset.root / "weights" / "linear.safetensors"
@@ -150,12 +149,12 @@ options = ["--data", str(folder), "--name", "tiny", "--tracking.folder", trackin
            "--scene", dataset.split("test")[0].name, "--start", "[-1, -1, 1]", "--goal", "[1, 1, 1]",
            "--method", "linear", "--plan.against", "[fewest]", "--film", "none",
            "--plan.grid", "[3, 3, 2]", "--plan.directions", "20"]
-experiment = parse_experiment("plan", options)
+experiment = parse_command("plan", options)
 
 
 def plan_within(seconds):
     planner = replace(experiment.plan.planner, time_s=seconds)
-    return plan(replace(experiment, plan=replace(experiment.plan, planner=planner)))
+    return replace(experiment, plan=replace(experiment.plan, planner=planner)).run()
 
 
 path = patiently(plan_within)

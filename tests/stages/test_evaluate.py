@@ -14,13 +14,13 @@ from scipy.special import expit, logit
 
 from learning_options import train_config
 from synthetic_dataset import make_dataset
+from wheretolook.commands.evaluate import evaluate_methods as evaluate
+from wheretolook.commands.train import train_methods as train
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses, write_table
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.results import latest_scores
 from wheretolook.scorers.visible import VisibleScorer
-from wheretolook.stages.evaluate import evaluate_methods as evaluate
-from wheretolook.stages.train import train_methods as train
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import artifact, experiment_ids, finished_runs, newest_run, start_run, ui_command
 from wheretolook.tracking.store import client

@@ -11,11 +11,11 @@ import pytest
 from tests.learning_options import train_config
 from tests.synthetic_dataset import make_dataset
 
+from wheretolook.commands.evaluate import evaluate_methods, not_logged
+from wheretolook.commands.label import log_labels
+from wheretolook.commands.train import train_methods
 from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.stages.evaluate import evaluate_methods, not_logged
-from wheretolook.stages.label import log_labels
-from wheretolook.stages.train import train_methods
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import artifact, finished_runs
 from wheretolook.tracking.store import client

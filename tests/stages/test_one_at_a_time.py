@@ -15,9 +15,9 @@ import pytest
 from learning_options import train_config
 from synthetic_dataset import make_dataset
 from wheretolook.cli import main
+from wheretolook.commands.train import train_methods
 from wheretolook.dataset.dataset_lock import changing, reading
 from wheretolook.dataset.layout import Dataset
-from wheretolook.stages.train import train_methods
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.utils.errors import InUseError
 

@@ -11,11 +11,16 @@ import numpy as np
 import pycolmap
 import pytest
 
+from all_options import AllOptions, run
 from box_scenes import box_quads, quads_mesh, random_texture
 from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room, take_photographs
-from wheretolook import stages
 from wheretolook.cli import main
-from wheretolook.config import Experiment, ScenesConfig
+from wheretolook.commands.label import Label
+from wheretolook.commands.map import Map
+from wheretolook.commands.plan import Plan
+from wheretolook.commands.preconditions import extractor_of
+from wheretolook.commands.sample import Sample
+from wheretolook.commands.viewpoint_map import BuildViewpointMap
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.features.config import ExtractorConfig
@@ -27,8 +32,8 @@ from wheretolook.mapping.imported_map import map_existing
 from wheretolook.planning.config import PathConfig, PlanConfig, ViewpointMapConfig
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.loading import save_glb
+from wheretolook.scenes.scenes_config import ScenesConfig
 from wheretolook.space.config import MappedSpaceConfig
-from wheretolook.stages.preconditions import extractor_of
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError, WeightsError
 
@@ -77,8 +82,8 @@ def save(model: pycolmap.Reconstruction, folder: Path) -> Path:
     return folder
 
 
-def experiment_of(model: Path, data: Path, **existing: object) -> Experiment:
-    return Experiment(
+def experiment_of(model: Path, data: Path, **existing: object) -> AllOptions:
+    return AllOptions(
         name="mine",
         data=data,
         device="cpu",
@@ -98,7 +103,7 @@ def test_from_a_model_to_a_planned_path(tmp_path, with_mesh):
         save_glb(empty_room(), tmp_path / "scan.glb")
     experiment = experiment_of(folder, tmp_path / "data", mesh=tmp_path / "scan.glb" if with_mesh else None)
     said: list[str] = []
-    stages.make_maps(experiment, said.append)
+    run(Map, experiment, said.append)
     n_points = model.num_points3D()
     assert f"flat: {n_points} landmarks from 36 images" in said[0] and "metre" in said[1]
     (scene,) = Dataset.load(tmp_path / "data" / "mine").scenes
@@ -107,10 +112,10 @@ def test_from_a_model_to_a_planned_path(tmp_path, with_mesh):
     np.testing.assert_allclose(scene.mapping_poses(), colmap_poses(folder), atol=1e-6)
     assert read_model(scene.map).num_points3D() == n_points
 
-    stages.sample(experiment, said.append)
+    run(Sample, experiment, said.append)
     table = scene.read_table()
     assert table["location_id"].nunique() == 6 and (table["n_visible"] > 0).all()
-    (views,) = stages.viewpoint_map(experiment, said.append).values()
+    (views,) = run(BuildViewpointMap, experiment, said.append).values()
     free = views.grid.centers()[views.row_of_voxel >= 0]
     to_cameras = np.linalg.norm(free[:, None] - camera_centers(colmap_poses(folder)), axis=2).min(1)
     assert (to_cameras.max() <= 0.6) is not with_mesh  # a mesh frees the whole room
@@ -120,15 +125,15 @@ def test_from_a_model_to_a_planned_path(tmp_path, with_mesh):
         scene="flat", start=tuple(ends[0]), goal=tuple(ends[1]), method="visible", film="none",
         planner=PathConfig(time_s=2.0), grid=(6, 5, 3), directions=30,
     )  # fmt: skip
-    path = stages.plan(replace(experiment, plan=config), said.append)
+    path = run(Plan, replace(experiment, plan=config), said.append)
     assert np.isfinite(path.scores).all() and (scene.folder / "path" / "path.png").is_file()
 
     with pytest.raises(MapError if with_mesh else SceneError, match="no descriptors" if with_mesh else "photographs"):
-        stages.label(experiment)
+        run(Label, experiment)
 
     said.clear()
-    stages.make_maps(experiment, said.append)
-    stages.sample(experiment, said.append)
+    run(Map, experiment, said.append)
+    run(Sample, experiment, said.append)
     assert sum("reusing" in line for line in said) == 2
 
 
@@ -136,9 +141,9 @@ def test_without_its_mesh_the_scene_is_made_anew(tmp_path):
     folder = save(room_model(), tmp_path / "flat")
     save_glb(empty_room(), tmp_path / "scan.glb")
     with_mesh = experiment_of(folder, tmp_path / "data", mesh=tmp_path / "scan.glb")
-    (scene,) = stages.make_maps(with_mesh).scenes
+    (scene,) = run(Map, with_mesh).scenes
     assert scene.mesh.is_file() and not scene.is_photographed
-    (scene,) = stages.make_maps(experiment_of(folder, tmp_path / "data")).scenes
+    (scene,) = run(Map, experiment_of(folder, tmp_path / "data")).scenes
     assert not scene.mesh.exists() and scene.is_photographed
 
 
@@ -150,11 +155,9 @@ def test_the_filter_that_is_asked_for_is_counted(tmp_path):
     n_bad = sum(point.error > 0.5 for point in model.points3D.values())
     folder = save(model, tmp_path / "flat")
     said: list[str] = []
-    stages.make_maps(experiment_of(folder, tmp_path / "data"), said.append)
+    run(Map, experiment_of(folder, tmp_path / "data"), said.append)
     assert "left out" not in " ".join(said)
-    (scene,) = stages.make_maps(
-        experiment_of(folder, tmp_path / "data", max_reprojection_error_px=0.5), said.append
-    ).scenes
+    (scene,) = run(Map, experiment_of(folder, tmp_path / "data", max_reprojection_error_px=0.5), said.append).scenes
     assert 100 < n_bad < 700 and f"from 36 images, {n_bad} points left out" in " ".join(said)
     assert len(scene.read_landmarks()) == read_model(scene.map).num_points3D() == model.num_points3D() - n_bad
     config = MapConfig(existing=ExistingModelConfig(folder, max_reprojection_error_px=1e-6))
@@ -168,23 +171,23 @@ def test_several_cameras_are_asked_for(tmp_path, capsys):
     arguments = ["map", "--name", "mine", "--data", str(tmp_path / "data"), "--model", str(folder)]
     assert main(arguments) == 2
     assert "2 cameras, not one" in (said := capsys.readouterr().err) and "--map.existing.camera_id" in said
-    (scene,) = stages.make_maps(experiment_of(folder, tmp_path / "data", camera_id=2)).scenes
+    (scene,) = run(Map, experiment_of(folder, tmp_path / "data", camera_id=2)).scenes
     assert scene.camera == OTHER
     named = replace(experiment_of(folder, tmp_path / "data"), camera=CameraConfig(400, 300, fov_deg=80.0))
-    (scene,) = stages.make_maps(named).scenes
+    (scene,) = run(Map, named).scenes
     assert scene.camera == named.camera.camera and not scene.own_camera
     with pytest.raises(ConfigError, match="made with another camera"):
-        stages.sample(experiment_of(folder, tmp_path / "data"))
+        run(Sample, experiment_of(folder, tmp_path / "data"))
 
 
 def test_scenes_of_models_stand_beside_one_another_with_their_own_cameras(tmp_path):
-    stages.make_maps(experiment_of(save(room_model(), tmp_path / "first"), tmp_path / "data"))
+    run(Map, experiment_of(save(room_model(), tmp_path / "first"), tmp_path / "data"))
     second = experiment_of(save(room_model(cameras=(OTHER,)), tmp_path / "second"), tmp_path / "data")
-    stages.make_maps(second)
+    run(Map, second)
     scenes = Dataset.load(tmp_path / "data" / "mine").scenes
     assert [(scene.name, scene.camera) for scene in scenes] == [("first", LOOKS), ("second", OTHER)]
     said: list[str] = []
-    stages.sample(second, said.append)
+    run(Sample, second, said.append)
     assert len(said) == 4 and all("occlusion" in line or "viewpoints" in line for line in said)
 
 
@@ -194,7 +197,7 @@ def test_models_do_not_join_generated_scenes(tmp_path):
     scene.mesh.write_bytes(b"")
     Dataset(scene.folder.parent, (scene,)).save()
     with pytest.raises(ConfigError, match="of their own: --name"):
-        stages.make_maps(experiment_of(save(room_model(), tmp_path / "flat"), tmp_path / "data"))
+        run(Map, experiment_of(save(room_model(), tmp_path / "flat"), tmp_path / "data"))
 
 
 def test_a_turned_and_scaled_model_is_doubted_and_mended(tmp_path):
@@ -232,9 +235,9 @@ def test_a_mesh_of_another_frame_is_doubted(tmp_path):
     save_glb(replace(mesh, vertices=mesh.vertices + np.float32([0, 0, 40])), tmp_path / "scan.glb")
     experiment = experiment_of(folder, tmp_path / "data", mesh=tmp_path / "scan.glb")
     with pytest.warns(MapWarning, match=r"scan\.glb: half of the landmarks are .* m or more from the mesh"):
-        stages.make_maps(experiment)
+        run(Map, experiment)
     with pytest.raises(ConfigError, match="leaves its mesh"):
-        stages.make_maps(experiment_of(folder, tmp_path / "data", mesh=tmp_path / "scan.glb", level=True))
+        run(Map, experiment_of(folder, tmp_path / "data", mesh=tmp_path / "scan.glb", level=True))
 
 
 @pytest.mark.parametrize("arguments, said", [

@@ -18,8 +18,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from mask_agreement import MaskAgreement
-from wheretolook import stages
-from wheretolook.cli import main, parse_experiment
+from wheretolook.cli import main, parse_command
+from wheretolook.commands.preconditions import open_scene
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import is_good, poses, read_table, write_table
 from wheretolook.evaluation.config import EvaluateConfig
@@ -33,7 +33,6 @@ from wheretolook.scorers.registry import scorers
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.space.tsdf_space import TsdfSpace
-from wheretolook.stages.preconditions import open_scene
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import artifact, finished_runs, newest_run
 from wheretolook.tracking.store import client
@@ -357,8 +356,11 @@ def test_a_report_that_could_not_be_logged_is_logged_the_next_time(
     tracking = TrackingConfig(str(copy / "mlruns"))
     first = newest_run(tracking, "label")
     with monkeypatch.context() as patch:
-        label_stage = import_module("wheretolook.stages.label")  # the package has its function under this name
-        patch.setattr(label_stage, "log", lambda *args, **options: (_ for _ in ()).throw(OSError("the disk is full")))
+        patch.setattr(
+            import_module("wheretolook.commands.label"),
+            "log_to_run",
+            lambda *args, **options: (_ for _ in ()).throw(OSError("the disk is full")),
+        )
         assert run("label", copy, "--label.localizer.min_inliers", "11") == 2
     assert "the disk is full" in capsys.readouterr().err
     assert run("label", copy, "--label.localizer.min_inliers", "11") == 0
@@ -404,12 +406,12 @@ def test_another_camera_is_refused(copy: Path, capsys: pytest.CaptureFixture[str
 
 
 def test_stages_are_plain_functions(demo: Path) -> None:
-    from wheretolook.cli import parse_experiment
+    from wheretolook.cli import parse_command
 
-    experiment = parse_experiment("sample", ["--config", str(demo / "tiny.yaml"), "--data", str(demo / "data")])
+    experiment = parse_command("sample", ["--config", str(demo / "tiny.yaml"), "--data", str(demo / "data")])
     assert experiment is not None
     said: list[str] = []
-    dataset = stages.sample(experiment, say=said.append)
+    dataset = experiment.run(log=said.append)
     assert len(said) == 2 and all("reusing" in line for line in said)
     assert dataset.name == "tiny"
 
@@ -527,11 +529,11 @@ def test_paths_keep_clear_of_what_depth_images_saw(copy: Path, tmp_path: Path) -
     """With the occlusion model tsdf; locations are sampled by the mesh all the same."""
     tsdf = ["--occlusion.model", "tsdf", "--occlusion.voxel_m", "0.04"]
     options = ["--config", str(copy / "tiny.yaml"), "--data", str(copy / "data"), "--device", "cpu", *tsdf]
-    experiment = parse_experiment("plan", options)
+    experiment = parse_command("plan", options)
     assert experiment is not None
     dataset = Dataset.load(experiment.root)
     scene = dataset.split("test")[0]
-    opened = open_scene(experiment, dataset, scene)
+    opened = open_scene(experiment, scene)
     by_mesh = opened.sampled_space
     space = opened.space
     assert type(by_mesh) is FreeSpace and isinstance(space, TsdfSpace) and opened.occlusion.name == "tsdf"

@@ -7,9 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from all_options import AllOptions, run
 from scans.recordings import COLOR, room, walk, write_seven_scenes
 from wheretolook.cli import main
-from wheretolook.config import Experiment, MeshSource, ScenesConfig
+from wheretolook.commands.map import Map
+from wheretolook.commands.sample import Sample
+from wheretolook.commands.scenes import Scenes
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.viewpoint_table import poses
@@ -18,7 +21,7 @@ from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping.config import MapConfig
 from wheretolook.scans.config import RgbdConfig
 from wheretolook.scenes.loading import load_mesh, save_glb
-from wheretolook.stages import make_maps, make_scenes, sample
+from wheretolook.scenes.scenes_config import MeshSource, ScenesConfig
 from wheretolook.utils.errors import ConfigError, SceneError
 
 
@@ -29,12 +32,14 @@ def experiment(tmp_path_factory):
     rgbd = RgbdConfig(folder=folder / "room", voxel_m=0.03, max_depth_m=5.0)
     few = SampleConfig(max_locations=4, max_directions=6, min_visible=1)
     scenes = ScenesConfig(rgbd=rgbd)
-    return Experiment("scan", folder / "data", device="cpu", scenes=scenes, map=MapConfig(n_images=30), sample=few)
+    return AllOptions(
+        name="scan", data=folder / "data", device="cpu", scenes=scenes, map=MapConfig(n_images=30), sample=few
+    )
 
 
 def test_a_recording_is_mapped_and_sampled(experiment):
     said = []
-    dataset = make_scenes(experiment, said.append)
+    dataset = run(Scenes, experiment, said.append)
     (scene,) = dataset.scenes
     assert scene.name == "room" and scene.split == "test"
     assert (scene.camera, scene.own_camera) == (COLOR, True)  # the recording's, as none was named
@@ -43,12 +48,12 @@ def test_a_recording_is_mapped_and_sampled(experiment):
         "60 frames of a recording of 7-scenes's layout" in text and "1000 units of depth a metre; up is (0.00" in text
     )
     again: list[str] = []
-    assert make_scenes(experiment, again.append) == dataset == Dataset.load(experiment.root)
+    assert run(Scenes, experiment, again.append) == dataset == Dataset.load(experiment.root)
     assert "reusing" in again[0]
 
-    make_maps(experiment, said.append)
+    run(Map, experiment, said.append)
     assert not scene.is_photographed and len(scene.read_landmarks()) > 200
-    sample(experiment, said.append)
+    run(Sample, experiment, said.append)
     table = scene.read_table()
     assert table["location_id"].nunique() == 4 and (table["n_visible"] > 0).all()
     at = camera_centers(poses(table))
@@ -61,17 +66,17 @@ def test_it_joins_scenes_with_meshes_and_a_named_camera_looks(experiment, tmp_pa
     coarse = replace(experiment.scenes.rgbd, voxel_m=0.06, max_frames=20, appearance="colors")
     camera = CameraConfig(width=320, height=240, fov_deg=90)
     wide = replace(experiment, data=tmp_path, camera=camera, scenes=ScenesConfig(rgbd=coarse))
-    make_scenes(replace(wide, scenes=loaded), lambda _: None)
-    dataset = make_scenes(wide, lambda _: None)
+    run(Scenes, replace(wide, scenes=loaded), lambda _: None)
+    dataset = run(Scenes, wide, lambda _: None)
     assert [(scene.name, scene.split) for scene in dataset.scenes] == [("loaded", "train"), ("room", "test")]
     assert {scene.camera for scene in dataset.scenes} == {wide.camera.camera}
     assert [scene.is_scanned for scene in dataset.scenes] == [False, True]
     before = dataset.scenes[1].mesh.stat().st_mtime_ns
-    assert make_scenes(replace(wide, scenes=loaded), lambda _: None) == dataset  # which does not name the scan
+    assert run(Scenes, replace(wide, scenes=loaded), lambda _: None) == dataset  # which does not name the scan
     assert dataset.scenes[1].mesh.stat().st_mtime_ns == before
     changed = replace(wide, scenes=ScenesConfig(rgbd=replace(coarse, up="-z")))
     with pytest.warns(UserWarning, match="up is said to be -z"):
-        make_scenes(changed, lambda _: None)  # other settings, so the scan is made anew
+        run(Scenes, changed, lambda _: None)  # other settings, so the scan is made anew
 
 
 def test_up_is_an_option_that_may_have_a_minus_sign(tmp_path, capsys):
@@ -92,4 +97,4 @@ def test_bad_names_and_folders_are_refused(experiment, tmp_path):
     for wrong, error in (({"name": "a/b"}, ConfigError), ({"folder": tmp_path / "none"}, SceneError)):
         rgbd = replace(experiment.scenes.rgbd, **wrong)
         with pytest.raises(error):
-            make_scenes(replace(experiment, data=tmp_path, scenes=ScenesConfig(rgbd=rgbd)), lambda _: None)
+            run(Scenes, replace(experiment, data=tmp_path, scenes=ScenesConfig(rgbd=rgbd)), lambda _: None)

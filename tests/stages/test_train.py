@@ -16,13 +16,13 @@ import torch
 
 from learning_options import changed, train_config
 from synthetic_dataset import make_dataset
+from wheretolook.commands.train import train_methods as train
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.names import RELEASE_FILE
 from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, UNLABELLED, is_good, write_table
 from wheretolook.inputs.bins import InputStatistics
 from wheretolook.scorers.mlp.network import ViewpointNetwork
 from wheretolook.scorers.train_config import TrainConfig
-from wheretolook.stages.train import train_methods as train
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.store import client
 from wheretolook.training.data import BinnedBatches, ViewpointDataModule, balance_classes, hold_out_locations

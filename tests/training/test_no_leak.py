@@ -11,6 +11,8 @@ import pytest
 
 from learning_options import train_config
 from synthetic_dataset import make_dataset
+from wheretolook.commands.evaluate import evaluate_methods as evaluate
+from wheretolook.commands.train import train_methods as train
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good, read_table, write_table
 from wheretolook.evaluation.config import EvaluateConfig
@@ -19,8 +21,6 @@ from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.matchability.config import MatchabilityConfig
 from wheretolook.scorers.set.config import SetConfig
-from wheretolook.stages.evaluate import evaluate_methods as evaluate
-from wheretolook.stages.train import train_methods as train
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.training.weights import read_weights
 from wheretolook_paper.scorers.pooled_features import POOLED

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from wheretolook.config import Experiment
+from wheretolook.commands.options import Experiment
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.training.scenes import with_also

@@ -9,12 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from wheretolook.dataset.names import NO_DATASET
 from wheretolook.dataset.sampling_config import Split
-from wheretolook.dataset.viewpoint_table import CAMERA_ID, read_table
 from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of_record, read_cameras
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, compact_poses, holds_model, load_mapping_poses
@@ -26,6 +24,8 @@ from wheretolook.utils.files import fingerprint, write_json
 from wheretolook.utils.reading import read_json_object
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.mapping.landmarks import Landmarks
 
@@ -149,6 +149,8 @@ class SceneFolder:
 
     def read_table(self, matches: bool = False) -> pd.DataFrame:
         """The scene's viewpoints, on request with their matches; see `wheretolook.dataset.viewpoint_table.read_table`."""
+        from wheretolook.dataset.viewpoint_table import read_table
+
         return read_table(self.table, matches)
 
     def mapping_poses(self) -> Float | None:
@@ -196,6 +198,8 @@ def views_by_camera(
         TableError: a viewpoint names a camera that the scene has not.
     """
     cameras = scene.cameras()
+    from wheretolook.dataset.viewpoint_table import CAMERA_ID
+
     if CAMERA_ID not in table:
         numbers = np.full(len(table), next(iter(cameras)))
         if len(cameras) > 1:

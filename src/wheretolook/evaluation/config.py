@@ -12,6 +12,7 @@ import numpy as np
 from wheretolook.dataset.thresholds import THRESHOLDS, threshold_key
 from wheretolook.scorers.registry import methods_named, scorers
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.shipped import or_shipped
 from wheretolook.visibility.config import check_occlusion_names
 
 
@@ -66,6 +67,7 @@ class EvaluateConfig:
     reference: str = ""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "weights", tuple(map(or_shipped, self.weights)))
         methods_named(self.methods, scorers())
         if self.split not in ("train", "val", "test"):
             raise ConfigError("unknown split", value=self.split, fix="Use train, val or test.")

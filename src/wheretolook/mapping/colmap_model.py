@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import Camera, cameras_by_id, mean_focal_px, only_camera
@@ -29,6 +28,9 @@ from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import MapError, StorageError
 from wheretolook.utils.files import STORAGE_FIX, storage_errors, temporary_folder
 from wheretolook.utils.npz_files import load_npz, save_npz
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 CAMERAS_FILE = "cameras.npz"  # next to the landmarks; small enough to be shipped without the COLMAP model
 MODEL_FILES = ("cameras", "images", "points3D")
@@ -156,6 +158,8 @@ def observation_matrix(model: ModelArrays, group: NDArray[np.integer[Any]] | Non
     point = np.repeat(np.arange(len(model.points)), np.diff(model.observation_start))
     rows = model.observation_image if group is None else group[model.observation_image]
     n_rows = len(model.image_ids) if group is None else int(group.max()) + 1
+    from scipy.sparse import coo_array
+
     matrix = coo_array(
         (np.ones(len(point), dtype=np.float32), (rows, point)), shape=(n_rows, len(model.points))
     ).tocsr()

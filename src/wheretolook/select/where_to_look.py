@@ -21,7 +21,7 @@ from wheretolook.planning.config import StopConfig
 from wheretolook.planning.routes import PlannedPath
 from wheretolook.planning.stops import check_stopping, stops_along
 from wheretolook.planning.view_sequence import TurnLimit, best_sequence
-from wheretolook.select.limits import check_limits
+from wheretolook.select.request import SelectionRequest
 from wheretolook.select.surroundings import grid_waypoints, usable_waypoints
 from wheretolook.select.views import SelectedViews, joined
 from wheretolook.select.waypoints import Waypoints
@@ -178,54 +178,42 @@ class WhereToLook:
         n: int = 1,
         *,
         ids: Sequence[str] = (),
-        pitch_deg: tuple[float, float] | None = None,
-        max_turn_deg: float | None = None,
-        skip: bool = False,
         progress: bool = False,
-        looks: int | None = None,
-        max_total_turn_deg: float | None = None,
-        least_score: float | None = None,
+        **options: Any,
     ) -> SelectedViews:
-        """The best view, or the n best, or the best set of looks, at each of points (W, 3) metres in the world.
+        """Select the best view, the n best, or the best set of views, at each of points (W, 3) metres in the world.
 
         Args:
-            points: where the camera is.
-            n: views of each point.
+            points: locations of the camera.
+            n: number of views of each point.
             ids: names of the points; counts from 0 unless given.
-            pitch_deg: lowest and highest pitch in degrees, 90 straight up.
-            max_turn_deg: greatest rotation between a view and the next, in the order of the points. The views are then
-                those with the greatest sum of scores of all sequences that keep the limit, exactly
-                (`wheretolook.planning.view_sequence.best_sequence`).
-            skip: leave out points outside the map or inside geometry.
             progress: show a progress bar.
-            looks: instead of n, how many looks to choose together, for a camera that turns there and whose looks are
-                localized together (`wheretolook.looks.selection.best_views`). Their rank is the order to look in, and
-                `set_score` the probability that they localize.
-            max_total_turn_deg: how far the camera turns in all from the first look to the last.
-            least_score: with `max_turn_deg` and `looks`: where the sequence's view scores less, the waypoint becomes a
-                stop with the fewest further looks that reach it together, `looks` in all at most
-                (`wheretolook.planning.stops.stops_along`). The view of the sequence has rank 1.
+            options: further fields of `wheretolook.select.request.SelectionRequest`. With `looks`, the rank is the
+                order to look in, and `set_score` the probability that the set localizes; with `least_score`, the view
+                of the sequence has rank 1.
 
         Raises:
             TableError: points of another shape, not finite, outside the map or inside geometry.
-            ConfigError: n or the limits are no such numbers, no direction is within the limit on pitch, or a least
-                score is asked of scores that are no probabilities.
+            ConfigError: an option is out of range, no direction is within the limit on pitch, or a least score is asked
+                of scores that are no probabilities.
             PlanningError: no sequence, or no set of looks, keeps the limit on turns.
         """
-        check_limits(n, pitch_deg, max_turn_deg, looks, max_total_turn_deg, least_score)
-        if least_score is not None:
+        request = SelectionRequest(n=n, **options)
+        looks = request.looks
+        max_turn_deg = request.max_turn_deg
+        if request.least_score is not None:
             check_stopping(self.scorer.name)
-        axes = self._allowed(looks or n, pitch_deg)
+        axes = self._allowed(looks or n, request.pitch_deg)
         waypoints = Waypoints.of(points, ids)
-        rows = np.flatnonzero(usable_waypoints(self.localization_map, waypoints, skip))
+        rows = np.flatnonzero(usable_waypoints(self.localization_map, waypoints, request.skip))
         at = waypoints.points[rows]
         scores = self._scores_around(at, axes, progress)
-        if looks is not None and max_turn_deg is not None and least_score is not None:
-            stops = StopConfig(int(looks), least_score)
+        if looks is not None and max_turn_deg is not None and request.least_score is not None:
+            stops = StopConfig(int(looks), request.least_score)
             self.views = self._sequence_with_stops(waypoints, rows, axes, scores, max_turn_deg, stops, progress)
             return self.views
         if looks is not None:
-            self.views = self._looks(waypoints, rows, axes, scores, looks, max_total_turn_deg, progress)
+            self.views = self._looks(waypoints, rows, axes, scores, looks, request.max_total_turn_deg, progress)
             return self.views
         if max_turn_deg is not None:
             chosen = best_sequence(scores, TurnLimit.of(axes, max_turn_deg)).direction_ids[:, None]
@@ -275,8 +263,8 @@ class WhereToLook:
         sets = [best_views(self.scorer, place, axes, values, n, max_turn_deg) for place, values in pairs]
         looked = axes[[look for found in sets for look in found.rows]]
         rank = np.tile(np.arange(1, n + 1), len(rows))
-        worths = np.repeat([found.score for found in sets], n)
-        return self._reported(waypoints, np.repeat(rows, n), rank, looked, worths)
+        set_scores = np.repeat([found.score for found in sets], n)
+        return self._reported(waypoints, np.repeat(rows, n), rank, looked, set_scores)
 
     def _sequence_with_stops(
         self,

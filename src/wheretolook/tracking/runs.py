@@ -24,14 +24,13 @@ from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import pandas as pd
-
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.store import client
 from wheretolook.utils.errors import MissingRunError, TrackingError
 from wheretolook.utils.version import VERSION
 
 if TYPE_CHECKING:
+    import pandas as pd
     from mlflow import MlflowClient
     from mlflow.entities import Experiment, Metric, Run
 

@@ -1,81 +1,100 @@
-"""The compare-paths stage: paths of several methods, rendered and localized, in `<dataset>/results/paths/`; resumes."""
+"""`wheretolook compare-paths`: paths of several methods, rendered and localized, in `<dataset>/results/paths/`; resumes."""
 
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import asdict
-from typing import TYPE_CHECKING
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, ClassVar
 
-import pandas as pd
-
-from wheretolook.config import Experiment
+from wheretolook.commands.options import LabelOptions, Log, Progress, SceneOptions, ignore_progress
+from wheretolook.commands.preconditions import extractor_of, load_dataset, open_scene
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.planning.config import PathsConfig
-from wheretolook.stages.preconditions import Say, Tick, dataset_after, extractor_of, open_scene
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.store import check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.files import atomic_write, write_text
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from wheretolook_paper.paths.scene_comparison import SceneComparison
 
 FOLDER = "paths"
 """In `results/`: a folder for each scene, and the views of all scenes."""
 
 
-def compare_paths(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> pd.DataFrame:
-    """Plan paths by several methods, render and localize their views; write and log `<dataset>/results/paths.*`.
+@dataclass(frozen=True, kw_only=True)
+class ComparePaths(SceneOptions, LabelOptions):
+    """Plan paths between random locations by several methods, render what the camera sees, localize it. Resumes.
 
-    Needs the map stage only. Planned paths and labels of earlier runs are reused. With `paths.stops` and
-    `paths.last_views`, views are also localized jointly. Returns the table of `summarize_paths`.
+    Examples:
+      wheretolook compare-paths --config configs/demo.yaml --paths.methods '[forward, set]' --paths.pairs 5
 
-    Raises:
-        ConfigError: no such scene or method, no weights, or no method that supports the requested stops.
-        WeightsError: the weights cannot be used.
-        SceneError: a scene has no mesh, or too little free space for starts and goals.
-        TrackingError: the tracking store cannot be used.
+    Args:
+        paths: which paths, and by which methods.
+        tracking: where MLflow keeps its runs.
     """
-    from wheretolook.localization.labeller import label_scenes
-    from wheretolook.planning.scene_map import check_methods
-    from wheretolook_paper.paths.joint_localization import check_joint
 
-    with reading(experiment.root, "compare-paths", FOLDER):
-        dataset = dataset_after(experiment, "map")
-        config = experiment.paths
-        check_methods(config.methods)
-        check_joint(config)
-        check_store(experiment.tracking)
-        scenes = _comparisons(experiment, dataset, say)
-        tasks = [task for scene in scenes for task in scene.tasks()]
-        with closing(label_scenes(tasks, experiment.label, description="localize")) as labelled:
-            labels = {result.task.shards: result.table.reset_index(drop=True) for result in labelled}
-        results = {one.scene.name: one.results(labels) for one in scenes}
-        paths = pd.concat([found.paths.assign(scene=name) for name, found in results.items()], ignore_index=True)
-        views = pd.concat([found.views.assign(scene=name) for name, found in results.items()], ignore_index=True)
-        summary = _report(paths, views, dataset, config, experiment.tracking, say)
-    tick(1)
-    return summary
+    SHORT: ClassVar = {"engine": "label.engine"}
+
+    paths: PathsConfig = field(default_factory=PathsConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+
+    def run(self, log: Log = print, progress: Progress = ignore_progress) -> pd.DataFrame:
+        """Plan paths by several methods, render and localize their views; write and log `<dataset>/results/paths.*`.
+
+        Needs `map` only. Planned paths and labels of earlier runs are reused. With `paths.stops` and
+        `paths.last_views`, views are also localized jointly. Returns the table of `summarize_paths`.
+
+        Raises:
+            ConfigError: no such scene or method, no weights, or no method that supports the requested stops.
+            WeightsError: the weights cannot be used.
+            SceneError: a scene has no mesh, or too little free space for starts and goals.
+            TrackingError: the tracking store cannot be used.
+        """
+        import pandas as pd
+
+        from wheretolook.localization.labeller import label_scenes
+        from wheretolook.planning.scene_map import check_methods
+        from wheretolook_paper.paths.joint_localization import check_joint
+
+        with reading(self.root, "compare-paths", FOLDER):
+            dataset = load_dataset(self, "map")
+            config = self.paths
+            check_methods(config.methods)
+            check_joint(config)
+            check_store(self.tracking)
+            scenes = _comparisons(self, dataset, log)
+            tasks = [task for scene in scenes for task in scene.tasks()]
+            with closing(label_scenes(tasks, self.label, description="localize")) as labelled:
+                labels = {result.task.shards: result.table.reset_index(drop=True) for result in labelled}
+            results = {one.scene.name: one.results(labels) for one in scenes}
+            paths = pd.concat([found.paths.assign(scene=name) for name, found in results.items()], ignore_index=True)
+            views = pd.concat([found.views.assign(scene=name) for name, found in results.items()], ignore_index=True)
+            summary = _report(paths, views, dataset, config, self.tracking, log)
+        progress(1)
+        return summary
 
 
-def _comparisons(experiment: Experiment, dataset: Dataset, say: Say) -> list[SceneComparison]:
+def _comparisons(options: ComparePaths, dataset: Dataset, log: Log) -> list[SceneComparison]:
     from wheretolook.localization.shard import SceneJob
     from wheretolook.weights.resolve import resolve_weights
     from wheretolook_paper.paths.scene_comparison import SceneComparison
 
-    config = experiment.paths
+    config = options.paths
     comparisons = []
     weights = None
     for files in _scene_folders(dataset, config):
-        scene = open_scene(experiment, dataset, files)
+        scene = open_scene(options, files)
         if weights is None:
             methods = config.methods
-            weights = {name: resolve_weights(name, config.weights, dataset=dataset, log=say) for name in methods}
-        extractor = extractor_of(files, experiment.map.extractor)
-        job = SceneJob(files.mesh, files.landmarks, scene.camera, experiment.label.localizer, extractor, scene.device)
+            weights = {name: resolve_weights(name, config.weights, dataset=dataset, log=log) for name in methods}
+        extractor = extractor_of(files, options.map.extractor)
+        job = SceneJob(files.mesh, files.landmarks, scene.camera, options.label.localizer, extractor, scene.device)
         folder = dataset.root / "results" / FOLDER / scene.name
-        comparisons.append(SceneComparison(scene, dataset, folder, config, weights, job, say))
+        comparisons.append(SceneComparison(scene, dataset, folder, config, weights, job, log))
     return comparisons
 
 
@@ -90,7 +109,7 @@ def _scene_folders(dataset: Dataset, config: PathsConfig) -> list[SceneFolder]:
 
 
 def _report(
-    paths: pd.DataFrame, views: pd.DataFrame, dataset: Dataset, config: PathsConfig, tracking: TrackingConfig, say: Say
+    paths: pd.DataFrame, views: pd.DataFrame, dataset: Dataset, config: PathsConfig, tracking: TrackingConfig, log: Log
 ) -> pd.DataFrame:
     """Summarize the localized views, write tables and figure, and log them."""
     from wheretolook.figures.style import save_figure
@@ -114,6 +133,6 @@ def _report(
         params |= {f"odometry_{unit}": getattr(config, f"odometry_{unit}") for unit in ("m_per_m", "deg_per_deg")}
     with kept_if_not_logged(f"the comparison in {folder}"):
         report.log_paths(params, summary, folder, tracking)
-    say(markdown)
-    say(f"-> {folder / report.PATHS_CSV}, {report.PATHS_MD}, {report.PATHS_PNG}; every view in {folder / FOLDER}")
+    log(markdown)
+    log(f"-> {folder / report.PATHS_CSV}, {report.PATHS_MD}, {report.PATHS_PNG}; every view in {folder / FOLDER}")
     return summary

@@ -1,87 +1,118 @@
-"""The release stage: a compact copy of a labelled dataset, and its card."""
+"""`wheretolook release`: a compact copy of a labelled dataset, and its card."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
-from typing import Any
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from wheretolook.config import Experiment
+from wheretolook.commands.evaluate import Evaluate
+from wheretolook.commands.options import Experiment, Log, Progress, ignore_progress, select_options
+from wheretolook.commands.preconditions import load_dataset
 from wheretolook.dataset.dataset_lock import changing, reading, reads_dataset
-from wheretolook.dataset.layout import Dataset
-from wheretolook.stages.evaluate import evaluate
-from wheretolook.stages.preconditions import Say, Tick, dataset_after
+from wheretolook.dataset.names import RELEASE_FILE
+from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.tracking.store import check_store
+from wheretolook.utils.confine import check_folder_name, safe_child
+from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import copy_file
 
+if TYPE_CHECKING:
+    from wheretolook.dataset.layout import Dataset
 
-@reads_dataset("release")
-def release(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Dataset:
-    """Publish a labelled dataset: a compact copy of it, `<data>/<release_name>/`, and in the end its card.
 
-    For any dataset but a release this makes the copy. For the copy itself, once networks are trained on it, it chooses
-    the weights that ship, evaluates them and writes the card. Either can be done again.
+@dataclass(frozen=True, kw_only=True)
+class Release(Experiment):
+    """Make a compact copy, data/release; given that copy and weights trained on it, evaluate and write its card.
 
-    Raises:
-        WeightsError: there are no weights, or they do not fit the release.
-        StorageError: it is not smaller than 16 MB.
-        ConfigError: another dataset lies where the copy belongs, or it is the dataset itself.
-        InUseError: another stage changes the dataset, or is at work on the copy.
+    Examples:
+      wheretolook release --config configs/release.yaml
+
+    Args:
+        release_name: name of the copy and its folder.
+        evaluate: how the weights are evaluated.
     """
-    from wheretolook_paper.release import copy as releases
-    from wheretolook_paper.release import naming
 
-    dataset = dataset_after(experiment, "label")
-    if not releases.is_release(dataset):
-        root = experiment.data / experiment.release_name
-        naming.check(experiment)
+    SHORT: ClassVar = {"engine": "label.engine"}
+
+    release_name: str = "release"
+    evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_folder_name("a release's name", self.release_name)
+        root = safe_child(self.data, self.release_name, "a release's name")
+        if root.resolve() == self.root.resolve() and not (root / RELEASE_FILE).is_file():
+            fix = "Give --release_name another name: the copy is a dataset of its own."
+            problem = "the release has the name of the dataset that it is a copy of"
+            raise ConfigError(problem, path=root, value=self.release_name, fix=fix)
+
+    @reads_dataset("release")
+    def run(self, log: Log = print, progress: Progress = ignore_progress) -> Dataset:
+        """Publish a labelled dataset: a compact copy of it, `<data>/<release_name>/`, and in the end its card.
+
+        For any dataset but a release this makes the copy. For the copy itself, once networks are trained on it, it
+        chooses the weights that ship, evaluates them and writes the card. Either can be repeated.
+
+        Raises:
+            WeightsError: there are no weights, or they do not fit the release.
+            StorageError: it is not smaller than 16 MB.
+            ConfigError: the copy's folder holds another dataset, or is the dataset's own.
+            InUseError: another command changes the dataset, or works on the copy.
+        """
+        from wheretolook_paper.release import copy as releases
+
+        dataset = load_dataset(self, "label")
+        if releases.is_release(dataset):
+            with reading(dataset.root, "release", "card"):
+                return _finish(self, dataset, log, progress)
+        root = self.data / self.release_name
         with changing(root, "release"):
-            copy = releases.copy_dataset(dataset, root, release_settings(experiment))
+            copy = releases.copy_dataset(dataset, root, release_settings(self))
             for scene, source in zip(copy.scenes, dataset.scenes, strict=True):
-                stamp = source.stage_cache("label").stored_key
-                assert stamp is not None  # `dataset_after` has checked it
-                scene.stage_cache("label", stamp).store()
-        say(f"{len(copy.scenes)} scenes -> {copy.root}: {releases.size_text(releases.sizes(copy.root, weights=False))}")
-        say("next: train on it, then `wheretolook release` with its own configuration")
+                key = source.stage_cache("label").stored_key
+                assert key is not None  # `load_dataset` has checked it
+                scene.stage_cache("label", key).store()
+        log(f"{len(copy.scenes)} scenes -> {copy.root}: {releases.size_text(releases.sizes(copy.root, weights=False))}")
+        log("next: train on it, then `wheretolook release` with its own configuration")
         return copy
-    with reading(dataset.root, "release", "card"):
-        return _finish(experiment, dataset, say, tick)
 
 
-def _finish(experiment: Experiment, dataset: Dataset, say: Say, tick: Tick) -> Dataset:
+def _finish(options: Release, dataset: Dataset, log: Log, progress: Progress) -> Dataset:
     """Choose the weights that ship with a release, evaluate them, and write its card."""
     from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV
     from wheretolook_paper.release import copy as releases
     from wheretolook_paper.release.card import write_card
     from wheretolook_paper.release.training_histories import keep_histories
 
-    check_store(experiment.tracking)
+    check_store(options.tracking)
     # on the CPU, so that machines without a GPU get the same scores
-    on_cpu = replace(experiment, device="cpu", evaluate=replace(experiment.evaluate, weights=()))
+    config = replace(options.evaluate, weights=())
+    on_cpu = replace(select_options(Evaluate, options), device="cpu", evaluate=config)
     results = dataset.root / "results"
-    if releases.choose_weights_to_ship(dataset).shelved:  # all that were trained, before only the best are left
+    if releases.choose_weights_to_ship(dataset).shelved:  # all that were trained, before only the best remain
         methods = tuple(method.name for method in releases.trained_weights(dataset).values())
-        evaluate(replace(on_cpu, evaluate=replace(on_cpu.evaluate, methods=methods, reference="")), say)
+        replace(on_cpu, evaluate=replace(config, methods=methods, reference="")).run(log)
         copy_file(results / SCORES_CSV, results / VARIANTS_CSV)
     choice = releases.ship_weights(dataset)
     compared = ", ".join(f"{name} {value:.4f}" for name, value in choice.precision.items())
-    say(f"validation average precision: {compared}")
-    say(f"the paper's network that ships, in half precision: {choice.network}; the best of all: {choice.best}")
-    keep_histories(dataset, experiment.tracking)
-    releases.sizes(dataset.root)  # too large? then before the evaluation
-    evaluate(on_cpu, say, tick)
-    say(f"the card -> {write_card(dataset, release_settings(Experiment()))}")
-    say(releases.size_text(releases.sizes(dataset.root)))
+    log(f"validation average precision: {compared}")
+    log(f"the paper's network that ships, in half precision: {choice.network}; the best of all: {choice.best}")
+    keep_histories(dataset, options.tracking)
+    releases.sizes(dataset.root)  # an error if too large, before the evaluation
+    on_cpu.run(log, progress)
+    log(f"the card -> {write_card(dataset, release_settings(Experiment()))}")
+    log(releases.size_text(releases.sizes(dataset.root)))
     return dataset
 
 
-def release_settings(experiment: Experiment) -> dict[str, Any]:
+def release_settings(options: Experiment) -> dict[str, Any]:
     """Settings that decide what a dataset holds, as JSON values. Meshes go by name: paths mean nothing elsewhere."""
-    meshes = [{"name": mesh.scene_name, "split": mesh.split, "up": mesh.up} for mesh in experiment.scenes.meshes]
-    settings = {name: _record(getattr(experiment, name)) for name in ("scenes", "map", "occlusion", "sample")}
-    settings = {"camera": experiment.camera.camera.record(), **settings}
+    meshes = [{"name": mesh.scene_name, "split": mesh.split, "up": mesh.up} for mesh in options.scenes.meshes]
+    settings = {name: _record(getattr(options, name)) for name in ("scenes", "map", "occlusion", "sample")}
+    settings = {"camera": options.camera.camera.record(), **settings}
     settings["scenes"]["meshes"] = meshes
-    settings["label"] = {"localizer": experiment.label.localizer.record()}
+    settings["label"] = {"localizer": options.label.localizer.record()}
     return dict(json.loads(json.dumps(settings, default=str)))
 
 

@@ -29,6 +29,7 @@ from wheretolook.scorers.registry import learned
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import artifact, finished_runs
 from wheretolook.tracking.store import client, kept_if_not_logged
+from wheretolook.training.run_record import HISTORY_CSV
 from wheretolook.utils.errors import ConfigError, MissingRunError, WhereToLookError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.markdown import markdown_table
@@ -60,7 +61,7 @@ from wheretolook_paper.release.showcase_figures import (
     planned_views,
     sampling_of,
 )
-from wheretolook_paper.release.training_histories import HISTORY_CSV, histories, method_of_run, train_runs
+from wheretolook_paper.release.training_histories import histories, method_of_run, train_runs
 
 if TYPE_CHECKING:
     from mlflow.entities import Run

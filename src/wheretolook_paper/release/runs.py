@@ -36,20 +36,14 @@ from wheretolook.tracking.runs import (
     start_run,
 )
 from wheretolook.tracking.store import client as client_of
+from wheretolook.training.run_record import HISTORY_CSV, kept_metrics, params_of
 from wheretolook.utils.files import temporary_folder, write_text
 from wheretolook.utils.locks import hold
 from wheretolook_paper.evaluation.looks import LOOKS_CSV, log_looks
 from wheretolook_paper.paths.path_report import PATHS_CSV, log_paths
 from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
 from wheretolook_paper.release.card import GENERALIZATION_CSV
-from wheretolook_paper.release.training_histories import (
-    HISTORY_CSV,
-    TRAINING_CSV,
-    kept_metrics,
-    params_of,
-    read_histories,
-    records,
-)
+from wheretolook_paper.release.training_histories import TRAINING_CSV, read_histories, records
 from wheretolook_paper.release.training_histories import train_runs as runs_of_training
 
 LEARNERS_CSV = "learners.csv"

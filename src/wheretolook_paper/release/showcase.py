@@ -26,7 +26,7 @@ from wheretolook.geometry.poses import Float
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.space.config import FreeSpaceConfig
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.utils.options import recorded
+from wheretolook.utils.records import from_record
 from wheretolook.visibility.config import OcclusionConfig
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_paper.release.copy import read_about
@@ -147,13 +147,13 @@ def open_showcase(dataset: Dataset, name: str | None = None, device: str = "cpu"
     seeded = _SEEDED.fullmatch(scene.name)
     if seeded is None:
         raise SceneError("this scene was not generated from a seed", path=scene.folder, value=scene.name)
-    occlusion = recorded(OcclusionConfig, {**settings["occlusion"], "model": "mesh"})
-    config = EnvironmentConfig(occlusion, recorded(FreeSpaceConfig, settings["scenes"]["free_space"]))
+    occlusion = from_record(OcclusionConfig, {**settings["occlusion"], "model": "mesh"})
+    config = EnvironmentConfig(occlusion, from_record(FreeSpaceConfig, settings["scenes"]["free_space"]))
     kind = cast(SceneKind, seeded[1])
-    apartment = recorded(ApartmentConfig, settings["scenes"]["apartment"])
+    apartment = from_record(ApartmentConfig, settings["scenes"]["apartment"])
     mesh, _ = generate_scene(kind, apartment, int(seeded[2]), device=device)
     showcase = Showcase(scene, None, config, device, mesh=mesh)
-    showcase.sampling = recorded(SampleConfig, settings["sample"])
+    showcase.sampling = from_record(SampleConfig, settings["sample"])
     if settings["occlusion"]["model"] == "mesh":
         _check_same(showcase)
     return showcase

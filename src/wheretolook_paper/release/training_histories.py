@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from io import StringIO
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +10,8 @@ import pandas as pd
 
 from wheretolook.dataset.layout import Dataset
 from wheretolook.tracking.config import TrackingConfig
-from wheretolook.tracking.runs import AUC, artifact, finished_runs
+from wheretolook.tracking.runs import artifact, finished_runs
+from wheretolook.training.run_record import HISTORY_CSV, history_not_logged, params_of
 from wheretolook.utils.errors import WeightsError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.reading import read_json_object
@@ -19,24 +19,8 @@ from wheretolook.utils.reading import read_json_object
 if TYPE_CHECKING:
     from mlflow.entities import Run
 
-HISTORY_CSV = "history.csv"  # artifact of a train run: a row an epoch
-
 TRAINING_CSV = "training.csv"
 """In a release's `results/`: the histories of all that was trained, one below the other, with a column `method`."""
-
-NOT_LOGGED = "not_logged"
-"""In the record of weights whose training is not logged yet: "params" and "history", the text of `HISTORY_CSV`."""
-
-
-def params_of(about: Mapping[str, Any]) -> dict[str, Any]:
-    """Parameters of a train run, from what its weights' record tells about it."""
-    return {name: about[name] for name in ("method", "dataset", "dataset_fingerprint")} | about["config"]
-
-
-def kept_metrics(metrics: Mapping[str, float]) -> dict[str, float]:
-    """Metrics of a train run that tell about the weights kept, given those of their epoch; that to sort by first."""
-    first = {AUC: metrics["val_roc_auc"]} if "val_roc_auc" in metrics else {}
-    return first | {f"kept_{name}": value for name, value in metrics.items()}
 
 
 def method_of_run(run: Run) -> str:
@@ -80,13 +64,6 @@ def trained(tracking: TrackingConfig, dataset: str) -> pd.DataFrame:
 
 
 _MEASURES = ("average_precision", "roc_auc", "calibration_error")
-
-
-def history_not_logged(record: Mapping[str, Any]) -> pd.DataFrame | None:
-    """The history in the record of a training that is not logged yet; None if there is none."""
-    kept = record.get(NOT_LOGGED)
-    text = kept.get("history") if isinstance(kept, dict) else None
-    return pd.read_csv(StringIO(text), float_precision="round_trip") if isinstance(text, str) and text else None
 
 
 def records(folder: Path) -> dict[Path, dict[str, Any]]:

@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from wheretolook.commands.adapt import labelled_views
 from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, poses
 from wheretolook.evaluation.adaptation import compare_log_odds
 from wheretolook.scorers.adapted.gp_correction import adapt
 from wheretolook.scorers.registry import make_scorer
-from wheretolook.stages.adapt import labelled_views
 from wheretolook.utils.shipped import WEIGHTS, shipped
 
 

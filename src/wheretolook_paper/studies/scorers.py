@@ -26,6 +26,7 @@ import numpy as np
 import pandas as pd
 import torch
 
+from wheretolook.commands.train import train_methods as train
 from wheretolook.dataset.layout import Dataset
 from wheretolook.inputs.landmark_features import ATTRIBUTES
 from wheretolook.scorers.mlp.config import MlpConfig
@@ -33,7 +34,6 @@ from wheretolook.scorers.set import learn as set_learner
 from wheretolook.scorers.set.config import SetConfig
 from wheretolook.scorers.set.learn import SetDataModule, learn_set
 from wheretolook.scorers.train_config import TrainConfig
-from wheretolook.stages.train import train_methods as train
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import start_run
 from wheretolook.training.fit import RunLog

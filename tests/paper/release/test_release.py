@@ -13,22 +13,28 @@ import pandas as pd
 import pytest
 from sklearn.metrics import roc_auc_score
 
+from all_options import AllOptions, run
 from learning_options import changed, train_config
 from synthetic_dataset import CAMERA, make_dataset
-from wheretolook import stages
-from wheretolook.cli import main, parse_experiment
-from wheretolook.config import Experiment, MeshSource, ScenesConfig
+from wheretolook.cli import main, parse_command
+from wheretolook.commands.evaluate import Evaluate
+from wheretolook.commands.evaluate import evaluate_methods as evaluate
+from wheretolook.commands.label import Label
+from wheretolook.commands.map import Map
+from wheretolook.commands.sample import Sample
+from wheretolook.commands.scenes import Scenes
+from wheretolook.commands.train import Train
+from wheretolook.commands.train import train_methods as train
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.names import RELEASE, RELEASE_FILE
 from wheretolook.dataset.viewpoint_table import is_good, poses, write_table
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.report import score_markdown
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.scenes.scenes_config import MeshSource, ScenesConfig
 from wheretolook.scorers.mlp.network import ViewpointNetwork
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.scorers.set.config import SetConfig
-from wheretolook.stages.evaluate import evaluate_methods as evaluate
-from wheretolook.stages.train import train_methods as train
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.training.data import load_views
 from wheretolook.training.trained_network import TrainedNetwork
@@ -36,7 +42,7 @@ from wheretolook.utils.errors import ConfigError, StorageError, TableError, Weig
 from wheretolook.utils.files import write_json
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook.weights.resolve import load_scorer
-from wheretolook_paper.commands.release import release_settings
+from wheretolook_paper.commands.release import Release, release_settings
 from wheretolook_paper.release import copy as releases
 from wheretolook_paper.release.card import release_card
 from wheretolook_paper.release.copy import convert_to_float16
@@ -64,8 +70,8 @@ def label_stamped(root: Path, **options: int) -> Dataset:
     return dataset
 
 
-def experiment_of(folder: Path, name: str = "tiny") -> Experiment:
-    return Experiment(
+def experiment_of(folder: Path, name: str = "tiny") -> AllOptions:
+    return AllOptions(
         name=name, data=folder / "data", device="cpu", camera=CAMERA, train=TRAIN,
         scenes=ScenesConfig(train=2, test=2, seed=70), evaluate=EVALUATE,
         tracking=TrackingConfig(str(folder / "mlruns")),
@@ -73,7 +79,7 @@ def experiment_of(folder: Path, name: str = "tiny") -> Experiment:
 
 
 def card_of(release: Dataset) -> str:
-    return release_card(release, release_settings(Experiment()))
+    return release_card(release, release_settings(AllOptions()))
 
 
 @pytest.fixture(scope="module")
@@ -81,9 +87,9 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with `data/tiny` and its finished `data/release`."""
     folder = tmp_path_factory.mktemp("release")
     label_stamped(folder / "data" / "tiny")
-    stages.release(experiment_of(folder), say=quiet)
-    stages.train(experiment_of(folder, "release"), say=quiet)
-    stages.release(experiment_of(folder, "release"), say=quiet)
+    run(Release, experiment_of(folder), log=quiet)
+    run(Train, experiment_of(folder, "release"), log=quiet)
+    run(Release, experiment_of(folder, "release"), log=quiet)
     return folder
 
 
@@ -213,7 +219,7 @@ def test_what_is_best_of_all_ships_beside_the_network(folder: Path, tmp_path: Pa
     experiment = replace(
         experiment_of(folder, "release"), evaluate=replace(EVALUATE, methods=(*EVALUATE.methods, "set"))
     )
-    stages.release(experiment, say=quiet)
+    run(Release, experiment, log=quiet)
     (network,) = (path for path in (root / "weights").glob("mlp-*.safetensors"))
     assert sorted(path.name for path in (root / "weights").glob("*.safetensors")) == [network.name, "set.safetensors"]
     assert (root / "weights" / releases.SHELF / "trees.safetensors").is_file()
@@ -227,20 +233,20 @@ def test_what_is_best_of_all_ships_beside_the_network(folder: Path, tmp_path: Pa
     scorer = load_scorer(root / "weights", release.scenes[0].localization_map(release.camera))
     assert scorer.name == "set"
     before = contents(root)
-    stages.release(experiment, say=quiet)
+    run(Release, experiment, log=quiet)
     assert contents(root) == before
 
 
 def test_done_again_it_gives_the_same_bytes(folder: Path) -> None:
     root = folder / "data" / "release"
     before = contents(root)
-    stages.release(experiment_of(folder), say=quiet)
-    stages.release(experiment_of(folder, "release"), say=quiet)
+    run(Release, experiment_of(folder), log=quiet)
+    run(Release, experiment_of(folder, "release"), log=quiet)
     assert contents(root) == before
     # evaluated alone, as on a fresh clone, without the source and the shelf
     shutil.rmtree(folder / "data" / "tiny")
     shutil.rmtree(root / "weights" / releases.SHELF)
-    stages.evaluate(experiment_of(folder, "release"), say=quiet)
+    run(Evaluate, experiment_of(folder, "release"), log=quiet)
     for name in ("scores.csv", "scores.md"):
         assert (root / "results" / name).read_bytes() == before[f"results/{name}"]
 
@@ -287,7 +293,7 @@ def test_the_card_tells_what_lies_there(folder: Path, monkeypatch: pytest.Monkey
 def test_scenes_made_by_others_keep_their_licence(folder: Path) -> None:
     experiment = experiment_of(folder)
     scenes = ScenesConfig(train=1, test=0, meshes=(MeshSource(Path("/secret/place/scan.glb")),))
-    stages.release(replace(experiment, scenes=scenes), say=quiet)
+    run(Release, replace(experiment, scenes=scenes), log=quiet)
     assert "secret" not in (folder / "data" / "release" / RELEASE_FILE).read_text()
     card = card_of(Dataset.load(folder / "data" / "release"))
     assert "made by others (scan)" in card and "secret" not in card
@@ -297,23 +303,23 @@ def test_a_changed_source_takes_the_card_and_old_scenes_along(folder: Path) -> N
     root = folder / "data" / "release"
     tiny = Dataset.load(folder / "data" / "tiny")
     replace(tiny, scenes=tiny.scenes[:-1]).save()
-    stages.release(experiment_of(folder), say=quiet)
+    run(Release, experiment_of(folder), log=quiet)
     assert not (root / "README.md").exists() and not (root / tiny.scenes[-1].name).exists()
     replace(tiny, scenes=tiny.scenes[1:]).save()
-    stages.release(experiment_of(folder), say=quiet)
+    run(Release, experiment_of(folder), log=quiet)
     with pytest.raises(WeightsError, match="not trained on this release"):
-        stages.release(experiment_of(folder, "release"), say=quiet)
+        run(Release, experiment_of(folder, "release"), log=quiet)
 
 
 def test_other_data_is_not_overwritten(folder: Path) -> None:
     label_stamped(folder / "data" / "another", n_landmarks=50)
     before = contents(folder / "data" / "release")
     with pytest.raises(ConfigError, match=r"of another dataset than another \(got 'tiny'\)"):
-        stages.release(experiment_of(folder, "another"), say=quiet)
+        run(Release, experiment_of(folder, "another"), log=quiet)
     assert contents(folder / "data" / "release") == before
     (folder / "data" / "release" / RELEASE_FILE).unlink()
     with pytest.raises(ConfigError, match="no release and would be overwritten"):
-        stages.release(experiment_of(folder), say=quiet)
+        run(Release, experiment_of(folder), log=quiet)
 
 
 def test_what_is_missing_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -321,21 +327,21 @@ def test_what_is_missing_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch)
     experiment = experiment_of(folder, "release")
     monkeypatch.setattr(releases, "MAX_BYTES", 20_000)
     with pytest.raises(StorageError, match=r"release.*not smaller than.*tables 0\.\d\d MB.*in all"):
-        stages.release(experiment, say=quiet)
+        run(Release, experiment, log=quiet)
     monkeypatch.undo()
     (root / "results" / "scores.csv").unlink()
     with pytest.raises(TableError, match=r"no scores.*evaluate|scores\.csv"):
         card_of(Dataset.load(root))
     shutil.copyfile(next((root / "weights").glob("*.safetensors")), root / "weights" / "mlp-2d+3d.safetensors")
     with pytest.raises(WeightsError, match=r"mlp-2d\+3d\.json"):
-        stages.release(experiment, say=quiet)
+        run(Release, experiment, log=quiet)
     shutil.rmtree(root / "weights")
     with pytest.raises(WeightsError, match=r"no weights to ship.*wheretolook train"):
-        stages.release(experiment, say=quiet)
+        run(Release, experiment, log=quiet)
     # a release cannot be labelled anew
-    for stage in (stages.make_scenes, stages.make_maps, stages.sample, stages.label):
+    for stage in (Scenes, Map, Sample, Label):
         with pytest.raises(ConfigError, match="a release has no meshes"):
-            stage(experiment, say=quiet)
+            run(stage, experiment, log=quiet)
 
 
 def test_from_the_command_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -352,11 +358,11 @@ def test_a_damaged_manifest_is_named(folder: Path) -> None:
     path = Dataset.load(folder / "data" / "tiny").scenes[1].label_manifest
     path.write_text("{")
     with pytest.raises(TableError, match=r"scene-1/labels\.json"):
-        stages.release(experiment_of(folder), say=quiet)
+        run(Release, experiment_of(folder), log=quiet)
 
 
 def test_the_shipped_configurations_fit_each_other() -> None:
-    release, paper = (parse_experiment("train", ["--config", str(CONFIGS / f"{n}.yaml")]) for n in ("release", "paper"))
+    release, paper = (parse_command("train", ["--config", str(CONFIGS / f"{n}.yaml")]) for n in ("release", "paper"))
     assert release is not None and paper is not None
     assert release.name == RELEASE and release.camera == paper.camera
 
@@ -401,14 +407,14 @@ def test_the_shipped_best_scorer_scores_as_the_card_says(shipped: Dataset) -> No
 @pytest.mark.slow
 def test_the_shipped_weights_score_as_the_card_says(shipped: Dataset, tmp_path: Path) -> None:
     shutil.copytree(shipped.root, tmp_path / "data" / "release")
-    experiment = parse_experiment(
+    experiment = parse_command(
         "evaluate", ["--config", str(CONFIGS / "release.yaml"), "--data", str(tmp_path / "data"), "--device", "cpu",
                      "--tracking.folder", str(tmp_path / "mlruns"), "--evaluate.resamples", "2",
                      "--evaluate.methods", "[random,visible,bins,fisher-logdet-exact,mlp]",
                      "--evaluate.occlusions", "[]"]
     )  # fmt: skip
     assert experiment is not None
-    scores = stages.evaluate(experiment, say=quiet)
+    scores = run(Evaluate, experiment, log=quiet)
     said = pd.read_csv(shipped.root / "results" / "scores.csv")
     said = said[said["occlusion"] == "mesh"].merge(scores[["method"]].drop_duplicates()).reset_index(drop=True)
     # what is compared with the reference is another here: that of the card is not among the methods

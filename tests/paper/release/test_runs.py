@@ -13,18 +13,19 @@ import pytest
 
 from synthetic_dataset import make_dataset
 from synthetic_release import METHODS, history, make_release
+from wheretolook.commands.evaluate import evaluate_methods as evaluate
 from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.results import latest_scores
 from wheretolook.evaluation.scores import read_scores
-from wheretolook.stages.evaluate import evaluate_methods as evaluate
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import experiment_ids, experiments, finished_runs, newest_artifact, newest_run
 from wheretolook.tracking.store import client
+from wheretolook.training.run_record import HISTORY_CSV
 from wheretolook.utils.errors import MissingRunError
 from wheretolook_paper.release.notebook import open_store
 from wheretolook_paper.release.runs import ReleaseRuns, log_release
-from wheretolook_paper.release.training_histories import HISTORY_CSV, histories, keep_histories, trained
+from wheretolook_paper.release.training_histories import histories, keep_histories, trained
 
 PAGE = Path(__file__).parents[3] / "mlruns" / "README.md"
 

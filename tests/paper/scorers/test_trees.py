@@ -12,9 +12,9 @@ from scipy.special import expit
 
 from learning_options import train_config
 from synthetic_dataset import CAMERA, make_dataset
+from wheretolook.commands.train import train_methods as train
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import is_good, poses
-from wheretolook.stages.train import train_methods as train
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.training.weights import method_of_weights, read_training, write_weights
 from wheretolook.utils.errors import ConfigError, WeightsError

@@ -1,4 +1,4 @@
-"""Photographs of a scene's map, left out of it in blocks, for stages that learn from them or evaluate by them."""
+"""Photographs of a scene's map held out of it in blocks, to train on or to evaluate."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from wheretolook.config import Experiment
+from wheretolook.commands.options import LabelOptions, Log
 from wheretolook.dataset.layout import SceneFolder
-from wheretolook.stages.preconditions import Say
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.locks import hold
 
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def knows_photographs(files: SceneFolder, images: Path | None = None, database: Path | None = None) -> bool:
-    """Whether the features of the photographs that a scene's map was made from are known, or these themselves."""
+    """Return whether the photographs that a scene's map was made from, or their features, are known."""
     from wheretolook.mapping.colmap_model import holds_model
     from wheretolook.mapping.sources import features_beside, photographs_of
 
@@ -28,16 +27,16 @@ def knows_photographs(files: SceneFolder, images: Path | None = None, database: 
     return given is not None
 
 
-def check_name(experiment: Experiment, files: SceneFolder) -> str:
-    """What the folder of a scene's check is called: as by `check --name`, unless there is one as by `check` alone."""
+def check_name(options: LabelOptions, files: SceneFolder) -> str:
+    """Return the folder name of a scene's check: that of `check --name`, unless only that of `check` exists."""
     from wheretolook.holdout.photo_map import CHECKS
 
-    names = f"{experiment.name}-{files.name}", files.name
-    return next((name for name in names if (experiment.data / CHECKS / name).is_dir()), names[0])
+    names = f"{options.name}-{files.name}", files.name
+    return next((name for name in names if (options.data / CHECKS / name).is_dir()), names[0])
 
 
 def leave_photographs_out(
-    experiment: Experiment,
+    options: LabelOptions,
     stage: str,
     model: Path,
     name: str,
@@ -45,20 +44,20 @@ def leave_photographs_out(
     keep_frame: bool,
     images: Path | None,
     database: Path | None,
-    say: Say,
+    log: Log,
     upright: bool = False,
 ) -> tuple[PhotographedMap, list[HoldoutResult]]:
-    """A map, and its photographs left out in blocks, in the folder of its check: neither does again what the other did.
+    """Return a map and its photographs, held out in blocks; finished blocks are shared with `wheretolook check`.
 
-    See `wheretolook.holdout.photo_map.open_map` for what is asked and raised; with `upright`, a MapError is raised if the
-    model's cameras seem to lie on their side.
+    See `wheretolook.holdout.photo_map.open_map` for arguments and errors; `upright` raises MapError if the model's
+    cameras seem to be on their side.
     """
     from wheretolook.holdout.holdout import left_out_blocks
     from wheretolook.holdout.photo_map import WORK, features_of, folder_of_check, open_map
 
-    out = folder_of_check(experiment.data, name)
-    workers = experiment.n_workers
-    device = experiment.warp_device
+    out = folder_of_check(options.data, name)
+    workers = options.n_workers
+    device = options.warp_device
     try:
         with hold(out / ".lock", stage):
             folder, features = features_of(model, images, database, out / WORK, workers, device)
@@ -66,8 +65,8 @@ def leave_photographs_out(
             if upright and source.is_turned:
                 fix = "Make a scene of it: `wheretolook map --name NAME --model SPARSE --map.existing.level true`."
                 raise MapError("the map lies on its side, and this needs z up", path=model, fix=fix)
-            say(f"{name}: leaving out blocks of {len(source.poses)} photographs")
+            log(f"{name}: leaving out blocks of {len(source.poses)} photographs")
             return source, left_out_blocks(source, out / WORK, workers=workers, device=device)
     finally:
-        with suppress(OSError):  # made for the lock of a stage that then found nothing to work on
+        with suppress(OSError):  # created for the lock only
             out.rmdir()

@@ -1,21 +1,22 @@
-"""The train stage: from labelled viewpoints to weights, one logged run for each method."""
+"""`wheretolook train`: from labelled viewpoints to weights, one logged run for each method."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from wheretolook.config import Experiment
+from wheretolook.commands.options import DatasetOptions, Log, Progress, ignore_progress
+from wheretolook.commands.preconditions import load_dataset
 from wheretolook.dataset.dataset_lock import reading, reads_dataset
 from wheretolook.dataset.layout import Dataset
 from wheretolook.scorers.method import Method
 from wheretolook.scorers.train_config import TrainConfig
-from wheretolook.stages.preconditions import Say, Tick, dataset_after
 from wheretolook.tracking.config import TrackingConfig
-from wheretolook.tracking.runs import log, log_history, start_run
+from wheretolook.tracking.runs import log as log_to_run
+from wheretolook.tracking.runs import log_history, start_run
 from wheretolook.tracking.store import check_store, kept_if_not_logged, warn_not_logged
 from wheretolook.utils.confine import safe_child
 from wheretolook.utils.errors import TrackingError
@@ -30,17 +31,32 @@ if TYPE_CHECKING:
 Values = dict[str, Any]
 
 
-@reads_dataset("train")
-def train(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Sequence[TrainedModel]:
-    """Stage 5: the weights of each method that is to learn, `<dataset>/weights/`, and an MLflow run for each."""
-    config = experiment.train
-    if experiment.warp_device == "cpu":
-        config = replace(config, accelerator="cpu")
-    models = train_methods(dataset_after(experiment, "label"), config, experiment.tracking)
-    for model in models:
-        say(f"{model.method}: reusing {model.path}" if model.reused else f"{model.method}: -> {model.path}")
-    tick(1)
-    return models
+@dataclass(frozen=True, kw_only=True)
+class Train(DatasetOptions):
+    """Train methods on the labels, one weights file for each method.
+
+    Examples:
+      wheretolook train --config configs/demo.yaml --train.methods '[mlp-2d+z, set]'
+
+    Args:
+        train: what is trained, and how.
+        tracking: where MLflow keeps its runs.
+    """
+
+    train: TrainConfig = field(default_factory=TrainConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+
+    @reads_dataset("train")
+    def run(self, log: Log = print, progress: Progress = ignore_progress) -> Sequence[TrainedModel]:
+        """Write the weights of each method, `<dataset>/weights/`, with an MLflow run for each; see `train_methods`."""
+        config = self.train
+        if self.warp_device == "cpu":
+            config = replace(config, accelerator="cpu")
+        models = train_methods(load_dataset(self, "label"), config, self.tracking)
+        for model in models:
+            log(f"{model.method}: reusing {model.path}" if model.reused else f"{model.method}: -> {model.path}")
+        progress(1)
+        return models
 
 
 def train_methods(
@@ -52,7 +68,7 @@ def train_methods(
 ) -> list[TrainedModel]:
     """Train methods on labelled train scenes, and val scenes if there are any: one MLflow run and model for each.
 
-    Writes `<dataset>/weights/<method>.safetensors` and, beside it, a JSON file that tells what it was trained on. A
+    Writes `<dataset>/weights/<method>.safetensors` and a JSON record of what it was trained on. A
     method already trained with the same options on the same train and val scenes is not trained again, unless forced.
 
     Raises:
@@ -94,14 +110,14 @@ def train_methods(
 def _train(
     method: Method, dataset: Dataset, config: TrainConfig, about: Values, tracking: TrackingConfig, shared: Values
 ) -> TrainedModel:
-    """Train a method, write its weights and record, and log it; `shared` are further fields of its `Task`."""
+    """Train a method, write its weights and record, and log it; `shared` are further fields of its task."""
     from lightning.pytorch import seed_everything
     from lightning.pytorch.utilities.seed import isolate_rng
 
     from wheretolook.training.fit import RunLog
     from wheretolook.training.learner import Task
     from wheretolook.training.provenance import TrainedModel, weights_path
-    from wheretolook_paper.release.training_histories import NOT_LOGGED, kept_metrics, params_of
+    from wheretolook.training.run_record import NOT_LOGGED, kept_metrics, params_of
 
     assert method.learn is not None
     path = weights_path(dataset, method.name)  # the title is that of its progress bar
@@ -119,8 +135,8 @@ def _train(
             kept = {NOT_LOGGED: {"params": devices | learnt.counts, "history": history}}
             record = {"about": about, "weights_sha256": sha256(path), "run_id": "", "metrics": learnt.metrics}
             write_json(path.with_suffix(".json"), record | kept)
-            log(client, run_id, params=learnt.counts, metrics=kept_metrics(learnt.metrics))
-            _log_artifacts(client, run_id, path, learnt.history, method.name)
+            log_to_run(client, run_id, params=learnt.counts, metrics=kept_metrics(learnt.metrics))
+            _log_artifacts(client, run_id, path, learnt.history)
             if run_log.failed is not None:
                 raise run_log.failed
         write_json(path.with_suffix(".json"), record | {"run_id": run_id})
@@ -133,9 +149,9 @@ def _train(
 
 
 def _log_later(model: TrainedModel, tracking: TrackingConfig) -> TrainedModel:
-    """Log a training whose weights and record lie on disk, from the record, as training itself does."""
+    """Log a training from the record of its weights, as training itself does."""
+    from wheretolook.training.run_record import NOT_LOGGED, history_not_logged, kept_metrics, params_of
     from wheretolook.training.weights import read_record
-    from wheretolook_paper.release.training_histories import NOT_LOGGED, history_not_logged, kept_metrics, params_of
 
     record = read_record(model.path)
     kept = record.pop(NOT_LOGGED, {})
@@ -143,27 +159,21 @@ def _log_later(model: TrainedModel, tracking: TrackingConfig) -> TrainedModel:
     history = history_not_logged({NOT_LOGGED: kept})
     with kept_if_not_logged(f"the training of {model.method}, {model.path}"):
         with start_run(tracking, model.method, "train", params) as (client, run_id):
-            log(client, run_id, metrics=kept_metrics(model.metrics))
+            log_to_run(client, run_id, metrics=kept_metrics(model.metrics))
             if history is not None:
                 log_history(client, run_id, history)
-            _log_artifacts(client, run_id, model.path, history, model.method)
+            _log_artifacts(client, run_id, model.path, history)
         write_json(model.path.with_suffix(".json"), record | {"run_id": run_id})
         return replace(model, run_id=run_id)
     return model
 
 
-def _log_artifacts(client: MlflowClient, run_id: str, weights: Path, history: pd.DataFrame | None, method: str) -> None:
-    from wheretolook.figures.style import save_figure
-    from wheretolook_paper.figures.training import training_figure
-    from wheretolook_paper.release.training_histories import HISTORY_CSV
+def _log_artifacts(client: MlflowClient, run_id: str, weights: Path, history: pd.DataFrame | None) -> None:
+    from wheretolook.training.run_record import HISTORY_CSV
 
     client.log_artifact(run_id, str(weights))
     if history is None:
         return
     with temporary_folder() as folder:
-        table = folder / HISTORY_CSV
-        curves = Path(folder) / "curves.png"
-        write_text(table, history.to_csv(index=False))
-        save_figure(training_figure({method: history}), curves)
-        for file in (table, curves):
-            client.log_artifact(run_id, str(file))
+        write_text(folder / HISTORY_CSV, history.to_csv(index=False))
+        client.log_artifact(run_id, str(folder / HISTORY_CSV))

@@ -1,73 +1,112 @@
-"""The evaluate stage: score the viewpoints of the test scenes with every method, tabulate, draw and log."""
+"""`wheretolook evaluate`: viewpoints of the test scenes scored by every method, tabulated, drawn and logged."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, ClassVar
 
-import pandas as pd
-
-from wheretolook.config import Experiment
+from wheretolook.commands.holdout_photos import check_name, knows_photographs, leave_photographs_out
+from wheretolook.commands.options import LabelOptions, Log, Progress, SceneOptions, ignore_progress
+from wheretolook.commands.preconditions import load_dataset, open_scene
 from wheretolook.dataset.dataset_lock import reading, reads_dataset
 from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.stages.holdout_photos import check_name, knows_photographs, leave_photographs_out
-from wheretolook.stages.preconditions import Say, Tick, dataset_after, open_scene
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.store import check_store, kept_if_not_logged
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.files import write_text
 from wheretolook.visibility.config import OcclusionConfig
-from wheretolook_paper.commands.look_sets import evaluate_looks
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from wheretolook.evaluation.photographs import HeldOutPhotographs
     from wheretolook.training.provenance import TrainedModel
 
 
-@reads_dataset("evaluate")
-def evaluate(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> pd.DataFrame:
-    """Stage 6: the score table of all methods on the test scenes, `<dataset>/results/`, and nested MLflow runs.
+EXTENSIONS = "wheretolook.after_evaluation"
+"""Entry-point group of functions (dataset, config, tracking, device) that are called after an evaluation."""
 
-    Where labels keep where landmarks were matched, also `looks.csv` and `looks.md`: sets of looks localized together.
+REPORTS = "wheretolook.score_reports"
+"""Entry-point group of functions (folder, table) that write further tables and figures of an evaluation's scores."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(SceneOptions, LabelOptions):
+    """Score all methods on the test scenes.
+
+    Examples:
+      wheretolook evaluate --config configs/demo.yaml --evaluate.methods '[random, visible, set]'
+      wheretolook evaluate --list-methods
+
+    Args:
+        evaluate: which methods, on which views, and by which thresholds.
+        tracking: where MLflow keeps its runs.
+        list_methods: only list the methods that can be compared.
     """
-    config = experiment.evaluate
-    device = experiment.warp_device
-    dataset = dataset_after(experiment, "label", knows_photographs if config.photographs else lambda scene: False)
-    check_store(experiment.tracking)  # before the imports of what scores, which take seconds
-    how: dict[str, Any] = {"device": device, "occlusion": experiment.occlusion}
-    if config.photographs:
-        how["photographs"] = _photographs(experiment, dataset, say)
-    scores = evaluate_methods(dataset, config, experiment.tracking, **how)
-    labelled = tuple(scene for scene in dataset.scenes if scene.stage_cache("label").stored_key is not None)
-    if any(scene.split == config.split for scene in labelled):
-        evaluate_looks(replace(dataset, scenes=labelled), config, experiment.tracking, device=device)
-    tick(1)
-    return scores
+
+    SHORT: ClassVar = {"engine": "label.engine"}
+
+    evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    list_methods: bool = False
+
+    def run(self, log: Log = print, progress: Progress = ignore_progress) -> pd.DataFrame | None:
+        """Write the score table, `<dataset>/results/`, and nested MLflow runs; or list the methods.
+
+        Installed packages add results of their own. Raises what `evaluate_methods` does.
+        """
+        if self.list_methods:
+            return list_methods()
+        return self._evaluate(log, progress)
+
+    @reads_dataset("evaluate")
+    def _evaluate(self, log: Log, progress: Progress) -> pd.DataFrame:
+        config = self.evaluate
+        dataset = load_dataset(self, "label", knows_photographs if config.photographs else lambda scene: False)
+        check_store(self.tracking)  # before imports that take seconds
+        photographs = held_out_photographs(self, dataset, log) if config.photographs else ()
+        scores = evaluate_methods(
+            dataset, config, self.tracking, device=self.warp_device, occlusion=self.occlusion, photographs=photographs
+        )
+        for extension in entry_points(group=EXTENSIONS):
+            extension.load()(dataset, config, self.tracking, self.warp_device)
+        progress(1)
+        return scores
 
 
-def _photographs(experiment: Experiment, dataset: Dataset, say: Say) -> list[HeldOutPhotographs]:
-    """The photographs of the maps of a split's scenes, left out of them."""
+def list_methods() -> None:
+    """Print the methods that can be compared."""
+    from wheretolook.scorers.registry import describe_methods
+
+    texts = describe_methods()
+    width = max(map(len, texts))
+    print("\n".join(f"{name:<{width}}  {text}" for name, text in texts.items()))
+
+
+def held_out_photographs(options: Evaluate, dataset: Dataset, log: Log) -> list[HeldOutPhotographs]:
+    """Hold the photographs of the maps of a split's scenes out of these maps."""
     from wheretolook.holdout.holdout_views import evaluated_photographs
     from wheretolook.holdout.photo_map import says_metric
 
-    found = []
-    for files in dataset.split(experiment.evaluate.split):
+    held_out = []
+    for files in dataset.split(options.evaluate.split):
         if knows_photographs(files):
-            metric = experiment.map.photographs.assume_metric or not files.is_photographed or says_metric(files.map)
-            name = check_name(experiment, files)
+            metric = options.map.photographs.assume_metric or not files.is_photographed or says_metric(files.map)
+            name = check_name(options, files)
             keep_frame = files.mesh.is_file()
-            how = (metric, keep_frame, None, None, say)
-            source, left_out = leave_photographs_out(experiment, "evaluate", files.map, name, *how)
-            hides = open_scene(experiment, dataset, files).occlusion
-            found.append(evaluated_photographs(files, source, left_out, hides, experiment.warp_device))
-    if not found:
+            how = (metric, keep_frame, None, None, log)
+            source, views = leave_photographs_out(options, "evaluate", files.map, name, *how)
+            occlusion = open_scene(options, files).occlusion
+            held_out.append(evaluated_photographs(files, source, views, occlusion, options.warp_device))
+    if not held_out:
         problem = "no scene of the split has a map whose photographs, or their features, are known"
         fix = "Map photographs (`wheretolook map --images`), or a model with its database or images."
-        raise MapError(problem, path=dataset.root, value=experiment.evaluate.split, fix=fix)
-    return found
+        raise MapError(problem, path=dataset.root, value=options.evaluate.split, fix=fix)
+    return held_out
 
 
 def evaluate_methods(
@@ -130,30 +169,21 @@ def not_logged(dataset: Dataset) -> Path:
 
 
 def write_results(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, title: str) -> None:
-    """Write tables, report, calibration curves (if any) and figures; those of an earlier evaluation go."""
+    """Write tables, report, calibration curves (if any) and figures; those of an earlier evaluation are removed."""
     from wheretolook.evaluation import results
     from wheretolook.evaluation.report import score_markdown
-    from wheretolook.evaluation.scores import main_rows, read_scores
     from wheretolook.figures.calibration import calibration_figure
     from wheretolook.figures.scores import regret_figure, score_figure
     from wheretolook.figures.style import save_figure
-    from wheretolook_paper.evaluation.paper_tables import write_paper_tables
-    from wheretolook_paper.figures.occlusion import occlusion_figure
 
     write_text(folder / results.SCORES_CSV, table.to_csv(index=False))
     write_text(folder / results.SCORES_MD, score_markdown(table, title))
-    variants = folder / results.VARIANTS_CSV
-    papers = table
-    if variants.is_file():  # the paper's tables have a row for each of the network's inputs, which a release knows
-        others = main_rows(read_scores(variants))
-        papers = pd.concat([table, others[~others["method"].isin(table["method"])]], ignore_index=True)
-    write_paper_tables(papers, folder)
     save_figure(score_figure(table), folder / results.SCORES_PNG)
     save_figure(regret_figure(table), folder / results.REGRET_PNG)
-    for name in (results.OCCLUSION_PNG, results.CALIBRATION_CSV, results.CALIBRATION_PNG):
+    for name in (results.CALIBRATION_CSV, results.CALIBRATION_PNG):
         (folder / name).unlink(missing_ok=True)
-    if table["occlusion"].nunique() > 1:
-        save_figure(occlusion_figure(table), folder / results.OCCLUSION_PNG)
     if len(calibration):
         write_text(folder / results.CALIBRATION_CSV, calibration.to_csv(index=False))
         save_figure(calibration_figure(calibration), folder / results.CALIBRATION_PNG)
+    for extension in entry_points(group=REPORTS):
+        extension.load()(folder, table)

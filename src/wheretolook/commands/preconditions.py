@@ -1,4 +1,4 @@
-"""What a stage asks of what earlier ones left: is it there, is it of these settings, is it what it was."""
+"""Preconditions of commands: whether the results of earlier commands exist, and by which settings."""
 
 from __future__ import annotations
 
@@ -8,69 +8,65 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from wheretolook.config import Experiment
 from wheretolook.dataset.environment import EnvironmentConfig, SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.names import RELEASE_FILE
 from wheretolook.geometry.camera import CameraConfig
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError
 from wheretolook.utils.files import fingerprint
-from wheretolook.utils.options import recorded
 from wheretolook.utils.reading import read_json_object
+from wheretolook.utils.records import from_record
 
 if TYPE_CHECKING:
+    from wheretolook.commands.options import DatasetOptions, SceneOptions
     from wheretolook.features.config import ExtractorConfig
 
-Say = Callable[[str], None]  # told in a line what a stage has done
 
-Tick = Callable[[float], None]
-"""Told how much of a stage's work is done: 1 a scene, or 1 in all for stages that do not go scene by scene."""
-
-
-def dataset_after(
-    experiment: Experiment, needs: str, but: Callable[[SceneFolder], bool] = lambda scene: False
+def load_dataset(
+    options: DatasetOptions, required_stage: str, exempt: Callable[[SceneFolder], bool] = lambda scene: False
 ) -> Dataset:
-    """The dataset, if the stage that is needed has been run for all of its scenes as they are now, but for some.
+    """Load a command's dataset, for all scenes of which, but exempt ones, a stage has been run on their present input.
 
     Raises ConfigError if it was made with another camera, or is a release where meshes and maps are needed; TableError
-    if there is none, or the stage has not been run.
+    if it does not exist, or the stage has not been run.
     """
-    dataset = Dataset.load(experiment.root)
-    if needs != "label":
-        refuse_release(experiment.root)
-    wanted = experiment.camera.camera
-    unnamed = experiment.camera == CameraConfig()
+    _ = options.warp_device  # a missing GPU is an error now, not after hours of other work
+    dataset = Dataset.load(options.root)
+    if required_stage != "label":
+        refuse_release(options.root)
+    wanted = options.camera.camera
+    unnamed = options.camera == CameraConfig()
     others = [scene.camera for scene in dataset.scenes if scene.camera != wanted and not (scene.own_camera and unnamed)]
     if others:
         fix = "Run the scenes stage with this configuration, or give the experiment another name."
         problem = "the dataset was made with another camera"
-        raise ConfigError(problem, path=experiment.root, value=others[0], fix=fix)
+        raise ConfigError(problem, path=options.root, value=others[0], fix=fix)
     for scene in dataset.scenes:
-        if scene.stage_cache(needs).stored_key is None and not but(scene):
-            problem = f"the {needs} stage has not been run for this scene since its input was made"
-            raise TableError(problem, path=scene.folder, fix=f"Run `wheretolook {needs}`.")
+        if scene.stage_cache(required_stage).stored_key is None and not exempt(scene):
+            problem = f"`wheretolook {required_stage}` has not been run for this scene since its input was made"
+            raise TableError(problem, path=scene.folder, fix=f"Run `wheretolook {required_stage}`.")
     return dataset
 
 
-def open_scene(experiment: Experiment, dataset: Dataset, files: SceneFolder) -> SceneEnvironment:
-    """A scene of the dataset as the experiment looks at it; nothing is read yet."""
-    scenes = experiment.scenes
-    assume_metric = experiment.map.photographs.assume_metric
-    config = EnvironmentConfig(experiment.occlusion, scenes.free_space, scenes.mapped_space, assume_metric)
-    return SceneEnvironment(files, config=config, device=experiment.device)
+def open_scene(options: SceneOptions, files: SceneFolder) -> SceneEnvironment:
+    """Return a scene of the dataset with a command's occlusion, free space and device; nothing is read yet."""
+    scenes = options.scenes
+    assume_metric = options.map.photographs.assume_metric
+    config = EnvironmentConfig(options.occlusion, scenes.free_space, scenes.mapped_space, assume_metric)
+    return SceneEnvironment(files, config=config, device=options.device)
 
 
 def refuse_release(root: Path) -> None:
-    """Raise a ConfigError if a release lies there."""
+    """Raise ConfigError if a folder holds a release."""
     if (root / RELEASE_FILE).is_file():
-        problem = "a release has no meshes and maps, and would be lost if they were made anew"
+        problem = "a release has no meshes and maps, and would be lost if they were made again"
         fix = "Use it with train, evaluate and release alone, or give the experiment another name."
         raise ConfigError(problem, path=root, fix=fix)
 
 
 @contextmanager
 def naming_scene(path: Path) -> Iterator[None]:
-    """Name a scene's file in errors of code that was given its content only."""
+    """Add a scene's file to errors of code that knows only the content."""
     try:
         yield
     except (SceneError, MapError) as error:
@@ -80,18 +76,17 @@ def naming_scene(path: Path) -> Iterator[None]:
 
 
 def extractor_of(scene: SceneFolder, given: ExtractorConfig | None = None) -> ExtractorConfig:
-    """The keypoint extractor the map was made with: queries must use the same.
+    """Return the keypoint extractor that the map was made with, which queries must use, too.
 
-    Weights of a network are those that settings of the same method name, if they do: the map's may have moved. Raises
-    MapError without the map's report, or if its landmarks have no descriptors to match queries with; WeightsError if
-    the weights are not where they were.
+    `given` of the same method may name other weights, as the map's may have moved. Raises MapError without the map's
+    report, or if its landmarks have no descriptors to match queries with; WeightsError if the weights are missing.
     """
     from wheretolook.features.config import ExtractorConfig
 
     path = scene.map / "report.json"
     try:
         report = read_json_object(path)
-        extractor = recorded(ExtractorConfig, report["config"]["extractor"])
+        extractor = from_record(ExtractorConfig, report["config"]["extractor"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise MapError("the map's report is missing or damaged", path=path, fix="Run the map stage again.") from error
     if not report.get("has_descriptors", True):
@@ -106,17 +101,17 @@ def extractor_of(scene: SceneFolder, given: ExtractorConfig | None = None) -> Ex
 
 
 def existing(path: Path, error: type[SceneError] | type[MapError], stage: str) -> str:
-    """Fingerprint of a file that an earlier stage makes; without it, the error given, naming the stage."""
+    """Return the fingerprint of a file that a stage makes; raise `error`, naming the stage, without the file."""
     if not path.is_file():
         raise error("this file is missing", path=path, fix=f"Run the {stage} stage first.")
     return fingerprint(path)
 
 
 def mesh_fingerprint(path: Path) -> str:
-    """A mesh file changes when its size or date does; it may be gigabytes. Raises SceneError if there is none."""
+    """Return sizes and dates of a mesh and the files next to it. Raises SceneError if there is no mesh."""
     if not path.exists():
         raise SceneError("there is no such mesh", path=path, fix="Check the path.")
     files = [path]
-    if path.is_dir() or path.suffix.lower() != ".glb":  # materials and textures lie beside it
+    if path.is_dir() or path.suffix.lower() != ".glb":  # materials and textures are files next to it
         files = sorted(file for file in (path if path.is_dir() else path.parent).iterdir() if file.is_file())
     return " ".join(f"{file.resolve()}:{file.stat().st_size}:{file.stat().st_mtime_ns}" for file in files)

@@ -1,4 +1,4 @@
-"""The adapt stage: weights adapted to one scene, by views that were localized there."""
+"""`wheretolook adapt`: weights adapted to one scene, by views that were localized there."""
 
 from __future__ import annotations
 
@@ -6,22 +6,23 @@ import shutil
 import time
 import warnings
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.config import Experiment
+from wheretolook.commands.holdout_photos import check_name, knows_photographs, leave_photographs_out
+from wheretolook.commands.options import LabelOptions, Log, Progress, SceneOptions, ignore_progress
+from wheretolook.commands.preconditions import extractor_of, open_scene, refuse_release
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.config import ExistingModelConfig
-from wheretolook.stages.holdout_photos import check_name, knows_photographs, leave_photographs_out
-from wheretolook.stages.preconditions import Say, Tick, extractor_of, open_scene, refuse_release
+from wheretolook.scorers.adapted.config import AdaptConfig
+from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.store import check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError, MapError, OutOfRangeWarning, SceneError, TableError, WeightsError
 from wheretolook.utils.files import fingerprint, write_text
@@ -30,6 +31,8 @@ from wheretolook.utils.reading import read_json_object
 from wheretolook.weights.resolve import resolve_weights
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from wheretolook.evaluation.adaptation import Gain
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.localization.labeller import LabelTask
@@ -56,59 +59,84 @@ class _Place:
     path: Path  # of the adapted weights
 
 
-def adapt(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> Path | None:
-    """Adapt a scorer to one scene, or to a COLMAP map of photographs, by views that were localized there.
+@dataclass(frozen=True, kw_only=True)
+class Adapt(SceneOptions, LabelOptions):
+    """Adapt the bundled weights to one scene by views localized there; keep them only if they are better.
 
-    Views are the map's photographs, left out in blocks as `wheretolook check` does, and a scene's rendered views: its
-    labels, or where it has a mesh views labelled now, in the time given. Of views that were not learnt from it is told
-    what the adapted weights have gained, in `<scene>.md` and an MLflow run. They are kept if their chances are truer by
-    more than the 95 % interval and they do not choose worse by more than it; with both kinds of views, those of the
-    photographs must not be less true by more than it. Returns their file, or None if the weights that it started from
-    are not bettered.
+    Uses the photographs of a COLMAP model (--map) or of a scene made of photographs, held out in blocks as `wheretolook
+    check` does; and a scene's labels, or, without labels but with a mesh, as many of its viewpoints as can be labelled
+    in the given minutes; run again, it continues with more. The weights are for this scene alone:
 
-    Raises:
-        ConfigError: no such scene. SceneError: it has neither labels, nor a mesh to render, nor photographs.
-        TableError: it has no viewpoints, or too few, or all localize, or none.
-        WeightsError: the weights to start from are not of the method `set`.
-        MapError: the map is not in metres, or lies on its side, or its photographs' features are not known.
+      wheretolook select --map sparse/0 --weights data/checks/mymap/adapted.safetensors --at 1,2,1.4 --out views.csv
+
+    Examples:
+      wheretolook adapt --map sparse/0 --database database.db
+      wheretolook adapt --config configs/demo.yaml --scene apartment-000 --minutes 5
+
+    Args:
+        adapt: which scene or map, its photographs, and the weights.
+        tracking: where MLflow keeps its runs.
     """
-    config = experiment.adapt
-    weights = resolve_weights("set", config.weights)
-    assert weights is not None
-    if config.map is not None:
-        return _adapt_map(experiment, config.map, weights, say, tick)
-    refuse_release(experiment.root)
-    with reading(experiment.root, "adapt", FOLDER):
-        dataset = Dataset.load(experiment.root)
-        files = _scene(dataset, config.scene)
-        if config.weights is None:
-            weights = resolve_weights("set", features=dataset.features)
-            assert weights is not None
-        path = config.out or dataset.root / FOLDER / f"{files.name}.safetensors"
-        _check_out(path, weights)
-        check_store(experiment.tracking)
-        scene = open_scene(experiment, dataset, files)
-        has_photographs = knows_photographs(files, config.images, config.database)
-        table = _labelled(experiment, files, scene, has_photographs, say)
-        views = None if table is None else labelled_views(files, scene, table, weights)
-        if has_photographs:
-            if files.is_photographed:
-                scene.require_metres()
-            name = check_name(experiment, files)
-            try:
-                left_out = _left_out(experiment, files.map, scene.occlusion, weights, name, say)
-                views = left_out if views is None else views.joined(left_out)
-            except MapError as error:
-                if views is None:
-                    raise
-                say(f"{files.name}: its photographs are not learnt from: {error}")
-        assert views is not None
-        _check_enough(views, files.table if table is not None else files.map)
-        place = _Place(files.name, dataset.name, files.table, weights, path)
-        return _learn(experiment, place, views, files.read_landmarks().points, say, tick)
+
+    SHORT: ClassVar = {
+        **{name: f"adapt.{name}" for name in ("scene", "map", "images", "database", "weights", "out", "minutes")},
+        "engine": "label.engine",
+    }
+
+    adapt: AdaptConfig = field(default_factory=AdaptConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+
+    def run(self, log: Log = print, progress: Progress = ignore_progress) -> Path | None:
+        """Adapt a set scorer to one scene, or to a COLMAP map of photographs, by views that were localized there.
+
+        Cross-validated measures before and after go to `<scene>.md` and an MLflow run. The weights are kept if the
+        probabilities are better by more than the 95 % interval and the choice of views is not worse by more than it;
+        with both kinds of views, those of the photographs must not be worse by more than it. Returns the file of the
+        adapted weights, or None if they are not better.
+
+        Raises:
+            ConfigError: no such scene. SceneError: it has neither labels, nor a mesh to render, nor photographs.
+            TableError: it has no viewpoints, or too few, or all localize, or none.
+            WeightsError: the weights to start from are not of the method `set`.
+            MapError: the map is not in metres, or on its side, or its photographs' features are not known.
+        """
+        config = self.adapt
+        weights = resolve_weights("set", config.weights)
+        assert weights is not None
+        if config.map is not None:
+            return _adapt_map(self, config.map, weights, log, progress)
+        refuse_release(self.root)
+        with reading(self.root, "adapt", FOLDER):
+            dataset = Dataset.load(self.root)
+            files = _scene(dataset, config.scene)
+            if config.weights is None:
+                weights = resolve_weights("set", features=dataset.features)
+                assert weights is not None
+            path = config.out or dataset.root / FOLDER / f"{files.name}.safetensors"
+            _check_out(path, weights)
+            check_store(self.tracking)
+            scene = open_scene(self, files)
+            has_photographs = knows_photographs(files, config.images, config.database)
+            table = _labelled(self, files, scene, has_photographs, log)
+            views = None if table is None else labelled_views(files, scene, table, weights)
+            if has_photographs:
+                if files.is_photographed:
+                    scene.require_metres()
+                name = check_name(self, files)
+                try:
+                    left_out = _left_out(self, files.map, scene.occlusion, weights, name, log)
+                    views = left_out if views is None else views.joined(left_out)
+                except MapError as error:
+                    if views is None:
+                        raise
+                    log(f"{files.name}: its photographs are not learnt from: {error}")
+            assert views is not None
+            _check_enough(views, files.table if table is not None else files.map)
+            place = _Place(files.name, dataset.name, files.table, weights, path)
+            return _learn(self, place, views, files.read_landmarks().points, log, progress)
 
 
-def _adapt_map(experiment: Experiment, model: Path, weights: Path, say: Say, tick: Tick) -> Path | None:
+def _adapt_map(options: Adapt, model: Path, weights: Path, log: Log, progress: Progress) -> Path | None:
     """Adapt to a COLMAP map by its photographs alone."""
     from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
     from wheretolook.holdout.photo_map import folder_of_check
@@ -116,38 +144,38 @@ def _adapt_map(experiment: Experiment, model: Path, weights: Path, say: Say, tic
     from wheretolook.mapping.georeference import read_scale
 
     name = ExistingModelConfig(model=model).scene_name
-    path = experiment.adapt.out or folder_of_check(experiment.data, name) / "adapted.safetensors"
+    path = options.adapt.out or folder_of_check(options.data, name) / "adapted.safetensors"
     _check_out(path, weights)
-    check_store(experiment.tracking)
+    check_store(options.tracking)
     scale = read_scale(model)
-    if scale is not None and not scale.is_metric and not experiment.map.photographs.assume_metric:
+    if scale is not None and not scale.is_metric and not options.map.photographs.assume_metric:
         fix = "Map it with a scale (map.photographs.scale), or pass --map.photographs.assume_metric true."
         raise MapError("the map has no scale, and this needs metres", path=model, value=scale.source, fix=fix)
     points = model_arrays(read_model(model)).points
-    occlusion = "none" if experiment.occlusion.model == "none" else "hidden-points"
-    environment = ColmapEnvironment(ColmapFiles(model), occlusion=occlusion, device=experiment.warp_device)
-    views = _left_out(experiment, model, environment.occlusion, weights, name, say)
+    occlusion = "none" if options.occlusion.model == "none" else "hidden-points"
+    environment = ColmapEnvironment(ColmapFiles(model), occlusion=occlusion, device=options.warp_device)
+    views = _left_out(options, model, environment.occlusion, weights, name, log)
     _check_enough(views, model)
     with hold(path.with_name(f".{path.name}.lock"), "adapt"):
-        return _learn(experiment, _Place(name, "", model, weights, path), views, points, say, tick)
+        return _learn(options, _Place(name, "", model, weights, path), views, points, log, progress)
 
 
 def _left_out(
-    experiment: Experiment, model: Path, occlusion: OcclusionModel, weights: Path, name: str, say: Say
+    options: Adapt, model: Path, occlusion: OcclusionModel, weights: Path, name: str, log: Log
 ) -> LocalizedViews:
     """A map's photographs, left out in blocks: in the folder of its check, so that neither does it again."""
     from wheretolook.holdout.holdout_views import photographed_views
 
     _set_scorer_file(weights)  # refused now, not after the work
-    settings = experiment.adapt
+    settings = options.adapt
     mesh = occlusion.name == "mesh"
     given = (settings.images, settings.database)
-    source, left_out = leave_photographs_out(experiment, "adapt", model, name, True, mesh, *given, say, True)
-    return photographed_views(source, left_out, weights, occlusion, experiment.warp_device)
+    source, left_out = leave_photographs_out(options, "adapt", model, name, True, mesh, *given, log, True)
+    return photographed_views(source, left_out, weights, occlusion, options.warp_device)
 
 
 def _learn(
-    experiment: Experiment, place: _Place, views: LocalizedViews, points: Float, say: Say, tick: Tick
+    options: Adapt, place: _Place, views: LocalizedViews, points: Float, log: Log, progress: Progress
 ) -> Path | None:
     """Learn from a place's views; keep, tell and log what came of it."""
     from wheretolook.evaluation.adaptation import compare_log_odds, gain_markdown
@@ -155,11 +183,11 @@ def _learn(
 
     name = place.name
     path = place.path
-    seed = experiment.adapt.seed
+    seed = options.adapt.seed
     photographs = views.photograph >= 0
     kinds = {"rendered views": ~photographs, "left-out photographs": photographs}
     told = " and ".join(f"{rows.sum():,} {kind}" for kind, rows in kinds.items() if rows.any())
-    say(f"{name}: learning from {told}, {views.good.mean():.0%} of which localize")
+    log(f"{name}: learning from {told}, {views.good.mean():.0%} of which localize")
     learnt = learn(views, seed)
 
     def gain_of(rows: NDArray[np.bool_]) -> Gain:
@@ -177,15 +205,15 @@ def _learn(
     write_text(path.with_suffix(".md"), f"# {name}: adapted by {told}\n\n{text}")
     if is_better:
         _save(place, points, learnt, views, gain)
-        say(f"{text}\n{name}: the adapted weights are better -> {path}")
+        log(f"{text}\n{name}: the adapted weights are better -> {path}")
     else:
-        say(f"{text}\n{name}: adapting does not make the weights better here: use {place.weights}")
-        if experiment.adapt.out is None and path.is_file():  # of an earlier run, by other labels
+        log(f"{text}\n{name}: adapting does not make the weights better here: use {place.weights}")
+        if options.adapt.out is None and path.is_file():  # of an earlier run, by other labels
             path.unlink()
-            say(f"{name}: removed {path}, which an earlier run had made")
+            log(f"{name}: removed {path}, which an earlier run had made")
     with kept_if_not_logged(f"what was gained, {path.with_suffix('.md')},"):
-        _log(experiment, place, learnt, views, gain, is_better)
-    tick(1)
+        _log(options, place, learnt, views, gain, is_better)
+    progress(1)
     return path if is_better else None
 
 
@@ -209,7 +237,7 @@ def _check_out(path: Path, weights: Path) -> None:
 
 
 def _labelled(
-    experiment: Experiment, files: SceneFolder, scene: SceneEnvironment, has_photographs: bool, say: Say
+    options: Adapt, files: SceneFolder, scene: SceneEnvironment, has_photographs: bool, log: Log
 ) -> pd.DataFrame | None:
     """The scene's labelled viewpoints: all if the label stage has been here, else those that the time allows.
 
@@ -226,20 +254,22 @@ def _labelled(
         raise SceneError(problem, path=files.folder, fix=fix)
     if files.stage_cache("sample").stored_key is None:
         if has_photographs:
-            say(f"{files.name}: no viewpoints are sampled, so photographs alone are learnt from")
+            log(f"{files.name}: no viewpoints are sampled, so photographs alone are learnt from")
             return None
         problem = "the sample stage has not been run for this scene since its input was made"
         raise TableError(problem, path=files.folder, fix="Run `wheretolook sample`.")
-    return _label_for(experiment, files, scene, say)
+    return _label_for(options, files, scene, log)
 
 
-def _label_for(experiment: Experiment, files: SceneFolder, scene: SceneEnvironment, say: Say) -> pd.DataFrame:
+def _label_for(options: Adapt, files: SceneFolder, scene: SceneEnvironment, log: Log) -> pd.DataFrame:
     """Label views for so many minutes, one location after the other in random order. What was labelled is kept."""
+    import pandas as pd
+
     from wheretolook.localization.labeller import LabelTask, label_scenes
     from wheretolook.localization.shard import SceneJob
 
-    config = experiment.adapt
-    label = experiment.label
+    config = options.adapt
+    label = options.label
     table = files.read_table()
     if table.empty:
         return table
@@ -247,28 +277,28 @@ def _label_for(experiment: Experiment, files: SceneFolder, scene: SceneEnvironme
     order = np.random.default_rng(config.seed).permutation(len(ids))[row.reshape(-1)]
     table = table.iloc[np.argsort(order, kind="stable")].reset_index(drop=True)
     cameras = tuple(files.cameras().items()) if files.cameras_file.is_file() else ()
-    options = (label.localizer, extractor_of(files, experiment.map.extractor), scene.device, False)
-    job = SceneJob(files.mesh, files.landmarks, scene.camera, *options, cameras)
+    how = (label.localizer, extractor_of(files, options.map.extractor), scene.device, False)
+    job = SceneJob(files.mesh, files.landmarks, scene.camera, *how, cameras)
     begins = range(0, len(table), _AT_ONCE)
     parts = {begin: table.iloc[begin : begin + _AT_ONCE] for begin in begins}
     tasks = [
         LabelTask(f"{files.name} {begin}", job, part, files.adapt_shards / f"{begin:06}")
         for begin, part in parts.items()
     ]
-    say(f"{files.name}: labelling up to {len(table):,} views, for {config.minutes:g} minutes at most")
+    log(f"{files.name}: labelling up to {len(table):,} views, for {config.minutes:g} minutes at most")
     done: dict[str, pd.DataFrame] = {}
     end = None  # counted from when work began on the first views that are labelled now: what lay there comes at once
     with closing(label_scenes(tasks, label)) as results:
         for labelled in results:
             done[labelled.task.name] = labelled.table
             if labelled.seconds and end is None:
-                end = time.monotonic() + 60 * config.minutes - sum(labelled.seconds.values()) / experiment.n_workers
+                end = time.monotonic() + 60 * config.minutes - sum(labelled.seconds.values()) / options.n_workers
             if end is not None and time.monotonic() >= end:
                 break
     _remove_stale(files.adapt_shards, tasks)
     found = pd.concat([done[task.name] for task in tasks if task.name in done], ignore_index=True)
     if len(found) < len(table):
-        say(f"{files.name}: {len(found):,} of {len(table):,} views labelled; run it again to go on with more")
+        log(f"{files.name}: {len(found):,} of {len(table):,} views labelled; run it again to go on with more")
     return found
 
 
@@ -364,9 +394,7 @@ def _save(place: _Place, points: Float, learnt: Adapted, views: LocalizedViews, 
     trained.save(place.path, {**about, "before": gain.before, "after": gain.after})
 
 
-def _log(
-    experiment: Experiment, place: _Place, learnt: Adapted, views: LocalizedViews, gain: Gain, is_better: bool
-) -> None:
+def _log(options: Adapt, place: _Place, learnt: Adapted, views: LocalizedViews, gain: Gain, is_better: bool) -> None:
     from wheretolook.tracking.runs import log, start_run
 
     params = {"dataset": place.dataset, "scene": place.name, "weights": place.weights, "views": len(views)}
@@ -374,7 +402,7 @@ def _log(
     params |= {"length_m": learnt.length_m, "amplitude": learnt.amplitude, "scale": learnt.adaptation.scale}
     metrics = {**gain.after, **{f"{name}_before": value for name, value in gain.before.items()}}
     metrics |= {"better": float(is_better), "log_loss_less": gain.log_loss_less[0]}
-    with start_run(experiment.tracking, place.name, "adapt", params) as (client, run):
+    with start_run(options.tracking, place.name, "adapt", params) as (client, run):
         log(client, run, metrics=metrics)
         client.log_artifact(run, str(place.path.with_suffix(".md")))
         if is_better:

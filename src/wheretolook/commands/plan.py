@@ -1,78 +1,110 @@
-"""The plan stage: one planned path of a scene, its views as a table, a picture, a film and a recording."""
+"""`wheretolook plan`: a planned path through a scene, its views as a table, a picture, a film and a recording."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
-import pandas as pd
 
-from wheretolook.config import Experiment
+from wheretolook.commands.options import Log, Progress, SceneOptions, ignore_progress
+from wheretolook.commands.preconditions import load_dataset, open_scene
 from wheretolook.dataset.dataset_lock import reads_dataset
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.viewpoint_table import pose_columns
 from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.stages.preconditions import Say, Tick, dataset_after, open_scene
-from wheretolook.tracking.runs import joined, log, start_run
+from wheretolook.planning.config import PlanConfig
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import joined, start_run
+from wheretolook.tracking.runs import log as log_to_run
 from wheretolook.tracking.store import check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.locks import hold
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from wheretolook.planning.routes import PathView, PlannedPath
 
 
-@reads_dataset("plan")
-def plan(experiment: Experiment, say: Say = print, tick: Tick = lambda work: None) -> PlannedPath:
-    """A path through a scene on which the camera localizes, `<scene>/path/path.{csv,png,gif}`; needs the map stage.
+@dataclass(frozen=True, kw_only=True)
+class Plan(SceneOptions):
+    """Plan a path on which the camera can localize; a table, a picture and a film of it.
 
-    Each view's score is that of its very pose, as the method's scorer gives it (`plan_by_methods`).
+    Reads a scene's map and its mesh, if it has one, as `scenes` and `map` leave them. To plan without the mesh, in the
+    space that depth images saw as free: --occlusion.model tsdf
 
-    Raises:
-        ConfigError: no such scene or method, no start or goal, no weights, or Rerun is asked for and not installed.
-        PlanningError: the start or the goal is not free, or no path was found. WeightsError: weights cannot be used.
-        SceneError, MapError: the scene has no free place, or no map with a scale.
-        TrackingError: the tracking store cannot be used.
+    Examples:
+      wheretolook plan --config configs/demo.yaml --scene apartment-000 --start '[-4, -3, 1.4]' --goal '[4, 3, 1.4]' \\
+        --plan.against '[forward]' --film mp4 --out way
+
+    Args:
+        plan: start, goal, scores and costs, and what is written.
+        tracking: where MLflow keeps its runs.
     """
-    from wheretolook.figures.path_film import score_text
-    from wheretolook.planning.method_paths import path_views, plan_by_methods
 
-    dataset = dataset_after(experiment, "map")
-    config = experiment.plan
-    files = dataset.scenes[0] if not config.scene and len(dataset.scenes) == 1 else dataset.scene(config.scene)
-    if config.start is None or config.goal is None:
-        fix = "Give plan.start and plan.goal, such as --plan.start '[1, 1, 1.4]'."
-        raise ConfigError("a path needs a start and a goal", value=(config.start, config.goal), fix=fix)
-    rerun = _rerun() if config.rerun else None
-    check_store(experiment.tracking)
-    scene = open_scene(experiment, dataset, files)
-    methods = (*(name for name in config.against if name != config.method), config.method)
-    paths = plan_by_methods(scene, dataset, methods, config.start, config.goal, config)
-    method, path = list(paths.items())[-1]
-    views = {name: path_views(path, scene.localization_map) for name, path in paths.items() if name != method}
-    renderer = None if scene.is_photographed else scene.renderer
-    views[method] = path_views(path, scene.localization_map, renderer)
-    folder = (config.out or files.folder / "path").resolve()  # so that "." has a name too
-    with hold(folder.with_name(f".{folder.name}.lock"), "plan", wait_s=WAIT_S):
-        written = _draw(views, scene.landmarks.points, f"{scene.name}, {method}", folder, config.film)
-        table = _table(path, stopping=config.stops.looks > 1)
-        write_text(folder / "path.csv", table.to_csv(index=False, lineterminator="\n"))
-        if rerun is not None:
-            _record(rerun, views[method], scene.landmarks.points, scene.camera, folder / "path.rrd")
-            written.append("path.rrd")
-        written.insert(0, "path.csv")
-        with kept_if_not_logged(f"the path in {folder}"):
-            _log(experiment, dataset, scene.name, list(paths), path, [folder / name for name in written])
+    SHORT: ClassVar = {
+        **{name: f"plan.{name}" for name in ("scene", "start", "goal", "method", "weights", "out", "film")},
+        "stops": "plan.stops.looks",
+    }
+
+    plan: PlanConfig = field(default_factory=PlanConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+
+    @reads_dataset("plan")
+    def run(self, log: Log = print, progress: Progress = ignore_progress) -> PlannedPath:
+        """Plan a path, write it to `<scene>/path/path.{csv,png,gif}` and log it. Needs `map` only.
+
+        The score of a view is the one that the method's scorer gives its exact pose (`plan_by_methods`).
+
+        Raises:
+            ConfigError: no such scene or method, no start or goal, no weights, or Rerun is asked for and not installed.
+            PlanningError: the start or the goal is not free, or no path exists. WeightsError: weights cannot be used.
+            SceneError, MapError: the scene has no free location, or no map with a scale.
+            TrackingError: the tracking store cannot be used.
+        """
+        from wheretolook.planning.method_paths import path_views, plan_by_methods
+
+        dataset = load_dataset(self, "map")
+        config = self.plan
+        files = dataset.scenes[0] if not config.scene and len(dataset.scenes) == 1 else dataset.scene(config.scene)
+        if config.start is None or config.goal is None:
+            fix = "Give plan.start and plan.goal, such as --plan.start '[1, 1, 1.4]'."
+            raise ConfigError("a path needs a start and a goal", value=(config.start, config.goal), fix=fix)
+        rerun = _rerun() if config.rerun else None
+        check_store(self.tracking)
+        scene = open_scene(self, files)
+        methods = (*(name for name in config.against if name != config.method), config.method)
+        paths = plan_by_methods(scene, dataset, methods, config.start, config.goal, config)
+        method, path = list(paths.items())[-1]
+        views = {name: path_views(path, scene.localization_map) for name, path in paths.items() if name != method}
+        renderer = None if scene.is_photographed else scene.renderer
+        views[method] = path_views(path, scene.localization_map, renderer)
+        folder = (config.out or files.folder / "path").resolve()  # "." gets a name, too
+        with hold(folder.with_name(f".{folder.name}.lock"), "plan", wait_s=WAIT_S):
+            written = _draw(views, scene.landmarks.points, f"{scene.name}, {method}", folder, config.film)
+            table = _table(path, stopping=config.stops.looks > 1)
+            write_text(folder / "path.csv", table.to_csv(index=False, lineterminator="\n"))
+            if rerun is not None:
+                _record(rerun, views[method], scene.landmarks.points, scene.camera, folder / "path.rrd")
+                written.append("path.rrd")
+            written.insert(0, "path.csv")
+            with kept_if_not_logged(f"the path in {folder}"):
+                _log(self, dataset, scene.name, list(paths), path, [folder / name for name in written])
+        log(f"{scene.name}: {_summary(path, config)} -> {folder}: {', '.join(written)}")
+        progress(1)
+        return path
+
+
+def _summary(path: PlannedPath, config: PlanConfig) -> str:
+    from wheretolook.figures.path_film import score_text
+
     score = "" if np.isnan(path.scores).any() else f", mean score {score_text(float(np.mean(path.scores)))}"
-    found = f"{path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, {len(path.positions)} views{score}"
-    if config.stops.looks > 1:
-        found += _stops_told(path)
-    say(f"{scene.name}: {found} -> {folder}: {', '.join(written)}")
-    tick(1)
-    return path
+    text = f"{path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, {len(path.positions)} views{score}"
+    return text + (_describe_stops(path) if config.stops.looks > 1 else "")
 
 
 WAIT_S = 120.0  # for another plan to write its path into the same folder
@@ -98,10 +130,8 @@ def _draw(views: dict[str, list[PathView]], landmarks: np.ndarray, title: str, f
     return written
 
 
-def _log(
-    experiment: Experiment, dataset: Dataset, scene: str, methods: list[str], path: PlannedPath, files: list[Path]
-) -> None:
-    config = experiment.plan
+def _log(options: Plan, dataset: Dataset, scene: str, methods: list[str], path: PlannedPath, files: list[Path]) -> None:
+    config = options.plan
     params: dict[str, object] = {"dataset": dataset.name, "scene": scene, "method": methods[-1]}
     params |= {"methods": " ".join(methods), "start": config.start, "goal": config.goal}
     params["score_weight"] = config.planner.score_weight
@@ -110,8 +140,8 @@ def _log(
         params |= {"stops.looks": config.stops.looks, "stops.least_score": config.stops.least_score}
         metrics |= {"stops": len(path.stops), "score_with_stops": float(path.scores_with_stops.mean())}
     tags = {"dataset": dataset.name}
-    with start_run(experiment.tracking, joined(scene, methods[-1]), "plan", params, tags=tags) as (client, run):
-        log(client, run, metrics=metrics)
+    with start_run(options.tracking, joined(scene, methods[-1]), "plan", params, tags=tags) as (client, run):
+        log_to_run(client, run, metrics=metrics)
         for file in files:
             client.log_artifact(run, str(file))
 
@@ -122,6 +152,10 @@ def _table(path: PlannedPath, stopping: bool) -> pd.DataFrame:
     Where stops were asked for, further looks are rows of the same place; `look` counts from 1, the path's own view, and
     `together` is the score of all looks of the stop (empty elsewhere).
     """
+    import pandas as pd
+
+    from wheretolook.dataset.viewpoint_table import pose_columns
+
     places, looks = path.looks
     at = path.positions[places]
     along = path.all_axes
@@ -137,8 +171,8 @@ def _table(path: PlannedPath, stopping: bool) -> pd.DataFrame:
     return table.assign(look=looks, together=together[places])
 
 
-def _stops_told(path: PlannedPath) -> str:
-    """Where the path stops, in words."""
+def _describe_stops(path: PlannedPath) -> str:
+    """Describe where the path stops."""
     from wheretolook.figures.path_film import score_text
     from wheretolook.planning.view_sequence import lengths_along
 
@@ -151,15 +185,14 @@ def _stops_told(path: PlannedPath) -> str:
     return f", {stops} with {looks} further looks: mean score {score_text(float(path.scores_with_stops.mean()))}"
 
 
-def _rerun():  # type: ignore[no-untyped-def]  # the package is no dependency
+def _rerun() -> Any:  # the package is no dependency
     try:
-        import rerun
+        return import_module("rerun")
     except ImportError as error:
         raise ConfigError("Rerun is not installed", fix="pip install rerun-sdk, or leave plan.rerun out.") from error
-    return rerun
 
 
-def _record(rerun, seen: list[PathView], landmarks: np.ndarray, camera: Camera, file: Path) -> None:  # type: ignore[no-untyped-def]
+def _record(rerun: Any, seen: list[PathView], landmarks: np.ndarray, camera: Camera, file: Path) -> None:
     """A recording for the Rerun viewer: landmarks, path, the camera moving along it, its image, its score."""
     stream = rerun.RecordingStream("wheretolook")
     stream.save(str(file))

@@ -1,0 +1,190 @@
+"""`wheretolook check`: how well the scorer separates good from bad views of your own map."""
+
+from __future__ import annotations
+
+import os
+import time
+from contextlib import AbstractContextManager, nullcontext, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from wheretolook.commands.options import OcclusionOptions, ScorerOptions
+from wheretolook.dataset.names import LOCK, check_scene_name
+from wheretolook.features.config import ExtractorConfig
+from wheretolook.mapping.config import ExistingModelConfig
+from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.locks import hold
+
+if TYPE_CHECKING:
+    from wheretolook.dataset.layout import SceneFolder
+    from wheretolook.holdout.photo_map import PhotographedMap
+    from wheretolook.visibility.occlusion import OcclusionModel
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check(OcclusionOptions, ScorerOptions):
+    """Check how well scores separate good from bad views of your own map, by its own photographs.
+
+    Blocks of neighbouring photographs are held out of the map, and localized against what remains. The model's poses
+    are the ground truth, so no mesh and no labels are needed.
+
+    Features: photographs are localized with the keypoints that the map was made from, of SIFT, ALIKED, DISK, XFeat or
+    SuperPoint: a COLMAP database, or hloc's features in HDF5. A database.db next to the model is used by default. With
+    --images instead, keypoints are extracted again (SIFT, or by --extractor), and the landmarks triangulated again at
+    the model's poses.
+
+    Metres: a photograph counts as localized within 5 cm and 0.4 degrees. Where metres are not known, it is 1 % of the
+    median depth of the photograph instead of 5 cm, and the map is scored as if its median depth were 5 m. A map of this
+    project knows whether it is in metres; for another, --metres says so. A map whose cameras are on their side is
+    turned upright first, unless it has a mesh.
+
+    Results (--out):
+      check.csv    one row for each photograph, blocks.csv for each block, views.csv for each photograph of each block
+      check.json   all numbers with 95 % intervals over blocks; check.png shows them
+      work         finished blocks: an interrupted check continues, and other weights are checked quickly
+
+    Examples:
+      wheretolook check --map sparse/0 --database database.db
+      wheretolook check --map sparse/0 --images photographs --metres
+      wheretolook check --scene photographs --weights my/weights/set.safetensors
+
+    Args:
+        map: folder of a COLMAP model, of any cameras.
+        scene: instead, a scene of a dataset, as `wheretolook map` made it.
+        data: folder of the datasets.
+        name: dataset of the scene, if several have such a scene.
+        database: features: COLMAP's database.db, or hloc's feats-*.h5.
+        images: instead, photographs, to extract features again.
+        extractor: extractor for the images: opencv, colmap, aliked, disk or xfeat.
+        extractor_weights: weights of a learned extractor; see docs/features.md.
+        metres: the map is in metres.
+        out: folder of the results; by default data/checks/<name>.
+        also: further methods to check, with the bundled weights.
+        views: largest number of photographs of a block that are localized.
+        workers: worker processes; 0 for one on each core.
+        device: where to compute: auto, cpu, cuda, or cuda:<index>.
+    """
+
+    map: Path | None = None
+    scene: str | None = None
+    data: Path = Path("data")
+    name: str = ""
+    database: Path | None = None
+    images: Path | None = None
+    extractor: str | None = None
+    extractor_weights: str = ""
+    metres: bool = False
+    out: Path | None = None
+    also: tuple[str, ...] = ()
+    views: int = 60
+    workers: int = 0
+    device: str = "auto"
+
+    def __post_init__(self) -> None:
+        if (self.map is None) == (self.scene is None):
+            raise ConfigError("what is checked is given by --map or by --scene", fix="Give one of them.")
+        if self.database is not None and self.images is not None:
+            fix = "Leave --images out to use the map's own features, --database to extract them again."
+            raise ConfigError("features come from a database or from images", value=str(self.images), fix=fix)
+        if self.views < 1 or self.workers < 0:
+            fix = "Give --views of at least 1, --workers of at least 0."
+            raise ConfigError("a number is out of range", value=(self.views, self.workers), fix=fix)
+        ExtractorConfig(self.extractor or "opencv", weights=self.extractor_weights)
+        if (self.extractor is not None or self.extractor_weights) and self.images is None:
+            fix = "Give --images, the folder of the photographs, or leave --extractor out."
+            raise ConfigError("an extractor needs images", value=self.extractor, fix=fix)
+
+    def run(self) -> None:
+        """Check the map, write the report to `out`, and print a summary."""
+        self._check_names()
+        from wheretolook.figures.style import save_figure
+        from wheretolook.holdout import photo_map as sources
+        from wheretolook.holdout.checking import check_map
+        from wheretolook.holdout.figure import check_figure
+        from wheretolook.holdout.scores import Scoring
+        from wheretolook.training.weights import read_training
+        from wheretolook.utils.devices import usable_device
+
+        start = time.monotonic()
+        device = usable_device(self.device)
+        workers = self.workers or len(os.sched_getaffinity(0))
+        scoring = Scoring(self.method, self.weights, self.also, self.anywhere)
+        scoring.check()
+        out = self.out or sources.folder_of_check(self.data, self._result_name())
+        scene = None if self.scene is None else sources.find_scene(self.data, self.scene, self.name)
+        try:
+            with _reading(scene), hold(out / ".lock", "check"):
+                source, occlusion = self._open(scene, out, device, workers)
+                report = check_map(source, out / sources.WORK, scoring, occlusion, self.views, workers, device)
+                report.save(out)
+                save_figure(check_figure(report), out / "check.png")
+        finally:
+            with suppress(OSError):  # created for the lock only
+                out.rmdir()
+        print("\n".join(report.lines()))
+        if scoring.chosen is not None and read_training(scoring.chosen).get("photographs"):
+            print(
+                "warning: the weights are adapted to one scene and may have been trained on these photographs; "
+                "`wheretolook adapt` reports their measures on blocks that they were not trained on"
+            )
+        print(f"done in {time.monotonic() - start:.0f} s: {out}")
+
+    def _check_names(self) -> None:
+        """Raise an error for a scene, method or model that does not exist, before long imports."""
+        from wheretolook.mapping.colmap_model import model_suffix
+        from wheretolook.scorers.registry import check_method
+
+        if self.scene is not None:
+            check_scene_name(self.data, self.scene, self.name)
+        for name in (*([self.method] if self.method else []), *self.also):
+            check_method(name)
+        if self.map is not None and self.mesh is None:  # with a mesh, missing metres are the first error
+            model_suffix(self.map)
+
+    def _result_name(self) -> str:
+        """Return the name of the results' folder: that of the model, or of the scene after its dataset's if given."""
+        if self.scene is None:
+            return ExistingModelConfig(model=self.map).scene_name
+        return "-".join(filter(None, (self.name, self.scene)))
+
+    def _open(
+        self, scene: SceneFolder | None, out: Path, device: str, workers: int
+    ) -> tuple[PhotographedMap, OcclusionModel]:
+        """Open the map with its photographs' features, and the occlusion model; results go to `out`."""
+        from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
+        from wheretolook.holdout import photo_map as source
+        from wheretolook.mapping.sources import features_beside, photographs_of
+
+        mesh = self.mesh
+        metric = self.metres
+        name = self.scene
+        if scene is not None:
+            model = scene.map
+            metric = metric or not scene.is_photographed or source.says_metric(model)
+            if mesh is None and scene.mesh.is_file():
+                mesh = scene.mesh
+        else:
+            assert self.map is not None
+            model = self.map
+            name = ExistingModelConfig(model=model).scene_name
+            metric = metric or source.says_metric(model)
+        if mesh is not None and not metric:
+            fix = "Say --metres if it is, or leave --mesh out."
+            raise ConfigError("a mesh is of use only for a map in metres", value=str(mesh), fix=fix)
+        files = ColmapFiles(model, mesh=mesh)
+        occlusion = ColmapEnvironment(files, occlusion=self.occlusion or "", device=device).occlusion
+        given = self.images or self.database or features_beside(model) or photographs_of(model)
+        if given is None and scene is not None and scene.mesh.is_file():  # its images were rendered, and are gone
+            problem = "neither the features nor the photographs of this map are known"
+            fix = "Map the scene again with `wheretolook map --map.keep_database true`, which keeps the features."
+            raise MapError(problem, path=model, fix=fix)
+        extractor = ExtractorConfig(self.extractor or "opencv", weights=self.extractor_weights)
+        where = (out / source.WORK, workers, device, extractor)
+        model, features = source.features_of(model, self.images, self.database, *where)
+        return source.open_map(model, features, metric, name, keep_frame=mesh is not None), occlusion
+
+
+def _reading(scene: SceneFolder | None) -> AbstractContextManager[None]:
+    """Hold the dataset of a scene, so that no command changes it."""
+    return nullcontext() if scene is None else hold(scene.folder.parent / LOCK, "check", shared=True)

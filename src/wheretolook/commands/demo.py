@@ -1,0 +1,239 @@
+"""`wheretolook demo`: all commands from scenes to evaluate, with an estimate of the remaining time."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from tqdm.auto import tqdm
+
+from wheretolook.commands.evaluate import evaluate_methods, not_logged
+from wheretolook.commands.label import Label
+from wheretolook.commands.map import Map
+from wheretolook.commands.options import Experiment, Log, Progress, select_options
+from wheretolook.commands.preconditions import load_dataset, open_scene
+from wheretolook.commands.sample import Sample
+from wheretolook.commands.scenes import Scenes
+from wheretolook.commands.train import Train
+from wheretolook.dataset.layout import STAGES, Dataset
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
+from wheretolook.scorers.registry import methods_named, scorers
+from wheretolook.scorers.train_config import TrainConfig
+from wheretolook.tracking.runs import ui_command
+from wheretolook.tracking.store import check_store
+from wheretolook.utils.artifact_cache import cache_key
+from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.files import fingerprint, write_json
+from wheretolook.utils.reading import read_json
+from wheretolook.utils.version import VERSION
+from wheretolook.weights.resolve import load_scorer, resolve_weights
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SECONDS = {"scenes": 5.0, "map": 15.0, "sample": 1.0, "label": 75.0, "train": 25.0, "evaluate": 6.0}
+"""Rough cost of a stage on two cores (the first four for each scene), from which the share done is estimated."""
+
+OVERVIEW = "overview.png"
+LEVEL_DEG = 25.0  # pitch at most of a camera held level
+STAMP = "compared.json"  # in the dataset's folder: what the demo's comparison was made from
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo(Experiment):
+    """Run all commands from scenes to evaluate on a small dataset, and draw the scores.
+
+    Without --config, on configs/demo.yaml: three apartments to train on and one to test on. Results that exist, made by
+    the same settings, are reused.
+
+    Examples:
+      wheretolook demo
+      wheretolook demo --name small --scenes.train 2
+
+    Args:
+        train: what is trained on the labels.
+        evaluate: which methods are compared.
+    """
+
+    CONFIG: ClassVar = "demo"
+    SHORT: ClassVar = {
+        "engine": "label.engine",
+        "images": "map.photographs.images",
+        "rgbd": "scenes.rgbd.folder",
+        "up": "scenes.rgbd.up",
+    }
+
+    train: TrainConfig = field(default_factory=TrainConfig)
+    evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
+
+    def run(self) -> None:
+        """Run every step with a progress bar, and print where the results are."""
+        config = self.scenes
+        n_scenes = config.train + config.val + config.test + len(config.meshes)
+        cost = {name: seconds * (n_scenes if name in STAGES else 1) for name, seconds in SECONDS.items()}
+        steps: dict[str, Callable[..., object]] = {
+            "scenes": select_options(Scenes, self).run,
+            "map": select_options(Map, self).run,
+            "sample": select_options(Sample, self).run,
+            "label": select_options(Label, self).run,
+            "train": select_options(Train, self).run,
+            "evaluate": partial(compare, self),
+        }
+        if config.train == 0 and not any(mesh.split == "train" for mesh in config.meshes):
+            del steps["train"], cost["train"]
+            self._check_weights()
+        print(f"Data go to {self.root.resolve()}, runs to {self.tracking.root}.")
+        check_store(self.tracking)
+        layout = "{desc}: {percentage:3.0f}%|{bar}| {elapsed} elapsed, about {remaining} remain"
+        with tqdm(total=sum(cost.values()), desc="demo", bar_format=layout, smoothing=0) as bar:
+            for number, (name, step) in enumerate(steps.items(), 1):
+                bar.set_description_str(f"demo {number}/{len(steps)} {name}")
+                step(log=partial(_write, name), progress=partial(_update, bar, SECONDS[name]))
+            weights = self.evaluate.weights
+            own = self.root / "weights"
+            drawn = (self.root / "results" / OVERVIEW).is_file()  # `compare` removes an outdated one
+            if not drawn and (weights or any(own.glob("*.safetensors"))):
+                draw_overview(self, weights[-1] if weights else own)
+            bar.set_description_str("demo")
+        _print_results(self)
+
+    def _check_weights(self) -> None:
+        """Raise ConfigError if weights must be named, as no scene is there to train on, and are not."""
+        chosen = methods_named(self.evaluate.methods, scorers())
+        if any(method.weights for method in chosen) and not self.evaluate.weights:
+            fix = "Name weights in evaluate.weights, or leave trained methods out of evaluate.methods."
+            raise ConfigError("no scene to train on, and no weights to evaluate", fix=fix)
+
+
+def compare(options: Demo, log: Log, progress: Progress) -> None:
+    """Evaluate with the dataset's own weights and the bundled ones, unless the results are current.
+
+    Raises what `evaluate_methods` does.
+    """
+    from wheretolook.evaluation.results import SCORES_CSV, SCORES_MD, results_folder
+
+    dataset = load_dataset(options, "label")
+    config = options.evaluate
+    tracking = options.tracking
+    results = results_folder(dataset, config)
+    stamp = options.root / STAMP
+    bundled = resolve_weights(features=dataset.features)
+    assert bundled is not None
+    files = config.weights or [*sorted((options.root / "weights").glob("*.safetensors")), bundled]
+    made_from: list[Any] = [dataset.fingerprint(), [fingerprint(path) for path in files if path.is_file()]]
+    made_from += [asdict(config), asdict(options.occlusion), VERSION]
+    scores = results / SCORES_CSV
+    report = results / SCORES_MD
+
+    def made() -> dict[str, str]:
+        content = [fingerprint(path) for path in (scores, report)]
+        return {"key": cache_key("evaluate", [*made_from, *content]), "runs": str(tracking.root)}
+
+    try:
+        known = read_json(stamp) == made() and (tracking.root / "mlflow.db").is_file()
+        known = known and not not_logged(dataset).exists()
+    except (OSError, ValueError):
+        known = False
+    if not known:
+        from wheretolook.evaluation.scoring import own_weights
+
+        models = list(config.weights) or [*own_weights(dataset), bundled]
+        (results / OVERVIEW).unlink(missing_ok=True)
+        device = options.warp_device
+        occlusion = options.occlusion
+        evaluate_methods(dataset, config, tracking, models, device=device, occlusion=occlusion, show=False)
+        write_json(stamp, made())
+    log(f"{'reusing' if known else 'all methods compared ->'} {report}")
+    progress(1)
+
+
+def draw_overview(options: Demo, weights: Path) -> None:
+    """Draw `<dataset>/results/overview.png`: the last scene's map, and what a network thinks of one place in it.
+
+    The place is one where to look matters (`wheretolook.dataset.viewpoint_table.instructive_location`). The weights are a
+    file, or a folder of files of which the best is taken, for a camera of the dataset's field of view. Raises
+    TableError if there is no dataset or its last scene is not labelled, WeightsError if the weights cannot be used.
+    """
+    from wheretolook.dataset.viewpoint_table import instructive_location, outcome_in_words, poses, shares_good
+    from wheretolook.figures.dollhouse import dollhouse
+    from wheretolook.figures.overview import Overview, overview_figure, rendered_views
+    from wheretolook.figures.style import save_figure, scene_label
+    from wheretolook.scorers.styles import method_style
+
+    dataset = Dataset.load(options.root)
+    scene = open_scene(options, dataset.scenes[-1])
+    table = scene.files.read_table()
+    localization_map = scene.files.localization_map(scene.camera, scene.device)
+    scorer = load_scorer(weights, localization_map)
+
+    ids, first = np.unique(table["location_id"], return_index=True)
+    locations = camera_centers(poses(table))[first]
+    chosen = instructive_location(table)
+    place = locations[np.searchsorted(ids, chosen)]
+    candidates = table[table["location_id"] == chosen]
+    scores = scorer.score(poses(candidates))
+    best, worst = rendered_views(scene, *_ends(candidates, scores), outcome_in_words)
+    directions = options.sample.axes()
+    around = scorer.score(poses_looking_along(np.tile(place, (len(directions), 1)), directions))
+    by_height = np.argsort(np.abs(locations[:, 2] - place[2]), kind="stable")
+    shown = by_height[np.unique(locations[by_height, :2].round(2), axis=0, return_index=True)[1]]
+    drawn = Overview(
+        scene=scene_label(dataset.scenes[-1].name),
+        method=method_style(scorer.name).label,
+        plan=dollhouse(scene.mesh, elevation_deg=90, cut_m=float(place[2]), one_sided=False, device=scene.device),
+        locations=locations[shown],
+        share_good=shares_good(table)[1][shown],
+        place=place,
+        directions=directions,
+        scores=around,
+        best=best,
+        worst=worst,
+    )
+    save_figure(overview_figure(drawn), dataset.root / "results" / OVERVIEW)
+
+
+def _ends(candidates: pd.DataFrame, scores: Float) -> tuple[pd.DataFrame, Float]:
+    """Rows and scores of the viewpoint with the highest score, and of the one with the lowest.
+
+    The lowest is that of a camera held about level, if there is one: what a robot sees that looks ahead, and not the
+    bare ceiling.
+    """
+    from wheretolook.dataset.viewpoint_table import poses
+
+    pitch = np.arcsin(np.clip(poses(candidates)[:, 2, 2], -1, 1))
+    level = np.abs(pitch) <= np.radians(LEVEL_DEG)
+    lowest = np.where(level, scores, np.inf) if level.any() else scores
+    ends = [int(np.argmax(scores)), int(np.argmin(lowest))]
+    return candidates.iloc[ends], scores[ends]
+
+
+def _write(step: str, text: str) -> None:
+    tqdm.write(f"[{step}] {text}")
+
+
+def _update(bar: tqdm, seconds: float, work: float) -> None:
+    bar.update(seconds * work)
+
+
+def _print_results(options: Demo) -> None:
+    """Print which method chose best, and where the picture, tables and runs are."""
+    from wheretolook.evaluation.report import best_in_words
+    from wheretolook.evaluation.results import SCORES_CSV, SCORES_MD, SCORES_PNG, results_folder
+    from wheretolook.evaluation.scores import read_scores
+
+    results = results_folder(Dataset.load(options.root), options.evaluate)
+    picture = options.root / "results" / OVERVIEW
+    print(f"""
+{textwrap.fill(best_in_words(read_scores(results / SCORES_CSV)), 100)}
+
+  picture       {picture if picture.is_file() else results / SCORES_PNG}
+  tables        {results / SCORES_MD}
+  runs          {ui_command(options.tracking)}
+  your own map  wheretolook select --map SPARSE --at FILE --out FILE
+""")

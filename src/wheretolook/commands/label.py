@@ -1,0 +1,209 @@
+"""`wheretolook label`: every viewpoint rendered and localized."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from wheretolook.commands.options import LabelOptions, Log, MapUseOptions, Progress, ignore_progress
+from wheretolook.commands.preconditions import existing, extractor_of, load_dataset
+from wheretolook.dataset.dataset_lock import changes_dataset
+from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.dataset.thresholds import ALL
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import log as log_to_run
+from wheretolook.tracking.runs import start_run
+from wheretolook.tracking.store import check_store, kept_if_not_logged
+from wheretolook.utils.artifact_cache import cache_key
+from wheretolook.utils.errors import MapError, SceneError, TableError
+from wheretolook.utils.files import write_json, write_text
+from wheretolook.utils.reading import read_json_object
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from wheretolook.localization.labeller import LabelTask
+    from wheretolook.localization.report import LabelSummary
+
+
+@dataclass(frozen=True, kw_only=True)
+class Label(LabelOptions):
+    """Render and localize every viewpoint, measure the pose error. Resumes.
+
+    Examples:
+      wheretolook label --config configs/paper.yaml --engine ray
+
+    Args:
+        map: where the weights of the map's extractor are, if they have moved.
+        tracking: where MLflow keeps its runs.
+    """
+
+    SHORT: ClassVar = {"engine": "label.engine"}
+
+    map: MapUseOptions = field(default_factory=MapUseOptions)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+
+    @changes_dataset("label")
+    def run(self, log: Log = print, progress: Progress = ignore_progress) -> Dataset:
+        """Write status and errors of every viewpoint into `<scene>/viewpoints.parquet`, a summary and an MLflow run.
+
+        Resumes after an interruption, see `wheretolook.localization.labeller.label_scenes`. The summary is
+        `<dataset>/results/labels.*`. Raises SceneError if a mesh is missing, or a scene is known from photographs alone.
+        """
+        from wheretolook.localization.report import LABELS_MD
+
+        dataset = load_dataset(self, "sample")
+        for files in dataset.scenes:
+            if files.is_photographed:
+                problem = "without a mesh, viewpoints of a scene of photographs cannot be rendered and labelled"
+                fix = "Score its viewpoints with weights trained elsewhere, or use a scene with a mesh."
+                raise SceneError(problem, path=files.folder, fix=fix)
+        to_label: list[tuple[SceneFolder, str]] = []
+        for files in sorted(dataset.scenes, key=lambda files: files.split == "train"):  # val and test scenes first
+            key = self._key(files)
+            if files.stage_cache("label", key).is_current(files.table):
+                shutil.rmtree(_shards(files), ignore_errors=True)
+                _report(files, files.read_table(), log)
+                progress(1)
+            else:
+                to_label.append((files, key))
+        summary = dataset.root / "results" / LABELS_MD
+        if to_label or not summary.is_file() or _not_logged(dataset).is_file():
+            check_store(self.tracking)
+        seconds = self._label(dataset, to_label, log, progress) if to_label else {}
+        if not summary.is_file() or _not_logged(dataset).is_file():
+            log_labels(dataset, self.tracking, seconds)
+        if to_label:
+            times = ", ".join(f"{step} {spent:.1f}" for step, spent in seconds.items())
+            log(f"seconds: {times} (sums over workers for each step; then wall time)")
+        return dataset
+
+    def _key(self, files: SceneFolder) -> str:
+        extractor = extractor_of(files, self.map.extractor)
+        settings = [self.label.localizer.record(), extractor.record(), files.camera.record()]
+        made_from = [existing(files.mesh, SceneError, "scenes"), existing(files.landmarks, MapError, "map")]
+        matches = [name for name in ("store_matches", "store_pixels") if getattr(self.label, name)]
+        return cache_key("label", [*settings, *made_from, files.stage_cache("sample").stored_key, *matches])
+
+    def _task(self, files: SceneFolder) -> LabelTask:
+        from wheretolook.localization.labeller import LabelTask
+        from wheretolook.localization.shard import SceneJob
+
+        config = self.label
+        options = (config.localizer, extractor_of(files, self.map.extractor), self.warp_device, config.store_matches)
+        cameras = tuple(files.cameras().items()) if files.cameras_file.is_file() else ()
+        job = SceneJob(files.mesh, files.landmarks, files.camera, *options, cameras, config.store_pixels)
+        return LabelTask(files.name, job, files.read_table(), _shards(files))
+
+    def _label(
+        self, dataset: Dataset, to_label: list[tuple[SceneFolder, str]], log: Log, progress: Progress
+    ) -> dict[str, float]:
+        """Label scenes and store their keys. Returns the seconds that each step took."""
+        from wheretolook.dataset.viewpoint_table import write_table
+        from wheretolook.localization.labeller import label_scenes
+        from wheretolook.localization.report import LABELS_MD
+
+        keys = {files.name: (files, key) for files, key in to_label}
+        tasks = [self._task(files) for files, _ in to_label]
+        seconds: dict[str, float] = {}
+        start = time.monotonic()
+        replacing = False
+        with closing(label_scenes(tasks, self.label)) as results:  # an interrupt here ends the workers
+            for labelled in results:
+                files, key = keys[labelled.task.name]
+                if not replacing:  # labels are unusable until all scenes have the new ones, and these are logged
+                    replacing = True
+                    (dataset.root / "results" / LABELS_MD).unlink(missing_ok=True)
+                    for other, _ in to_label:
+                        other.stage_cache("label").clear()
+                write_table(labelled.table, files.table)
+                write_json(files.label_manifest, labelled.manifest)
+                files.stage_cache("label", key).store()
+                shutil.rmtree(labelled.task.shards, ignore_errors=True)
+                shutil.rmtree(files.adapt_shards, ignore_errors=True)
+                for step, spent in labelled.seconds.items():
+                    seconds[step] = seconds.get(step, 0.0) + spent
+                _report(files, labelled.table, log)
+                progress(1)
+        return {**seconds, "wall": time.monotonic() - start}
+
+
+def _shards(files: SceneFolder) -> Path:
+    return files.folder / "shards"
+
+
+def _report(files: SceneFolder, table: pd.DataFrame, log: Log) -> None:
+    from wheretolook.dataset.viewpoint_table import is_good
+
+    good = f"{is_good(table).mean():.0%} of {len(table):,} viewpoints localize within 5 cm and 0.4 degrees"
+    log(f"{files.name}: {good} -> {files.table}")
+
+
+def log_labels(
+    dataset: Dataset, tracking: TrackingConfig = TrackingConfig(), seconds: Mapping[str, float] | None = None
+) -> LabelSummary:
+    """Summarize the labels of a dataset, write `<dataset>/results/labels.csv`, `.md` and `.png`, and log an MLflow run.
+
+    The run's metrics are the numbers of `LabelSummary.shares` over all scenes and, prefixed with the split's name, over
+    each split, and the seconds that each step took, `seconds_<name>`. Raises TableError if there is no scene, a scene
+    has no viewpoints, or one of them has no label. If the run cannot be logged, the files are kept with the seconds,
+    and a TrackingWarning announces that a later call logs it.
+    """
+    from wheretolook.figures.labels import label_figure
+    from wheretolook.figures.style import save_figure
+    from wheretolook.localization import report
+
+    if not dataset.scenes:
+        raise TableError("the dataset has no scene", path=dataset.root, fix="Run `wheretolook scenes`.")
+    tables = {scene.name: _labelled_table(scene) for scene in dataset.scenes}
+    summary = report.label_summary(tables, {scene.name: scene.split for scene in dataset.scenes})
+    folder = dataset.root / "results"
+    note = _not_logged(dataset)
+    if not seconds and note.is_file():
+        seconds = _seconds_of(note)
+    write_json(note, seconds or {})  # before the files, which count as logged without it
+    write_text(folder / report.LABELS_CSV, summary.shares.to_csv(index=False))
+    save_figure(label_figure(summary), folder / report.LABELS_PNG)
+    write_text(folder / report.LABELS_MD, report.label_markdown(summary, f"Labels of {dataset.name}"))
+
+    params = {"dataset": dataset.name, "dataset_fingerprint": dataset.fingerprint(), "scenes": " ".join(tables)}
+    metrics = {f"seconds_{name}": value for name, value in (seconds or {}).items()}
+    for row in summary.shares[summary.shares["scene"] == ALL].to_dict("records"):
+        prefix = "" if row["split"] == ALL else f"{row['split']}_"
+        metrics |= {f"{prefix}{name}": value for name, value in row.items() if name not in ("scene", "split")}
+    opened = start_run(tracking, "all scenes", "label", params, tags={"dataset": dataset.name})
+    with kept_if_not_logged(f"the summary of labels in {folder}", note, seconds or {}), opened as (client, run):
+        log_to_run(client, run, metrics=metrics)
+        for name in (report.LABELS_CSV, report.LABELS_MD, report.LABELS_PNG):
+            client.log_artifact(run, str(folder / name))
+    return summary
+
+
+def _not_logged(dataset: Dataset) -> Path:
+    """Return the file with the seconds of each step that exists until the dataset's labels are logged."""
+    return dataset.root / "labels_not_logged.json"
+
+
+def _seconds_of(note: Path) -> dict[str, float]:
+    try:
+        return {name: float(value) for name, value in read_json_object(note).items()}
+    except (OSError, ValueError, TypeError):
+        return {}
+
+
+def _labelled_table(scene: SceneFolder) -> pd.DataFrame:
+    from wheretolook.dataset.viewpoint_table import is_good
+
+    table = scene.read_table()
+    if table.empty:
+        raise TableError("the table has no viewpoints", path=scene.table, fix="Run `wheretolook sample` again.")
+    try:
+        is_good(table)
+    except TableError as error:
+        raise TableError(error.problem, path=scene.table, value=error.value, fix=error.fix) from None
+    return table

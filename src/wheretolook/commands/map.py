@@ -1,0 +1,276 @@
+"""`wheretolook map`: a COLMAP model of every scene, of a folder of photographs, or imported from a model."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from wheretolook.commands.options import LabelOptions, Log, Progress, SceneOptions, ignore_progress
+from wheretolook.commands.preconditions import (
+    existing,
+    load_dataset,
+    mesh_fingerprint,
+    naming_scene,
+    open_scene,
+    refuse_release,
+)
+from wheretolook.dataset.dataset_lock import changes_dataset
+from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, describe_camera, draw_camera
+from wheretolook.geometry.poses import Float
+from wheretolook.mapping.config import MapConfig, ScaleConfig
+from wheretolook.mapping.georeference import read_scale
+from wheretolook.scenes.scenes_config import NOT_SCENES
+from wheretolook.utils.artifact_cache import cache_key
+from wheretolook.utils.confine import check_folder_name, path_within, safe_child
+from wheretolook.utils.errors import ConfigError, MapError, SceneError
+from wheretolook.utils.files import fingerprint
+
+
+@dataclass(frozen=True, kw_only=True)
+class Map(SceneOptions, LabelOptions):
+    """Build a COLMAP map of every scene from renders, or of photographs: --images. Or import one: --model.
+
+    A model of your own, from COLMAP or hloc, in metres with z up, becomes a scene for sample, viewpoint-map and plan.
+    Mesh and database are optional. With --images its landmarks are triangulated again. If it is not upright, or not in
+    metres: --map.existing.level true, --map.photographs.scale.positions FILE. Its own camera is the scene's, unless
+    --camera names one.
+
+    Examples:
+      wheretolook map --name photos --images FOLDER
+      wheretolook map --name mymap --model sparse/0 --mesh scan.glb --database database.db
+
+    Args:
+        map: what is mapped, and how.
+    """
+
+    SHORT: ClassVar = {
+        "images": "map.photographs.images",
+        "model": "map.existing.model",
+        "mesh": "map.existing.mesh",
+        "database": "map.existing.database",
+        "engine": "label.engine",
+    }
+
+    map: MapConfig = field(default_factory=MapConfig)  # type: ignore[assignment]
+
+    @changes_dataset("map")
+    def run(self, log: Log = print, progress: Progress = ignore_progress) -> Dataset:
+        """Write a COLMAP model of every scene with attributes of its landmarks, `<scene>/map/`.
+
+        Images are rendered along a walk, or for a scan at the poses of its frames. `map.photographs.images` makes one
+        scene of photographs, without a mesh; `map.existing.model` one of that model, with or without a mesh. Raises
+        SceneError or MapError if a mesh or a model cannot be read, or no landmark could be triangulated.
+        """
+        if self.map.existing.model is not None:
+            refuse_release(self.root)
+            return _import_model(self, self.map.existing.model, log, progress)
+        if self.map.photographs.images is not None:
+            refuse_release(self.root)
+            return _map_photographs(self, self.map.photographs.images, log, progress)
+        dataset = load_dataset(self, "scenes")
+        for files in dataset.scenes:
+            _map_mesh(self, files, log)
+            progress(1)
+        return dataset
+
+
+def _map_mesh(options: Map, files: SceneFolder, log: Log) -> None:
+    """Map a scene by renders of its mesh, unless its map is current."""
+    config = options.map
+    unused = ("photographs", "existing", "camera", "draw_camera")  # the mapping camera is a part of the key itself
+    settings = {name: value for name, value in config.record().items() if name not in unused}
+    scene = open_scene(options, files)
+    seed = _seed(files)
+    made_from = existing(files.mesh, SceneError, "scenes")
+    floor = files.mapped_floor()
+    camera = _mapping_camera(config, scene.camera, seed)
+    views = [asdict(scene.config.free_space), camera.record(), seed, made_from, *([floor] if floor else [])]
+    cache = files.stage_cache("map", cache_key("map", [settings, *views]))
+    model = [files.map / name for name in ("cameras.bin", "images.bin", "points3D.bin")]
+    if cache.is_current(files.landmarks, *model):
+        log(f"{scene.name}: reusing {files.map}")
+        return
+    from wheretolook.mapping.rendered_map import build_map
+    from wheretolook.mapping.walk import PartOfFloor
+
+    poses = _poses_of_recording(files, config.n_images)
+    with naming_scene(files.mesh):
+        space = PartOfFloor(scene.mesh_space, floor) if floor else scene.mesh_space
+        shown = (scene.mesh, scene.renderer, space, camera)
+        how = (scene.raycaster, options.n_workers, scene.device)
+        report = build_map(*shown, config, seed, files.map, *how, before_replace=cache.clear, poses=poses)
+    cache.store()
+    landmarks = f"{report.n_landmarks:,} landmarks from {report.n_registered} images"
+    distance = f"median {report.median_distance_to_mesh_cm:.2f} cm from the mesh"
+    log(f"{scene.name}: {landmarks}, {distance} -> {files.map}")
+
+
+def _poses_of_recording(scene: SceneFolder, at_most: int) -> Float | None:
+    """Return at most `at_most` poses (M, 3, 4), evenly spaced, of a scan's frames; the mesh is complete only there."""
+    if not scene.is_scanned:
+        return None
+    from wheretolook.mapping.colmap_model import colmap_poses
+
+    poses = colmap_poses(scene.frames)
+    return poses[np.unique(np.linspace(0, len(poses) - 1, min(len(poses), at_most)).round().astype(int))]
+
+
+def _mapping_camera(config: MapConfig, looking: Camera, seed: int) -> PinholeCamera:
+    """Return the camera that maps: from the options, drawn, or the scene's. Raises ConfigError if it has distortion."""
+    if config.draw_camera:
+        return draw_camera(np.random.default_rng([seed, 1]))
+    camera = looking if config.camera is None else config.camera.camera
+    if not isinstance(camera, PinholeCamera):
+        fix = "Give one without distortion: --map.camera '{width: 640, height: 480, fov_deg: 90}'."
+        raise ConfigError("a mesh is mapped with a pinhole camera", value=camera.model, fix=fix)
+    return camera
+
+
+def _seed(scene: SceneFolder) -> int:
+    """Return a seed that depends on the scene's name only."""
+    return zlib.crc32(scene.name.encode()) % 2**31
+
+
+def _map_photographs(options: Map, folder: Path, log: Log, progress: Progress) -> Dataset:
+    """Map the photographs in `map.photographs.images`: `<scene>/map/`, with finished steps in `<scene>/photographs/`.
+
+    The scene joins those of the dataset that are made of photographs too. Raises what `map_photographs` does, and
+    ConfigError if the dataset holds scenes with meshes.
+    """
+    from wheretolook.mapping.photographs import list_photographs
+
+    settings = options.map.photographs
+    root = options.root
+    name = settings.name or folder.resolve().name
+    check_folder_name("a scene's name, map.photographs.name,", name, NOT_SCENES)
+    scene = SceneFolder(safe_child(root, name, "a scene's name"), "test", options.camera.camera)
+    dataset = _with_photographs(scene, options)
+    files = [folder / name for name in list_photographs(folder)]
+    tables = [path for path in (settings.scale.marker_table, settings.scale.positions) if path is not None]
+    missing = next((path for path in tables if not path.is_file()), None)
+    if missing is not None:
+        raise ConfigError("there is no such table", path=missing, fix="Check map.photographs.scale.")
+    images = [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+    used = [replace(settings, assume_metric=False).record(), options.map.extractor.record()]
+    made_from = [images, [fingerprint(path) for path in tables]]
+    key = cache_key("map", [*used, options.map.keep_database, _seed(scene), *made_from])
+    if not scene.stage_cache("map", key).is_current(scene.landmarks, scene.mapping_cameras):
+        from wheretolook.mapping.photograph_map import map_photographs
+
+        how = (scene.folder / "photographs", _seed(scene), options.n_workers, options.warp_device)
+        forget = scene.stage_cache("map").clear
+        report = map_photographs(options.map, scene.map, *how, before_replace=forget)
+        scene.stage_cache("map", key).store()
+        used_images = f"{report.n_registered} of {report.n_images} photographs"
+        log(f"{scene.name}: {report.n_landmarks:,} landmarks from {used_images} -> {scene.map}")
+        if report.unregistered:
+            log(f"{scene.name}: not placed: {', '.join(report.unregistered)}")
+    else:
+        log(f"{scene.name}: reusing {scene.map}")
+    scale = read_scale(scene.map)
+    assert scale is not None
+    log(f"{scene.name}: {scale.describe()}")
+    dataset.save()
+    progress(1)
+    return dataset
+
+
+def _import_model(options: Map, folder: Path, log: Log, progress: Progress) -> Dataset:
+    """Make a scene of the model in `map.existing.model`: `<scene>/map/`, and `<scene>/mesh.glb` if a mesh is given.
+
+    The scene joins those of the dataset that are made of photographs or models too. Raises what `map_existing` does,
+    ConfigError if the dataset holds other scenes, and SceneError if the mesh cannot be used.
+    """
+    from wheretolook.mapping.colmap_model import read_model
+
+    settings = options.map.existing
+    photographs = options.map.photographs
+    root = options.root
+    name = settings.scene_name
+    check_folder_name("a scene's name, map.existing.name,", name, NOT_SCENES)
+    if settings.mesh is not None and (settings.level or photographs.scale != ScaleConfig()):
+        fix = "Give a model and a mesh that are both in metres with z up."
+        raise ConfigError("a model that is turned or scaled leaves its mesh", value=str(settings.mesh), fix=fix)
+    model = read_model(folder)
+    scene = SceneFolder(safe_child(root, name, "a scene's name"), "test", options.camera.camera)
+    scene = _with_own_camera(scene, model, folder, options)
+    dataset = _with_photographs(scene, options)
+    tables = [photographs.scale.marker_table, photographs.scale.positions, settings.database]
+    files = [*sorted(folder.iterdir()), *(path for path in tables if path is not None)]
+    if photographs.images is not None:
+        names = [image.name for _, image in sorted(model.images.items())]
+        files += [path_within(photographs.images, name, "the name of a model's image") for name in names]
+    stats = [(path, path.stat()) for path in files if path.is_file()]
+    made_from = [(str(path), stat.st_size, stat.st_mtime_ns) for path, stat in stats]
+    mesh = [] if settings.mesh is None else [mesh_fingerprint(settings.mesh)]
+    chosen = {name: value for name, value in options.map.record().items() if name not in ("camera", "draw_camera")}
+    key = cache_key("map", [chosen, _seed(scene), made_from, mesh])
+    if scene.stage_cache("map", key).is_current(
+        scene.landmarks, scene.mapping_cameras, *([scene.mesh] if mesh else [])
+    ):
+        log(f"{scene.name}: reusing {scene.map}")
+    else:
+        from wheretolook.mapping.imported_map import map_existing
+        from wheretolook.mapping.sanity import warn_of_mesh
+        from wheretolook.rendering.raycasting import MeshRaycaster
+        from wheretolook.scenes.loading import load_mesh, save_glb
+
+        loaded = None if settings.mesh is None else load_mesh(settings.mesh, settings.mesh_up, colored=False)
+        scene.stage_cache("map").clear()
+        how = (scene.folder / "photographs", _seed(scene), options.n_workers, options.warp_device)
+        report = map_existing(options.map, scene.map, *how, reconstruction=model)
+        scene.mesh.unlink(missing_ok=True)
+        if settings.mesh is not None and loaded is not None:
+            caster = MeshRaycaster(loaded, options.warp_device)
+            warn_of_mesh(settings.mesh, scene.read_landmarks().points, caster)
+            save_glb(loaded, scene.mesh)
+        scene.stage_cache("map", key).store()
+        left_out = f", {report.n_landmarks_removed:,} points left out" if report.n_landmarks_removed else ""
+        again = ", triangulated again," if report.triangulated_anew else ""
+        found = f"{report.n_landmarks:,} landmarks{again} from {report.n_images} images{left_out}"
+        log(f"{scene.name}: {found} -> {scene.map}")
+    scale = read_scale(scene.map)
+    assert scale is not None
+    log(f"{scene.name}: {scale.describe()}; camera {describe_camera(scene.camera)}")
+    dataset.save()
+    progress(1)
+    return dataset
+
+
+def _with_own_camera(scene: SceneFolder, model: Any, folder: Path, options: Map) -> SceneFolder:
+    """Return the scene with the model's camera, unless the options name one."""
+    from wheretolook.mapping.colmap_model import camera_of_model
+
+    if options.camera != CameraConfig():
+        return scene
+    try:
+        camera = camera_of_model(model, folder, options.map.existing.camera_id)
+        return replace(scene, camera=camera, own_camera=True)
+    except MapError as error:
+        fix = "Name one of the model's, --map.existing.camera_id 1, or describe another, such as --camera.fov_deg 70."
+        raise MapError(error.problem, path=error.path, value=error.value, fix=fix) from error
+
+
+def _with_photographs(scene: SceneFolder, options: Map) -> Dataset:
+    """Return the dataset with this scene added or replaced."""
+    root = options.root
+    scenes = [scene]
+    if (root / "dataset.json").is_file():
+        known = Dataset.load(root)
+        scenes += [other for other in known.scenes if other.name != scene.name]
+        if not all(read_scale(other.map) for other in known.scenes):  # maps of meshes have none
+            problem = "this dataset holds scenes with meshes, which photographs do not join"
+            names = [other.name for other in known.scenes]
+            fix = "Give the photographs a dataset of their own: --name."
+            raise ConfigError(problem, path=root, value=names, fix=fix)
+        others = [other for other in known.scenes if not (other.own_camera or scene.own_camera)]
+        for other in others:
+            if other.camera != scene.camera:  # what was sampled with another camera is no longer valid
+                other.stage_cache("map", other.stage_cache("map").stored_key or "").store()
+        scenes = [replace(other, camera=scene.camera) if other in others else other for other in scenes]
+    return Dataset(root, tuple(sorted(scenes, key=lambda scene: scene.name)))

@@ -1,0 +1,229 @@
+"""Options that several commands share."""
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
+
+from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.features.config import ExtractorConfig
+from wheretolook.geometry.camera import Camera, CameraConfig
+from wheretolook.localization.config import LabelConfig
+from wheretolook.mapping.config import MapConfig
+from wheretolook.scenes.scenes_config import ScenesConfig
+from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.utils.confine import safe_child
+from wheretolook.utils.devices import check_device_name, usable_device
+from wheretolook.utils.errors import ConfigError
+from wheretolook.visibility.config import OcclusionConfig
+
+T = TypeVar("T")
+
+Log = Callable[[str], None]
+"""Receives one line about what a command has finished."""
+
+Progress = Callable[[float], None]
+"""Receives the work finished since the last call: 1 for each scene, or 1 for a command that does not go by scene."""
+
+
+def ignore_progress(work: float) -> None:
+    """Do nothing: for callers that show no progress."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """Base of all commands."""
+
+    CONFIG: ClassVar[str] = ""
+    """Bundled configuration that is read unless `--config` names another, such as demo."""
+    SHORT: ClassVar[Mapping[str, str]] = {}
+    """Shorter names of options, as the command line writes them, without `--`."""
+    POSITIONAL: ClassVar[str] = "config"
+    """Option of the values before the first option."""
+
+    def run(self) -> Any:
+        """Do the command's work."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetOptions(Command):
+    """Which dataset a command works on, and where it computes.
+
+    Args:
+        name: name of the dataset and its folder.
+        data: folder of all datasets.
+        device: where to compute: auto, cpu, cuda, or cuda:<index>.
+        camera: the camera of the viewpoints; it also maps unless `map.camera` names another.
+    """
+
+    name: str = "demo"
+    data: Path = Path("data")
+    device: str = "auto"
+    camera: CameraConfig = field(default_factory=CameraConfig)
+
+    def __post_init__(self) -> None:
+        check_device_name(self.device)
+        safe_child(self.data, self.name, "a dataset's name")
+        if not isinstance(self.camera, CameraConfig):  # in Python a camera itself is accepted
+            object.__setattr__(self, "camera", CameraConfig.of(self.camera))
+
+    @property
+    def root(self) -> Path:
+        """Folder of the dataset."""
+        return self.data / self.name
+
+    @property
+    def warp_device(self) -> str:
+        """The device that kernels run on, with "auto" resolved. Raises ConfigError if there is no such device."""
+        return usable_device(self.device)
+
+
+@dataclass(frozen=True)
+class SpaceOptions:
+    """Where a camera can be.
+
+    Args:
+        free_space: in a scene with a mesh.
+        mapped_space: in a scene of photographs, which has no mesh, or in a scan, which is in parts.
+    """
+
+    free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
+    mapped_space: MappedSpaceConfig = field(default_factory=MappedSpaceConfig)
+
+
+@dataclass(frozen=True)
+class MetricOptions:
+    """Whether maps are in metres.
+
+    Args:
+        assume_metric: take a map of unknown scale for one in metres.
+    """
+
+    assume_metric: bool = False
+
+
+@dataclass(frozen=True)
+class MapUseOptions:
+    """How an existing map is used.
+
+    Args:
+        photographs: whether the map of photographs is in metres.
+        extractor: where the weights of the map's extractor are, if they have moved since the map was made.
+    """
+
+    photographs: MetricOptions = field(default_factory=MetricOptions)
+    extractor: ExtractorConfig = field(default_factory=ExtractorConfig)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions(DatasetOptions):
+    """A dataset whose scenes are opened.
+
+    Args:
+        occlusion: how occluded landmarks are recognized.
+        scenes: where a camera can be.
+        map: how maps are used.
+    """
+
+    occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)
+    scenes: SpaceOptions = field(default_factory=SpaceOptions)
+    map: MapUseOptions = field(default_factory=MapUseOptions)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelOptions(DatasetOptions):
+    """How views are rendered and localized.
+
+    Args:
+        label: localization, and the processes that run it.
+    """
+
+    label: LabelConfig = field(default_factory=LabelConfig)
+
+    @property
+    def n_workers(self) -> int:
+        """Worker processes: `label.workers`, by default one for each CPU core that this process may use."""
+        return self.label.workers or len(os.sched_getaffinity(0))
+
+    @property
+    def warp_device(self) -> str:
+        """The device that kernels run on. Not checked for a Ray cluster: only its machines know their devices."""
+        if self.label.engine == "ray" and self.device != "auto":
+            return self.device
+        return usable_device(self.device)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment(SceneOptions, LabelOptions):
+    """Options of all stages from scenes to labels.
+
+    Args:
+        scenes: meshes.
+        map: COLMAP maps of meshes or of photographs.
+        sample: viewpoints and which landmarks they see.
+        tracking: where MLflow keeps its runs.
+    """
+
+    scenes: ScenesConfig = field(default_factory=ScenesConfig)  # type: ignore[assignment]
+    map: MapConfig = field(default_factory=MapConfig)  # type: ignore[assignment]
+    sample: SampleConfig = field(default_factory=SampleConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+
+
+def select_options(command: type[T], options: object) -> T:
+    """Return a command with those of its options that another command's options include."""
+    names = [field.name for field in fields(command) if hasattr(options, field.name)]  # type: ignore[arg-type]
+    return command(**{name: getattr(options, name) for name in names})
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraOptions(Command):
+    """The camera of the views.
+
+    Args:
+        camera: COLMAP's MODEL,width,height,parameters, such as PINHOLE,640,480,320,320,320,240; by default the map's.
+        camera_id: instead, the camera_id of one of the map's cameras.
+    """
+
+    camera: str | None = None
+    camera_id: int | None = None
+
+    def named_camera(self) -> Camera | int | None:
+        """Return the camera asked for: one, a camera_id of the map, or None for the map's own."""
+        from wheretolook.geometry.camera_text import parse_camera
+
+        if self.camera is not None and self.camera_id is not None:
+            raise ConfigError("the camera is described in several ways", value=self.camera, fix="Give one of them.")
+        return self.camera_id if self.camera is None else parse_camera(self.camera)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OcclusionOptions(Command):
+    """What occludes landmarks.
+
+    Args:
+        mesh: a mesh of the scene (GLB, OBJ, PLY) in the map's frame.
+        occlusion: mesh, tsdf (depth images), hidden-points (from the landmarks alone) or none; by default the first of
+            these that there is data for.
+    """
+
+    mesh: Path | None = None
+    occlusion: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScorerOptions(Command):
+    """How views are scored.
+
+    Args:
+        weights: file or folder of weights; by default the bundled ones.
+        method: a name of `wheretolook evaluate --list-methods`; by default that of the weights.
+        anywhere: allow weights adapted to another scene.
+    """
+
+    weights: Path | None = None
+    method: str = ""
+    anywhere: bool = False

@@ -1,0 +1,103 @@
+"""`wheretolook sample`: viewpoints, and which landmarks their locations see."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+
+from wheretolook.commands.options import Log, Progress, SceneOptions, ignore_progress
+from wheretolook.commands.preconditions import existing, load_dataset, naming_scene, open_scene
+from wheretolook.dataset.dataset_lock import changes_dataset
+from wheretolook.dataset.environment import SceneEnvironment
+from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.geometry.camera import Camera, draw_camera, write_cameras
+from wheretolook.utils.artifact_cache import cache_key
+from wheretolook.utils.errors import MapError, SceneError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sample(SceneOptions):
+    """Choose viewpoints by the landmarks they see.
+
+    Examples:
+      wheretolook sample --config configs/demo.yaml --sample.max_locations 100
+
+    Args:
+        sample: which viewpoints.
+    """
+
+    sample: SampleConfig = field(default_factory=SampleConfig)
+
+    @changes_dataset("sample")
+    def run(self, log: Log = print, progress: Progress = ignore_progress) -> Dataset:
+        """Write viewpoints and the landmarks that their locations see, `<scene>/viewpoints.parquet`, `occlusion.npz`.
+
+        A camera looks in every direction from the centre of every free voxel, and visible landmarks are counted
+        exactly. In a scene of photographs or a scan, the camera stays near where these were taken; without a mesh,
+        hidden-point removal decides what is occluded. Raises SceneError if no location is free, MapError if there is no
+        map, or one without a scale.
+        """
+        dataset = load_dataset(self, "map")
+        for files in dataset.scenes:
+            scene = open_scene(self, files)
+            cache = files.stage_cache("sample", _key(scene, self.sample))
+            if cache.is_current(files.table, files.occlusion):
+                log(f"{scene.name}: reusing {files.table}")
+            else:
+                _sample(scene, self.sample, log)
+                cache.store()
+            progress(1)
+        return dataset
+
+
+def _key(scene: SceneEnvironment, config: SampleConfig) -> str:
+    files = scene.files
+    space = asdict(scene.config.free_space)
+    stage = "scenes"
+    if scene.is_photographed:
+        scene.require_metres()
+        space = asdict(scene.config.mapped_space)
+        stage = "map"
+    elif files.is_scanned:
+        space = asdict(scene.config.mapped_space)
+    chosen = {name: value for name, value in asdict(config).items() if name != "memory_gb"}
+    if not config.cameras:  # keys of datasets that were sampled before this option existed
+        del chosen["cameras"]
+    chosen["max_directions"] = config.directions_of(files.split)
+    made_from = [existing(scene.source, SceneError, stage), existing(files.landmarks, MapError, "map")]
+    settings = [chosen, scene.occlusion_config.settings(), space, scene.camera.record()]
+    return cache_key("sample", [*settings, *made_from])
+
+
+def _cameras(scene: SceneEnvironment, config: SampleConfig) -> Camera | dict[int, Camera]:
+    """Return the scene's camera, or those drawn for it by number; other scenes do not change the draw."""
+    if not config.cameras:
+        return scene.camera
+    rng = np.random.default_rng([config.seed, zlib.crc32(scene.name.encode())])
+    return {number: draw_camera(rng) for number in range(1, config.cameras + 1)}
+
+
+def _sample(scene: SceneEnvironment, config: SampleConfig, log: Log) -> None:
+    from wheretolook.dataset.sampling import sample_viewpoints
+    from wheretolook.dataset.viewpoint_table import write_table
+
+    files = scene.files
+    with naming_scene(scene.source):
+        grid, free = scene.free_voxels(config, scene.sampled_space)
+        cameras = _cameras(scene, config)
+        visible = (scene.landmarks, cameras, scene.occlusion)
+        title = f"sample {scene.name}"
+        table, occlusion = sample_viewpoints(grid, free, *visible, config, scene.device, title, files.split)
+    files.stage_cache("sample").clear()
+    files.cameras_file.unlink(missing_ok=True)
+    if isinstance(cameras, dict):
+        write_cameras(cameras, files.cameras_file)
+    occlusion.save(files.occlusion)
+    write_table(table, files.table)
+    n_locations = table["location_id"].nunique()
+    log(f"{scene.name}: {len(table):,} viewpoints at {n_locations} of {len(free)} free locations -> {files.table}")
+    if scene.occlusion_config != scene.config.occlusion:
+        log(f"{scene.name}: occlusion by {scene.occlusion_config.model}, as there is no mesh")

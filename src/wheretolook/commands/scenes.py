@@ -1,0 +1,140 @@
+"""`wheretolook scenes`: textured meshes, generated, loaded, or fused from a recording."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from wheretolook.commands.options import DatasetOptions, Log, Progress, ignore_progress
+from wheretolook.commands.preconditions import mesh_fingerprint, refuse_release
+from wheretolook.commands.rgbd_scene import fuse_recording
+from wheretolook.dataset.dataset_lock import changes_dataset
+from wheretolook.dataset.layout import Dataset, MappedFloor, SceneFolder
+from wheretolook.scenes.scenes_config import MeshSource, ScenesConfig
+from wheretolook.utils.artifact_cache import cache_key
+from wheretolook.utils.confine import safe_child
+from wheretolook.utils.errors import ConfigError, SceneError
+
+if TYPE_CHECKING:
+    from wheretolook.geometry.mesh import TexturedMesh
+
+    MakeMesh = Callable[[], tuple[TexturedMesh, MappedFloor]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenes(DatasetOptions):
+    """Make or load the textured meshes, or fuse one from colour and depth images: --rgbd.
+
+    Examples:
+      wheretolook scenes --config configs/demo.yaml --scenes.train 5
+      wheretolook scenes --name kitchen --rgbd FOLDER
+
+    Args:
+        scenes: which scenes.
+    """
+
+    SHORT: ClassVar = {"rgbd": "scenes.rgbd.folder", "up": "scenes.rgbd.up"}
+
+    scenes: ScenesConfig = field(default_factory=ScenesConfig)
+
+    @changes_dataset("scenes")
+    def run(self, log: Log = print, progress: Progress = ignore_progress) -> Dataset:
+        """Write `<scene>/mesh.glb` for every scene, and the dataset's description. Finished meshes are reused.
+
+        With `scenes.rgbd.folder`, one scene is fused from the RGB-D recording and joins the dataset's others. Raises
+        SceneError if a mesh or the recording cannot be used or two scenes have the same name, ConfigError if the
+        dataset's folder holds a release.
+        """
+        refuse_release(self.root)
+        if self.scenes.rgbd.folder is not None:
+            return fuse_recording(self, self.scenes.rgbd, log, progress)
+        keys: dict[SceneFolder, str] = {}
+        sources: dict[SceneFolder, MakeMesh] = {}
+        for scene, make, made_from in [*self._generated(), *self._loaded()]:
+            if scene.name in {other.name for other in sources}:
+                raise SceneError("two scenes have the same name", path=self.root, value=scene.name, fix="Give a name.")
+            sources[scene] = make
+            keys[scene] = cache_key("scenes", made_from)
+        for scene, make in sources.items():
+            if scene.stage_cache("scenes", keys[scene]).is_current(scene.mesh):
+                log(f"{scene.name}: reusing {scene.mesh}")
+            else:
+                save_scene(scene, make, keys[scene], log)
+            progress(1)
+        dataset = self._with_scans(tuple(sources))
+        dataset.save()
+        return dataset
+
+    def _generated(self) -> list[tuple[SceneFolder, MakeMesh, list[Any]]]:
+        config = self.scenes
+        splits = [*["train"] * config.train, *["val"] * config.val, *["test"] * config.test]
+        generated = []
+        for seed, split in enumerate(splits, config.seed):
+            kind = config.kind_of(seed)
+            scene = self._scene(f"{kind}-{seed:03d}", split)
+            make = partial(_generate, self, kind, seed)
+            generated.append((scene, make, [config.apartment.key(), seed, *([] if kind == "apartment" else [kind])]))
+        return generated
+
+    def _loaded(self) -> list[tuple[SceneFolder, MakeMesh, list[Any]]]:
+        return [
+            (self._scene(mesh.scene_name, mesh.split), partial(_load, mesh), [mesh_fingerprint(mesh.path), mesh.up])
+            for mesh in self.scenes.meshes
+        ]
+
+    def _scene(self, name: str, split: Any) -> SceneFolder:
+        return SceneFolder(safe_child(self.root, name, "a scene's name"), split, self.camera.camera)
+
+    def _with_scans(self, made: tuple[SceneFolder, ...]) -> Dataset:
+        """Return the dataset of the scenes made and of the scans that it had; samples of other cameras are forgotten."""
+        if not (self.root / "dataset.json").is_file():
+            return Dataset(self.root, made)
+        before = Dataset.load(self.root).scenes
+        names = {scene.name for scene in made}
+        dataset = Dataset(
+            self.root, (*made, *(scene for scene in before if scene.is_scanned and scene.name not in names))
+        )
+        cameras = {scene.name: scene.camera for scene in before}
+        for scene in dataset.scenes:
+            if cameras.get(scene.name, self.camera.camera) != self.camera.camera:
+                scene.stage_cache("sample").clear()
+        return dataset
+
+
+def save_scene(scene: SceneFolder, make: MakeMesh, key: str, log: Log) -> None:
+    """Make a scene's mesh and write it; results of an earlier mesh or recording are forgotten first."""
+    from wheretolook.scenes.loading import save_glb
+
+    mesh, mapped = make()
+    scene.folder.mkdir(parents=True, exist_ok=True)
+    scene.stage_cache("scenes").clear()
+    shutil.rmtree(scene.frames, ignore_errors=True)
+    save_glb(mesh, scene.mesh)
+    scene.save_mapped_floor(mapped)
+    scene.stage_cache("scenes", key).store()
+    log(f"{scene.name}: {len(mesh.triangles):,} triangles -> {scene.mesh}")
+
+
+def scene_generator() -> Callable[..., tuple[TexturedMesh, MappedFloor]]:
+    """Return the installed generator of scenes, `generate(kind, config, seed, device=...)`.
+
+    Raises ConfigError if no package registers one in the entry-point group `wheretolook.scene_generators`.
+    """
+    for entry in entry_points(group="wheretolook.scene_generators"):
+        generator: Callable[..., tuple[TexturedMesh, MappedFloor]] = entry.load()
+        return generator
+    raise ConfigError("no generator of scenes is installed", fix="Install wheretolook again, or name scenes.meshes.")
+
+
+def _generate(options: Scenes, kind: str, seed: int) -> tuple[TexturedMesh, MappedFloor]:
+    return scene_generator()(kind, options.scenes.apartment, seed, device=options.warp_device)
+
+
+def _load(source: MeshSource) -> tuple[TexturedMesh, MappedFloor]:
+    from wheretolook.scenes.loading import load_mesh
+
+    return load_mesh(source.path, up=source.up), ()

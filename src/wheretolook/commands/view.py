@@ -1,0 +1,175 @@
+"""`wheretolook view`: a scene or a map in the browser, with the score of every view."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from wheretolook.commands.options import CameraOptions
+from wheretolook.dataset.names import check_scene_name
+from wheretolook.utils.errors import ConfigError
+
+if TYPE_CHECKING:
+    from wheretolook.view.shared import Shared
+    from wheretolook.view.state import ViewState
+    from wheretolook.view.viewed_map import ViewedMap
+
+
+@dataclass(frozen=True, kw_only=True)
+class View(CameraOptions):
+    """View a scene or your own map in the browser, with the score of every view.
+
+    The page shows mesh or landmarks, mapping cameras, and free space at one height, coloured by the best score at each
+    location. Click a location for the score of every direction, the best views, the visible landmarks by their
+    detection probability, and the camera's image. Rotate the camera by hand, and its score follows.
+
+    Paths (--path): the folder or path.csv that `wheretolook plan` wrote; a scene's folder in results/paths of
+    `wheretolook compare-paths`, of which --pair names the start and goal; a TUM trajectory; or a CSV of `wheretolook
+    select`. A single path is shown next to the same locations seen by a camera that looks ahead.
+
+    Access: by default only this machine, and no page of another site that is open in its browser; --host 0.0.0.0 serves
+    everyone who reaches it. There is no password, and nothing is served but the scene.
+
+    Examples:
+      wheretolook view --scene apartment-000
+      wheretolook view --map sparse/0 --mesh house.glb
+      wheretolook view --map sparse/0 --images photographs --port 8081
+      wheretolook view --scene apartment-000 --path data/demo/apartment-000/path
+      wheretolook view --scene apartment-000 --record apartment.rrd    # for the Rerun viewer, nothing is served
+
+    Args:
+        scene: a scene of a dataset, as `wheretolook map` leaves it.
+        data: folder of the datasets.
+        name: dataset of the scene, if several have such a scene.
+        map: instead, folder of a COLMAP model, in metres with z up.
+        mesh: a mesh of the map's scene (GLB, OBJ, PLY) in its frame.
+        images: its photographs, shown next to views.
+        path: a path to play.
+        pair: which start and goal of compared paths.
+        weights: file or folder of weights; by default the scene's own, or the bundled ones.
+        method: method that scores at first; by default that of the weights.
+        host: address to serve at.
+        port: port to serve at.
+        state: what to show at first, from the page's field `state`.
+        dark: dark at first.
+        record: instead of a page, a Rerun recording, FILE.rrd.
+        film: instead of a page, the path, method next to method, FILE.webp or .gif.
+        device: where to compute: auto, cpu, cuda, or cuda:<index>.
+    """
+
+    scene: str | None = None
+    data: Path = Path("data")
+    name: str = ""
+    map: Path | None = None
+    mesh: Path | None = None
+    images: Path | None = None
+    path: Path | None = None
+    pair: int = 0
+    weights: Path | None = None
+    method: str = ""
+    host: str = "127.0.0.1"
+    port: int = 8080
+    state: str = ""
+    dark: bool = False
+    record: Path | None = None
+    film: Path | None = None
+    device: str = "auto"
+
+    def __post_init__(self) -> None:
+        if (self.map is None) == (self.scene is None):
+            raise ConfigError("what is viewed is given by --scene or by --map", fix="Give one of them.")
+        if self.scene is not None and (self.mesh is not None or self.images is not None):
+            fix = "Leave them out: a scene has its own."
+            raise ConfigError("--mesh and --images belong to --map", value=str(self.mesh or self.images), fix=fix)
+        if self.scene is not None and self.camera_id is not None:
+            raise ConfigError("--camera-id belongs to --map", value=self.camera_id, fix="Describe it by --camera.")
+        if self.record is not None and self.film is not None:
+            raise ConfigError("a recording and a film are made one at a time", value=str(self.film), fix="Give one.")
+        if self.record is not None and self.record.suffix != ".rrd":
+            raise ConfigError("a Rerun recording is a .rrd", path=self.record, fix="Name it so.")
+        if self.film is not None and self.film.suffix not in (".webp", ".gif"):
+            raise ConfigError("this film is a .webp or a .gif", path=self.film, fix="Name it so.")
+        if self.film is not None and (self.path is None or (self.map is not None and self.mesh is None)):
+            raise ConfigError("a film needs a path, and a mesh to render", path=self.film, fix="Give --path.")
+        self.named_camera()
+
+    def run(self) -> None:
+        """Serve the page until interrupted; or write a recording or a film."""
+        start = time.monotonic()
+        self._check_environment()
+        from wheretolook.view.paths import read_paths
+        from wheretolook.view.shared import Shared
+        from wheretolook.view.state import ViewState
+
+        state = ViewState.parse(self.state)
+        if self.method:
+            state = replace(state, method=self.method)
+        paths = None if self.path is None else read_paths(self.path, self.pair)
+        viewed = self._open()
+        if state.method and state.method not in viewed.methods:
+            fix = f"Use {', '.join(viewed.methods)}."
+            raise ConfigError("there is no such method here, or no weights of it", value=state.method, fix=fix)
+        summary = f"{viewed.name}: {len(viewed.landmarks):,} landmarks"
+        shared = Shared(viewed, paths)
+        if self.record is not None:
+            from wheretolook.view.recording import record
+
+            record(shared, self.record, state)
+            print(f"{summary}, in {time.monotonic() - start:.0f} s: {self.record}")
+        elif self.film is not None:
+            n_frames = film_writer()(shared, self.film, state)
+            print(f"{summary}, {n_frames} pictures in {time.monotonic() - start:.0f} s: {self.film}")
+        else:
+            print(f"{summary}, open after {time.monotonic() - start:.1f} s", flush=True)
+            self._serve(shared, state)
+
+    def _serve(self, shared: Shared, state: ViewState) -> None:
+        from wheretolook.view.server import Viewer
+
+        viewer = Viewer(shared, self.host, self.port, state, self.dark)
+        viewed = shared.viewed
+        print(viewed.weights.describe(state.method or viewed.methods[0]) or "a method without weights", flush=True)
+        print(f"{viewer.url}    (Ctrl-C ends it)", flush=True)
+        try:
+            viewer.wait()
+        except KeyboardInterrupt:
+            print("ended")
+        finally:
+            viewer.stop()
+
+    def _check_environment(self) -> None:
+        """Raise ConfigError for missing folders, packages and ports, before long imports."""
+        from wheretolook.view.server import check_port, require
+
+        if self.images is not None and not self.images.is_dir():
+            raise ConfigError("there is no such folder of photographs", path=self.images, fix="Correct the path.")
+        if self.scene is not None and self.data.is_dir():
+            check_scene_name(self.data, self.scene, self.name)
+        if self.record is not None:
+            require("rerun")
+        elif self.film is None:
+            require("viser")
+            check_port(self.host, self.port)
+
+    def _open(self) -> ViewedMap:
+        from wheretolook.utils.devices import usable_device
+        from wheretolook.view.viewed_map import open_map, open_named_scene
+
+        device = usable_device(self.device)
+        camera = self.named_camera()
+        if self.map is not None:
+            return open_map(self.map, self.mesh, camera, self.images, self.weights, device, self.data)
+        assert self.scene is not None and not isinstance(camera, int)
+        return open_named_scene(self.data, self.scene, self.name, camera, self.weights, device)
+
+
+def film_writer() -> Callable[[Shared, Path, ViewState], int]:
+    """Return the installed writer of films, which returns the number of pictures. Raises ConfigError without one."""
+    for entry in entry_points(group="wheretolook.view", name="film"):
+        writer: Callable[[Shared, Path, ViewState], int] = entry.load()
+        return writer
+    raise ConfigError("no package that writes films is installed", fix="Install wheretolook with its paper package.")

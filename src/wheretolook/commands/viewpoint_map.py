@@ -1,0 +1,71 @@
+"""`wheretolook viewpoint-map`: every direction scored at every free voxel of a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, ClassVar
+
+from wheretolook.commands.options import Log, Progress, SceneOptions, ignore_progress
+from wheretolook.commands.preconditions import load_dataset, naming_scene, open_scene
+from wheretolook.dataset.dataset_lock import reads_dataset
+from wheretolook.planning.config import ViewpointMapConfig
+
+if TYPE_CHECKING:
+    from wheretolook.planning.viewpoint_map import ViewpointMap
+
+
+@dataclass(frozen=True, kw_only=True)
+class BuildViewpointMap(SceneOptions):
+    """Score every direction at every free voxel of a scene, for planners to query. Needs no labels.
+
+    Reads a scene's map and its mesh, as `scenes` and `map` leave them; a scene of photographs has no mesh, and is free
+    where scenes.mapped_space says. Without weights or a method, the best weights of the dataset, or else the bundled
+    ones, score the views. The folder holds plain arrays and LAYOUT.txt, which describes them; in Python:
+
+      from wheretolook import ViewpointMap
+      viewpoint_map = ViewpointMap.load("apartment.map", mmap=True)
+      choice = viewpoint_map.best((1.0, 2.0, 1.5))    # None where no camera can be, else axis, score, n_visible
+
+    Examples:
+      wheretolook viewpoint-map --config configs/demo.yaml --scene apartment-000 --out apartment.map
+
+    Args:
+        viewpoint_map: which views, and how they are scored.
+    """
+
+    SHORT: ClassVar = {name: f"viewpoint_map.{name}" for name in ("scene", "method", "weights", "out")}
+
+    viewpoint_map: ViewpointMapConfig = field(default_factory=ViewpointMapConfig)
+
+    @reads_dataset("viewpoint-map")
+    def run(self, log: Log = print, progress: Progress = ignore_progress) -> dict[str, ViewpointMap]:
+        """Write `<scene>/viewpoint-map/`, and return the viewpoint maps by the scene's name. Needs `map` only.
+
+        Raises:
+            ConfigError: no such scene or method, or the method needs weights. WeightsError: the weights cannot be used.
+            SceneError: there is no mesh, or no voxel is free. MapFormatError: the map's folder holds something else.
+        """
+        from wheretolook.planning.scene_map import scene_scorer, scene_viewpoint_map
+        from wheretolook.weights.resolve import resolve_weights
+
+        dataset = load_dataset(self, "map")
+        config = self.viewpoint_map
+        if not config.method and config.weights is None:
+            weights = resolve_weights(dataset=dataset, log=log)
+            if weights is not None:
+                log(f"scored by {weights}")
+                config = replace(config, weights=weights)
+        built: dict[str, ViewpointMap] = {}
+        for files in [dataset.scene(config.scene)] if config.scene else dataset.scenes:
+            scene = open_scene(self, files)
+            with naming_scene(scene.source):
+                scorer = scene_scorer(scene, config.method, config.weights, config.anywhere)
+                viewpoint_map = scene_viewpoint_map(scene, config, scorer)
+            folder = config.out or files.folder / "viewpoint-map"
+            viewpoint_map.save(folder)
+            built[scene.name] = viewpoint_map
+            n_rows, n_directions = viewpoint_map.scores.shape
+            scored = f"{n_directions} directions at {n_rows} free voxels of {len(viewpoint_map.grid)}"
+            log(f"{scene.name}: {scored}, scored by {viewpoint_map.origin.scorer} -> {folder}")
+            progress(1)
+        return built

@@ -1,0 +1,90 @@
+"""Options of the scenes command."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, get_args
+
+from wheretolook.scans.config import RgbdConfig
+from wheretolook.scenes.config import ApartmentConfig, SceneKind
+from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
+from wheretolook.utils.confine import check_folder_name
+from wheretolook.utils.errors import ConfigError
+
+NOT_SCENES = (
+    "weights",
+    "results",
+    "adapted",
+    "all",
+)  # folders of a dataset that are no scenes, and what all scenes are called
+
+
+@dataclass(frozen=True)
+class MeshSource:
+    """A scene from a mesh file.
+
+    Args:
+        path: GLB, PLY or OBJ file with textures, in metres, or a Habitat-Matterport folder `<id>-<name>`.
+        split: where its viewpoints go: train, val or test.
+        name: of the scene; the file's own name if empty.
+        up: which axis of the file points up: x, y or z, with a minus sign if it points down.
+    """
+
+    path: Path
+    split: Literal["train", "val", "test"] = "test"
+    name: str = ""
+    up: str = "z"
+
+    def __post_init__(self) -> None:
+        check_folder_name("a scene's name", self.scene_name, NOT_SCENES)
+
+    @property
+    def scene_name(self) -> str:
+        """Name of the scene's folder."""
+        return self.name or self.path.stem
+
+
+@dataclass(frozen=True)
+class ScenesConfig:
+    """Settings of the scenes stage.
+
+    Args:
+        train: generated scenes to learn from.
+        val: generated scenes for validation; with none, some locations of the training scenes are held out.
+        test: generated scenes to evaluate on.
+        seed: seed of the first generated scene; each further one counts up.
+        kinds: kinds of generated scenes, one after the other in turn: a seed's is `kinds[seed % len(kinds)]`. Beside
+            `apartment` there are `hall`, `court`, `office` and `building`, in which rooms repeat that are mapped in
+            part. These draw their sizes and difficulty from the seed, as apartments do that `vary`.
+        apartment: what an apartment is like, and the texture and light of all generated scenes.
+        meshes: scenes from meshes of one's own, beside the generated ones, such as [{path: scans/office.glb}].
+        rgbd: an RGB-D recording to make one scene of. With its folder no other scene is made; those that the dataset
+            has are kept.
+        free_space: where a camera may be.
+        mapped_space: where it may be in a scene of photographs, which has no mesh, or in a scan, which is in parts.
+    """
+
+    train: int = 3
+    val: int = 0
+    test: int = 1
+    seed: int = 0
+    kinds: tuple[SceneKind, ...] = ("apartment",)
+    apartment: ApartmentConfig = field(default_factory=ApartmentConfig)
+    meshes: tuple[MeshSource, ...] = ()
+    rgbd: RgbdConfig = field(default_factory=RgbdConfig)
+    free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
+    mapped_space: MappedSpaceConfig = field(default_factory=MappedSpaceConfig)
+
+    def __post_init__(self) -> None:
+        if min(self.train, self.val, self.test) < 0 or self.train + self.val + self.test + len(self.meshes) == 0:
+            fix = "Set scenes.train and scenes.test, or name meshes in scenes.meshes."
+            value = (self.train, self.val, self.test, self.meshes)
+            raise ConfigError("an experiment needs scenes", value=value, fix=fix)
+        if not self.kinds or not set(self.kinds) <= set(get_args(SceneKind)):
+            fix = f"Name some of {', '.join(get_args(SceneKind))}."
+            raise ConfigError("scenes.kinds are kinds of generated scenes", value=self.kinds, fix=fix)
+
+    def kind_of(self, seed: int) -> SceneKind:
+        """The kind of the generated scene of a seed."""
+        return self.kinds[seed % len(self.kinds)]

@@ -24,7 +24,7 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.planning.map_building import build_viewpoint_map, update_viewpoint_map
 from wheretolook.planning.refine import refine_directions
-from wheretolook.planning.view_sequence import TurnLimit, best_sequence, greedy_sequence
+from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.config import ApartmentConfig
@@ -33,6 +33,7 @@ from wheretolook.scorers.registry import make_scorer
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.visibility.occlusion import MeshOcclusion
 from wheretolook.weights.resolve import load_scorer
+from wheretolook_paper.paths.greedy import greedy_sequence
 from wheretolook_rooms.generator import generate_apartment
 
 

@@ -11,7 +11,7 @@ import pytest
 from planning.test_path_planning import BOUNDS, Room, looking_north
 from wheretolook.planning.config import PathConfig
 from wheretolook.planning.rrt import plan_path
-from wheretolook.planning.scene_map import shares_below, with_borrowed_views
+from wheretolook.planning.scene_map import fill_partially_free_voxels, shares_below
 from wheretolook.utils.errors import MapFormatError
 
 
@@ -35,7 +35,7 @@ def known_west_and_east() -> tuple:
 
 def test_nothing_is_borrowed_through_walls() -> None:
     centers, own = known_west_and_east()
-    lent = with_borrowed_views(own, BoundedRoom())
+    lent = fill_partially_free_voxels(own, BoundedRoom())
     assert (own.row_of_voxel < 0).sum() > (lent.row_of_voxel < 0).sum()
     np.testing.assert_array_equal(lent.row_of_voxel[own.row_of_voxel >= 0], own.row_of_voxel[own.row_of_voxel >= 0])
     room = Room()
@@ -58,15 +58,15 @@ def test_a_planner_has_scores_where_it_had_none() -> None:
     config = PathConfig(time_s=0.5, pitch_deg=(-30, 30))
     ends = (1.5, 1.0, 1.1), (2.2, 2.5, 1.1)
     assert (plan_path(*ends, BoundedRoom(), BOUNDS, own, config, progress=False).scores == 0).all()
-    lent = with_borrowed_views(own, BoundedRoom())
+    lent = fill_partially_free_voxels(own, BoundedRoom())
     np.testing.assert_allclose(plan_path(*ends, BoundedRoom(), BOUNDS, lent, config, progress=False).scores, 0.25)
 
 
-def test_a_map_with_borrowed_views_is_told_from_the_original(tmp_path: Path) -> None:
+def test_a_map_fill_partially_free_voxels_is_told_from_the_original(tmp_path: Path) -> None:
     _, own = known_west_and_east()
-    lent = with_borrowed_views(own, BoundedRoom())
+    lent = fill_partially_free_voxels(own, BoundedRoom())
     assert own.origin.derived == "" and lent.origin.derived == "views borrowed by neighbours"
-    ranks = with_borrowed_views(shares_below(own), BoundedRoom())
+    ranks = fill_partially_free_voxels(shares_below(own), BoundedRoom())
     assert ranks.origin.derived == "scores replaced by ranks; views borrowed by neighbours"
     with pytest.raises(MapFormatError, match="views borrowed by neighbours"):
         lent.save(tmp_path / "map")

@@ -137,144 +137,75 @@ int main() {{
 
 @pytest.mark.parametrize("mmap", [False, True])
 @pytest.mark.parametrize(
-    ("change", "message"),
+    "change",
     [
-        ({"version": 2}, r"viewpoint_map\.json: not a viewpoint map of version 1 \(got .*2"),
-        ({"format": "else"}, "not a viewpoint map of version 1"),
-        ({"sizes": {"V": 60, "L": 1, "D": 60, "N": 200}}, r"ranked\.npy: not an array of uint16 of shape \(1, 60\)"),
-        ({"sizes": {}}, "damaged description"),
-        ({"grid": {"lower": [0, 0, 0], "upper": [0, 1, 1], "shape": [1, 1, 1]}}, "damaged description"),
-        ({"grid": {"lower": [0, 0, 0], "upper": [1, 1, 1], "shape": [1, 1, 1]}}, "do not fit together"),
-        ({"origin": {"scorer": "bins"}}, "damaged description"),
+        {"version": 2},
+        {"format": "else"},
+        {"sizes": {"V": 60, "L": 1, "D": 60, "N": 200}},
+        {"sizes": {}},
+        {"grid": {"lower": [0, 0, 0], "upper": [0, 1, 1], "shape": [1, 1, 1]}},
+        {"grid": {"lower": [0, 0, 0], "upper": [1, 1, 1], "shape": [1, 1, 1]}},
+        {"origin": {"scorer": "bins"}},
     ],
 )
-def test_another_version_or_a_damaged_description_is_refused(folder: Path, change, message: str, mmap: bool) -> None:
+def test_damaged_descriptions(folder: Path, change: dict[str, object], mmap: bool) -> None:
     path = folder / DESCRIPTION
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-    with pytest.raises(MapFormatError, match=message):
+    with pytest.raises(MapFormatError):
         ViewpointMap.load(folder, mmap)
 
 
-@pytest.mark.parametrize("mmap", [False, True])
 @pytest.mark.parametrize("name", [*(f"{name}.npy" for name in ARRAYS), DESCRIPTION])
-@pytest.mark.parametrize("damage", ["missing", "truncated", "empty", "other"])
-def test_damaged_files_are_refused(folder: Path, name: str, damage: str, mmap: bool) -> None:
+@pytest.mark.parametrize("damage", ["missing", "truncated", "flipped"])
+def test_damaged_files(folder: Path, name: str, damage: str) -> None:
     path = folder / name
     content = path.read_bytes()
     path.unlink()
-    if damage != "missing":
-        path.write_bytes({"truncated": content[: len(content) // 2], "empty": b"", "other": b"\xff" * 500}[damage])
-    with pytest.raises(MapFormatError, match=name if damage != "missing" else str(folder)):
-        ViewpointMap.load(folder, mmap)
-
-
-def test_a_flipped_bit_is_found(folder: Path) -> None:
-    path = folder / "scores.npy"
-    content = bytearray(path.read_bytes())
-    content[-100] ^= 1
-    path.write_bytes(content)
-    with pytest.raises(MapFormatError, match=r"scores\.npy: damaged: the checksum"):
+    if damage == "truncated":
+        path.write_bytes(content[: len(content) // 2])
+    if damage == "flipped":
+        path.write_bytes(content[:-10] + bytes([content[-10] ^ 0x80]) + content[-9:])
+    with pytest.raises(MapFormatError):
         ViewpointMap.load(folder)
+    if damage != "flipped":
+        with pytest.raises(MapFormatError):
+            ViewpointMap.load(folder, mmap=True)
 
 
-def test_what_is_no_map_is_neither_read_nor_replaced(viewpoint_map: ViewpointMap, tmp_path: Path) -> None:
-    with pytest.raises(MapFormatError, match="no viewpoint map"):
-        ViewpointMap.load(tmp_path / "none")
-    (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(MapFormatError, match="something else is here"):
+@pytest.mark.parametrize(
+    "name, content", [("notes.txt", "mine"), (DESCRIPTION, "{"), (DESCRIPTION, '{"format": "else"}')]
+)
+def test_other_folders_are_neither_read_nor_replaced(
+    viewpoint_map: ViewpointMap, tmp_path: Path, name: str, content: str
+) -> None:
+    (tmp_path / name).write_text(content)
+    with pytest.raises(MapFormatError):
+        ViewpointMap.load(tmp_path)
+    with pytest.raises(MapFormatError):
         viewpoint_map.save(tmp_path)
-    with pytest.raises(MapFormatError, match="something else is here"):
-        viewpoint_map.save(tmp_path / "notes.txt")
-    assert (tmp_path / "notes.txt").read_text() == "mine"
+    assert content_of(tmp_path) == {name: content.encode()}
 
 
-@pytest.mark.parametrize("content", ['{"mine": 1}', "[]", "null", "{", '{"format": "else"}'])
-def test_a_file_of_the_maps_name_does_not_make_a_map(viewpoint_map: ViewpointMap, tmp_path: Path, content: str) -> None:
-    (tmp_path / DESCRIPTION).write_text(content)
-    (tmp_path / "thesis.tex").write_text("mine")
-    with pytest.raises(MapFormatError, match="something else is here"):
-        viewpoint_map.save(tmp_path)
-    assert content_of(tmp_path) == {DESCRIPTION: content.encode(), "thesis.tex": b"mine"}
-
-
-def test_a_map_with_notes_beside_it_is_not_replaced(viewpoint_map: ViewpointMap, folder: Path) -> None:
+def test_a_map_with_other_files_is_not_replaced(viewpoint_map: ViewpointMap, folder: Path) -> None:
     (folder / "notes.txt").write_text("mine")
     before = content_of(folder)
-    with pytest.raises(MapFormatError, match=r"notes\.txt: this is no file of the viewpoint map"):
+    with pytest.raises(MapFormatError):
         viewpoint_map.save(folder)
     assert content_of(folder) == before
 
 
-def test_folders_beside_a_map_are_left_alone(viewpoint_map: ViewpointMap, folder: Path) -> None:
-    others = [folder.with_name(name) for name in ("room.before", "room.partial", ".room.mine")]
-    for other in others:
-        other.mkdir()
-        (other / "mine").write_text("mine")
-    viewpoint_map.save(folder)
-    assert all((other / "mine").read_text() == "mine" for other in others)
-    assert {path.name for path in folder.parent.iterdir()} == {"room", *(other.name for other in others)}
-
-
-@pytest.mark.parametrize("killed", [False, True])
-def test_the_old_map_outlives_a_save_that_ends_between_the_two_moves(
-    viewpoint_map: ViewpointMap, folder: Path, monkeypatch: pytest.MonkeyPatch, killed: bool
-) -> None:
-    """An error puts it back; who is killed leaves it where `load` says it is, and the next save leaves it alone."""
-    before = content_of(folder)
-    rename = Path.rename
-    moves = []
-
-    def interrupted(path: Path, target: Path) -> Path:
-        moves.append(target)
-        if len(moves) == 2 or (killed and len(moves) > 2):
-            raise OSError("interrupted")
-        return rename(path, target)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "rename", interrupted)
-        if killed:
-            patch.setattr(shutil, "rmtree", lambda *_, **__: None)
-        with pytest.raises(OSError, match="interrupted"):
-            viewpoint_map.save(folder)
-    if not killed:
-        assert content_of(folder) == before and len(list(folder.parent.iterdir())) == 1
-        return
-    with pytest.raises(MapFormatError, match="A save was interrupted: the map from before is") as error:
-        ViewpointMap.load(folder)
-    old = Path(str(error.value.fix).split(" is ")[1].removesuffix(", move it here."))
-    assert content_of(old) == before
-    viewpoint_map.save(folder)
-    assert content_of(old) == content_of(folder) == before
-
-
-def test_what_killed_saves_left_is_removed_by_the_next(viewpoint_map: ViewpointMap, folder: Path) -> None:
-    """A half-written new map always, the old one once there is a new one."""
-    unfinished = folder.with_name(".room.abcdefgh")
-    superseded = folder.with_name(".room.ijklmnop")
-    (unfinished / "new").mkdir(parents=True)
-    (superseded / "old").mkdir(parents=True)
-    for path in (unfinished / "new" / "scores.npy", superseded / "old" / "scores.npy"):
-        path.write_bytes(b"half")
-    (folder.with_name(".room.settings")).write_text("mine")
-    viewpoint_map.save(folder)
-    assert {path.name for path in folder.parent.iterdir()} == {"room", ".room.settings"}
-
-
-def test_rows_that_are_not_each_of_one_voxel_are_refused(viewpoint_map: ViewpointMap, folder: Path) -> None:
+def test_rows_must_be_used_once(viewpoint_map: ViewpointMap, folder: Path) -> None:
     rows = viewpoint_map.row_of_voxel.copy()
     first, second = viewpoint_map.voxel_of_row[:2]
-    for changed in ({first: 1, second: 0}, {first: 1}, {first: -2}):
-        wrong = rows.copy()
-        for voxel, row in changed.items():
-            wrong[voxel] = row
-        with pytest.raises(ValueError, match="row_of_voxel"):
-            replace(viewpoint_map, row_of_voxel=wrong)
-        np.save(folder / "row_of_voxel.npy", wrong)
-        with pytest.raises(MapFormatError, match="do not fit together: row_of_voxel"):
-            ViewpointMap.load(folder, mmap=True)
+    rows[[first, second]] = rows[[second, first]]
+    with pytest.raises(ValueError):
+        replace(viewpoint_map, row_of_voxel=rows)
+    np.save(folder / "row_of_voxel.npy", rows)
+    with pytest.raises(MapFormatError):
+        ViewpointMap.load(folder, mmap=True)
 
 
 def test_derived_maps_are_not_saved(viewpoint_map: ViewpointMap, tmp_path: Path) -> None:
-    with pytest.raises(MapFormatError, match=r"derived from another.*scores replaced by ranks"):
+    with pytest.raises(MapFormatError):
         shares_below(viewpoint_map).save(tmp_path / "room")
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""Building viewpoint maps from a localization map and any scorer, and bringing them up to date."""
+"""Build viewpoint maps from a localization map and any scorer, and update them."""
 
 from __future__ import annotations
 
@@ -26,20 +26,23 @@ Text = str | None  # text of progress bars; None shows none
 VIEWS_AT_ONCE = 16_384
 """Views scored at a time, in whole locations: enough to fill a GPU, few enough for the progress bar to move."""
 
-SIGHT_BYTES = 1 << 28  # lines of sight tested at a time in an update, one byte each
+SIGHT_BYTES = 1 << 28  # memory for lines of sight tested at a time in an update, one byte each
 
-SAME_SCORE = 1e-4
-"""Absolute and relative tolerance for scores of a voxel computed again; networks may sum in another order."""
+SCORE_TOLERANCE = 1e-4  # absolute and relative, of scores computed again: networks may sum in another order
 
 
 def build_viewpoint_map(
     scorer: Scorer, grid: VoxelGrid, free: ArrayLike, directions: ArrayLike, lattice: str = "", progress: Text = None
 ) -> ViewpointMap:
-    """Score every direction at the centre of every free voxel of a grid (metres).
+    """Score every direction at the centre of every free voxel of a grid.
 
-    The scorer is any method, on the localization map to be used. A camera can be in voxels whose ids (L,) are given,
-    such as `viewpoints.sampling.free_locations` finds, or a mask of all voxels (V,) bool. Directions (D, 3) are optical
-    axes in the world, of any length, such as `direction_lattice` gives; their name is kept in the map's origin.
+    Args:
+        scorer: any method, on the localization map to be used.
+        grid: of V voxels, metres.
+        free: ids (L,) of the voxels that a camera can be in, or a mask (V,) of all voxels.
+        directions: (D, 3) optical axes in the world, of any length.
+        lattice: name of the directions, for the map's origin.
+        progress: text of the progress bar; None shows none.
 
     Raises:
         SceneError: no voxel is free, or the centre of one lies inside geometry.
@@ -66,13 +69,13 @@ def build_viewpoint_map(
 def update_viewpoint_map(
     old: ViewpointMap, scorer: Scorer, progress: Text = None
 ) -> tuple[ViewpointMap, NDArray[np.int64]]:
-    """Update a viewpoint map after landmarks were added; equal to building it anew, for networks up to rounding.
+    """Update a viewpoint map after landmarks were added: the same as building it again, for networks up to rounding.
 
     Landmarks are compared by id. Voxels from which a new landmark, or one whose attributes have changed, is unoccluded
     are scored again. Nothing else can change if a score depends only on landmarks in view (`Scorer.local`) and
     landmarks do not hide one another (`OcclusionModel.landmarks_hide`). Otherwise, and if landmarks were removed or
-    moved, all voxels are scored again. The method, camera, occlusion and the scene's geometry must be the same; if they
-    changed, build the map anew. Returns the new map, and the ids of the voxels that were scored again.
+    moved, all voxels are scored again. The method, camera, occlusion and the scene's geometry must be the same. Returns the
+    new map, and the ids of the voxels that were scored again.
 
     Raises:
         ConfigError: the map was derived from another; the method, camera or occlusion model differs; or scores or
@@ -91,7 +94,7 @@ def update_viewpoint_map(
         now = getattr(origin, name)
         before = getattr(old.origin, name)
         if now != before:
-            fix = f"Use {before!r}, or build it anew."
+            fix = f"Use {before!r}, or build it again."
             raise ConfigError(f"the viewpoint map was built with another {name}", value=now, fix=fix)
     changed = _changed_landmarks(old, landmarks, digests)
     if changed is None or occlusion.landmarks_hide or not scorer.local:
@@ -109,25 +112,26 @@ def update_viewpoint_map(
 
 
 def landmark_digests(landmarks: Landmarks) -> NDArray[np.uint64]:
-    """Digests (N, 2) of each landmark's position and of its attributes: BLAKE2b of 8 bytes, little-endian."""
+    """Compute digests (N, 2) of each landmark's position and of its attributes: BLAKE2b of 8 bytes, little-endian."""
     attributes = np.concatenate([landmarks.mapping_direction, landmarks.attributes()], axis=1)
     return np.stack([_digests(landmarks.points), _digests(attributes)], axis=1)
 
 
 def _digests(rows: NDArray[Any]) -> NDArray[np.uint64]:
-    found = b"".join(hashlib.blake2b(row.tobytes(), digest_size=8).digest() for row in rows)
-    return np.frombuffer(found, dtype="<u8").astype(np.uint64)
+    digests = b"".join(hashlib.blake2b(row.tobytes(), digest_size=8).digest() for row in rows)
+    return np.frombuffer(digests, dtype="<u8").astype(np.uint64)
 
 
 def _score_and_count(
     scorer: Scorer, locations: Float, directions: Float, progress: Text
 ) -> tuple[NDArray[np.uint16], NDArray[np.float32], NDArray[np.uint32]]:
-    """Ranked ids, scores and numbers of landmarks in view, each (L, D), of all directions at locations (L, 3) m."""
-    around = scorer.localization_map
-    rotations = rotation_looking_along(directions)
+    """Return ranked ids, scores and numbers of landmarks in view, each (L, D), of directions at locations (L, 3) m."""
+    localization_map = scorer.localization_map
+    points = localization_map.landmarks.points
     text = progress and f"{progress}: count"
-    options = SurveyOptions(keep=1, keep_occlusion=False, device=around.device, progress=text)
-    counted = survey(around.camera, rotations, locations, around.landmarks.points, around.occlusion, options)
+    options = SurveyOptions(keep=1, keep_occlusion=False, device=localization_map.device, progress=text)
+    rotations = rotation_looking_along(directions)
+    counted = survey(localization_map.camera, rotations, locations, points, localization_map.occlusion, options)
     ranked = np.empty((len(locations), len(directions)), dtype=np.uint16)
     scores = np.empty(ranked.shape, dtype=np.float32)
     block = max(1, VIEWS_AT_ONCE // len(directions))
@@ -149,7 +153,7 @@ def _score_exactly(scorer: Scorer, locations: Float, directions: Float) -> Float
 
 
 def _ids(free: ArrayLike, n_voxels: int) -> NDArray[np.int64]:
-    """Ids of free voxels, ascending, each once, from ids or a mask."""
+    """Return the ids of free voxels, ascending, each once, from ids or a mask."""
     given = np.asarray(free)
     if given.dtype == bool:
         if given.shape != (n_voxels,):
@@ -186,7 +190,7 @@ def _unit(directions: ArrayLike) -> Float:
 def _changed_landmarks(
     old: ViewpointMap, landmarks: Landmarks, digests: NDArray[np.uint64]
 ) -> NDArray[np.int64] | None:
-    """Rows of landmarks that are new or have other attributes; None if some were removed or moved."""
+    """Return rows of landmarks that are new or have other attributes; None if some were removed or moved."""
     place = np.searchsorted(landmarks.ids, old.landmark_ids)
     place = np.minimum(place, max(0, len(landmarks) - 1))
     kept = len(landmarks) > 0 and np.array_equal(landmarks.ids[place], old.landmark_ids)
@@ -201,36 +205,39 @@ def _any_unoccluded(
     occlusion: OcclusionModel, points: Float, rows: NDArray[np.int64], locations: Float
 ) -> NDArray[np.bool_]:
     """Whether at least one of the landmarks at some rows of points (N, 3) m is unoccluded from locations (L, 3) m."""
-    found = np.zeros(len(locations), dtype=bool)
+    unoccluded = np.zeros(len(locations), dtype=bool)
     if len(rows) == 0:
-        return found
-    whole = isinstance(occlusion, StoredOcclusion)  # it answers only for all landmarks of its map
-    asked, columns = (points, rows) if whole else (points[rows], slice(None))
-    step = max(1, SIGHT_BYTES // len(asked))
+        return unoccluded
+    columns: Any = slice(None)
+    if isinstance(occlusion, StoredOcclusion):  # it holds results for all landmarks of its map
+        columns = rows
+    else:
+        points = points[rows]
+    step = max(1, SIGHT_BYTES // len(points))
     for begin in range(0, len(locations), step):
         block = slice(begin, begin + step)
-        found[block] = occlusion.unoccluded(locations[block], asked)[:, columns].any(axis=1)
-    return found
+        unoccluded[block] = occlusion.unoccluded(locations[block], points)[:, columns].any(axis=1)
+    return unoccluded
 
 
 def _check_unchanged(old: ViewpointMap, scorer: Scorer, rows: NDArray[np.int64]) -> None:
-    """Raise a ConfigError if rows that see nothing new have other scores or counts: weights or geometry changed."""
+    """Raise a ConfigError if voxels that see no new landmark have other scores or counts."""
     if len(rows) == 0:
         return
     _, scores, n_visible = _score_and_count(scorer, old.locations[rows], old.directions, None)
-    same_scores = np.allclose(scores, old.scores[rows], rtol=SAME_SCORE, atol=SAME_SCORE)
+    same_scores = np.allclose(scores, old.scores[rows], rtol=SCORE_TOLERANCE, atol=SCORE_TOLERANCE)
     if not (same_scores and np.array_equal(n_visible, old.n_visible[rows])):
         problem = "a voxel that sees none of the added landmarks has other scores or counts than in the viewpoint map"
         value = tuple(np.round(old.locations[rows[0]], 3).tolist())
-        fix = "Weights, or what stands in the scene, must have changed: build it anew."
+        fix = "Weights or the scene's geometry must have changed: build it again."
         raise ConfigError(problem, value=value, fix=fix)
 
 
 def _origin(scorer: Scorer, lattice: str, digests: NDArray[np.uint64]) -> MapOrigin:
-    around = scorer.localization_map
-    camera = scorer.localization_map.camera
-    digest = hashlib.sha256(around.landmarks.ids.tobytes() + digests.tobytes()).hexdigest()[:16]
+    localization_map = scorer.localization_map
+    camera = localization_map.camera
+    digest = hashlib.sha256(localization_map.landmarks.ids.tobytes() + digests.tobytes()).hexdigest()[:16]
     intrinsics = camera.colmap.record()
-    if isinstance(camera, PinholeCamera):  # one model for all, as maps always had it
+    if isinstance(camera, PinholeCamera):  # stored in one form, whatever the model
         intrinsics |= {"model": "PINHOLE", "params": [float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy)]}
-    return MapOrigin(scorer.name, lattice, intrinsics, around.occlusion.name, digest)
+    return MapOrigin(scorer.name, lattice, intrinsics, localization_map.occlusion.name, digest)

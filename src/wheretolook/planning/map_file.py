@@ -1,11 +1,8 @@
-"""A viewpoint map on disk: a folder of plain arrays that any language can read, and a description of their layout."""
+"""Viewpoint maps on disk: a folder of plain arrays that any language can read, and a description of their layout."""
 
 from __future__ import annotations
 
-import glob
 import math
-import shutil
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +12,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.utils.errors import MapFormatError
-from wheretolook.utils.files import moved_later, sha256, storage_errors, write_json, write_text
+from wheretolook.utils.files import atomic_folder, sha256, write_json, write_text
 from wheretolook.utils.locks import hold
 from wheretolook.utils.npz_files import save_npy
 from wheretolook.utils.reading import read_json
@@ -35,15 +32,12 @@ ARRAYS = {
     "landmark_ids": ("<i8", "N", "of the map's landmarks, ascending"),
     "landmark_digests": ("<u8", "N, 2", "of these"),
 }
-"""Type, little-endian, shape and meaning of each array; each is a file `<name>.npy`."""
+"""Little-endian type, shape and meaning of each array; each is a file `<name>.npy`."""
 
-_MOST_VOXELS = 2**40
+_MAX_VOXELS = 2**40
+_WAIT_S = 120.0  # for another process that writes into the same folder
 
-_OLD = "old"  # name of a map that is being replaced, in the hidden folder where the new one is written
-_NEW = "new"  # name of the new one there
-_WAIT_S = 120.0  # for another process to write its map into the same folder
-
-REBUILD = "Build it anew with `wheretolook viewpoint-map`, or get the folder again."
+REBUILD = "Build it again with `wheretolook viewpoint-map`, or get the folder again."
 
 _TEXT = """\
 A viewpoint map, version {version}: where to point a camera so that it knows where it is.
@@ -102,45 +96,21 @@ TO UPDATE
 def write_map(
     folder: str | Path, grid: VoxelGrid, origin: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
 ) -> None:
-    """Write a folder; one that holds a viewpoint map and nothing else is replaced once the new one is complete.
+    """Write a viewpoint map into a folder; a folder that holds nothing but another one is replaced in one step.
 
-    The same map gives the same bytes; the folder's own `LAYOUT.txt` describes them. The new map is written in a hidden
-    folder beside it, `.<name>.<some letters>`, into which the old one is moved until the new one is in place. A process
-    killed in between leaves both there, and `read_map` says where; one killed earlier leaves part of the new one, which
-    the next one that writes here removes. They wait for one another.
+    The same map gives the same bytes; the folder's own `LAYOUT.txt` describes them. Processes that have mapped the old
+    files into memory still read them.
 
     `origin` has the fields of `MapOrigin` but `derived`, `arrays` those of `ARRAYS` by name. Raises MapFormatError if
     the folder holds anything that is not part of a viewpoint map.
     """
     folder = Path(folder).resolve()  # so that "." has a name too
-    _refuse_something_else(folder)
-    with hold(folder.with_name(f".{folder.name}.lock"), "viewpoint map", wait_s=_WAIT_S):
-        for left in folder.parent.glob(f".{glob.escape(folder.name)}.????????"):
-            inside = {path.name for path in left.iterdir()} if left.is_dir() and not left.is_symlink() else {"a file"}
-            if inside <= {_NEW} or (inside <= {_NEW, _OLD} and (folder / DESCRIPTION).is_file()):
-                shutil.rmtree(left, ignore_errors=True)  # of a process that was killed while it wrote, or afterwards
-        with storage_errors(folder):
-            work = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-        new = work / _NEW
-        old = work / _OLD
-        try:
-            with moved_later(new, folder), storage_errors(folder):
-                new.mkdir()
-                _write(new, grid, origin, arrays)
-            if folder.exists():
-                folder.rename(old)
-            new.rename(folder)
-        finally:
-            if old.exists() and not folder.exists():
-                old.rename(folder)
-            try:
-                shutil.rmtree(work, ignore_errors=True)  # processes that have mapped the old files still read them
-            except KeyboardInterrupt:
-                shutil.rmtree(work, ignore_errors=True)
-                raise
+    _check_replaceable(folder)
+    with hold(folder.with_name(f".{folder.name}.lock"), "viewpoint map", wait_s=_WAIT_S), atomic_folder(folder) as new:
+        _write(new, grid, origin, arrays)
 
 
-def _refuse_something_else(folder: Path) -> None:
+def _check_replaceable(folder: Path) -> None:
     """Raise MapFormatError unless a folder is missing, empty, or holds a viewpoint map of any version and only that."""
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
@@ -148,12 +118,10 @@ def _refuse_something_else(folder: Path) -> None:
         is_map = read_json(folder / DESCRIPTION)["format"] == FORMAT
     except (OSError, ValueError, LookupError, TypeError):
         is_map = False
-    if not is_map:
-        raise MapFormatError("something else is here", path=folder, fix="Name a new folder, or remove this.")
-    known = {DESCRIPTION, LAYOUT, *(f"{name}.npy" for name in ARRAYS)}
-    for name in sorted(path.name for path in folder.iterdir() if path.name not in known):
-        fix = "Move it elsewhere, or name a new folder for the map."
-        raise MapFormatError("this is no file of the viewpoint map that is to be replaced", path=folder / name, fix=fix)
+    files = {DESCRIPTION, LAYOUT, *(f"{name}.npy" for name in ARRAYS)}
+    if not is_map or not files >= {path.name for path in folder.iterdir()}:
+        fix = "Name a new folder, or remove this."
+        raise MapFormatError("the folder holds something else than a viewpoint map", path=folder, fix=fix)
 
 
 def _write(folder: Path, grid: VoxelGrid, origin: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -161,30 +129,38 @@ def _write(folder: Path, grid: VoxelGrid, origin: Mapping[str, Any], arrays: Map
     for name, (kind, _, _) in ARRAYS.items():
         save_npy(folder / f"{name}.npy", np.ascontiguousarray(arrays[name], dtype=kind))
         checksums[f"{name}.npy"] = sha256(folder / f"{name}.npy")
-    n_rows, n_directions = arrays["scores"].shape
     files = "\n".join(
         f"  {name + '.npy':<20}{np.dtype(kind).name:<9}({shape + ')':<7}{meaning}"
         for name, (kind, shape, meaning) in ARRAYS.items()
     )
     write_text(folder / LAYOUT, _TEXT.format(version=VERSION, files=files))
-    corners = {name: [*map(float, getattr(grid, name))] for name in ("lower", "upper")}
-    content = {"format": FORMAT, "version": VERSION, "grid": {**corners, "shape": [*map(int, grid.shape)]}}
-    sizes = {"V": len(grid), "L": n_rows, "D": n_directions, "N": len(arrays["landmark_ids"])}
-    write_json(folder / DESCRIPTION, {**content, "sizes": sizes, "origin": dict(origin), "sha256": checksums})
+    n_rows, n_directions = arrays["scores"].shape
+    content = {
+        "format": FORMAT,
+        "version": VERSION,
+        "grid": {
+            "lower": [float(value) for value in grid.lower],
+            "upper": [float(value) for value in grid.upper],
+            "shape": [int(side) for side in grid.shape],
+        },
+        "sizes": {"V": len(grid), "L": n_rows, "D": n_directions, "N": len(arrays["landmark_ids"])},
+        "origin": dict(origin),
+        "sha256": checksums,
+    }
+    write_json(folder / DESCRIPTION, content)
 
 
 def read_map(folder: str | Path, mmap: bool = False) -> tuple[VoxelGrid, dict[str, Any], dict[str, NDArray[Any]]]:
-    """Read what `write_map` wrote: grid, origin and arrays.
+    """Read the grid, origin and arrays that `write_map` wrote.
 
-    With `mmap` the files are mapped into memory, read-only, and read where they are used. Sizes and types are still
-    checked, but not the checksums, for which every byte would have to be read. Raises MapFormatError if there is no
-    map, or it is damaged or of another version.
+    With `mmap` the files are mapped into memory, read-only: sizes and types are checked, but not the checksums, for
+    which every byte would have to be read. Raises MapFormatError if there is no map, or it is damaged or of another
+    version.
     """
     folder = Path(folder)
     path = folder / DESCRIPTION
     if not path.is_file():
-        fix = _left_behind(folder) or REBUILD
-        raise MapFormatError("there is no viewpoint map in this folder", path=folder, fix=fix)
+        raise MapFormatError("there is no viewpoint map in this folder", path=folder, fix=REBUILD)
     try:
         content = read_json(path)
         found = content.get("format"), content.get("version")
@@ -193,35 +169,26 @@ def read_map(folder: str | Path, mmap: bool = False) -> tuple[VoxelGrid, dict[st
     if found != (FORMAT, VERSION):
         raise MapFormatError(f"not a viewpoint map of version {VERSION}", path=path, value=found, fix=REBUILD)
     try:
-        corners = content["grid"]
-        grid = VoxelGrid(tuple(corners["lower"]), tuple(corners["upper"]), tuple(corners["shape"]))
-        lengths = {len(values) for values in (grid.lower, grid.upper, grid.shape)}
-        whole = all(type(side) is int for side in grid.shape)
-        if not whole or lengths != {3} or math.prod(grid.shape) > _MOST_VOXELS:
-            raise ValueError(f"a grid of shape {grid.shape} between {grid.lower} and {grid.upper}")
+        lower, upper, shape = (tuple(content["grid"][name]) for name in ("lower", "upper", "shape"))
+        grid = VoxelGrid(lower, upper, shape)
+        whole = all(type(side) is int for side in shape)
+        if not whole or {len(lower), len(upper), len(shape)} != {3} or math.prod(shape) > _MAX_VOXELS:
+            raise ValueError(f"a grid of shape {shape} between {lower} and {upper}")
         origin, sizes, checksums = (dict(content[name]) for name in ("origin", "sizes", "sha256"))
         sides = {name: shape.split(", ") for name, (_, shape, _) in ARRAYS.items()}
         expected = {name: tuple(int(sizes.get(side, side)) for side in sides[name]) for name in ARRAYS}
     except Exception as error:  # any value may be damaged
         raise MapFormatError(f"damaged description: {error}", path=path, fix=REBUILD) from error
     arrays: dict[str, NDArray[Any]] = {}
-    for name, shape in expected.items():
-        arrays[name] = _read(folder / f"{name}.npy", ARRAYS[name][0], shape, mmap)
-        if not mmap and sha256(folder / f"{name}.npy") != checksums.get(f"{name}.npy"):
-            raise MapFormatError("damaged: the checksum differs", path=folder / f"{name}.npy", fix=REBUILD)
+    for name, dimensions in expected.items():
+        file = folder / f"{name}.npy"
+        arrays[name] = _read(file, ARRAYS[name][0], dimensions, mmap)
+        if not mmap and sha256(file) != checksums.get(file.name):
+            raise MapFormatError("damaged: the checksum differs", path=file, fix=REBUILD)
     return grid, origin, arrays
 
 
-def _left_behind(folder: Path) -> str:
-    """Where an interrupted save left the map that it was about to replace, as a sentence; "" if there is none."""
-    folder = folder.resolve()
-    found = sorted(folder.parent.glob(f".{glob.escape(folder.name)}.*/{_OLD}/{DESCRIPTION}"))
-    return f"A save was interrupted: the map from before is {found[-1].parent}, move it here." if found else ""
-
-
 def _read(path: Path, kind: str, shape: tuple[int, ...], mmap: bool) -> NDArray[Any]:
-    if not path.is_file():
-        raise MapFormatError("this file is missing", path=path, fix=REBUILD)
     try:
         # a plain array over the mapped memory, because np.memmap is slow to index
         array = np.asarray(np.load(path, mmap_mode="r" if mmap else None, allow_pickle=False))

@@ -1,4 +1,4 @@
-"""Paths of several methods from a start to a goal, and what the camera sees along them."""
+"""Plan paths by several methods, and render the views along them."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def plan_by_methods(
 ) -> dict[str, PlannedPath]:
     """Plan a path from start to goal, (3,) m in the world, by each method, with progress bars.
 
-    A method plans by its own viewpoint map, whose scores are those of views from the centres of voxels. The scores of
-    the path returned are those that the method's scorer gives its very poses, in the scorer's units; NaN for "forward",
-    which scores nothing. The path's cost stays what the planner made of the map. If `config.stops` asks for them, paths
-    get stops (`stops_along`) by methods whose scores are probabilities; the last method's must be.
+    A method plans by its own viewpoint map, whose scores are of views from the centres of voxels. The scores of the
+    returned path are of its exact poses, in the scorer's units; NaN for "forward". Its cost is still the planner's. If
+    `config.stops` asks for them, paths get stops (`stops_along`) where the method's scores are probabilities; the last
+    method's must be.
 
     Methods are "forward", or names of scorers; empty for that of the weights, or bins without. `config` has weights for
     methods that have learnt, if they are of their kind (`resolve_weights`). Returns paths by the names of their methods, in
@@ -64,11 +64,12 @@ def plan_by_methods(
             path = plan_path(start, goal, space, space.bounds, views, config.planner)
             path = replace(path, scores=scorer.score(poses_looking_along(path.positions, path.axes)))
             if stopping and can_stop(scorer.name):
-                around = within_pitch(views.directions, config.planner)
-                about = (config.stops, config.planner)
-                stops = stops_along(scorer, path.positions, path.axes, around, *about, progress="stops")
+                directions = within_pitch(views.directions, config.planner)
+                stops = stops_along(
+                    scorer, path.positions, path.axes, directions, config.stops, config.planner, progress="stops"
+                )
                 path = replace(path, stops=stops)
-        paths.pop(name, None)  # a method named twice stands where it was named last
+        paths.pop(name, None)  # a method named twice comes where it was named last
         paths[name] = path
     return paths
 
@@ -76,25 +77,33 @@ def plan_by_methods(
 def path_views(
     path: PlannedPath, localization_map: LocalizationMap, renderer: Renderer | None = None
 ) -> list[PathView]:
-    """What the camera sees along a path: the landmarks in view, and the image if there is a renderer.
+    """Return the views along a path, with the landmarks in view, and the image if there is a renderer.
 
     The further looks of a stop follow the path's view there.
     """
     camera = localization_map.camera
-    points = localization_map.landmarks.points
-    places, looks = path.looks
+    rows, looks = path.looks
     axes = path.all_axes
     scores = path.all_scores
-    cam_from_world = poses_looking_along(path.positions[places], axes)
-    seen = localization_map.landmarks_in_view(cam_from_world)
-    images: Any = [None] * len(seen) if renderer is None else renderer.render(camera, cam_from_world).rgb
+    cam_from_world = poses_looking_along(path.positions[rows], axes)
+    in_view = localization_map.landmarks_in_view(cam_from_world)
+    images: Any = [None] * len(rows) if renderer is None else renderer.render(camera, cam_from_world).rgb
+    n_looks = np.bincount(rows)
+    joint = path.scores_with_stops
     views = []
-    size = (camera.width, camera.height)
-    n_looks = np.bincount(places)
-    together = path.scores_with_stops
-    for number, (place, pose, image) in enumerate(zip(places.tolist(), cam_from_world, images, strict=True)):
-        pixels = camera.project(points[seen[number]] @ pose[:, :3].T + pose[:, 3])
-        view = (path.positions[place], axes[number], float(scores[number]))
-        stop = int(looks[number]), int(n_looks[place]), float(together[place]) if n_looks[place] > 1 else np.nan
-        views.append(PathView(*view, pixels, size, image, *stop))
+    for number, (row, pose) in enumerate(zip(rows.tolist(), cam_from_world, strict=True)):
+        points = localization_map.landmarks.points[in_view[number]]
+        views.append(
+            PathView(
+                position=path.positions[row],
+                axis=axes[number],
+                score=float(scores[number]),
+                pixels=camera.project(points @ pose[:, :3].T + pose[:, 3]),
+                size_px=(camera.width, camera.height),
+                rgb=images[number],
+                look=int(looks[number]),
+                n_looks=int(n_looks[row]),
+                together=float(joint[row]) if n_looks[row] > 1 else np.nan,
+            )
+        )
     return views

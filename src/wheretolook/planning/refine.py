@@ -1,7 +1,4 @@
-"""Scores of any directions, and a local search that improves a direction between those of a lattice.
-
-A scorer can score any pose, not only those of a lattice; the paper notes this of its own, beyond its 500 directions.
-"""
+"""Improve directions of a lattice by a local search: scorers can score any pose, not only those of a lattice."""
 
 from __future__ import annotations
 
@@ -20,8 +17,8 @@ COMPASS = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.p
 
 @dataclass(frozen=True, eq=False)
 class RefinedViews:
-    """Axes found by a local search: (B, 3) unit vectors in the world, their scores (B,), which are never less than the
-    scores (B,) at the start, and the number of views that were scored."""
+    """Result of a local search: unit axes (B, 3) in the world, their scores (B,), which are at least the scores (B,) at the
+    start, and the number of scored views."""
 
     axes: Float
     scores: Float
@@ -63,11 +60,11 @@ def refine_directions(
     while len(active := np.flatnonzero(step_deg >= last_step_deg)):
         candidates = _around(current[active], step_deg[active])
         candidates = _within(candidates, start[active, None], max_angle_deg)
-        found = scorer.score(poses_looking_along(np.repeat(at[active], 8, axis=0), candidates.reshape(-1, 3)))
-        n_scored += len(found)
-        found = found.reshape(-1, 8)
-        best = found.argmax(axis=1)
-        value = found[np.arange(len(active)), best]
+        values = scorer.score(poses_looking_along(np.repeat(at[active], 8, axis=0), candidates.reshape(-1, 3)))
+        n_scored += len(values)
+        values = values.reshape(-1, 8)
+        best = values.argmax(axis=1)
+        value = values[np.arange(len(active)), best]
         better = value > scores[active]
         moved = active[better]
         current[moved] = candidates[better, best[better]]
@@ -77,7 +74,7 @@ def refine_directions(
 
 
 def _around(axes: Float, step_deg: Float) -> Float:
-    """Eight unit vectors (B, 8, 3) at angles of `step_deg` (B,) around axes (B, 3)."""
+    """Return eight unit vectors (B, 8, 3) at angles of `step_deg` (B,) around axes (B, 3)."""
     smallest = np.eye(3)[np.abs(axes).argmin(axis=1)]  # a coordinate axis that is not parallel to the axis
     u = np.cross(axes, smallest)
     u /= np.linalg.norm(u, axis=1, keepdims=True)
@@ -88,7 +85,7 @@ def _around(axes: Float, step_deg: Float) -> Float:
 
 
 def _within(candidates: Float, start: Float, max_angle_deg: float) -> Float:
-    """Candidates (B, 8, 3); those too far from their start (B, 1, 3) are moved back to the limit."""
+    """Move candidates (B, 8, 3) that are too far from their start (B, 1, 3) back to the limit."""
     angle = angles_to_axis_deg(candidates, start)[..., None]
     outside: NDArray[np.bool_] = angle > max_angle_deg
     limit = np.radians(max_angle_deg)

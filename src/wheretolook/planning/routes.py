@@ -1,4 +1,4 @@
-"""Views along a route: the best sequence that a camera can turn through, and the cost of the path."""
+"""Choose the best views along a route, and compute the cost of the path."""
 
 from __future__ import annotations
 
@@ -22,17 +22,20 @@ LIMIT_STEP_DEG = 0.5
 SHORT_ROUTE = "short route"
 SEARCH = "search"
 IMPROVEMENT = "improvement"
-"""How a path was found: as a short route with views chosen along it, by the search over places and views, or by
+"""How a path was found: as a short route with views chosen along it, by the search over positions and views, or by
 improving either."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stop:
-    """A place of a path where the camera turns away from the path's view and back (`wheretolook.planning.stops`).
+    """A position of a path where the camera turns away from the path's view and back (`wheretolook.planning.stops`).
 
-    `place` is its row in the path; `axes` (K, 3) are the unit axes of the further looks in the world, in the order to
-    look along them, and `scores` (K,) of each one alone; `together` is the probability that they and the path's view
-    localize together; `turn_deg` is the sum of the angles between the axes from the path's view to them and back.
+    Attributes:
+        place: row in the path.
+        axes: (K, 3) unit axes of the further looks in the world, in their order.
+        scores: (K,) their single-view scores.
+        together: probability that they and the path's view localize jointly.
+        turn_deg: sum of the angles between the axes from the path's view to them and back.
     """
 
     place: int
@@ -46,11 +49,14 @@ class Stop:
 class PlannedPath:
     """A path of a camera, sampled at its corners and every `PathConfig.spacing_m` or a little less.
 
-    `positions` (W, 3) m and unit optical `axes` (W, 3) are in the world; `scores` (W,) are what the planner read in the
-    viewpoint map, 0 outside its free voxels, NaN without a map, or, from `plan_by_methods`, the scores of these very
-    poses; `cost` is as `PathConfig` defines it, by the trapezoidal rule over the map's scores; `found_by` is
-    `SHORT_ROUTE`, `SEARCH` or `IMPROVEMENT`, empty if the path was not planned; `stops` are in the order of the path,
-    and not part of the cost.
+    Attributes:
+        positions: (W, 3) m, world.
+        axes: (W, 3) unit optical axes.
+        scores: (W,) from the viewpoint map, 0 outside its free voxels, NaN without a map; from `plan_by_methods` the
+            scores of these exact poses.
+        cost: see `PathConfig`, by the trapezoidal rule over the map's scores.
+        found_by: `SHORT_ROUTE`, `SEARCH` or `IMPROVEMENT`; empty if the path was not planned.
+        stops: in the order of the path, not part of the cost.
     """
 
     positions: Float
@@ -67,7 +73,7 @@ class PlannedPath:
 
     @property
     def turn_deg(self) -> float:
-        """Sum of the angles between consecutive axes, those of further looks at stops among them."""
+        """Sum of the angles between consecutive axes, including further looks at stops."""
         return turning_deg(self.axes) + sum(stop.turn_deg for stop in self.stops)
 
     @property
@@ -77,7 +83,7 @@ class PlannedPath:
 
     @property
     def looks(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Of all L looks in the order they are taken: the place (L,) in the path, and which look it is there (L,).
+        """Row in the path (L,) and number at that position (L,) of all looks in their order.
 
         The path's own view is 1, further looks of a stop count from 2. `all_axes` and `all_scores` are in this order.
         """
@@ -94,19 +100,19 @@ class PlannedPath:
 
     @property
     def all_scores(self) -> Float:
-        """Scores (L,) of all looks, each alone."""
+        """Single-view scores (L,) of all looks."""
         return self._with_further(self.scores, [stop.scores for stop in self.stops])
 
-    def _with_further(self, own: Float, further: list[Float]) -> Float:
-        """Values (L, ...) of all looks, from those of the path's views (W, ...) and of each stop's further looks."""
+    def _with_further(self, values: Float, further: list[Float]) -> Float:
+        """Merge values (W, ...) of the path's views and of each stop's further looks; (L, ...)."""
         if not further:
-            return own
-        after = np.repeat([stop.place + 1 for stop in self.stops], [len(values) for values in further])
-        return np.insert(own, after, np.concatenate(further), axis=0)
+            return values
+        after = np.repeat([stop.place + 1 for stop in self.stops], [len(of_stop) for of_stop in further])
+        return np.insert(values, after, np.concatenate(further), axis=0)
 
     @property
     def scores_with_stops(self) -> Float:
-        """The scores (W,), at stops those of all looks together."""
+        """Scores (W,), at stops the joint ones of all looks."""
         scores = self.scores.copy()
         scores[[stop.place for stop in self.stops]] = [stop.together for stop in self.stops]
         return scores
@@ -116,10 +122,16 @@ class PlannedPath:
 class PathView:
     """One view along a path.
 
-    `position` (3,) m and unit optical `axis` (3,) are in the world; `score` is one of `PlannedPath.scores`, NaN if
-    unknown; `pixels` (K, 2) are those of the landmarks in view, in an image of `size_px` (width, height); `rgb`
-    (H, W, 3) is None if the scene cannot be rendered. At a stop the path's own view is `look` 1 of `n_looks`, the
-    further ones follow it as views of their own, and `together` is the score of all of them; NaN elsewhere.
+    Attributes:
+        position: (3,) m, world.
+        axis: (3,) unit optical axis.
+        score: one of `PlannedPath.scores`, NaN if unknown.
+        pixels: (K, 2) of the landmarks in view.
+        size_px: width and height of the image.
+        rgb: (H, W, 3); None if the scene cannot be rendered.
+        look: number at its position: 1 for the path's own view, more for further looks at a stop.
+        n_looks: number of looks at its position.
+        together: joint score of all looks at a stop; NaN elsewhere.
     """
 
     position: Float
@@ -135,9 +147,10 @@ class PathView:
 
 @dataclass(frozen=True, eq=False)
 class RouteSamples:
-    """Points along a route, by arc length in metres: its S corners, E even steps no longer than the spacing, and both.
+    """Points along a route, by arc length in metres: S corners, E even steps of at most the spacing, and both.
 
-    `along` (W,) holds both: a path sampled without its corners would cut through walls. `positions` (W, 3) m are there.
+    `along` (W,) holds both, as a path sampled without its corners would cut through walls, and `positions` (W, 3) m the
+    points there.
     """
 
     corners: Float
@@ -147,7 +160,7 @@ class RouteSamples:
 
     @classmethod
     def of(cls, places: Float, spacing_m: float) -> RouteSamples:
-        """Samples of a polyline (S, 3) m."""
+        """Sample a polyline (S, 3) m."""
         corners = lengths_along(places)
         even = np.linspace(0, corners[-1], max(1, math.ceil(corners[-1] / spacing_m - 1e-9)) + 1)
         along = np.union1d(even, corners)
@@ -156,7 +169,7 @@ class RouteSamples:
 
 
 class RouteViews:
-    """Chooses the views along routes by the scores of a viewpoint map, which are in [0, 1].
+    """Chooses the views along routes by the scores, in [0, 1], of a viewpoint map.
 
     Every route starts with the unit axis `start_axis` (3,), if given.
     """
@@ -169,18 +182,18 @@ class RouteViews:
         height = viewpoint_map.directions[:, 2]
         self._inside = (height >= low) & (height <= high)
         best = viewpoint_map.scores[:, self._inside].max(axis=1, initial=0.0)
-        self._best = np.append(best, 0.0)  # best score of each row; the last entry stands for row -1
+        self._best = np.append(best, 0.0)  # best score of each row; the last entry is for row -1
         self._limits: dict[int, TurnLimit] = {}
 
     def least_cost(self, places: Float) -> float:
-        """Lower bound of the cost of a route (S, 3) m: with the best view everywhere, and turns for free."""
+        """Compute a lower bound of the cost of a route (S, 3) m: the best view everywhere, and rotations for free."""
         samples = RouteSamples.of(places, self.config.spacing_m)
         return self._cost(samples.positions, self._best[self.map.rows(samples.positions)])
 
     def best(self, places: Float) -> PlannedPath | None:
-        """A route (S, 3) m with the views that have the greatest sum of scores, exactly; turns are spread evenly.
+        """Choose the views along a route (S, 3) m with the greatest sum of scores, exactly; rotations are spread evenly.
 
-        None if the map's directions are too coarse for the limit on turns.
+        None if the map's directions are too coarse for the limit on rotations.
         """
         samples = RouteSamples.of(places, self.config.spacing_m)
         at = between(samples.corners, places, samples.even)
@@ -199,7 +212,7 @@ class RouteViews:
         return self.costed(samples.positions, turned_evenly(samples.even, axes, samples.along))
 
     def costed(self, positions: Float, axes: Float) -> PlannedPath:
-        """The path through positions (W, 3) m with axes (W, 3), with its scores and cost."""
+        """Return the path through positions (W, 3) m with axes (W, 3), with its scores and cost."""
         rows = self.map.rows(positions)
         nearest = (axes @ self.map.directions.T).argmax(1)
         scores = np.where(rows >= 0, self.map.scores[rows, nearest], 0.0).astype(np.float64)
@@ -208,7 +221,7 @@ class RouteViews:
         return replace(path, cost=turning + self._cost(positions, scores))
 
     def _cost(self, positions: Float, scores: NDArray[np.floating]) -> float:
-        """The part of the cost that depends on length and scores."""
+        """Compute the part of the cost that depends on length and scores."""
         steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
         return float((steps * (1 + self.config.score_weight * (1 - (scores[1:] + scores[:-1]) / 2))).sum())
 
@@ -220,13 +233,13 @@ class RouteViews:
 
 
 def turning_deg(axes: Float) -> float:
-    """Sum of the angles between consecutive unit axes (W, 3)."""
+    """Sum the angles between consecutive unit axes (W, 3)."""
     cosines = (axes[1:] * axes[:-1]).sum(1).clip(-1, 1)
     return float(np.degrees(np.arccos(cosines)).sum())
 
 
 def turned_evenly(knots: Float, axes: Float, at: Float) -> Float:
-    """Unit axes (S, 3) at knots (S,), interpolated at (W,) linearly in yaw and pitch; (W, 3).
+    """Interpolate unit axes (S, 3) at knots (S,) linearly in yaw and pitch at (W,); (W, 3).
 
     The pitch thus stays between those at the knots, which it would not on a great circle.
     """

@@ -1,11 +1,11 @@
-"""Paths on which a robot can localize: RRT* over position and orientation of the camera (paper, Sec. 4.3; OMPL)."""
+"""Plan paths on which a robot can localize: RRT* over position and orientation of the camera (paper, Sec. 4.3; OMPL)."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -26,7 +26,7 @@ TABLE_STEP_DEG = 2.0  # step of yaw and pitch of the table of the map's directio
 SHORT_SHARE = 0.25
 SEARCH_SHARE = 0.3
 SHORTEN_SHARE = 0.05
-"""Shares of the time for finding a short path, for searching places and views together, and for shortening the short
+"""Shares of the time for finding a short path, for searching positions and views jointly, and for shortening the short
 path. The rest is for improving the cheapest path."""
 
 AHEAD_SHARE = 0.5  # share of the time for finding a short path without a viewpoint map; the rest is for shortening it
@@ -36,13 +36,41 @@ STEPS_M = (0.05, 1.0)  # range of the standard deviation by which a corner of a 
 
 
 class Space(Protocol):
-    """Where a camera may be: `wheretolook.space.free_space.FreeSpace`, or anything that answers the same."""
+    """Free space of the camera, such as `wheretolook.space.free_space.FreeSpace`."""
 
     def is_free(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Whether a camera may be at points (N, 3) m; (N,)."""
 
     def segments_are_free(self, a: ArrayLike, b: ArrayLike) -> NDArray[np.bool_]:
         """Whether it may go straight from points a to points b, (N, 3) m each; (N,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class PathRequest:
+    """A path to plan: `ends` (2, 3) m, start and goal; `bounds` (2, 3) m, the corners of the space to plan in."""
+
+    ends: Float
+    bounds: Float
+    space: Space
+    config: PathConfig
+
+
+class _TimeBudget:
+    """The time to plan, and its progress bar."""
+
+    def __init__(self, total_s: float, bar: Any) -> None:
+        self.total_s = total_s
+        self.bar = bar
+        self._end = time.monotonic() + total_s
+
+    @property
+    def left_s(self) -> float:
+        """Seconds left."""
+        return self._end - time.monotonic()
+
+    def share(self, share: float) -> float:
+        """Seconds of a share of the whole, at most those left."""
+        return min(self.left_s, share * self.total_s)
 
 
 def plan_path(
@@ -55,91 +83,112 @@ def plan_path(
     start_axis: ArrayLike | None = None,
     progress: bool = True,
 ) -> PlannedPath:
-    """Plan a path along which a robot can localize; the best found in `config.time_s` is returned.
+    """Plan a path along which a robot can localize; returns the best one found in `config.time_s`.
 
-    RRT* (Karaman and Frazzoli 2011) searches for a short path, then for places and views together. The views along
+    RRT* (Karaman and Frazzoli 2011) searches for a short path, then for positions and views jointly. The views along
     either are then chosen exactly (`best_sequence`), and the cheapest path is improved by moving its corners.
 
     Without a viewpoint map the path is the shortest found. The camera, fixed to the front of the robot, looks forward
-    along it, as level as `PathConfig.pitch_deg` allows, without limit on turns.
+    along it, as level as `PathConfig.pitch_deg` allows, without limit on rotations.
 
-    `start` and `goal` are (3,) world, metres; `bounds` the lowest and highest corner (2, 3) m of the space to plan in;
-    the map's scores are in [0, 1]; `start_axis` (3,) is the optical axis to start with, None lets the planner choose.
+    Args:
+        start: (3,) m, world.
+        goal: (3,) m.
+        space: free space.
+        bounds: (2, 3) m, lowest and highest corner of the space to plan in.
+        viewpoint_map: with scores in [0, 1].
+        config: costs and limits.
+        start_axis: (3,) optical axis at the start; None lets the planner choose.
+        progress: whether to show a progress bar.
 
     Raises:
-        PlanningError: the start or the goal is not free or lies outside the bounds; they are the same; the axis is
-            beyond the camera's limits, or given without a viewpoint map; or no path was found in time.
+        PlanningError: the start or the goal is not free or outside the bounds; they are the same; the axis is beyond
+            the camera's limits, or given without a viewpoint map; or no path was found in time.
         ValueError: a point is not finite, or the axis has no direction.
     """
     ends = np.asarray([start, goal], dtype=np.float64)
-    box = np.array(bounds, dtype=np.float64)
+    request = PathRequest(ends, np.array(bounds, dtype=np.float64), space, config)
     if not np.isfinite(ends).all():
         raise ValueError(f"start and goal must be finite, got {ends.tolist()}")
-    check_ends(ends, space, box)
+    check_ends(ends, space, request.bounds)
     if viewpoint_map is None and start_axis is not None:
         fix = "Give no start axis."
         raise PlanningError("without a viewpoint map the camera looks ahead", value=start_axis, fix=fix)
-    problem = _Problem(ends, box, space, viewpoint_map, config)
+    problem = _Problem(request, viewpoint_map)
     orientations = problem.start_orientations(start_axis)
-    rng = np.random.default_rng(0)
     with tqdm(total=round(config.time_s, 1), desc="plan", unit="s", disable=not progress) as bar:
-        end = time.monotonic() + config.time_s
-        ahead = viewpoint_map is None
-        shortest = _Problem(ends, box, space, None, config)
-        route: Float | None = None
-        try:
-            least, most = (AHEAD_SHARE, 1.0) if ahead else (SHORT_SHARE, 1 - SEARCH_SHARE)
-            route = shortest.solve([(0.0, 0.0)], least * config.time_s, most * config.time_s, bar)[:, :3]
-        except PlanningError:
-            if ahead:
-                raise
-        if route is not None:
-            left = end - time.monotonic()
-            seconds = left if ahead else min(left, SHORTEN_SHARE * config.time_s)
-            route = improve(route, _shorter, _length(route), space, box, seconds, rng)
+        budget = _TimeBudget(config.time_s, bar)
         if viewpoint_map is None:
-            assert route is not None
-            bar.update(max(0.0, bar.total - bar.n))
-            samples = RouteSamples.of(route, config.spacing_m)
-            axes = _forward(samples.positions, np.radians(config.pitch_deg))
-            unknown = np.full(len(samples.positions), np.nan)
-            return PlannedPath(samples.positions, axes, unknown, float(samples.corners[-1]), SHORT_ROUTE)
-        axis = None if start_axis is None else axes_of_angles(np.degrees(orientations[0]))
-        views = RouteViews(viewpoint_map, config, axis)
-        found: dict[float, tuple[PlannedPath, Float]] = {}
-
-        def add(path: PlannedPath | None, places: Float, found_by: str) -> None:
-            if path is not None:
-                found[path.cost] = replace(path, found_by=found_by), places
-
-        if route is not None:
-            add(views.best(route), route, SHORT_ROUTE)
-        try:
-            left = max(1e-3, end - time.monotonic())
-            most = min(left, SEARCH_SHARE * config.time_s)
-            states = problem.solve(orientations, most, most if found else left, bar)
-            add(problem.path(states, views), states[:, :3], SEARCH)
-            add(views.best(states[:, :3]), states[:, :3], SEARCH)
-        except PlanningError:
-            if not found:
-                raise
-        cheapest, places = found[min(found)]
-
-        def cost_below(candidate: Float, limit: float) -> float | None:
-            if views.least_cost(candidate) >= limit:
-                return None
-            path = views.best(candidate)
-            return None if path is None or path.cost >= limit else path.cost
-
-        better = improve(places, cost_below, cheapest.cost, space, box, end - time.monotonic(), rng)
-        if better is not places:
-            add(views.best(better), better, IMPROVEMENT)
+            path = plan_shortest(request, budget)
+        else:
+            axis = None if start_axis is None else axes_of_angles(np.degrees(orientations[0]))
+            path = plan_informed(problem, RouteViews(viewpoint_map, config, axis), orientations, budget)
         bar.update(max(0.0, bar.total - bar.n))
-    return found[min(found)][0]
+    return path
+
+
+def plan_shortest(request: PathRequest, budget: _TimeBudget) -> PlannedPath:
+    """Plan the shortest path, with the camera looking ahead; PlanningError if none was found."""
+    route = _short_route(request, budget, AHEAD_SHARE, 1.0)
+    route = improve(route, _shorter, _length(route), request, budget.left_s, np.random.default_rng(0))
+    samples = RouteSamples.of(route, request.config.spacing_m)
+    axes = _forward(samples.positions, np.radians(request.config.pitch_deg))
+    unknown = np.full(len(samples.positions), np.nan)
+    return PlannedPath(samples.positions, axes, unknown, float(samples.corners[-1]), SHORT_ROUTE)
+
+
+def plan_informed(
+    problem: _Problem, views: RouteViews, orientations: list[tuple[float, float]], budget: _TimeBudget
+) -> PlannedPath:
+    """Plan the cheapest path with views from a viewpoint map; PlanningError if none was found."""
+    request = problem.request
+    rng = np.random.default_rng(0)
+    candidates: list[tuple[PlannedPath, Float]] = []  # with their routes
+
+    def add(path: PlannedPath | None, route: Float, found_by: str) -> None:
+        if path is not None:
+            candidates.append((replace(path, found_by=found_by), route))
+
+    try:
+        route = _short_route(request, budget, SHORT_SHARE, 1 - SEARCH_SHARE)
+        route = improve(route, _shorter, _length(route), request, budget.share(SHORTEN_SHARE), rng)
+        add(views.best(route), route, SHORT_ROUTE)
+    except PlanningError:
+        pass  # the search below may find one
+    try:
+        search_s = max(1e-3, budget.share(SEARCH_SHARE))
+        states = problem.solve(orientations, search_s, search_s if candidates else max(1e-3, budget.left_s), budget.bar)
+        add(problem.path(states, views), states[:, :3], SEARCH)
+        add(views.best(states[:, :3]), states[:, :3], SEARCH)
+    except PlanningError:
+        if not candidates:
+            raise
+    cheapest, route = _cheapest(candidates)
+
+    def cost_below(candidate: Float, limit: float) -> float | None:
+        if views.least_cost(candidate) >= limit:
+            return None
+        path = views.best(candidate)
+        return None if path is None or path.cost >= limit else path.cost
+
+    better = improve(route, cost_below, cheapest.cost, request, budget.left_s, rng)
+    if better is not route:
+        add(views.best(better), better, IMPROVEMENT)
+    return _cheapest(candidates)[0]
+
+
+def _cheapest(candidates: list[tuple[PlannedPath, Float]]) -> tuple[PlannedPath, Float]:
+    return min(candidates, key=lambda candidate: candidate[0].cost)
+
+
+def _short_route(request: PathRequest, budget: _TimeBudget, share: float, max_share: float) -> Float:
+    """Find a short route (S, 3) m in a share of the time, or up to `max_share` until there is one."""
+    seconds = share * budget.total_s, max_share * budget.total_s
+    return _Problem(request, None).solve([(0.0, 0.0)], *seconds, budget.bar)[:, :3]
 
 
 def check_ends(ends: Float, space: Space, bounds: Float) -> None:
-    """Raise a PlanningError unless a start and a goal (2, 3) m are different places where a camera can be."""
+    """Raise a PlanningError unless start and goal (2, 3) m are different positions in free space."""
     low, high = bounds
     for name, point in zip(("start", "goal"), ends, strict=True):
         if not ((point >= low) & (point <= high)).all() or not space.is_free(point[None])[0]:
@@ -155,68 +204,73 @@ def check_ends(ends: Float, space: Space, bounds: Float) -> None:
         raise PlanningError("the start is the goal", value=tuple(ends[0].tolist()), fix=fix)
 
 
-def _length(places: Float) -> float:
-    return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+def _length(route: Float) -> float:
+    return float(np.linalg.norm(np.diff(route, axis=0), axis=1).sum())
 
 
-def _shorter(places: Float, limit: float) -> float | None:
-    length = _length(places)
+def _shorter(route: Float, limit: float) -> float | None:
+    length = _length(route)
     return length if length < limit - 1e-9 else None
 
 
 def improve(
-    places: Float,
+    route: Float,
     cost_below: Callable[[Float, float], float | None],
     cost: float,
-    space: Space,
-    bounds: Float,
+    request: PathRequest,
     seconds: float,
     rng: np.random.Generator,
-    most: int | None = None,
+    max_tries: int | None = None,
 ) -> Float:
-    """Improve a route by shortcuts and by moving, adding and removing corners; returns the cheapest found, (S', 3) m.
+    """Improve a free route (S, 3) m by shortcuts and by moving, adding and removing corners; returns the cheapest found.
 
-    Every route tried lies in free space and keeps its ends.
+    Every route tried is in free space and keeps its ends.
 
-    `places` (S, 3) m are the corners of a free route and `cost` is its cost; `cost_below` is that of a route if less
-    than a limit, else None. `bounds` (2, 3) m are corners of the space to plan in; `most` limits the routes tried.
+    Args:
+        route: (S, 3) m, corners.
+        cost_below: cost of a route if less than a limit, else None.
+        cost: of the route.
+        request: space and bounds.
+        seconds: time limit.
+        rng: of the variations.
+        max_tries: limit on the routes tried.
     """
     end = time.monotonic() + seconds
-    tried = 0
-    while time.monotonic() < end and (most is None or tried < most):
-        tried += 1
-        candidate, first, last = _varied(places, bounds, rng)
+    tries = 0
+    while time.monotonic() < end and (max_tries is None or tries < max_tries):
+        tries += 1
+        candidate, first, last = propose_route_change(route, request.bounds, rng)
         # only the changed segments need to be tested
-        if not space.segments_are_free(candidate[first:last], candidate[first + 1 : last + 1]).all():
+        if not request.space.segments_are_free(candidate[first:last], candidate[first + 1 : last + 1]).all():
             continue
-        found = cost_below(candidate, cost)
-        if found is not None:
-            places = candidate
-            cost = found
-    return places
+        lower = cost_below(candidate, cost)
+        if lower is not None:
+            route = candidate
+            cost = lower
+    return route
 
 
-def _varied(places: Float, bounds: Float, rng: np.random.Generator) -> tuple[Float, int, int]:
-    """A random variation of a route, and the first and last corner between which it differs."""
-    n = len(places)
+def propose_route_change(route: Float, bounds: Float, rng: np.random.Generator) -> tuple[Float, int, int]:
+    """Draw a variation of a route (S, 3) m; returns it, and the first and last corner between which it differs."""
+    n = len(route)
     step = np.exp(rng.uniform(*np.log(STEPS_M)))
     kind = rng.integers(4) if n > 2 else rng.integers(2)
-    if kind == 0:  # a new corner beside a random point of the route
+    if kind == 0:  # a new corner near a random point of the route
         after = int(rng.integers(1, n))
         t = rng.random()
-        new = places[after - 1] * (1 - t) + places[after] * t + rng.normal(0, step, 3)
-        return np.insert(places, after, new.clip(*bounds), axis=0), after - 1, after + 1
+        new = route[after - 1] * (1 - t) + route[after] * t + rng.normal(0, step, 3)
+        return np.insert(route, after, new.clip(*bounds), axis=0), after - 1, after + 1
     if kind == 1:  # a shortcut between two random points of the route
-        at = lengths_along(places)
+        at = lengths_along(route)
         a, b = np.sort(rng.uniform(0, at[-1], 2))
-        ends = between(at, places, np.array([a, b]))
+        ends = between(at, route, np.array([a, b]))
         before = int((at < a).sum())
         after = int((at <= b).sum())
-        return np.concatenate([places[:before], ends, places[after:]]), before - 1, before + 2
+        return np.concatenate([route[:before], ends, route[after:]]), before - 1, before + 2
     row = int(rng.integers(1, n - 1))
     if kind == 2:  # remove a corner
-        return np.delete(places, row, axis=0), row - 1, row
-    moved = places.copy()
+        return np.delete(route, row, axis=0), row - 1, row
+    moved = route.copy()
     moved[row] = (moved[row] + rng.normal(0, step, 3)).clip(*bounds)
     return moved, row - 1, row + 1
 
@@ -224,13 +278,10 @@ def _varied(places: Float, bounds: Float, rng: np.random.Generator) -> tuple[Flo
 class _Problem:
     """A planning problem over states x, y, z (m), yaw, pitch (radians); without a map the last two do not matter."""
 
-    def __init__(
-        self, ends: Float, bounds: Float, space: Space, viewpoint_map: ViewpointMap | None, config: PathConfig
-    ) -> None:
-        self.ends = ends
-        self.bounds = bounds
-        self.space = space
-        self.config = config
+    def __init__(self, request: PathRequest, viewpoint_map: ViewpointMap | None) -> None:
+        self.request = request
+        self.space = request.space
+        self.config = config = request.config
         self.map = viewpoint_map
         self.pitch = tuple(map(math.radians, config.pitch_deg))
         if viewpoint_map is not None:
@@ -238,7 +289,7 @@ class _Problem:
             self._table = _nearest_directions(viewpoint_map.directions)
 
     def start_orientations(self, axis: ArrayLike | None) -> list[tuple[float, float]]:
-        """Yaws and pitches that a path may start with, in radians."""
+        """Return yaws and pitches that a path may start with, in radians."""
         if self.map is None:
             return [(0.0, 0.0)]
         if axis is None:
@@ -248,29 +299,29 @@ class _Problem:
         yaw = math.atan2(y, x)
         pitch = math.asin(z)
         if not self.pitch[0] - 1e-6 <= pitch <= self.pitch[1] + 1e-6:
-            problem = "the camera cannot be pitched as it should start"
+            problem = "the start axis is beyond the limits of the pitch"
             value = f"{math.degrees(pitch):.1f} deg"
             fix = f"Start within {self.config.pitch_deg} degrees, or widen pitch_deg."
             raise PlanningError(problem, value=value, fix=fix)
         return [(yaw, min(max(pitch, self.pitch[0]), self.pitch[1]))]
 
     def motion_cost(self, a: tuple[float, ...], b: tuple[float, ...]) -> float:
-        """Cost of going straight from one state to another."""
+        """Compute the cost of going straight from one state to another."""
         length = math.dist(a[:3], b[:3])
         if self.map is None:
             return length
         config = self.config
         n = max(1, math.ceil(length / config.spacing_m))
         turn = _wrapped(b[3] - a[3])
-        worth = 0.0
+        score = 0.0
         for k in range(n):
             t = (k + 0.5) / n
             at = (a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1]), a[2] + t * (b[2] - a[2]))
-            worth += self.score(at, a[3] + t * turn, a[4] + t * (b[4] - a[4]))
-        return length * (1 + config.score_weight * (1 - worth / n)) + config.turn_weight_m * _angle(a[3:], b[3:])
+            score += self.score(at, a[3] + t * turn, a[4] + t * (b[4] - a[4]))
+        return length * (1 + config.score_weight * (1 - score / n)) + config.turn_weight_m * _angle(a[3:], b[3:])
 
     def score(self, point: tuple[float, float, float], yaw: float, pitch: float) -> float:
-        """Score of a view, 0 outside the map's free voxels."""
+        """Look up the score of a view, 0 outside the map's free voxels."""
         assert self.map is not None
         row = self.map.row(point)
         if row < 0:
@@ -283,14 +334,14 @@ class _Problem:
     def motion_is_possible(self, a: tuple[float, ...], b: tuple[float, ...]) -> bool:
         """Whether the camera can go straight from one state to another."""
         if self.map is not None:
-            most = math.radians(self.config.max_turn_deg_per_m) * math.dist(a[:3], b[:3])
+            limit = math.radians(self.config.max_turn_deg_per_m) * math.dist(a[:3], b[:3])
             # the sum of yaw and pitch is never less than the angle between the axes, so the limit holds
-            if abs(_wrapped(b[3] - a[3])) + abs(b[4] - a[4]) > most:
+            if abs(_wrapped(b[3] - a[3])) + abs(b[4] - a[4]) > limit:
                 return False
         return bool(self.space.segments_are_free([a[:3]], [b[:3]])[0])
 
-    def solve(self, orientations: list[tuple[float, float]], time_s: float, most_s: float, bar: Any) -> Float:
-        """States (S, 5) of the best path found in `time_s`, or else of the first one found until `most_s`.
+    def solve(self, orientations: list[tuple[float, float]], time_s: float, max_s: float, bar: Any) -> Float:
+        """Return the states (S, 5) of the best path found in `time_s`, or else of the first one found until `max_s`.
 
         Raises PlanningError if no path was found.
         """
@@ -299,7 +350,7 @@ class _Problem:
         util.setLogLevel(util.LOG_NONE)
         # without a map nothing depends on where the camera looks: the pitch has next to no range, the yaw no weight
         pitch = self.pitch if self.map is not None else (-1e-6, 1e-6)
-        low, high = self.bounds
+        low, high = self.request.bounds
         space = _state_space(low, high, pitch, 0.2 if self.map is not None else 1e-6)
         information = base.SpaceInformation(space)
         information.setStateValidityChecker(lambda state: bool(self.space.is_free([_numbers(state)[:3]])[0]))
@@ -322,13 +373,13 @@ class _Problem:
         definition = base.ProblemDefinition(information)
         for yaw, start_pitch in orientations:
             state = space.allocState()
-            for index, number in enumerate((*self.ends[0], start_pitch)):
+            for index, number in enumerate((*self.request.ends[0], start_pitch)):
                 state[0][index] = float(number)
             state[1].value = float(yaw)
             definition.addStartState(state)
-        around_goal = base.GoalSpace(information)
-        around_goal.setSpace(_state_space(self.ends[1] - 1e-9, self.ends[1] + 1e-9, pitch, 1.0))
-        definition.setGoal(around_goal)
+        goal_region = base.GoalSpace(information)
+        goal_region.setSpace(_state_space(self.request.ends[1] - 1e-9, self.request.ends[1] + 1e-9, pitch, 1.0))
+        definition.setGoal(goal_region)
         objective = Costs(information)
         definition.setOptimizationObjective(objective)
         planner = geometric.RRTstar(information)
@@ -337,18 +388,18 @@ class _Problem:
         planner.setup()
         step = max(1e-3, min(0.25, time_s))
         spent = 0.0
-        while spent < time_s - 1e-9 or (spent < most_s - 1e-9 and not definition.hasExactSolution()):
+        while spent < time_s - 1e-9 or (spent < max_s - 1e-9 and not definition.hasExactSolution()):
             planner.solve(step)
             spent += step
             bar.update(min(step, max(0.0, bar.total - bar.n)))
         if not definition.hasExactSolution():
             fix = "Give it more time, or loosen the camera's limits."
             raise PlanningError("no path was found in time", value=f"{spent:.2g} s", fix=fix)
-        found = definition.getSolutionPath()
-        return np.array([_numbers(found.getState(index)) for index in range(found.getStateCount())])
+        solution = definition.getSolutionPath()
+        return np.array([_numbers(solution.getState(index)) for index in range(solution.getStateCount())])
 
     def path(self, states: Float, views: RouteViews) -> PlannedPath:
-        """The path through states (S, 5) that keeps their views."""
+        """Return the path through states (S, 5) with their views."""
         samples = RouteSamples.of(states[:, :3], self.config.spacing_m)
         angles = np.column_stack([np.unwrap(states[:, 3]), states[:, 4]])
         axes = axes_of_angles(np.degrees(between(samples.corners, angles, samples.along)))
@@ -356,7 +407,7 @@ class _Problem:
 
 
 def _state_space(low: Float, high: Float, pitch: tuple[float, ...], yaw_weight: float) -> Any:
-    """OMPL's space of states: x, y, z and pitch within bounds, and the yaw, with its weight in distances."""
+    """Make OMPL's space of states: x, y, z and pitch within bounds, and the yaw, with its weight in distances."""
     from ompl import base
 
     space = base.CompoundStateSpace()

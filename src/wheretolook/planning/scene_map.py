@@ -1,4 +1,4 @@
-"""The viewpoint map of a scene of a dataset, the weights that score it, and the map that a planner is given."""
+"""Build the viewpoint map of a scene of a dataset, and its variant for planners."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from wheretolook.scorers.registry import fallback, find, make_scorer, members, m
 from wheretolook.utils.errors import ConfigError
 from wheretolook.weights.resolve import load_scorer
 
-REACH = 2  # a voxel borrows from voxels at most this many away along each axis
+REACH = 2  # voxels along each axis from which views may be taken
 
 INSIDE = np.stack(np.meshgrid(*[(-1 / 3, 0.0, 1 / 3)] * 3, indexing="ij"), -1).reshape(-1, 3)
-"""Points of a voxel that are tested for free space (27, 3), relative to its centre in units of its size."""
+"""Points (27, 3) of a voxel that are tested for free space, relative to its centre in units of its size."""
 
 
 def scene_scorer(
     scene: SceneEnvironment, method: str = "", weights: Path | None = None, anywhere: bool = False
 ) -> Scorer:
-    """What scores views of a scene by a method (empty for that of the weights, or bins).
+    """Build the scorer of a scene by a method; an empty one stands for that of the weights, or bins.
 
-    With `anywhere`, weights that are adapted to one place score in another, too.
+    With `anywhere`, weights adapted to another scene are allowed.
 
     Raises:
         ConfigError: no such method, or it needs weights. WeightsError: the weights cannot be used.
@@ -53,9 +53,9 @@ def scene_viewpoint_map(scene: SceneEnvironment, views: ViewLattice, scorer: Sco
 def planner_scorer(
     scene: SceneEnvironment, dataset: Dataset, method: str = "", weights: Path | None = None, anywhere: bool = False
 ) -> Scorer:
-    """The scorer by which paths are planned in a scene of a dataset, with weights from `resolve_weights`.
+    """Build the scorer for planning in a scene of a dataset, with weights from `resolve_weights`; see `scene_scorer`.
 
-    `anywhere` as of `scene_scorer`. Raises as that; where weights are missing, the error names the dataset.
+    Raises a ConfigError that names the dataset where weights are missing.
     """
     if weights is None and any(known.weights for known in members(method, scorers())):
         raise ConfigError(f"{method} needs weights", path=dataset.root, fix="Train it, or name weights.")
@@ -63,16 +63,16 @@ def planner_scorer(
 
 
 def planner_map(scene: SceneEnvironment, views: ViewLattice, scorer: Scorer) -> ViewpointMap:
-    """The map that a planner is given: scores in [0, 1], and something to go by wherever a camera can be.
+    """Build the map for planners: scores in [0, 1], and views wherever a camera can be.
 
-    Scores are the scorer's probabilities, or ranks of scores that are none; views are borrowed where needed. Raises as
+    Scores that are no probabilities are replaced by ranks, and partially free voxels are filled. Raises as
     `scene_viewpoint_map`.
     """
     scored = scene_viewpoint_map(scene, views, scorer)
     scored_by = find(scored.origin.scorer)
     if scored_by is None or not scored_by.probability:
         scored = shares_below(scored)
-    return with_borrowed_views(scored, scene.space)
+    return fill_partially_free_voxels(scored, scene.space)
 
 
 def check_methods(methods: Iterable[str]) -> None:
@@ -82,9 +82,9 @@ def check_methods(methods: Iterable[str]) -> None:
 
 
 def shares_below(viewpoint_map: ViewpointMap) -> ViewpointMap:
-    """The map with the share of all its views that score lower in place of each score: a ranking, in [0, 1].
+    """Replace each score by the share of all views in the map that score lower: a ranking in [0, 1].
 
-    Planning weighs scores against metres. Information has no upper end and other units, so it enters by its ranks.
+    Planning weighs scores against metres, and information has other units and no upper limit.
     """
     ordered = np.sort(viewpoint_map.scores, axis=None)
     shares = np.searchsorted(ordered, viewpoint_map.scores, side="left") / max(1, ordered.size - 1)
@@ -92,11 +92,11 @@ def shares_below(viewpoint_map: ViewpointMap) -> ViewpointMap:
     return replace(viewpoint_map, scores=shares.astype(np.float32), origin=origin)
 
 
-def with_borrowed_views(viewpoint_map: ViewpointMap, space: Space) -> ViewpointMap:
-    """A map for planners: voxels with free space but an occupied centre get the views of the nearest voxel in reach.
+def fill_partially_free_voxels(viewpoint_map: ViewpointMap, space: Space) -> ViewpointMap:
+    """Give voxels with free space but an occupied centre the views of the nearest voxel in reach.
 
-    A voxel is in reach if a camera can go straight to its centre, so nothing is borrowed through walls. In the result,
-    a derived map (`MapOrigin.derived`), voxels share rows, so it can be neither saved nor updated.
+    A voxel is in reach if a camera can go straight to its centre, so no views are taken through walls. In the result, a
+    derived map (`MapOrigin.derived`), voxels share rows, so it can be neither saved nor updated.
     """
     rows = viewpoint_map.row_of_voxel.copy()
     centers = viewpoint_map.grid.centers()
@@ -106,10 +106,10 @@ def with_borrowed_views(viewpoint_map: ViewpointMap, space: Space) -> ViewpointM
     points = centers[unknown][:, None] + INSIDE * size
     free = space.is_free(points.reshape(-1, 3)).reshape(len(unknown), len(INSIDE))
     order = np.argsort((INSIDE**2).sum(1), kind="stable")
-    for voxel, own, is_free in zip(unknown, points, free, strict=True):
+    for voxel, inside, is_free in zip(unknown, points, free, strict=True):
         if not is_free.any():
             continue
-        start = own[order[is_free[order]][0]]  # the free point nearest to the centre
+        start = inside[order[is_free[order]][0]]  # the free point nearest to the centre
         near = known[(np.abs(centers[known] - centers[voxel]) <= (REACH + 1e-6) * size).all(1)]
         near = near[np.argsort(np.linalg.norm(centers[near] - start, axis=1), kind="stable")]
         if len(near):

@@ -1,8 +1,9 @@
-"""Stops: where along a path one look will not do, and where else to look from there."""
+"""Choose where a camera stops along a path, and in which further directions it looks there."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,11 +23,11 @@ if TYPE_CHECKING:
     from wheretolook.scorers.base import Scorer
 
 TURNS_DEG = (45.0, 90.0, 180.0, None)
-"""Limits on the turn from the path's view to the last look that are tried one after another; None for no limit."""
+"""Limits on the rotation from the path's view to the last look, in the order they are tried; None for no limit."""
 
 NEAR_DEG = 60.0
-NEAR = 8
-"""So many of the candidates for further looks lie no farther from the path's view, so that small turns are possible."""
+N_NEAR = 8
+"""Number of candidates within this angle of the path's view, so that small rotations are possible."""
 
 MIN_PROBABILITY = 1e-3  # probabilities are clipped to this distance from 0 and 1 before odds are taken
 
@@ -40,42 +41,42 @@ def stops_along(
     planner: PathConfig = PathConfig(),
     progress: str | None = None,
 ) -> tuple[Stop, ...]:
-    """The stops of a path through positions (W, 3) m with views along unit axes (W, 3), such as `best_sequence` gives.
+    """Choose the stops of a path through positions (W, 3) m with views along unit axes (W, 3).
 
-    A place whose view scores below `config.least_score` becomes a stop with the fewest further looks, along some of
-    unit directions (D, 3), by which all looks together reach that score, and of as many those that turn least. Where no
-    set of `config.looks` does, the stop is made if it gains more than it costs, and of those that do the one that gains
-    most: `planner.score_weight` for every metre of the path around the place times the rise of its score, less
+    A position whose view scores below `config.least_score` becomes a stop with the fewest further looks, along some of
+    unit directions (D, 3), by which all looks jointly reach that score; of equally many those with the smallest
+    rotation. Where `config.looks` do not suffice, the stop with the largest gain is made, if positive:
+    `planner.score_weight` for every metre of the path around the position times the rise of its score, less
     `planner.turn_weight_m` for every radian there and back.
 
-    What several looks score is told from the score of the path's view: its odds rise as those of the shipped
-    `SetScoreModel` do when the further looks are added. Raises a ConfigError if scores are no probabilities
-    (`check_stopping`). `progress` is the text of the progress bar; None shows none.
+    The joint score of several looks has the odds of the path's view, raised as those of the bundled `SetScoreModel`
+    rise with the further looks. `progress` is the text of the progress bar; None shows none. Raises a ConfigError if
+    scores are no probabilities (`check_stopping`).
     """
     if config.looks < 2:
         return ()
     check_stopping(scorer.name)
-    own = scorer.score(poses_looking_along(positions, axes))
+    scores = scorer.score(poses_looking_along(positions, axes))
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     metres = (np.append(steps, 0.0) + np.append(0.0, steps)) / 2
-    found = []
-    places = np.flatnonzero(own < config.least_score)
-    for place in tqdm(places.tolist(), desc=progress, unit="stop", disable=progress is None):
-        view = positions[place], axes[place], float(own[place])
-        stop = _stop(scorer, place, *view, directions, config, planner, float(metres[place]))
+    stops = []
+    rows = np.flatnonzero(scores < config.least_score)
+    for row in tqdm(rows.tolist(), desc=progress, unit="stop", disable=progress is None):
+        view = _View(row, positions[row], axes[row], float(scores[row]), float(metres[row]))
+        stop = _best_stop(scorer, view, directions, config, planner)
         if stop is not None:
-            found.append(stop)
-    return tuple(found)
+            stops.append(stop)
+    return tuple(stops)
 
 
 def within_pitch(directions: Float, planner: PathConfig) -> Float:
-    """Those of unit directions (D, 3) that a planner's camera can look along."""
+    """Return those of unit directions (D, 3) that a planner's camera can look along."""
     low, high = np.sin(np.radians(planner.pitch_deg))
     return directions[(directions[:, 2] >= low) & (directions[:, 2] <= high)]
 
 
 def can_stop(method: str) -> bool:
-    """Whether a method's scores are probabilities, which can be asked to reach one."""
+    """Whether a method's scores are probabilities."""
     from wheretolook.scorers.registry import find
 
     known = find(method)
@@ -85,53 +86,54 @@ def can_stop(method: str) -> bool:
 def check_stopping(method: str) -> None:
     """Raise a ConfigError if paths of a method cannot have stops (`can_stop`)."""
     if not can_stop(method):
-        fix = "Use a method that tells one, such as set, or leave stops out."
+        fix = "Use a method such as set, or leave stops out."
         raise ConfigError("stops need scores that are probabilities", value=method, fix=fix)
 
 
-def _stop(
-    scorer: Scorer,
-    place: int,
-    at: Float,
-    axis: Float,
-    own: float,
-    directions: Float,
-    config: StopConfig,
-    planner: PathConfig,
-    metres: float,
-) -> Stop | None:
-    """The stop at a place (3,) m whose view along an axis (3,) has a score of its own; None if none is worth it."""
-    apart = directions[directions @ axis < math.cos(math.radians(SEPARATION_DEG))]
+@dataclass(frozen=True, eq=False)
+class _View:
+    """A view of a path: its row, position (3,) m, axis (3,), score, and the metres of the path around it."""
+
+    row: int
+    position: Float
+    axis: Float
+    score: float
+    metres: float
+
+
+def _best_stop(scorer: Scorer, view: _View, directions: Float, config: StopConfig, planner: PathConfig) -> Stop | None:
+    """Choose the further looks at a view; None if no stop gains more than it costs."""
+    apart = directions[directions @ view.axis < math.cos(math.radians(SEPARATION_DEG))]
     if len(apart) == 0:
         return None
-    scores = scorer.score_around(at[None], apart)[0]
-    near = np.flatnonzero(apart @ axis > math.cos(math.radians(NEAR_DEG)))
-    rows = np.union1d(candidates(apart, scores, CANDIDATES), near[candidates(apart[near], scores[near], NEAR)])
-    looked = np.concatenate([axis[None], apart[rows]])
-    alone = np.append(own, scores[rows])
-    seen = candidate_views(scorer, at, looked, alone)
+    scores = scorer.score_around(view.position[None], apart)[0]
+    near = np.flatnonzero(apart @ view.axis > math.cos(math.radians(NEAR_DEG)))
+    rows = np.union1d(candidates(apart, scores, CANDIDATES), near[candidates(apart[near], scores[near], N_NEAR)])
+    axes = np.concatenate([view.axis[None], apart[rows]])
+    single = np.append(view.score, scores[rows])
+    visible = candidate_views(scorer, view.position, axes, single)
     set_score = SetScoreModel.bundled()
-    rotations = Rotations(looked, axis)
-    before = score_of_set(seen, set_score, [0])
+    rotations = Rotations(axes, view.axis)
+    before = score_of_set(visible, set_score, [0])
     best = None
-    most = 0.0
-    for n in range(2, min(config.looks, len(looked)) + 1):
+    best_gain = 0.0
+    for n in range(2, min(config.looks, len(axes)) + 1):
         for limit in TURNS_DEG:
             try:
-                chosen = select_views(seen, set_score, n, rotations, limit, required=0)
-            except PlanningError:  # nothing lies so near
+                chosen = select_views(visible, set_score, n, rotations, limit, required=0)
+            except PlanningError:  # no directions within the limit
                 continue
-            further = [look for look in chosen.rows if look != 0]
-            turn = turning_deg(np.concatenate([axis[None], looked[further], axis[None]]))
-            together = _raised(own, before, chosen.score)
-            stop = Stop(place, looked[further], alone[further], together, turn)
-            if together >= config.least_score:
+            further = [row for row in chosen.rows if row != 0]
+            turn = turning_deg(np.concatenate([view.axis[None], axes[further], view.axis[None]]))
+            joint = _raised(view.score, before, chosen.score)
+            stop = Stop(view.row, axes[further], single[further], joint, turn)
+            if joint >= config.least_score:
                 return stop
             cost = planner.turn_weight_m * math.radians(turn)
-            gain = planner.score_weight * metres * (together - own) - cost
-            if gain > most:
+            gain = planner.score_weight * view.metres * (joint - view.score) - cost
+            if gain > best_gain:
                 best = stop
-                most = gain
+                best_gain = gain
     return best
 
 

@@ -1,7 +1,4 @@
-"""The viewpoint map: the orientations of every free voxel, ranked by a score, for planners to look up.
-
-A query takes the same time on a map of any size: it computes the voxel's index and reads a few numbers.
-"""
+"""The viewpoint map: orientations of every free voxel, ranked by a score, which planners look up in constant time."""
 
 from __future__ import annotations
 
@@ -19,7 +16,7 @@ from wheretolook.geometry.camera_turns import angles_to_axis_deg, check_axis, tu
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.looks.selection import best_views
-from wheretolook.planning.map_file import ARRAYS, DESCRIPTION, REBUILD, read_map, write_map
+from wheretolook.planning.map_file import ARRAYS, REBUILD, read_map, write_map
 from wheretolook.utils.errors import ConfigError, MapFormatError
 
 if TYPE_CHECKING:
@@ -29,9 +26,14 @@ Point = Sequence[float] | NDArray[Any]
 
 
 class ViewChoice(NamedTuple):
-    """One orientation at a voxel: its row in the map's directions, its unit optical axis (3,) in the world (read-only;
-    the camera does not roll), its score by the map's scorer, and the number of landmarks in view from the voxel's
-    centre."""
+    """One orientation at a voxel.
+
+    Attributes:
+        direction_id: row in the map's directions.
+        axis: (3,) unit optical axis in the world, read-only; the camera does not roll.
+        score: by the map's scorer.
+        n_visible: number of landmarks in view from the voxel's centre.
+    """
 
     direction_id: int
     axis: Float
@@ -41,7 +43,7 @@ class ViewChoice(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ViewChoices:
-    """The best orientation at each of N points; found is False outside the grid or in a voxel that is not free."""
+    """Best orientations at N points; `found` is False outside the grid or in a voxel that is not free."""
 
     found: NDArray[np.bool_]
     direction_id: NDArray[np.int64]  # -1 where not found
@@ -51,34 +53,37 @@ class ViewChoices:
 
 @dataclass(frozen=True)
 class MapOrigin:
-    """What a viewpoint map was made from: names of the method, the directions' lattice and the occlusion model.
+    """Origin of a viewpoint map.
 
-    `camera` has COLMAP's name of the "model", "width" and "height" in pixels, and "params" in COLMAP's order. `derived`
-    tells what was done to the map since it was built, such as scores replaced by ranks; "" if nothing. A derived map
-    answers queries, but cannot be saved or updated.
+    Attributes:
+        scorer: name of the method.
+        lattice: name of the directions' lattice, "" for others.
+        camera: COLMAP's "model", "width" and "height" in pixels, and "params".
+        occlusion: name of the occlusion model.
+        landmarks: 16 hexadecimal digits that change with any landmark.
+        derived: changes of the map since it was built, such as scores replaced by ranks. A derived map answers
+            queries, but cannot be saved or updated.
     """
 
     scorer: str
-    lattice: str  # "" for others
+    lattice: str
     camera: dict[str, Any]
     occlusion: str
-    landmarks: str  # 16 hexadecimal digits that change with any landmark
+    landmarks: str
     derived: str = ""
 
-    def derive(self, what: str) -> MapOrigin:
-        """The origin of a map after one more change, described by `what`."""
-        return replace(self, derived=f"{self.derived}; {what}" if self.derived else what)
+    def derive(self, change: str) -> MapOrigin:
+        """Return the origin of a map after one more change."""
+        return replace(self, derived=f"{self.derived}; {change}" if self.derived else change)
 
 
 @dataclass(frozen=True, eq=False)
 class ViewpointMap:
     """Ranked orientations of every free voxel.
 
-    A point gets the scores of the voxel that holds it, which were computed at its centre; `interpolated` is smooth
-    between centres. For points outside the grid or in voxels that are not free, queries of one point return None, and
-    batches `found = False`. Points that are not finite raise a ValueError.
-
-    `wheretolook.planning.map_building.build_viewpoint_map` makes a map.
+    A point gets the scores of its voxel, which were computed at the centre; `interpolated` is smooth between centres.
+    For points outside the grid or in voxels that are not free, queries of one point return None, and batches
+    `found = False`. Points that are not finite raise a ValueError. See `map_building.build_viewpoint_map`.
 
     Attributes:
         grid: V voxels of the world, metres, z up.
@@ -87,12 +92,11 @@ class ViewpointMap:
         directions: (D, 3) float64 unit optical axes in the world.
         ranked: (L, D) uint16, ids of the directions at each of L free voxels, by falling score (in double precision),
             then by rising id.
-        scores: (L, D) float32, by direction id. Single precision, since scores need not be probabilities, and fewer
-            bytes would need a scale and save at most a fifth of the size.
+        scores: (L, D) float32, by direction id.
         n_visible: (L, D) uint32, landmarks in view, by direction id.
-        landmark_ids: (N,) int64, of the landmarks it was built from, ascending.
-        landmark_digests: (N, 2) uint64, digests of each one's position and of its attributes, for updates.
-        origin: what it was made from.
+        landmark_ids: (N,) int64, ascending.
+        landmark_digests: (N, 2) uint64, digests of each landmark's position and of its attributes, for updates.
+        origin: method, camera and so on.
     """
 
     grid: VoxelGrid
@@ -130,29 +134,22 @@ class ViewpointMap:
         try:
             return cls(grid=grid, origin=MapOrigin(**origin), **arrays)
         except (TypeError, ValueError) as error:
-            problem = f"the arrays do not fit together: {error}"
-            path = Path(folder)
-            if isinstance(error, TypeError):
-                problem = f"damaged description: {error}"
-                path = path / DESCRIPTION
-            raise MapFormatError(problem, path=path, fix=REBUILD) from error
+            raise MapFormatError(f"damaged: {error}", path=Path(folder), fix=REBUILD) from error
 
     def save(self, folder: str | Path) -> None:
         """Write a folder that needs no Python to be read, see `wheretolook.planning.map_file.write_map`.
 
-        Raises MapFormatError if the folder holds something else, or something beside a map; or the map was derived from
-        another (`MapOrigin.derived`).
+        Raises MapFormatError if the folder holds anything else than a map, or this map is derived.
         """
         origin = asdict(self.origin)
         if derived := origin.pop("derived"):
-            problem = "a map derived from another is not to be saved"
             fix = "Save the map it was derived from."
-            raise MapFormatError(problem, path=Path(folder), value=derived, fix=fix)
+            raise MapFormatError("a derived map cannot be saved", path=Path(folder), value=derived, fix=fix)
         write_map(folder, self.grid, origin, {name: getattr(self, name) for name in ARRAYS})
 
     @property
     def voxel_of_row(self) -> NDArray[np.int64]:
-        """Ids of the free voxels, (L,), ascending. Raises ValueError if voxels share rows in this derived map."""
+        """Ids (L,) of the free voxels, ascending; ValueError if voxels share rows in a derived map."""
         voxels = np.flatnonzero(self.row_of_voxel >= 0)
         if len(voxels) != len(self.scores):
             raise ValueError(f"voxels share rows in this map ({self.origin.derived}); ask the one it was derived from")
@@ -160,11 +157,11 @@ class ViewpointMap:
 
     @property
     def locations(self) -> Float:
-        """Centres of the free voxels, (L, 3) metres; raises as `voxel_of_row`."""
+        """Centres (L, 3) m of the free voxels; raises as `voxel_of_row`."""
         return self.grid.centers()[self.voxel_of_row]
 
     def row(self, point: Point) -> int:
-        """Row of the free voxel that holds a world point (3,) m; -1 if none does."""
+        """Return the row of the free voxel that contains a world point (3,) m; -1 if none does."""
         x, y, z = point
         x = float(x)  # faster than NumPy's scalars
         y = float(y)
@@ -184,12 +181,12 @@ class ViewpointMap:
         return -1
 
     def best(self, point: Point) -> ViewChoice | None:
-        """The best orientation at a world point (3,) m."""
+        """Return the best orientation at a world point (3,) m."""
         row = self.row(point)
         return None if row < 0 else self._choice(row, self.ranked.item(row, 0))
 
     def best_n(self, point: Point, n: int) -> list[ViewChoice] | None:
-        """The n best orientations at a world point (3,) m, or all if there are fewer, the best first.
+        """Return the n best orientations at a world point (3,) m, or all if there are fewer, the best first.
 
         Raises ValueError if n is no whole number of at least 1.
         """
@@ -199,7 +196,7 @@ class ViewpointMap:
         return None if row < 0 else [self._choice(row, choice) for choice in self.ranked[row, :n].tolist()]
 
     def best_in_cone(self, point: Point, axis: ArrayLike, half_angle_deg: float) -> ViewChoice | None:
-        """The best orientation whose optical axis is at most `half_angle_deg` from a world axis (3,), or None.
+        """Return the best orientation whose optical axis is at most `half_angle_deg` from a world axis (3,), or None.
 
         Raises ValueError if the axis is not finite or has no length.
         """
@@ -208,7 +205,7 @@ class ViewpointMap:
         return self._best_of(row, inside)
 
     def best_reachable(self, point: Point, current: ArrayLike, max_turn_deg: float) -> ViewChoice | None:
-        """The best orientation that the camera reaches by a single rotation of at most `max_turn_deg`.
+        """Return the best orientation that the camera reaches by a single rotation of at most `max_turn_deg`.
 
         The angle is that of the whole camera's rotation (`turns_deg`). `current` is the (3,) axis of a camera without
         roll, or a (3, 3) cam_from_world rotation. Returns None also if no direction of the lattice is in reach. Raises
@@ -222,10 +219,10 @@ class ViewpointMap:
     def best_looks(
         self, point: Point, n: int, max_turn_deg: float | None = None, *, scorer: Scorer, start: ArrayLike | None = None
     ) -> list[ViewChoice] | None:
-        """The n orientations at a world point (3,) m whose looks are worth most together, in the order to look.
+        """Return the n orientations at a world point (3,) m with the highest joint score, in the order to look.
 
-        The map's scores tell which orientations are worth considering; what they see together is found out by the
-        `scorer` that the map was built with, at the point itself (`wheretolook.looks.selection.best_views`). The camera
+        The map's scores preselect orientations; their joint score is computed at the point itself by the `scorer` that
+        the map was built with (`wheretolook.looks.selection.best_views`). The camera
         turns by at most `max_turn_deg` in all, from the axis `start` (3,) on if that is given. None where no voxel is
         free.
 
@@ -244,14 +241,13 @@ class ViewpointMap:
         return [self._choice(row, look) for look in chosen.rows]
 
     def best_many(self, points: ArrayLike) -> ViewChoices:
-        """The best orientation at each of world points (N, 3) m; raises as `rows`."""
+        """Return the best orientation at each of world points (N, 3) m; raises as `rows`."""
         rows = self.rows(points)
-        found = rows >= 0
         direction, score, n_visible = self._best_of_rows
-        return ViewChoices(found, direction[rows], score[rows], n_visible[rows])
+        return ViewChoices(rows >= 0, direction[rows], score[rows], n_visible[rows])
 
     def rows(self, points: ArrayLike) -> NDArray[np.int64]:
-        """Rows (N,) of the free voxels that hold world points (N, 3) m; -1 where none does.
+        """Return the rows (N,) of the free voxels that contain world points (N, 3) m; -1 where none does.
 
         Raises ValueError for points of another shape, or not finite.
         """
@@ -264,7 +260,7 @@ class ViewpointMap:
         return np.where(ids >= 0, self.row_of_voxel[ids], -1).astype(np.int64)
 
     def interpolated(self, point: Point) -> Float | None:
-        """Scores (D,) float64 of all directions at a world point (3,) m, trilinear between the centres of voxels.
+        """Interpolate the scores (D,) float64 of all directions at a world point (3,) m between the centres of voxels.
 
         Neighbours that are not free or outside the grid are left out and the other weights normalized. None if the
         voxel that holds the point is not free.
@@ -280,7 +276,7 @@ class ViewpointMap:
         i, j, k = corners[exists].T
         rows = self.row_of_voxel[(i * ny + j) * nz + k]
         weights = weights[exists][rows >= 0]
-        # the voxel of the point is free and holds at least an eighth of the weight
+        # the voxel of the point is free and has at least an eighth of the weight
         return np.asarray(weights / weights.sum() @ self.scores[rows[rows >= 0]].astype(np.float64))
 
     def _best_of(self, row: int, allowed: NDArray[np.bool_]) -> ViewChoice | None:
@@ -318,7 +314,7 @@ class ViewpointMap:
 
     @cached_property
     def _best_of_rows(self) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int64]]:
-        """Id, score and landmarks in view of the best direction of each row; a last entry stands for row -1."""
+        """Id, score and landmarks in view of the best direction of each row; the last entry is for row -1."""
         best = self.ranked[:, 0].astype(np.int64)
         at = np.arange(len(best)), best
         try:
@@ -330,8 +326,8 @@ class ViewpointMap:
 
 
 def _ranks_nothing(error: IndexError) -> MapFormatError:
-    """For a damaged file that was mapped into memory, so that its checksum was not compared."""
-    return MapFormatError(f"ranked.npy is damaged, it names a direction that is none: {error}", fix=REBUILD)
+    """Return the error for a damaged file that was mapped into memory without comparing its checksum."""
+    return MapFormatError(f"ranked.npy is damaged: {error}", fix=REBUILD)
 
 
 _CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)

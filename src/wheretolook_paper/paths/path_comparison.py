@@ -19,11 +19,12 @@ from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.planning.config import FORWARD, PathsConfig
 from wheretolook.planning.routes import PlannedPath
 from wheretolook.planning.rrt import plan_path
-from wheretolook.planning.view_sequence import TurnLimit, ViewSequence, best_sequence, greedy_sequence, resample_path
+from wheretolook.planning.view_sequence import TurnLimit, ViewSequence, best_sequence
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.errors import PlanningError, SceneError
+from wheretolook_paper.paths.greedy import greedy_sequence, resample_path
 
 PLANNED = "planned"
 GIVEN = "given"

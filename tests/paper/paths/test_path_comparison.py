@@ -151,7 +151,7 @@ def test_shares_by_hand() -> None:
     of_both = paths[paths["planned"]].groupby("pair")["method"].nunique() == 2
     good = views[views["error_m"] < 0.25].groupby(["method", "pair"]).size().unstack(fill_value=0)
     size = views.groupby(["method", "pair"]).size().unstack(fill_value=0)
-    shares = good.loc[:, of_both].sum(1) / size.loc[:, of_both].sum(1)  # pairs that both planned
+    shares = good.loc[:, of_both].sum(axis=1) / size.loc[:, of_both].sum(axis=1)  # pairs that both planned
     assert table.loc["set", "times_forward"] == pytest.approx(shares["set"] / shares["forward"])
     assert table.loc["set", "times_forward_length"] == pytest.approx(6 / 5)  # over the pairs that both planned
     assert table.loc["set", "failures"] == 1 and table.loc["set", "turn_deg_per_m"] == pytest.approx(10)

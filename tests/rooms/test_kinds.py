@@ -2,35 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from all_options import run
-from wheretolook.cli import parse_command
-from wheretolook.commands.label import Label
-from wheretolook.commands.map import Map
-from wheretolook.commands.sample import Sample
-from wheretolook.commands.scenes import Scenes
 from wheretolook.dataset.layout import SceneFolder
-from wheretolook.dataset.viewpoint_table import poses as poses_of
-from wheretolook.geometry.poses import camera_centers
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.scenes.scenes_config import ScenesConfig
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook_rooms.building import MAX_DIFFERENCE, Copy, Module, draw_building
-from wheretolook_rooms.court import court
 from wheretolook_rooms.generator import generate_scene
-from wheretolook_rooms.hall import hall
 from wheretolook_rooms.large import Furnished
-from wheretolook_rooms.office import office
 from wheretolook_rooms.patches import join
 
 FAST = ApartmentConfig(texels_per_m=20, texture_size=2048, light_rays=4, light_spacing_m=1.0)
@@ -64,26 +50,6 @@ def test_mesh_is_well_formed_and_follows_from_the_seed(kind: SceneKind) -> None:
     assert 60 < np.median(mesh.textures[0][row, column]) < 225  # neither black nor burnt
 
 
-@SLOW
-@pytest.mark.parametrize(
-    ("furnish", "sides_m", "heights_m"),
-    [(hall, (4, 40), (4, 9)), (court, (6, 40), (5, 15)), (office, (6, 24), (2.6, 3.3))],
-)
-def test_sizes_are_drawn_from_the_seed(
-    furnish: Callable[[ApartmentConfig, int], Furnished], sides_m: tuple[float, float], heights_m: tuple[float, float]
-) -> None:
-    widths = []
-    for seed in range(3):
-        config = replace(ApartmentConfig(vary=True).of_seed(seed), clutter=0.0)
-        patches = furnish(config, seed).patches
-        vertices = join(patches).vertices
-        width, depth, height = vertices.max(0) - vertices.min(0)
-        widths.append(width)
-        assert sides_m[0] < min(width, depth) and max(width, depth) < sides_m[1] + 1
-        assert heights_m[0] - 0.1 < height < heights_m[1] + 0.3
-    assert np.ptp(widths) > 2
-
-
 @cache
 def drawn_building(seed: int) -> tuple[Furnished, Module, list[Copy]]:
     return draw_building(ApartmentConfig(clutter=0.3), seed)
@@ -112,18 +78,13 @@ def test_copies_of_a_building_are_copies(seed: int) -> None:
             assert min(x1, a1) <= max(x0, a0) or min(y1, b1) <= max(y0, b0)
 
 
-def test_buildings_turn_their_copies() -> None:
-    turns = [{copy.quarter_turns for copy in drawn_building(seed)[2]} for seed in range(4)]
-    assert set.union(*turns) == {0, 1, 2, 3} and any(len(of_one) > 1 for of_one in turns)
-
-
 def test_kinds_take_turns() -> None:
     scenes = ScenesConfig(kinds=("apartment", "hall", "court"))
     assert [scenes.kind_of(seed) for seed in range(3, 8)] == ["apartment", "hall", "court", "apartment", "hall"]
     assert ScenesConfig().kind_of(7) == "apartment"
-    with pytest.raises(ConfigError, match=r"scenes\.kinds"):
+    with pytest.raises(ConfigError):
         ScenesConfig(kinds=())
-    with pytest.raises(ConfigError, match=r"scenes\.kinds"):
+    with pytest.raises(ConfigError):
         ScenesConfig(kinds=("castle",))  # type: ignore[arg-type]
 
 
@@ -134,48 +95,7 @@ def test_mapped_floor_is_kept_beside_the_mesh(tmp_path: Path) -> None:
     scene.save_mapped_floor(floor)
     assert scene.mapped_floor() == floor
     (scene.folder / "scene.json").write_text('{"mapped_floor": [[1, 2]]}')
-    with pytest.raises(SceneError, match="damaged"):
+    with pytest.raises(SceneError):
         scene.mapped_floor()
     scene.save_mapped_floor(())
     assert scene.mapped_floor() == ()
-
-
-SMALL = """\
-name: repeated
-camera: {width: 320, height: 240, focal_px: 160}
-scenes:
-  train: 1
-  test: 0
-  seed: 410
-  kinds: [building]
-  apartment: {texels_per_m: 80, texture_size: 2048, light_spacing_m: 0.5, light_rays: 4}
-map: {n_images: 50}
-sample: {grid: [14, 14, 5], keep: 0, max_locations: 40, max_directions: 4}
-label: {workers: 1}
-"""
-
-
-@SLOW
-def test_views_of_unmapped_copies_localize_in_mapped_ones(tmp_path: Path) -> None:
-    """Images are taken on the mapped floor only; views off it are found metres away, with many inliers."""
-    (tmp_path / "small.yaml").write_text(SMALL)
-    options = ["--config", str(tmp_path / "small.yaml"), "--data", str(tmp_path), "--device", "cpu"]
-    experiment = parse_command("demo", options)
-    assert experiment is not None
-    for stage in (Scenes, Map, Sample, Label):
-        dataset = run(stage, experiment)
-    (scene,) = dataset.scenes
-    part = np.array(scene.mapped_floor())
-    poses = scene.mapping_poses()
-    assert poses is not None
-
-    def on_mapped_floor(points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        at = points[:, None, :2]
-        return ((at >= part[:, :2] - 1e-6) & (at <= part[:, 2:] + 1e-6)).all(-1).any(-1)
-
-    assert on_mapped_floor(camera_centers(poses)).all()
-    table = scene.read_table()
-    elsewhere = ~on_mapped_floor(camera_centers(poses_of(table)))
-    wrong = (table["error_m"] > 2) & (table["n_inliers"] >= 30)
-    assert elsewhere.mean() > 0.2 and wrong[elsewhere].mean() > 0.2
-    assert wrong[elsewhere].mean() > 3 * wrong[~elsewhere].mean()

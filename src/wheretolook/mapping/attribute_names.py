@@ -10,4 +10,4 @@ MAP_ATTRIBUTES = (
     "distance_spread",  # standard deviation of the mapping distances over their mean
     "mapped_pixel_size",  # logarithm of the mean mapping distance over the mapping cameras' focal length in pixels
 )
-"""What a scorer is told of a landmark in its map; NaN where a value is not known."""
+"""Attributes of a landmark that scorers use; NaN where a value is unknown."""

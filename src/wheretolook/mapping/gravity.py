@@ -1,4 +1,4 @@
-"""Which way is up in a map of photographs, from how the camera was held."""
+"""Estimate the direction up in a map of photographs, from how the camera was held."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 from wheretolook.geometry.poses import Float
 
 _ITERATIONS = 50
-_SOFT = np.sin(np.radians(0.5))  # smaller residuals count like this one, so that weights stay finite
-_LEAST_TURN = np.sin(np.radians(5.0))  # spread of the x axes within the level plane that fixes the plane
-_CLEARLY = 3.0  # how many times their spread across the plane that must be
+_MIN_RESIDUAL = np.sin(np.radians(0.5))  # limits the weights
+_MIN_SPREAD = np.sin(np.radians(5.0))  # of the x axes within the level plane, to determine the plane
+_MIN_SPREAD_RATIO = 3.0  # of the spread within the plane to that across it
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,21 +21,21 @@ class Gravity:
     """The direction up, and how well the photographs agree on it."""
 
     up: Float  # (3,) unit vector in the frame of the poses
-    # "level": the direction most nearly at right angles to the images' x axes. "mean": the cameras turned too little
-    # for that, so it is the mean of the images' own up directions. "given": the direction in the camera was given.
+    # "level": the direction most nearly perpendicular to the images' x axes. "mean": the cameras rotated too little for
+    # that, so it is the mean of the images' own up directions. "given": the direction in the camera was given.
     method: Literal["level", "mean", "given"]
-    residual_deg: Float  # (M,) of each photograph: its roll for "level", else the angle between its own up and `up`
+    residual_deg: Float  # (M,) roll of each photograph for "level", else the angle between its own up and `up`
 
     @property
     def rotation(self) -> Float:
-        """(3, 3), the smallest rotation that takes `up` to z."""
+        """The smallest rotation (3, 3) from `up` to z."""
         return rotation_to_z(self.up)
 
 
 def estimate_gravity(cam_from_world: ArrayLike, up_in_camera: tuple[float, float, float] | None = None) -> Gravity:
-    """Estimate the direction up from poses (M, 3, 4), or from up in every camera's frame if that is known.
+    """Estimate the direction up from poses (M, 3, 4), or from up in the camera frame if that is known.
 
-    People tilt a camera up and down but hardly roll it: the images' x axes are level. So up is the direction d with the
+    People tilt a camera up and down but hardly roll it, so the images' x axes are level: up is the direction d with the
     least sum of |x . d|, which a minority of rolled photographs does not move. Iteratively reweighted least squares.
     """
     rotation = np.asarray(cam_from_world, dtype=np.float64)[:, :, :3]
@@ -52,7 +52,7 @@ def estimate_gravity(cam_from_world: ArrayLike, up_in_camera: tuple[float, float
 
 
 def rotation_to_z(up: ArrayLike) -> Float:
-    """The smallest rotation (3, 3) that takes a direction (3,) to z; about x if it points straight down."""
+    """The smallest rotation (3, 3) from a direction (3,) to z; about x if it points straight down."""
     a = np.asarray(up, dtype=np.float64)
     x, y, z = a / np.linalg.norm(a)
     if z < -1 + 1e-12:
@@ -62,20 +62,20 @@ def rotation_to_z(up: ArrayLike) -> Float:
 
 
 def _level_direction(axes: Float) -> Float | None:
-    """The direction most nearly at right angles to unit axes (M, 3); None if they do not determine it."""
+    """The direction most nearly perpendicular to unit axes (M, 3); None if they do not determine it."""
     weights = np.ones(len(axes))
     for _ in range(_ITERATIONS):
         values, vectors = np.linalg.eigh((axes.T * weights) @ axes / weights.sum())
-        weights = 1 / np.maximum(np.abs(axes @ vectors[:, 0]), _SOFT)
+        weights = 1 / np.maximum(np.abs(axes @ vectors[:, 0]), _MIN_RESIDUAL)
     least, middle = np.sqrt(np.maximum(values[:2], 0))
-    return vectors[:, 0] if middle > _LEAST_TURN and middle > _CLEARLY * least else None
+    return vectors[:, 0] if middle > _MIN_SPREAD and middle > _MIN_SPREAD_RATIO * least else None
 
 
 def _median_direction(directions: Float) -> Float:
-    """The unit vector with about the least sum of angles to unit vectors (M, 3): Weiszfeld's iteration on a sphere."""
+    """The unit vector with nearly the least sum of angles to unit vectors (M, 3): Weiszfeld's iteration on a sphere."""
     at: Float = directions.mean(0)
     for _ in range(_ITERATIONS):
         at = at / max(float(np.linalg.norm(at)), 1e-12)
-        weights = 1 / np.maximum(np.linalg.norm(directions - at, axis=1), _SOFT)
+        weights = 1 / np.maximum(np.linalg.norm(directions - at, axis=1), _MIN_RESIDUAL)
         at = (directions * weights[:, None]).sum(0) / weights.sum()
     return at / max(float(np.linalg.norm(at)), 1e-12)

@@ -1,4 +1,4 @@
-"""ArUco and AprilTag markers: found in photographs, with corners to hundredths of a pixel, and placed in a map."""
+"""Detect ArUco and AprilTag markers in photographs, with corners to hundredths of a pixel, and place them in a map."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from wheretolook.utils.errors import ConfigError, MapError
 if TYPE_CHECKING:
     import pycolmap
 
-_LEAST_ANGLE_DEG = 1.5  # between two rays to a marker, as for landmarks
-_SOFT_PX = 1.0  # residuals beyond this count less than by their square
+_MIN_ANGLE_DEG = 1.5  # between two rays to a marker, as for landmarks
+_SOFT_PX = 1.0  # larger residuals count less than quadratically
 _ROUNDS = 3  # of fitting lines to the edges between the corners
 _SAMPLES = 32  # profiles across an edge
-_AWAY_FROM_CORNERS = 0.15  # share of an edge left out at either end, where its neighbours blur into it
+_AWAY_FROM_CORNERS = 0.15  # share of an edge that is skipped at either end, where its neighbours blur into it
 _STEPS_PER_PX = 4  # samples of a profile
 
-# A marker is refused if the root mean square reprojection error of its corners exceeds both this many pixels and this
+# A marker is rejected if the root mean square reprojection error of its corners exceeds both this many pixels and this
 # share of the photographs' longer side. That of a marker that was moved, or printed twice, is tens of pixels.
 MAX_ERROR_PX = 4.0
 MAX_ERROR_SHARE = 1 / 400
@@ -33,7 +33,7 @@ MAX_ERROR_SHARE = 1 / 400
 
 @dataclass(frozen=True, eq=False)
 class MarkerView:
-    """A marker as seen in a photograph with a known pose."""
+    """A view of a marker in a photograph with a known pose."""
 
     image: str  # the photograph's name
     camera: pycolmap.Camera
@@ -62,10 +62,10 @@ class Marker:
 
 
 def detect_markers(rgb: NDArray[np.uint8], dictionary: str, path: Path | None = None) -> dict[int, Float]:
-    """Corners (4, 2) of each marker in a photograph (H, W, 3) uint8 by its id, clockwise from its top left.
+    """Detect markers in a photograph (H, W, 3) uint8: corners (4, 2) by id, clockwise from the marker's top left.
 
-    (0.5, 0.5) is the centre of the top-left pixel. The dictionary has OpenCV's name, such as DICT_4X4_50; else
-    ConfigError. MapError if two markers have the same id: which is which in another photograph would be open.
+    (0.5, 0.5) is the centre of the top-left pixel. Raises ConfigError if OpenCV has no such dictionary, MapError if two
+    markers have the same id, which would be ambiguous in other photographs.
     """
     import cv2
 
@@ -74,31 +74,33 @@ def detect_markers(rgb: NDArray[np.uint8], dictionary: str, path: Path | None = 
     numbers = [] if ids is None else np.asarray(ids).reshape(-1).tolist()
     if len(set(numbers)) < len(numbers):
         twice = next(number for number in numbers if numbers.count(number) > 1)
-        fix = "Print every marker once, or choose the dictionary the markers are of."
-        raise MapError(f"marker {twice} is twice in this photograph", path=path, value=numbers, fix=fix)
+        fix = "Print every marker once, or choose the markers' dictionary."
+        raise MapError(f"marker {twice} appears twice in this photograph", path=path, value=numbers, fix=fix)
     refined = [refine_corners(grey, np.asarray(at, np.float64).reshape(4, 2)) for at in corners]
-    return {number: at + 0.5 for number, at in zip(numbers, refined, strict=True)}  # OpenCV's pixel centres are whole
+    return {
+        number: at + 0.5 for number, at in zip(numbers, refined, strict=True)
+    }  # OpenCV's pixel centres are integers
 
 
 def place_marker(marker_id: int, views: Sequence[MarkerView]) -> Marker:
-    """Place a marker's corners where the rays to them meet, by least reprojection error (robust: Huber-like).
+    """Place a marker's corners (4, 3) in the map, by least robust reprojection error over its views.
 
-    Raises MapError if fewer than two photographs see the marker, or all from one direction; or no place fits all of
-    them, for instance because the marker was moved or printed twice.
+    Raises MapError if fewer than two photographs see the marker, all see it from one direction, or no position fits all
+    of them, for instance because the marker was moved or printed twice.
     """
     from scipy.optimize import least_squares
 
     images = tuple(view.image for view in views)
     again = "Take another photograph of it from another place."
     if len(views) < 2:
-        problem = f"marker {marker_id} is seen in one photograph only, which says nothing of its distance"
+        problem = f"marker {marker_id} is seen in one photograph only, which does not determine its distance"
         raise MapError(problem, value=" ".join(images), fix=again)
     start = np.stack([_meeting_point(views, corner) for corner in range(4)])
     centers = camera_centers(np.stack([view.cam_from_world for view in views]))
     rays = start.mean(0) - centers
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     angle_deg = max(np.degrees(np.arccos(np.clip(a @ b, -1, 1))) for a, b in itertools.combinations(rays, 2))
-    if not angle_deg >= _LEAST_ANGLE_DEG:
+    if not angle_deg >= _MIN_ANGLE_DEG:
         problem = f"the photographs see marker {marker_id} from one direction, {angle_deg:.1f} degrees apart at most"
         raise MapError(problem, value=" ".join(images), fix=again)
 

@@ -1,4 +1,4 @@
-"""What is needed of a COLMAP model to localize against it: landmarks, the camera that looks, and who mapped."""
+"""Open a COLMAP model for localization: landmarks, query camera and mapping poses."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class OpenedMap(NamedTuple):
     """Parts of a COLMAP model in metres with z up."""
 
     landmarks: Landmarks
-    camera: Camera  # the one that will look
+    camera: Camera  # the query camera
     mapping_poses: Float  # cam_from_world (M, 3, 4) of its images
 
 

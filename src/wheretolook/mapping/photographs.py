@@ -1,4 +1,4 @@
-"""Reads the photographs in a folder, upright and reduced, and the intrinsics of the cameras that took them."""
+"""Read photographs, upright and reduced, and the intrinsics of their cameras."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
 
 def list_photographs(folder: Path) -> list[str]:
-    """Names of the photographs in a folder and its subfolders, relative to it, sorted. MapError if fewer than two."""
+    """List photographs in a folder and its subfolders by relative name. Raises MapError if there are fewer than two."""
     if not folder.is_dir():
         raise MapError("there is no such folder", path=folder, fix="Give the folder of the photographs.")
     files = (path for path in folder.rglob("*") if path.is_file() and path.suffix.lower() in SUFFIXES)
@@ -35,7 +35,7 @@ def list_photographs(folder: Path) -> list[str]:
 
 
 def read_photograph(path: Path, turned: bool = True) -> NDArray[np.uint8]:
-    """Pixels (H, W, 3) uint8 RGB, turned upright as the EXIF orientation says, or as they are stored.
+    """Read a photograph (H, W, 3) uint8 RGB, turned upright by its EXIF orientation, or as stored.
 
     Raises MapError if the file cannot be read.
     """
@@ -50,7 +50,7 @@ def read_photograph(path: Path, turned: bool = True) -> NDArray[np.uint8]:
 
 
 def reduce_photograph(rgb: NDArray[np.uint8], max_side_px: int) -> NDArray[np.uint8]:
-    """The photograph (H, W, 3) with at most `max_side_px` pixels along its longer side; 0 keeps its size."""
+    """Reduce a photograph (H, W, 3) to `max_side_px` pixels along its longer side, if it is larger; 0 keeps its size."""
     import cv2
 
     height, width = rgb.shape[:2]
@@ -63,11 +63,11 @@ def reduce_photograph(rgb: NDArray[np.uint8], max_side_px: int) -> NDArray[np.ui
 
 @dataclass(frozen=True, eq=False)
 class PhotographCameras:
-    """Intrinsics of photographs that the mapping starts from."""
+    """Initial intrinsics of photographs."""
 
     cameras: list[pycolmap.Camera]  # of the reduced photographs, with ids from 1
     camera_of: NDArray[np.int64]  # (I,) each photograph's row in `cameras`
-    given: bool  # whether the intrinsics are to be kept as they are
+    given: bool  # whether the intrinsics stay fixed
 
     @property
     def n_known_focal(self) -> int:
@@ -78,15 +78,15 @@ class PhotographCameras:
 def photograph_cameras(
     folder: Path, names: list[str], full_sizes: NDArray[np.int64], sizes: NDArray[np.int64], config: PhotographsConfig
 ) -> PhotographCameras:
-    """Intrinsics of photographs, given or from their EXIF data.
+    """Initial intrinsics of photographs, given or from their EXIF data.
 
-    Takes width and height (I, 2) of each photograph as taken, upright, and as mapped. Raises ConfigError if COLMAP has
-    no such camera, or intrinsics are given for photographs of different sizes.
+    Takes width and height (I, 2) of each photograph as captured, upright, and as mapped. Raises ConfigError if COLMAP
+    has no such camera model, or intrinsics are given for photographs of different sizes.
     """
     given = len(config.camera_params) > 0
     different = np.unique(full_sizes, axis=0).tolist()
     if given and len(different) > 1:
-        fix = "Leave camera_params out, or map the photographs of each size apart."
+        fix = "Omit camera_params, or map the photographs of each size separately."
         raise ConfigError("camera_params are for photographs of one size", path=folder, value=different, fix=fix)
     if given:
         width, height = full_sizes[0].tolist()
@@ -107,10 +107,10 @@ def photograph_cameras(
 
 
 def photograph_pairs(n: int, exhaustive_up_to: int, overlap: int) -> NDArray[np.int64]:
-    """Pairs (P, 2) of n photographs to match, i < j: all pairs, if n is at most `exhaustive_up_to`.
+    """Choose pairs (P, 2) of n photographs to match, i < j: all pairs, if n does not exceed `exhaustive_up_to`.
 
     Otherwise each with the `overlap` that follow it and as many at distances that double, as COLMAP's sequential
-    matching does. This needs no vocabulary tree, but names in the order in which the photographs were taken.
+    matching does. This needs no vocabulary tree, but names in the order of capture.
     """
     if n <= exhaustive_up_to:
         return np.array(list(itertools.combinations(range(n), 2)), dtype=np.int64).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""Whether a map of unknown origin is what it is taken for: in metres, with z up."""
+"""Plausibility checks of maps of unknown origin: metres, z up, and the frame of a mesh."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ if TYPE_CHECKING:
     from wheretolook.rendering.raycasting import MeshRaycaster
 
 DISTANCE_M = (0.2, 50.0)
-"""Median distance from mapping cameras to landmarks in maps of places where people walk, from desks to squares."""
+"""Plausible range of the median distance from mapping cameras to landmarks, from desks to squares."""
 SPACING_M = 5.0
-"""Median distance from a mapping camera to the nearest other one: farther apart, photographs there hardly overlap."""
+"""Largest plausible median distance from a mapping camera to the nearest other one."""
 TILT_DEG = {"level": 25.0, "mean": 50.0}
-"""Angle between z and up as the cameras were held, by how that is known (`Gravity.method`): people roll a camera by a
-few degrees, but may tilt all their photographs of a thing the same way."""
+"""Largest plausible angle between z and the estimated up, by `Gravity.method`: people roll a camera by a few degrees,
+but may tilt all their photographs of an object the same way."""
 MESH_DISTANCE_M = (0.3, 100.0)
-"""Median distance of landmarks to the mesh of the same place that is too far, and the farthest that is measured."""
-_MOST_MEASURED = 10_000  # landmarks whose distance to a mesh is measured: enough for a median
-_LOOKING_DOWN = 0.7  # mean of the cameras' directions along -z; how such cameras are turned says nothing about up
+"""Largest plausible median distance of landmarks to a mesh, and the farthest distance that is measured."""
+_MAX_MEASURED = 10_000  # landmarks whose distance to a mesh is measured: enough for a median
+_LOOKING_DOWN = 0.7  # mean of the cameras' axes along -z above which their roll does not determine up
 
 
 def warn_of_frame(model: str | Path, mapping_distance_m: ArrayLike, cam_from_world: ArrayLike) -> None:
-    """Warn with a `MapWarning` each if a map seems not to be in metres, or not to have z up.
+    """Issue a `MapWarning` each if a map seems not to be in metres, or not to have z up.
 
     Takes the mean distance of each landmark's mapping cameras (N,), and the poses (M, 3, 4) of all.
     """
@@ -40,25 +40,22 @@ def warn_of_frame(model: str | Path, mapping_distance_m: ArrayLike, cam_from_wor
 
 
 def frame_doubts(mapping_distance_m: ArrayLike, cam_from_world: ArrayLike) -> tuple[str, ...]:
-    """`scale_doubt` and `axes_doubt` of a map, as far as there are any; arguments as of `warn_of_frame`."""
+    """The non-empty ones of `scale_doubt` and `axes_doubt`; arguments of `warn_of_frame`."""
     poses = np.asarray(cam_from_world, dtype=np.float64)
     found = scale_doubt(mapping_distance_m, camera_centers(poses)), axes_doubt(poses)
     return tuple(doubt for doubt in found if doubt)
 
 
 def warn_of_mesh(mesh: str | Path, points: ArrayLike, raycaster: MeshRaycaster) -> None:
-    """Warn with a `MapWarning` if a map's landmarks (N, 3) m seem not to be in the frame or unit of a mesh."""
+    """Issue a `MapWarning` if a map's landmarks (N, 3) m seem not to be in the frame or unit of a mesh."""
     if doubt := mesh_doubt(points, raycaster):
         warnings.warn(f"{mesh}: {doubt}", MapWarning, stacklevel=2)
 
 
 def mesh_doubt(points: ArrayLike, raycaster: MeshRaycaster) -> str:
-    """Why a mesh seems not to be in a map's frame and unit, and what to do; empty if it may be.
-
-    Landmarks lie on surfaces: those of the map (N, 3) m are mostly near what the mesh shows, or it shows another place.
-    """
+    """Message if a mesh seems not to be in a map's frame and unit, because landmarks (N, 3) m are far from it; else ""."""
     at = np.asarray(points, dtype=np.float64)
-    at = at[:: max(1, -(-len(at) // _MOST_MEASURED))]
+    at = at[:: max(1, -(-len(at) // _MAX_MEASURED))]
     off_m = float(np.median(raycaster.distance_to_surface(at, MESH_DISTANCE_M[1])))
     if not off_m > MESH_DISTANCE_M[0]:
         return ""
@@ -71,10 +68,9 @@ def mesh_doubt(points: ArrayLike, raycaster: MeshRaycaster) -> str:
 
 
 def scale_doubt(mapping_distance_m: ArrayLike, centers: ArrayLike) -> str:
-    """Why a map seems not to be in metres, and what to do; empty if it may be.
+    """Message if a map seems not to be in metres; else "".
 
-    Scale has no trace in a map but its lengths: how far landmarks are from the cameras that mapped them (N,), and these
-    from one another, by their centres (M, 3).
+    Takes the mean distance of each landmark's mapping cameras (N,), and the cameras' centres (M, 3).
     """
     distance = float(np.median(np.asarray(mapping_distance_m)))
     at = np.asarray(centers, dtype=np.float64)
@@ -85,11 +81,11 @@ def scale_doubt(mapping_distance_m: ArrayLike, centers: ArrayLike) -> str:
     lengths = f"landmarks are {distance:.3g} m from the cameras that mapped them, and these {spacing:.3g} m from the "
     lengths += f"nearest other (medians); where people walk it is {low:g} to {high:g} m, and at most {SPACING_M:g} m"
     fix = "`wheretolook map --model` gives it a scale: --map.photographs.scale.positions, .distance or .marker_size_m"
-    return f"the model seems not to be in metres: {lengths}. {fix}. If it is in metres, never mind"
+    return f"the model seems not to be in metres: {lengths}. {fix}. Ignore this warning if it is metric"
 
 
 def axes_doubt(cam_from_world: ArrayLike) -> str:
-    """Why z seems not to be up in a map, by the poses (M, 3, 4) of its cameras, and what to do; empty if it may be."""
+    """Message if z seems not to be up in a map, by the poses (M, 3, 4) of its cameras; else ""."""
     poses = np.asarray(cam_from_world, dtype=np.float64)
     gravity = estimate_gravity(poses)
     off_deg = float(np.degrees(np.arccos(np.clip(gravity.up[2], -1, 1))))
@@ -98,9 +94,9 @@ def axes_doubt(cam_from_world: ArrayLike) -> str:
     how = "upside down" if off_deg > 135 else "on their side" if off_deg > 45 else "askew"
     up = " ".join(f"{value:.2f}" for value in _rounded(gravity.up))
     return (
-        f"the cameras lie {how}: up, as they were held, is ({up}) in the model, {off_deg:.0f} degrees from z, which is "
+        f"the cameras are {how}: up, as they were held, is ({up}) in the model, {off_deg:.0f} degrees from z, which is "
         "up here. `wheretolook map --model` turns it upright with --map.existing.level true, or give a model with z up "
-        "(COLMAP's model_orientation_aligner). If the cameras were held so, never mind"
+        "(COLMAP's model_orientation_aligner). Ignore this warning if the cameras were held so"
     )
 
 

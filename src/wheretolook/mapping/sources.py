@@ -1,4 +1,4 @@
-"""What a map was made from, as far as it lies beside it or its report tells."""
+"""Locate the database and images that a map was built from."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from wheretolook.utils.reading import read_json_object
 
 
 def features_beside(model_dir: Path) -> Path | None:
-    """The features that lie beside a map of this project or one of COLMAP's usual folders; None if there are none."""
+    """Find the file of features of a map, in its folder, COLMAP's usual folders or its report; None if there is none."""
     places = (model_dir, model_dir.parent / "photographs", model_dir.parent, model_dir.parent.parent)
     for place in places:
         if (place / DATABASE_FILE).is_file():
@@ -24,7 +24,7 @@ def features_beside(model_dir: Path) -> Path | None:
 
 
 def photographs_of(model_dir: Path) -> Path | None:
-    """The folder of photographs that a map of this project was made from, if its report names one that is there."""
+    """Find the folder of images that a map was built from, in its folder or its report; None if there is none."""
     named = _reported(model_dir, "photographs", "images")
     for folder in (model_dir / "images", *([Path(named)] if named is not None else [])):
         if folder.is_dir():
@@ -33,7 +33,7 @@ def photographs_of(model_dir: Path) -> Path | None:
 
 
 def _reported(model_dir: Path, group: str, name: str) -> str | None:
-    """A path among the settings in the report of a map of this project; None if there is none."""
+    """A path among the settings in a map's report; None if there is none."""
     try:
         found = read_json_object(model_dir / REPORT_FILE)["config"][group][name]
     except (OSError, ValueError, KeyError, TypeError):

@@ -1,4 +1,4 @@
-"""Chooses pairs of images with known poses that share surface, matches them and triangulates landmarks, in COLMAP."""
+"""Extract and match keypoints of images with known poses, and triangulate landmarks with COLMAP."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from wheretolook.utils.files import temporary_folder
 from wheretolook.utils.processes import WorkerPool
 
 _SAMPLES_ACROSS = 16  # surface points taken from an image, in x
-DEPTH_STRIDE = 4  # depth images are kept at every fourth pixel, the centre of each 4 x 4 block being the one at index 2
-_ANGLE_DEG = (1.0, 55.0)  # between the rays of two images: less triangulates badly, more than that SIFT does not match
-_DEPTH_RATIO = 2.5  # between the distances of two images to a point: beyond it, the scales differ too much
+DEPTH_STRIDE = 4  # of the pixels of depth images that are used, at index 2 of each 4 x 4 block
+_ANGLE_DEG = (1.0, 55.0)  # between the rays of two images: smaller triangulates badly, larger does not match
+_MAX_DEPTH_RATIO = 2.5  # between the distances of two images to a point, beyond which scales differ too much
 _DEPTH_TOLERANCE = 0.05
-_PAIRS_AT_A_TIME = 64  # that a process matches; also the step of the progress bar
+_PAIRS_AT_A_TIME = 64  # pairs in one job of a worker process
 MatchJob = tuple[NDArray[np.int64], list[Stored], Path, DescriptorKind]
 
 
 def image_name(index: int) -> str:
-    """File name of the map's image number `index`, from 0. Its id in COLMAP is `index` + 1."""
+    """File name of the image with an index from 0; its id in COLMAP is `index` + 1."""
     return f"{index:05d}.png"
 
 
@@ -140,7 +140,7 @@ def triangulate_model(
 
 
 def _local_frame(model: Any) -> tuple[Any, Any]:
-    """The `pycolmap.Sim3d` to a frame with its origin near a reconstruction's cameras, and the one back."""
+    """The `pycolmap.Sim3d` to a frame with its origin near a reconstruction's cameras, and its inverse."""
     import pycolmap
 
     posed = [image.projection_center() for image in model.images.values() if image.has_pose]
@@ -157,15 +157,15 @@ def match_pairs(
     progress: bool = True,
     kind: DescriptorKind = SIFT,
 ) -> Generator[NDArray[np.uint32], None, None]:
-    """Match pairs (P, 2) of images, without geometric verification. Yields (M, 2) indices of keypoints, pair by pair.
+    """Match pairs (P, 2) of images without geometric verification; yields (M, 2) indices of keypoints for each pair.
 
-    SIFT is matched by COLMAP, learned features by `SimilarityMatcher`. Works in processes, not threads: pycolmap's
-    BLAS is built without locks, so that two threads sometimes get the same buffer, and the nearest neighbours come out
-    wrong. Small databases are made in `folder` meanwhile.
+    SIFT is matched by COLMAP, learned features by `SimilarityMatcher`. Uses processes, not threads: pycolmap's BLAS is
+    built without locks, so that two threads sometimes get the same buffer and wrong nearest neighbours. `folder` holds
+    small temporary databases.
     """
     chunks = [pairs[start : start + _PAIRS_AT_A_TIME] for start in range(0, len(pairs), _PAIRS_AT_A_TIME)]
     bar = tqdm(total=len(pairs), desc="map: match", disable=not progress, unit="pair")
-    with bar, temporary_folder(".partial", parent=folder) as work:  # goes with what a killed process leaves in it
+    with bar, temporary_folder(".partial", parent=folder) as work:  # removes what a killed process leaves
         jobs = (_match_job(chunk, stored, work, kind) for chunk in chunks)
         for matches in processes.map(_run_match_job, jobs):
             yield from matches
@@ -173,13 +173,13 @@ def match_pairs(
 
 
 def _match_job(pairs: NDArray[np.int64], stored: Sequence[Stored], folder: Path, kind: DescriptorKind) -> MatchJob:
-    """Pairs (P, 2) renumbered to index the keypoints of their own images, these keypoints, and where to work."""
+    """Pairs (P, 2) renumbered to index the keypoints of their own images, these keypoints, and a working folder."""
     images, renumbered = np.unique(pairs, return_inverse=True)
     return renumbered.reshape(-1, 2), [stored[i] for i in images], folder, kind
 
 
 def _run_match_job(job: MatchJob) -> list[NDArray[np.uint32]]:
-    """(M, 2) indices of matched keypoints, of each pair."""
+    """Match the pairs of a job: (M, 2) indices of keypoints for each."""
     pairs, stored, parent, kind = job
     if not kind.in_bytes:
         return _match_by_similarity(pairs, stored, kind)
@@ -202,7 +202,7 @@ def _run_match_job(job: MatchJob) -> list[NDArray[np.uint32]]:
 def _match_by_similarity(
     pairs: NDArray[np.int64], stored: Sequence[Stored], kind: DescriptorKind
 ) -> list[NDArray[np.uint32]]:
-    """(M, 2) indices of keypoints that are each other's nearest, of each pair."""
+    """Match mutual nearest neighbours: (M, 2) indices of keypoints for each pair."""
     from wheretolook.features.learned import one_thread
     from wheretolook.features.similarity import SimilarityMatcher
 
@@ -227,14 +227,14 @@ def _posed_model(camera: PinholeCamera, cam_from_world: NDArray[np.floating[Any]
 
 
 def stored_keypoints(keypoints: Keypoints, kind: DescriptorKind = SIFT) -> Stored:
-    """Keypoints as files hold them."""
+    """Pixels (N, 2) and descriptors of keypoints as files hold them."""
     return keypoints.pixels, kind.store(keypoints.descriptors)
 
 
 def fill_database(database: Path, model: Any, stored: Iterable[Stored], kind: DescriptorKind = SIFT) -> None:
-    """Make a COLMAP database of a reconstruction's cameras and images, and of their keypoints in the order of ids.
+    """Write a COLMAP database of a reconstruction's cameras and images, and their keypoints in the order of ids.
 
-    Descriptors that are not bytes stand in it as COLMAP 4 has them, in single precision.
+    Descriptors that are not bytes are stored in single precision, as COLMAP 4 does.
     """
     import pycolmap
 
@@ -258,7 +258,7 @@ def fill_database(database: Path, model: Any, stored: Iterable[Stored], kind: De
 
 
 def shrink_depth(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Every fourth pixel of depth images (..., H, W), for `surface_overlap`."""
+    """Subsample depth images (..., H, W) by `DEPTH_STRIDE`, for `surface_overlap`."""
     half = DEPTH_STRIDE // 2
     return depth_m[..., half::DEPTH_STRIDE, half::DEPTH_STRIDE].copy()
 
@@ -266,11 +266,11 @@ def shrink_depth(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
 def surface_overlap(
     camera: PinholeCamera, cam_from_world: NDArray[np.floating[Any]], depth_m: NDArray[np.float32]
 ) -> NDArray[np.float64]:
-    """Share of the surface in one image that another image sees too, similarly enough for the two to be matched.
+    """Share (I, I) of the surface in one image that another image also sees, similarly enough to be matched.
 
     Takes poses (I, 3, 4) and z-depth (I, h, w) from `shrink_depth`, 0 where there is none. A point counts if the other
     image's depth agrees with it (5 %), if the rays of the two images meet at 1 to 55 degrees, and if their depths
-    differ by less than a factor of 2.5. Returns (I, I), the mean of both directions' shares; 0 on the diagonal.
+    differ by less than a factor of 2.5. Returns the mean of both directions; 0 on the diagonal.
     """
     n, h, w = depth_m.shape
     step = max(1, w // _SAMPLES_ACROSS)
@@ -295,17 +295,17 @@ def surface_overlap(
         ray = points - centers[j]
         cosine = (ray * seen_from).sum(-1) / np.maximum(np.linalg.norm(ray, axis=-1), 1e-9)
         shared = inside & (np.abs(there - z) < _DEPTH_TOLERANCE * z) & (cosine > farthest) & (cosine < closest)
-        shared &= (z < _DEPTH_RATIO * depth) & (depth < _DEPTH_RATIO * z)
+        shared &= (z < _MAX_DEPTH_RATIO * depth) & (depth < _MAX_DEPTH_RATIO * z)
         share[:, j] = shared.mean(1)
     np.fill_diagonal(share, 0)
     return (share + share.T) / 2
 
 
 def choose_pairs(overlap: NDArray[np.float64], partners: int, min_overlap: float = 0.05) -> NDArray[np.int64]:
-    """Pairs (P, 2) of each image with its `partners` images of largest overlap; i < j, sorted, each pair once.
+    """Choose pairs (P, 2) of each image with its `partners` images of largest overlap; i < j, sorted, each pair once.
 
-    `overlap` (I, I) is symmetric; pairs of less than `min_overlap` are left out. An image can be in more than
-    `partners` pairs, since others choose it too.
+    `overlap` (I, I) is symmetric; pairs below `min_overlap` are omitted. An image can be in more than `partners` pairs,
+    since others choose it, too.
     """
     best = np.argsort(-overlap, axis=1, kind="stable")[:, :partners]
     first = np.repeat(np.arange(len(overlap)), best.shape[1])

@@ -1,4 +1,4 @@
-"""Plans a walk through a scene with a camera at eye height, which leaves part of the floor unvisited."""
+"""Plan a walk through a scene with a camera at eye height, which covers part of the floor."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class PartOfFloor:
     rectangles: tuple[tuple[float, float, float, float], ...]
 
     def is_free(self, points: Any) -> NDArray[np.bool_]:
-        """Whether a camera can be at points (N, 3); (N,)."""
+        """Whether a camera can be at points (N, 3)."""
         at = np.asarray(points, dtype=np.float64)[:, None, :2]
         part = np.asarray(self.rectangles, dtype=np.float64)
         free: NDArray[np.bool_] = np.any(((at >= part[:, :2]) & (at <= part[:, 2:])).all(-1), axis=-1)
@@ -76,7 +76,7 @@ class Walk:
 
 @dataclass(frozen=True, eq=False)
 class _Places:
-    """Places a person can stand: eye positions (P, 3) and a symmetric graph of free steps weighted by length."""
+    """Eye positions (P, 3) above free floor, and a symmetric graph of free steps weighted by length."""
 
     eyes: Float
     steps: csr_matrix
@@ -85,7 +85,7 @@ class _Places:
 def plan_walk(
     free_space: FreeSpaceQueries, bounds: ArrayLike, n_images: int, config: WalkConfig | None = None, seed: int = 0
 ) -> Walk:
-    """Plan a walk that starts at a random place and goes on to the nearest unvisited floor until enough is visited.
+    """Plan a walk from a random place to ever the nearest unvisited floor until enough is visited.
 
     `bounds` (2, 3) metres are the lowest and highest corner of the scene. The poses are spaced evenly along the walk
     and look mostly along it. Raises ConfigError for fewer than two, SceneError if there is no floor to walk on.
@@ -113,7 +113,7 @@ def _length_m(path: Float) -> float:
 
 
 def _reachable_places(free_space: FreeSpaceQueries, bounds: Float, config: WalkConfig) -> _Places:
-    """The largest connected set of places, found on every storey of the scene."""
+    """The largest connected set of places, over all storeys of the scene."""
     low, high = bounds
     nx, ny = np.maximum(np.ceil((high - low)[:2] / CELL_M).astype(int), 1)
     heights = np.arange(low[2] + config.eye_height_m, high[2] + config.eye_height_m, 1.0)
@@ -122,7 +122,7 @@ def _reachable_places(free_space: FreeSpaceQueries, bounds: Float, config: WalkC
     probes = np.column_stack([low[:2] + (cell + 0.5) * CELL_M, heights[h.ravel()]])
     floor = np.asarray(free_space.floor_below(probes), dtype=np.float64)
     found = np.isfinite(floor)
-    # Several probes of a cell may find the same floor: keep one place for each floor of each cell.
+    # Several probes of a cell may hit the same floor: one place for each floor of each cell.
     key = np.column_stack([cell[found], np.rint(100 * floor[found]).astype(np.int64)])
     key, first = np.unique(key, axis=0, return_index=True)
     eyes = probes[found][first]
@@ -179,7 +179,7 @@ def _neighbours(key: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.i
 
 
 def _visit(places: _Places, start: int, radius_m: float, coverage: float) -> tuple[NDArray[np.int64], float]:
-    """Indices of the places along the walk and the share of all places visited."""
+    """Indices of the places along the walk, and the share of all places visited."""
     here = start
     corners = [here]
     fresh = [here]
@@ -201,7 +201,7 @@ def _visit(places: _Places, start: int, radius_m: float, coverage: float) -> tup
 
 
 def _along(path: Float, n_images: int, rng: np.random.Generator) -> tuple[Float, Float]:
-    """Points spaced evenly along the path (n, 3) and the direction in which the path goes on from each (n, 3)."""
+    """Points spaced evenly along the path (n, 3), and the direction of the path ahead of each (n, 3)."""
     look_ahead_m = 1.0
     start = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     at = np.linspace(0, start[-1], n_images)

@@ -1,4 +1,4 @@
-"""Whether a recording's depths and poses are in the same unit, and that in metres."""
+"""Check that depths and poses of a recording are in the same unit, and in metres."""
 
 from __future__ import annotations
 
@@ -13,42 +13,42 @@ from wheretolook.scans.frames import SURVEY_STRIDE, RgbdFrames
 from wheretolook.utils.errors import SceneError
 
 DEPTH_M = (0.2, 20.0)
-"""Median reading of depth cameras where people walk: they do not see farther."""
-_AGREE = 0.03  # by which two depths of the same point may differ, of the depth
+"""Plausible range of the median reading of a depth camera."""
+_AGREE = 0.03  # relative difference of two depths of the same point that agree
 _PAIRS = 40  # pairs of frames that are compared
-_LEAST_PAIRS = 3  # of them, and readings that the two of a pair share
-_LEAST_SHARED = 50
-_FACING = np.cos(np.radians(40.0))  # of the optical axes of a pair
+_MIN_PAIRS = 3
+_MIN_SHARED = 50  # readings that the two frames of a pair share
+_FACING = np.cos(np.radians(40.0))  # largest angle between the optical axes of a pair
 _STEPS = 83
-_FACTORS = np.geomspace(1 / 12, 12, _STEPS)  # that depths are multiplied with, in steps of 6 %
+_FACTORS = np.geomspace(1 / 12, 12, _STEPS)  # candidate factors of depth, in steps of 6 %
 _FACTORS = np.concatenate([_FACTORS, *(power * np.geomspace(0.8, 1.25, 7) for power in (0.001, 0.01, 100, 1000))])
-_ONE = 41  # where among them is 1
-_LEAST_AGREEMENT = 0.2  # share of the readings, or poses and depths have nothing to do with each other
-_CLEARLY = 0.15  # by how much more of the readings must agree with another factor
-_OFF = 1.25  # a factor by which a unit is wrong, not a camera
+_ONE = 41  # index of the factor 1
+_MIN_AGREEMENT = 0.2  # share of the readings below which poses and depths do not belong together
+_CLEARLY = 0.15  # share of the readings by which another factor must agree better
+_UNIT_OFF = 1.25  # smallest factor that is attributed to the unit
 _LANDMARK_OFF = 1.1  # a factor between depths and landmarks
 
 
 def check_depth_unit(frames: RgbdFrames) -> None:
-    """Raise SceneError if depths are in another unit than poses or landmarks, or no depths in metres.
+    """Raise SceneError if depths are in another unit than poses or landmarks, or not in metres.
 
-    Frames that share surface tell it: a reading of one, moved into the other by the poses, is as deep there as that
-    one's own reading says, but only with depths and poses in one unit. With a model, the readings at its landmarks do.
+    Frames that share surface show it: readings of one, transformed into the other by the poses, agree with that one's
+    readings only if depths and poses are in one unit. With a model, depths are compared with its landmarks.
     """
     scale = frames.depth_scale
     if frames.model is not None:
         factor = landmark_factor(landmark_readings(frames, frames.model))
         if factor is not None and not 1 / _LANDMARK_OFF < factor < _LANDMARK_OFF:
             problem = "depths are in another unit than the model: its landmarks are "
-            problem += f"{factor:.3g} times as far as the depth images say"
+            problem += f"{factor:.3g} times as far as the depth images show"
             fix = f"Give the model metres (`wheretolook map --model`), or {_option(scale / factor)} if its unit is one."
             raise SceneError(problem, path=frames.folder, value=f"{scale:g} units a metre", fix=fix)
     factor = pose_factor(frames.survey_m, frames.camera, frames.cam_from_world)
     if factor is not None and np.isnan(factor):
-        problem = "by their poses, neighbouring frames do not show the same surfaces, whatever the unit of depth"
+        problem = "neighbouring frames do not show the same surfaces at their poses, whatever the unit of depth"
         fix = "Give poses world_from_cam (not cam_from_world), x right, y down, z forward, of the same frames."
         raise SceneError(problem, path=frames.folder, fix=fix)
-    if factor is not None and not 1 / _OFF < factor < _OFF:
+    if factor is not None and not 1 / _UNIT_OFF < factor < _UNIT_OFF:
         problem = "depths are in another unit than poses: neighbouring frames show the same surfaces only if depths "
         problem += f"are about {factor:.2g} times as large"
         fix = f"Give {_option(scale / factor)}, or poses in metres."
@@ -62,7 +62,7 @@ def check_depth_unit(frames: RgbdFrames) -> None:
 
 
 def landmark_readings(frames: RgbdFrames, model: Any) -> Float:
-    """Depths of a model's landmarks in the frames that observe them, and what the depth images say there, (N, 2).
+    """Depths of a model's landmarks in the frames that observe them, and the readings there, (N, 2).
 
     Takes the `pycolmap.Reconstruction` that gave the poses.
     """
@@ -77,14 +77,14 @@ def landmark_readings(frames: RgbdFrames, model: Any) -> Float:
 
 
 def landmark_factor(readings: Float) -> float | None:
-    """Median of how many times as deep landmarks are as read, of (N, 2); None of fewer than 20."""
+    """Median ratio of the depth of landmarks to the readings there, of (N, 2); None for fewer than 20."""
     return float(np.median(readings[:, 0] / readings[:, 1])) if len(readings) >= 20 else None
 
 
 def pose_factor(survey_m: NDArray[np.float32], camera: PinholeCamera, cam_from_world: Float) -> float | None:
-    """By what depths (F, h, w) must be multiplied for neighbouring frames to agree; 1 unless another is clearly better.
+    """Factor of depths (F, h, w) at which neighbouring frames agree; 1 unless another is clearly better.
 
-    NaN if hardly any agree by any factor, None if the camera moved too little to tell.
+    NaN if hardly any readings agree at any factor, None if the camera moved too little.
     """
     pairs = _pairs(cam_from_world)
     agreements = []
@@ -99,20 +99,20 @@ def pose_factor(survey_m: NDArray[np.float32], camera: PinholeCamera, cam_from_w
         for factor in _FACTORS:
             both = _readings_at(survey_m[j], camera, turned + relative[:, 3] / factor)
             agree = np.abs(both[:, 0] - both[:, 1]) < _AGREE * both[:, 1]
-            shares.append(agree.mean() if len(both) >= _LEAST_SHARED else 0.0)
+            shares.append(agree.mean() if len(both) >= _MIN_SHARED else 0.0)
         agreements.append(shares)
-    if len(agreements) < _LEAST_PAIRS:
+    if len(agreements) < _MIN_PAIRS:
         return None
     agreement = np.mean(agreements, axis=0)
     best = int(agreement.argmax())
-    near_one = agreement[np.abs(np.log(_FACTORS)) < np.log(_OFF)].max()
-    if agreement[best] < _LEAST_AGREEMENT:
+    near_one = agreement[np.abs(np.log(_FACTORS)) < np.log(_UNIT_OFF)].max()
+    if agreement[best] < _MIN_AGREEMENT:
         return float("nan")
     return _peak(agreement, best) if agreement[best] > near_one + _CLEARLY else float(_FACTORS[_ONE])
 
 
 def _peak(agreement: Float, best: int) -> float:
-    """Where a parabola through the best of `_FACTORS` and two on either side has its top: the peak is flat."""
+    """Maximum of a parabola through the best of `_FACTORS` and two on either side."""
     if not 2 <= best < _STEPS - 2:
         return float(_FACTORS[best])
     steps = np.arange(-2, 3)
@@ -122,7 +122,7 @@ def _peak(agreement: Float, best: int) -> float:
 
 
 def _pairs(cam_from_world: Float) -> list[tuple[int, int]]:
-    """Pairs of frames that look the same way from places some way apart."""
+    """Pairs of frames with similar directions and typical distances."""
     centers = camera_centers(cam_from_world)
     axes = cam_from_world[:, 2, :3]
     first = np.unique(np.linspace(0, len(centers) - 1, _PAIRS).round().astype(int))
@@ -137,7 +137,7 @@ def _pairs(cam_from_world: Float) -> list[tuple[int, int]]:
 
 
 def _readings_at(survey_m: NDArray[np.float32], camera: PinholeCamera, points_cam: Float) -> Float:
-    """Depth of points (N, 3) in a camera, and what its survey reads there, (M, 2), of those where it reads anything."""
+    """Depth of points (N, 3) in a camera and its survey's readings there, (M, 2), where there is a reading."""
     pixels = camera.project(points_cam)
     z = points_cam[:, 2]
     inside = (z > 0) & camera.in_image(pixels)

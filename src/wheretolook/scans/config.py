@@ -1,4 +1,4 @@
-"""How a recording of colour and depth becomes a mesh: options only, so that the command line reads them quickly."""
+"""Options of scenes from RGB-D recordings."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ class RgbdConfig:
         camera: fx, fy, cx, cy of the colour images in pixels; the layout's if empty.
         depth_camera: the same of the depth images, where they are not registered to the colour images.
         color_from_depth_m: where the depth camera is in the colour camera's frame; x right, y down, z forward.
-        correct_depth: with a model, bring depths to those of its landmarks: a structured-light camera reads far ones
-            wrong by centimetres.
-        up: which way is up in its world. `auto`, x, y, z, one of these with a minus sign, or three numbers
-            such as "0 -0.9 -0.4". `auto` finds it by how the camera was held and by the surfaces that it saw.
+        correct_depth: with a model, bring depths to those of its landmarks: a structured-light camera is wrong
+            by centimetres at far ones.
+        up: direction up in its world. `auto`, x, y, z, one of these with a minus sign, or three numbers
+            such as "0 -0.9 -0.4". `auto` estimates it from how the camera was held and from the surfaces.
         voxel_m: distance between two samples of the distance field. Finer ones need more memory and triangles.
-        max_depth_m: farther readings are left out, as depth cameras are too noisy there.
+        max_depth_m: farther readings are ignored, as depth cameras are too noisy there.
         max_frames: of more frames, so many are taken, evenly.
         appearance: `texture` projects the sharpest colour image on each triangle, `colors` averages all at the
             vertices.
@@ -53,7 +53,7 @@ class RgbdConfig:
     max_frames: int = 1000
     appearance: Literal["texture", "colors"] = "texture"
 
-    # Voxels behind a surface that count as inside it: 4 cm hold what a depth camera's noise and poses are off by.
+    # Voxels behind a surface that count as inside it: 4 cm cover the noise of depth and poses.
     truncation_voxels: float = field(default=4.0, init=False)
 
     def __post_init__(self) -> None:
@@ -76,7 +76,7 @@ class RgbdConfig:
 
     @property
     def up_direction(self) -> tuple[float, ...] | None:
-        """Up in the recording's world, not of unit length; None to find it. Raises ConfigError if `up` is none."""
+        """Up in the recording's world, not of unit length; None for `auto`. Raises ConfigError if `up` is not a direction."""
         if self.up == "auto":
             return None
         if self.up in UP_AXES:

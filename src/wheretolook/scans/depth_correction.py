@@ -1,4 +1,4 @@
-"""Corrects the depths of a structured-light camera by the landmarks of a map of its colour images.
+"""Correct the depths of a structured-light camera by the landmarks of a map of its colour images.
 
 Such a camera measures disparity, and 1 / depth is linear in it. So a disparity that is a little off, or a baseline that
 is not the nominal one, shows as 1 / z = factor / depth + offset, with errors that grow with the square of the depth:
@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float
 
-LEAST_LANDMARKS = 200
-"""Landmarks with a reading that a correction is fitted to, at least."""
-LEAST_RANGE = 1.5
-"""The far depths over the near ones (90 % and 10 % of the readings): of nearer ones the offset cannot be told."""
-_NOISE = 0.01  # of the depth; readings that are off by more count for ever less (Cauchy)
+MIN_LANDMARKS = 200
+"""Fewest landmarks with a reading for a fit."""
+MIN_RANGE = 1.5
+"""Smallest ratio of far to near depths (90 % and 10 % of the readings) that determines the offset."""
+_NOISE = 0.01  # of the depth; larger errors count less (Cauchy)
 _NEAREST_M = 0.1
 
 
@@ -30,27 +30,27 @@ class DepthCorrection:
     offset_per_m: float = 0.0
 
     def apply(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Corrected depths of any shape; 0, which stands for no reading, stays 0."""
+        """Correct depths of any shape; 0, which means no reading, stays 0."""
         inverse = np.float32(self.factor) / np.maximum(depth_m, np.float32(1e-3)) + np.float32(self.offset_per_m)
         return np.where((depth_m > 0) & (inverse > 0), 1 / np.where(inverse > 0, inverse, 1), 0).astype(np.float32)
 
     def describe(self) -> str:
-        """What it does at 1, 2 and 3 m."""
+        """Text of the correction at 1, 2 and 3 m."""
         at = np.arange(1, 4, dtype=np.float32)
         return ", ".join(f"{100 * by:+.1f} cm at {z:g} m" for z, by in zip(at, self.apply(at) - at, strict=True))
 
 
 def fit_depth_correction(true_m: Float, read_m: Float) -> DepthCorrection | None:
-    """The correction that brings readings (N,) to the depths (N,) of the landmarks there; None if it cannot be told.
+    """Fit the correction from readings (N,) to true depths (N,) of landmarks; None if they do not determine it.
 
-    A third of the readings or so may be of something else, such as a surface in front of the landmark.
+    About a third of the readings may be outliers, such as a surface in front of the landmark.
     """
     from scipy.optimize import least_squares
 
     usable = (read_m > _NEAREST_M) & (true_m > _NEAREST_M)
     true_m = true_m[usable]
     read_m = read_m[usable]
-    if len(read_m) < LEAST_LANDMARKS or np.quantile(read_m, 0.9) < LEAST_RANGE * np.quantile(read_m, 0.1):
+    if len(read_m) < MIN_LANDMARKS or np.quantile(read_m, 0.9) < MIN_RANGE * np.quantile(read_m, 0.1):
         return None
 
     def relative_errors(values: Float) -> Float:

@@ -1,4 +1,4 @@
-"""The frames of an RGB-D recording as one pinhole camera sees them: colour, and depth registered to it."""
+"""Frames of an RGB-D recording in one pinhole camera: colour, and depth registered to it."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from wheretolook.scans.layouts import FrameFiles, Skipped, find_layout, frame_fi
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.images import MAX_DEPTH_PIXELS, MAX_PIXELS, image_size, read_image
 
-SURVEY_STRIDE = 8  # pixels between the readings that are kept of each depth image
-_LEAST_READINGS = 0.02  # share of a depth image's pixels; with fewer it counts as without depth
+SURVEY_STRIDE = 8  # pixels between the readings of each depth image that stay in memory
+_MIN_READINGS = 0.02  # share of a depth image's pixels; with fewer it counts as without depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class RgbdFrame:
 
 
 class Frames(Protocol):
-    """Frames by number, each read when it is asked for."""
+    """Frames by index, read on access."""
 
     def __len__(self) -> int: ...
 
@@ -43,15 +43,15 @@ class Frames(Protocol):
 
 
 class RgbdFrames:
-    """The frames of a recording that can be used; each is read from disk when it is asked for.
+    """The usable frames of a recording, read from disk on access.
 
     `camera` is the pinhole that all are brought to, `cam_from_world` (F, 3, 4) its poses, `names` the paths of the
-    colour images in the recording, `survey_m` (F, h, w) every 8th pixel of the depth images, `skipped` says which
-    frames were left out. `model` is the COLMAP model that poses were taken from, if any. `depth_correction` is none
-    until `correct_depths`.
+    colour images in the recording, `survey_m` (F, h, w) every 8th pixel of the depth images, `skipped` counts
+    frames that were not used. `model` is the COLMAP model that gives the poses, if any. `depth_correction` is the
+    identity until `correct_depths`.
 
-    Raises SceneError if the recording lacks something or its images are of another kind, MapError if the model cannot
-    be read, ConfigError for intrinsics that no camera has.
+    Raises SceneError if the recording is incomplete or its images are of another kind, MapError if the model cannot be
+    read, ConfigError for invalid intrinsics.
     """
 
     def __init__(self, config: RgbdConfig, progress: bool = True) -> None:
@@ -74,7 +74,7 @@ class RgbdFrames:
             depth = self._read_depth(frame.depth)
             if depth is None or _read(frame.color, cv2.IMREAD_REDUCED_COLOR_8) is None:
                 self.skipped.add("with an image that cannot be read")
-            elif (depth > 0).mean() < _LEAST_READINGS:
+            elif (depth > 0).mean() < _MIN_READINGS:
                 self.skipped.add("without depth")
             else:
                 self._frames.append(frame)
@@ -93,7 +93,7 @@ class RgbdFrames:
         image = _read(frame.color, cv2.IMREAD_COLOR)
         depth = self._read_depth(frame.depth)
         if image is None or depth is None:
-            raise SceneError("an image has vanished while it was used", path=frame.color, fix="Run the stage again.")
+            raise SceneError("an image vanished during the run", path=frame.color, fix="Run the stage again.")
         rgb = np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
         if self._undistort is not None:
             across, down = self._undistort
@@ -101,7 +101,7 @@ class RgbdFrames:
         return RgbdFrame(rgb, self._registered(depth))
 
     def correct_depths(self, correction: DepthCorrection) -> None:
-        """Correct all depths that are read from now on, and the survey."""
+        """Apply a correction to the survey and to all depths read later."""
         self.depth_correction = correction
         self.survey_m = correction.apply(self.survey_m)
 
@@ -124,7 +124,7 @@ class RgbdFrames:
         return poses
 
     def _of_one_size(self, frames: list[FrameFiles]) -> list[FrameFiles]:
-        """The frames whose images have the sizes that most have; sets `_size` and `_depth_size`, width by height."""
+        """Select frames whose images have the most frequent sizes; sets `_size` and `_depth_size`, width by height."""
         pairs = [(_size(frame.color), _size(frame.depth)) for frame in frames]
         sizes = [(color, depth) if color and depth else None for color, depth in pairs]
         readable = Counter(size for size in sizes if size is not None)
@@ -179,7 +179,7 @@ class RgbdFrames:
         return self.depth_correction.apply(read_m)
 
     def _registered(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Depth as the pinhole camera sees it: the nearest reading that falls into each pixel."""
+        """Register depth to the pinhole camera: the nearest reading that falls into each pixel."""
         if self._depth_camera == self.camera and not self._color_from_depth_m.any():
             return depth_m
         row, column = np.nonzero(depth_m)

@@ -1,4 +1,4 @@
-"""A recording of colour and depth fused to a mesh, upright, in metres."""
+"""Fuse an RGB-D recording to a mesh, upright, in metres."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ from wheretolook.scans.textures import textured
 from wheretolook.scans.upright import find_up
 from wheretolook.utils.errors import MapWarning, SceneError
 
-_LEAST_READINGS = 3.0  # of a voxel, for its surface to be believed
-_LEAST_PIECE_M2 = 0.01  # smaller pieces that hang in the air are noise
-_DISAGREE_DEG = 30.0  # between up as it is said to be and as it seems
+_MIN_READINGS = 3.0  # of a voxel that is part of the surface
+_MIN_PIECE_M2 = 0.01  # smaller disconnected pieces are noise
+_DISAGREE_DEG = 30.0  # between the given and the estimated direction up
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """What became of a recording."""
+    """The mesh of a recording and its frames."""
 
     mesh: TexturedMesh  # metres, z up
     frames: RgbdFrames
     up: Float  # (3,) unit, up in the recording's world, or the model's
-    rotation: Float  # (3, 3) that turned that world upright
+    rotation: Float  # (3, 3) from that world to the upright one
 
     def describe(self) -> list[str]:
-        """In sentences: frames used and skipped, the unit of depth, up."""
+        """Sentences about frames used and skipped, the unit of depth, and up."""
         skipped = self.frames.skipped.describe()
         used = f"{len(self.frames)} frames of a recording of {self.frames.layout.name}'s layout"
         up = " ".join(f"{value:.2f}" for value in np.round(self.up, 2) + 0.0)
@@ -56,7 +56,7 @@ class Scan:
         return lines
 
     def report(self) -> dict[str, Any]:
-        """The same and more, as values of JSON."""
+        """Properties of the scan as values of JSON."""
         frames = self.frames
         return {
             "layout": frames.layout.name,
@@ -74,7 +74,7 @@ class Scan:
     def save_model(self, folder: Path) -> None:
         """Write the frames as a COLMAP model in the mesh's world: cameras, poses and names, and a given model's points.
 
-        So `wheretolook map --model` makes a map of the colour images that has this mesh.
+        With it, `wheretolook map --model` maps the colour images in the frame of this mesh.
         """
         import pycolmap
 
@@ -94,7 +94,7 @@ class Scan:
 def make_scan(config: RgbdConfig, device: str = "cpu", progress: bool = True) -> Scan:
     """Read, check and fuse the recording in `config.folder`.
 
-    Warns with a `MapWarning` if up as it is given seems wrong. Raises SceneError if the recording lacks something, its
+    Issues a `MapWarning` if the given direction up seems wrong. Raises SceneError if the recording is incomplete, its
     depths are in another unit, or show no surface; MapError if the model cannot be read; ConfigError if the voxels do
     not fit into memory.
     """
@@ -119,10 +119,10 @@ def fuse(
     device: str = "cpu",
     progress: bool = True,
 ) -> TexturedMesh:
-    """The mesh of frames (F) of one camera at poses (F, 3, 4), in their world. Raises SceneError if they show none."""
+    """Fuse frames (F) of one camera at poses (F, 3, 4) to a mesh in their world. Raises SceneError if it is empty."""
     tsdf = TsdfConfig(config.voxel_m, config.truncation_voxels, config.max_depth_m)
     volume = TsdfVolume.from_images(_DepthImages(frames, camera, cam_from_world), tsdf, progress, colored=True)
-    mesh = _without_crumbs(volume.surface(min(_LEAST_READINGS, len(frames))))
+    mesh = _without_small_pieces(volume.surface(min(_MIN_READINGS, len(frames))))
     del volume
     if config.appearance == "texture":
         return textured(mesh, frames, camera, cam_from_world, device, progress)
@@ -138,24 +138,24 @@ def _up(config: RgbdConfig, frames: RgbdFrames, mesh: TexturedMesh) -> Float:
     off_deg = float(np.degrees(np.arccos(np.clip(up @ held, -1, 1))))
     if off_deg > _DISAGREE_DEG:
         seems = " ".join(f"{value:.2f}" for value in np.round(held, 2) + 0.0)
-        text = f"{frames.folder}: up is said to be {config.up}, but as the camera was held it is ({seems}), "
-        text += f"{off_deg:.0f} degrees from it. --scenes.rgbd.up auto finds it"
+        text = f"{frames.folder}: up is given as {config.up}, but as the camera was held it is ({seems}), "
+        text += f"{off_deg:.0f} degrees from it. --scenes.rgbd.up auto estimates it"
         warnings.warn(text, MapWarning, stacklevel=3)
     return up
 
 
-def _without_crumbs(mesh: TexturedMesh) -> TexturedMesh:
-    """The mesh without small pieces that are connected to nothing, and without vertices that nothing uses."""
+def _without_small_pieces(mesh: TexturedMesh) -> TexturedMesh:
+    """Remove small disconnected pieces of a mesh, and unused vertices."""
     n = len(mesh.vertices)
     (a, b, c) = mesh.triangles.T
     edges = coo_array((np.ones(2 * len(a), dtype=np.int8), (np.r_[a, b], np.r_[b, c])), shape=(n, n))
     _, piece = connected_components(edges, directed=False)
     piece_of = piece[a]
     area_m2 = np.bincount(piece_of, np.linalg.norm(mesh.normals, axis=1) / 2)
-    keep = area_m2[piece_of] >= _LEAST_PIECE_M2
+    keep = area_m2[piece_of] >= _MIN_PIECE_M2
     if not keep.any():
         fix = "Check the poses, and that depths are in metres."
-        raise SceneError("the depth images show no surface, only crumbs", value=f"{area_m2.max():.2g} m2", fix=fix)
+        raise SceneError("the depth images show no connected surface", value=f"{area_m2.max():.2g} m2", fix=fix)
     used, triangles = np.unique(mesh.triangles[keep], return_inverse=True)
     colors = None if mesh.vertex_colors is None else mesh.vertex_colors[used]
     rest: dict[str, Any] = {"vertices": mesh.vertices[used], "vertex_colors": colors}
@@ -163,7 +163,7 @@ def _without_crumbs(mesh: TexturedMesh) -> TexturedMesh:
 
 
 class _DepthImages(Sequence[DepthImage]):
-    """Frames as the fusion takes them, each read when it is asked for."""
+    """Frames as depth images for the fusion, read on access."""
 
     def __init__(self, frames: Frames, camera: PinholeCamera, poses: NDArray[Any]) -> None:
         self.frames = frames

@@ -1,4 +1,4 @@
-"""Which files make the frames of an RGB-D recording, in the layouts of 7-Scenes and of the TUM RGB-D benchmark.
+"""List the frames of an RGB-D recording in the layout of 7-Scenes or of the TUM RGB-D benchmark.
 
 Shotton et al., "Scene Coordinate Regression Forests for Camera Relocalization in RGB-D Images", CVPR 2013; Sturm et
 al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012.
@@ -17,24 +17,24 @@ from wheretolook.utils.confine import path_within
 from wheretolook.utils.errors import SceneError
 from wheretolook.utils.reading import read_text
 
-_MAX_APART_S = 0.02  # between a colour image and its depth image or pose: as TUM's own associate.py has it
-_RIGID = 1e-2  # by which a rotation's entries may be off
-_FAR_M = 1e9  # from the origin; no recording has such coordinates
-_MOST_FRAMES = 100_000  # rows of a list: an hour at 30 Hz and at 100 Hz
-_MOST_POSES = 400_000
+_MAX_APART_S = 0.02  # between a colour image and its depth image or pose, as in TUM's associate.py
+_RIGID_TOLERANCE = 1e-2  # of a rotation's entries
+_MAX_COORDINATE_M = 1e9
+_MAX_FRAMES = 100_000  # rows of a list: an hour at 30 Hz
+_MAX_POSES = 400_000  # an hour at 100 Hz
 _IMAGES = (".png", ".jpg", ".jpeg")
 
 
 @dataclass(frozen=True)
 class Layout:
-    """What the images of a layout are like, where nothing else is said; intrinsics are fx, fy, cx, cy in pixels."""
+    """Default properties of a layout's images; intrinsics are fx, fy, cx, cy in pixels."""
 
     name: str
     depth_scale: float  # units in a metre
     camera: tuple[float, float, float, float]
     depth_camera: tuple[float, float, float, float] | None  # None: depth images are registered to the colour images
     color_from_depth_m: tuple[float, float, float]
-    no_reading: int  # value of a depth pixel without one, beside 0
+    no_reading: int  # value of a depth pixel without reading, in addition to 0
 
 
 # Kinect's nominal cameras, 2.5 cm apart. The pose is the depth camera's.
@@ -51,13 +51,13 @@ class FrameFiles:
     name: str  # path of the colour image, relative to the recording
     color: Path
     depth: Path
-    cam_from_world: Float  # (3, 4), as the recording tells: of its depth camera; or of a model's image
+    cam_from_world: Float  # (3, 4) of the recording's depth camera, or of a model's image
     in_model: str = ""  # the name of that image
 
 
 @dataclass
 class Skipped:
-    """How many frames were not used, and why."""
+    """Numbers of frames that were not used, by reason."""
 
     reasons: dict[str, int] = field(default_factory=dict)
 
@@ -66,12 +66,12 @@ class Skipped:
         self.reasons[reason] = self.reasons.get(reason, 0) + 1
 
     def describe(self) -> str:
-        """Such as "3 without a pose, 1 without depth"; empty for none."""
+        """Text such as "3 without a pose, 1 without depth"."""
         return ", ".join(f"{number} {reason}" for reason, number in self.reasons.items())
 
 
 def find_layout(folder: Path) -> Layout:
-    """The layout of a recording. Raises SceneError if it has neither."""
+    """Detect the layout of a recording. Raises SceneError if it is of neither kind."""
     if not folder.is_dir():
         raise SceneError("there is no such folder", path=folder, fix="Name the folder of an RGB-D recording.")
     if (folder / "rgb.txt").is_file() and (folder / "depth.txt").is_file():
@@ -83,10 +83,9 @@ def find_layout(folder: Path) -> Layout:
 
 
 def frame_files(folder: Path, layout: Layout, need_poses: bool = True) -> tuple[list[FrameFiles], Skipped]:
-    """The frames of a recording that have all their files and a pose, in order, and how many have not.
+    """List the frames of a recording that have all their files and a pose, and count the others.
 
-    Where poses come from elsewhere, those missing are the identity. Raises SceneError if a list of files or all poses
-    are missing.
+    Unless poses are needed, they are the identity. Raises SceneError if a list of files or all poses are missing.
     """
     skipped = Skipped()
     read = _tum_frames if layout is TUM else _seven_scenes_frames
@@ -119,7 +118,7 @@ def _seven_scenes_frames(folder: Path, skipped: Skipped, need_poses: bool) -> It
 
 
 def _read_pose(path: Path) -> Float | None:
-    """cam_from_world of a file of world_from_cam, four rows of four numbers; None if it is missing or no pose."""
+    """Read cam_from_world from a file of world_from_cam, four rows of four numbers; None if it is missing or invalid."""
     try:
         matrix = np.array(read_text(path, 10_000).split(), dtype=np.float64)
     except (OSError, ValueError):
@@ -128,9 +127,11 @@ def _read_pose(path: Path) -> Float | None:
 
 
 def _checked(world_from_cam: Float) -> Float | None:
-    """cam_from_world with an exact rotation; None if there is none."""
+    """Invert world_from_cam to cam_from_world with an exact rotation; None if it is not a pose."""
     rotation = world_from_cam[:, :3]
-    if not (np.abs(world_from_cam) < _FAR_M).all() or not np.allclose(rotation @ rotation.T, np.eye(3), atol=_RIGID):
+    if not (np.abs(world_from_cam) < _MAX_COORDINATE_M).all() or not np.allclose(
+        rotation @ rotation.T, np.eye(3), atol=_RIGID_TOLERANCE
+    ):
         return None
     u, _, vt = np.linalg.svd(rotation)
     if np.linalg.det(u @ vt) < 0:
@@ -139,11 +140,11 @@ def _checked(world_from_cam: Float) -> Float | None:
 
 
 def _tum_frames(folder: Path, skipped: Skipped, need_poses: bool) -> Iterator[FrameFiles]:
-    rgb, depth = (_read_list(folder / name, 1, _MOST_FRAMES) for name in ("rgb.txt", "depth.txt"))
+    rgb, depth = (_read_list(folder / name, 1, _MAX_FRAMES) for name in ("rgb.txt", "depth.txt"))
     times = list[float]()
     poses = np.zeros((0, 7))
     if need_poses:
-        rows = _read_list(folder / "groundtruth.txt", 7, _MOST_POSES)
+        rows = _read_list(folder / "groundtruth.txt", 7, _MAX_POSES)
         times = [time for time, _ in rows]
         poses = np.array([[_number(value) for value in values] for _, values in rows])
     depth_of = _Times([time for time, _ in depth])
@@ -170,15 +171,15 @@ def _tum_frames(folder: Path, skipped: Skipped, need_poses: bool) -> Iterator[Fr
 
 
 def _tum_pose(values: Float) -> Float | None:
-    """cam_from_world of tx, ty, tz, qx, qy, qz, qw of world_from_cam; None if that is no pose."""
-    if not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1) > _RIGID:
+    """Convert tx, ty, tz, qx, qy, qz, qw of world_from_cam to cam_from_world; None if it is not a pose."""
+    if not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1) > _RIGID_TOLERANCE:
         return None
     rotation = rotation_from_quaternion(values[[6, 3, 4, 5]])
     return _checked(np.column_stack([rotation, values[:3]]))
 
 
 class _Times:
-    """Times of a list, which need not be in order."""
+    """Times of a list in any order."""
 
     def __init__(self, times: Iterable[float]) -> None:
         self.times = np.array([*times], dtype=np.float64)
@@ -186,7 +187,7 @@ class _Times:
         self.times = self.times[self.order]
 
     def nearest(self, time: float) -> int | None:
-        """The row of the nearest time, of equals the first; None if none is near."""
+        """Row of the nearest time, the first of equals; None if none is within the limit."""
         end = int(np.searchsorted(self.times, time))
         near = [at for at in (end - 1, end) if 0 <= at < len(self.times)]
         at = min(near, key=lambda at: abs(self.times[at] - time), default=None)
@@ -203,7 +204,7 @@ def _number(text: str) -> float:
 
 
 def _read_list(path: Path, n_values: int, at_most: int) -> list[tuple[float, list[str]]]:
-    """Rows of a TUM list: a time, and so many values. SceneError if it is missing, or has other rows, or too many."""
+    """Read rows of a TUM list: a time and `n_values` values. Raises SceneError if it is missing, invalid or too long."""
     try:
         text = read_text(path)
         if text.count("\n") > at_most:

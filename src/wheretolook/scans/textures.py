@@ -1,7 +1,7 @@
-"""Textures from photographs: every triangle shows the piece of one photograph that it projects to.
+"""Texture a mesh from photographs: every triangle shows the part of one photograph that it projects to.
 
-Each photograph is a texture, so nothing is resampled. Of photographs that show a triangle about as large, one that
-shows many of them is taken, greedily, so that seams are few (set cover; the problem is that of Lempitsky and Ivanov,
+Each photograph is a texture, so nothing is resampled. Among photographs that show a triangle about equally large, one
+that shows many triangles is chosen, greedily, so that seams are few (set cover; the problem is that of Lempitsky and Ivanov,
 "Seamless Mosaicing of Image-Based Texture Maps", CVPR 2007).
 """
 
@@ -22,12 +22,12 @@ from wheretolook.rendering.registry import make_renderer
 from wheretolook.rendering.types import Renderer
 from wheretolook.scans.frames import Frames
 
-MAX_PHOTOGRAPHS = 100  # that are looked at; of more, so many evenly
-_BEHIND_M = 0.03  # by which a corner may lie behind what a photograph sees: voxels and rounding
-_EDGE_PX = 5  # pixels around that must see nothing nearer: at an edge, poses decide which side a pixel shows
+MAX_PHOTOGRAPHS = 100  # larger sets are subsampled evenly
+_BEHIND_M = 0.03  # tolerance of the visibility of a corner: voxels and rounding
+_EDGE_PX = 5  # window that must not contain nearer surface: at an edge, small pose errors change the surface
 _MARGIN_PX = 8  # at the image's border
-_GAINS = (0.5, 2.0)  # least and greatest by which a photograph's exposure is changed
-_NEARLY = 0.5  # share of the largest area in pixels that any photograph shows of a triangle, to be taken, too
+_GAINS = (0.5, 2.0)  # range of exposure correction
+_MIN_AREA_SHARE = 0.5  # of the largest area in pixels of a triangle in any photograph
 
 
 def textured(
@@ -38,7 +38,7 @@ def textured(
     device: str = "cpu",
     progress: bool = True,
 ) -> TexturedMesh:
-    """The mesh with photographs (F) of poses (F, 3, 4) as its textures; vertex colours where none shows a triangle."""
+    """Texture a mesh with photographs (F) at poses (F, 3, 4); triangles that none shows get their vertex colours."""
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MAX_PHOTOGRAPHS)).round().astype(int))
     poses = cam_from_world[chosen]
     areas = np.zeros((len(chosen), len(mesh.triangles)), dtype=np.float16)
@@ -68,7 +68,7 @@ def textured(
 
 
 def _areas_px(mesh: TexturedMesh, renderer: Renderer, camera: PinholeCamera, pose: Float) -> NDArray[np.float16]:
-    """How many pixels a photograph shows of each triangle (T,); 0 of those hidden, turned away or not all in it."""
+    """Area in pixels of each triangle (T,) in a photograph; 0 if it is hidden, turned away or not completely inside."""
     depth = renderer.render(camera, pose[None]).depth_m[0]
     nearest = cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), np.ones((_EDGE_PX, _EDGE_PX), np.uint8))
     points = transform(poses_from(pose, mesh.origin), mesh.vertices)
@@ -89,9 +89,9 @@ def _areas_px(mesh: TexturedMesh, renderer: Renderer, camera: PinholeCamera, pos
 
 
 def _cover(areas: NDArray[np.float16]) -> NDArray[np.int64]:
-    """The photograph of each triangle (T,), -1 for none, by the areas (F, T) that each shows."""
+    """Choose the photograph of each triangle (T,), -1 for none, from the areas (F, T) in pixels."""
     best = areas.max(0)
-    good = (areas > 0) & (areas >= np.float16(_NEARLY) * best)
+    good = (areas > 0) & (areas >= np.float16(_MIN_AREA_SHARE) * best)
     chosen = np.full(areas.shape[1], -1)
     open_ones = good.sum(1)
     while open_ones.max() > 0:
@@ -106,9 +106,9 @@ def _cover(areas: NDArray[np.float16]) -> NDArray[np.int64]:
 def _as_exposed(
     rgb: NDArray[np.uint8], pixels: Float, mesh: TexturedMesh, triangles: NDArray[np.int64]
 ) -> NDArray[np.uint8]:
-    """A photograph as bright, channel by channel, as the mean of all is where it shows triangles (N,), at (N, 2) px.
+    """Scale a photograph's channels to the mean vertex colour of the triangles (N,) that it shows at (N, 2) px.
 
-    Cameras set their exposure and white balance anew for every photograph, which would leave edges at seams.
+    Cameras adjust exposure and white balance for every photograph, which would leave edges at seams.
     """
     if mesh.vertex_colors is None:
         return rgb
@@ -120,7 +120,7 @@ def _as_exposed(
 
 
 def _flat_colors(mesh: TexturedMesh, rows: NDArray[np.int64]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """A texture of one texel for each of some triangles, in the mean colour of its corners, and their corners' uvs."""
+    """A texture of one texel per triangle, in the mean colour of its corners, and the texture coordinates."""
     side = int(np.ceil(np.sqrt(len(rows))))
     texels = np.full((side * side, 3), 255, dtype=np.uint8)
     if mesh.vertex_colors is not None:

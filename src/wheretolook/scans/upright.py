@@ -1,4 +1,4 @@
-"""Which way is up in a recording: by how the camera was held, and by the floors and walls that it saw."""
+"""Estimate the direction up in a recording, from how the camera was held and from floors and walls."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ from wheretolook.geometry.poses import Float
 from wheretolook.mapping.gravity import estimate_gravity
 
 _ROUNDS_DEG = (45.0,) * 5 + (15.0,) * 5
-_IS_Z_DEG = 3.0  # a world so nearly upright is meant to be
+_IS_Z_DEG = 3.0  # a world this close to upright counts as upright
 
 
 def find_up(cam_from_world: Float, mesh: TexturedMesh) -> Float:
-    """The direction up (3,), unit, in the frame of poses (F, 3, 4) and a mesh of what they saw.
+    """Estimate the unit direction up (3,) in the frame of poses (F, 3, 4) and of a mesh of the recording.
 
-    From the poses as `estimate_gravity` does, then refined by the mesh: floors and walls lie at right angles to up or
-    along it (Gupta, Arbelaez and Malik, "Perceptual Organization and Recognition of Indoor Scenes from RGB-D Images",
+    Starts from `estimate_gravity`, then refines it by the mesh: floors and walls are perpendicular or parallel to up (Gupta, Arbelaez and Malik, "Perceptual Organization and Recognition of Indoor Scenes from RGB-D Images",
     CVPR 2013), weighted by area. z itself if it is that to within 3 degrees.
     """
     up = estimate_gravity(cam_from_world).up

@@ -1,4 +1,4 @@
-"""What a procedural apartment is like: options only, so that the command line reads them quickly."""
+"""Options of procedural apartments."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ class ApartmentConfig:
                 raise ConfigError(f"{name} must be a positive number", value=getattr(self, name))
 
     def key(self) -> dict[str, Any]:
-        """What decides an apartment, but for its seed; options that came later only where they are not the default."""
+        """Settings that determine an apartment apart from its seed; later options only if they are not the default."""
         later = ("repetition", "enlarged", "vary")
         default = asdict(ApartmentConfig())
         return {name: value for name, value in asdict(self).items() if name not in later or value != default[name]}
 
     def of_seed(self, seed: int) -> ApartmentConfig:
-        """What the apartment of a seed is like: this, unless it is to `vary`."""
+        """The options of the apartment of a seed: these, unless `vary` is set."""
         if not self.vary:
             return self
         rng = np.random.default_rng([seed, 2])

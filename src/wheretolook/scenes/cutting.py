@@ -1,4 +1,4 @@
-"""Cutting a mesh by a level plane."""
+"""Cut a mesh by a horizontal plane."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from wheretolook.geometry.mesh import TexturedMesh
 
 
 def cut_above(mesh: TexturedMesh, height_m: float) -> TexturedMesh:
-    """The part of a mesh at or below a world height; triangles that reach above it are cut."""
+    """Return the part of a mesh at or below a world height; triangles that reach above it are cut."""
     height_m -= float(mesh.origin[2])
     below = mesh.vertices[mesh.triangles][..., 2] <= height_m
     n_below = below.sum(1)
     whole = n_below == 3
     rows = np.flatnonzero((n_below == 1) | (n_below == 2))
-    # In each triangle that is cut, the corner that is alone on its side of the plane comes first.
+    # In each cut triangle, the corner that is the only one on its side of the plane comes first.
     lone = np.where(n_below[rows] == 1, below[rows].argmax(1), (~below[rows]).argmax(1))
     order = (lone[:, None] + np.arange(3)) % 3
     corners = np.take_along_axis(mesh.triangles[rows], order, axis=1)
@@ -30,7 +30,7 @@ def cut_above(mesh: TexturedMesh, height_m: float) -> TexturedMesh:
     on_second, on_third = len(mesh.vertices) + np.arange(2 * len(rows)).reshape(2, -1)
 
     def with_cuts(values: NDArray[Any]) -> NDArray[Any]:
-        """Values of the old vertices, followed by those of the new ones on the plane."""
+        """Append the values of the new vertices on the plane."""
         new = (1 - along) * values[corners[:, 0]] + along * values[corners[:, 1:].T]
         return np.concatenate([values, new.reshape(-1, values.shape[1]).astype(values.dtype)])
 

@@ -1,4 +1,4 @@
-"""Reading textured meshes from GLB, PLY and OBJ files, and writing them as GLB."""
+"""Read textured meshes from GLB, PLY and OBJ files, and write them as GLB."""
 
 from __future__ import annotations
 

@@ -13,18 +13,17 @@ resampled together; differences to the first method are paired.
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score
 
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.sampling_config import Split
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, is_good, poses
+from wheretolook.evaluation.bootstrap import ClusterBootstrap
 from wheretolook.evaluation.calibration import expected_calibration_error
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.scores import is_probability
@@ -40,21 +39,6 @@ RIGHT = 0.5, 5.0  # metres and degrees within which a pose is not a wrong hypoth
 SHARES = ("expected-inliers", "visible")  # scores that are shares of a map's landmarks
 SQUARE_M = 1.0  # locations in one square of the floor are resampled together
 DRAWS = 2000
-
-
-@dataclass(frozen=True)
-class Group:
-    """Views evaluated together: of a scene, or of some cameras.
-
-    Args:
-        kind: groups of a kind are averaged first.
-        name: of the scene or the cameras.
-        rows: (V,) of the views in their table.
-    """
-
-    kind: str
-    name: str
-    rows: NDArray[Any]
 
 
 def scored(root: Path, split: Split, methods: tuple[str, ...], weights: list[Path]) -> pd.DataFrame:
@@ -88,58 +72,35 @@ def scored(root: Path, split: Split, methods: tuple[str, ...], weights: list[Pat
     return views.assign(**{name: views[name] * views["n_landmarks"] for name in SHARES if name in views})
 
 
-def groups(views: pd.DataFrame) -> list[Group]:
-    """Return the scenes, and narrow and wide cameras where scenes have several cameras."""
-    found = [
-        Group(str(part["kind"].iloc[0]), str(scene), part.index.to_numpy())
-        for scene, part in views.groupby("scene", sort=False)
-    ]
+def groups(views: pd.DataFrame) -> list[tuple[str, str, pd.DataFrame]]:
+    """Return kind, name and views of each scene, and of narrow and wide cameras where scenes have several cameras."""
+    found = [(str(part["kind"].iloc[0]), str(name), part) for name, part in views.groupby("scene", sort=False)]
     if views.groupby("scene")["across"].nunique().max() > 1:
-        across = views["across"].to_numpy()
-        found += [
-            Group(name, f"{name} cameras", np.flatnonzero(chosen))
-            for name, chosen in (("narrow", across < NARROW_DEG), ("wide", across > WIDE_DEG))
-        ]
+        found.append(("narrow", "narrow cameras", views[views["across"] < NARROW_DEG]))
+        found.append(("wide", "wide cameras", views[views["across"] > WIDE_DEG]))
     return found
 
 
-def regrets(views: pd.DataFrame, method: str) -> pd.DataFrame:
-    """Return the regret (0 or 1) of each location's best view by a method, and the location's square."""
-    order = views.assign(score=views[method]).sort_values("score", ascending=False, kind="stable")
-    best = order.groupby("location")["good"].first()
-    one = views.groupby("location").agg(good=("good", "any"), square=("square", "first"))
-    return pd.DataFrame({"regret": one["good"].astype(float) - best.astype(float), "square": one["square"]})
-
-
-def _drawn_squares(views: pd.DataFrame) -> tuple[dict[str, int], NDArray[np.float64]]:
-    """Return the column of each square, and how often squares are drawn (DRAWS, squares), within scenes.
-
-    All groups and methods share the draws, because they share locations.
-    """
-    rng = np.random.default_rng(0)
-    columns: dict[str, int] = {}
-    parts = []
-    for _, part in views.groupby("scene", sort=False):
-        squares = part["square"].unique()
-        columns |= {str(square): len(columns) + k for k, square in enumerate(squares)}
-        parts.append(rng.multinomial(len(squares), np.full(len(squares), 1 / len(squares)), DRAWS))
-    return columns, np.concatenate(parts, 1).astype(float)
+def regrets(views: pd.DataFrame, method: str) -> pd.Series:
+    """Return the regret (0 or 1) of the best view by a method, by location."""
+    order = views.sort_values(method, ascending=False, kind="stable").groupby("location")["good"]
+    return order.any().astype(float) - order.first().astype(float)
 
 
 def summary(views: pd.DataFrame, methods: list[str]) -> pd.DataFrame:
-    """Return a row for each group and method, and the mean over kinds."""
+    """Return a row for each group and method, for each kind, and for the mean over kinds."""
+    locations = views.drop_duplicates("location").set_index("location")
+    strata, clusters = (pd.factorize(locations[name])[0] for name in ("scene", "square"))
+    bootstrap = ClusterBootstrap(clusters, DRAWS, 0, strata)
     rows: list[dict[str, Any]] = []
-    draws: dict[tuple[str, str], Float] = {}
-    known, drawn = _drawn_squares(views)
-    for group in groups(views):
-        part = views.loc[group.rows]
+    draws: list[Float] = []  # regret of each row: of the data, then of the resamples
+    for kind, name, part in groups(views):
         for method in methods:
             regret = regrets(part, method)
-            squares = regret.groupby("square")["regret"].agg(["sum", "size"])
-            total = drawn[:, [known[square] for square in squares.index]] @ squares.to_numpy()
-            draws[group.name, method] = 100 * total[:, 0] / total[:, 1]
-            row = {"kind": group.kind, "group": group.name, "method": method, "n_locations": len(regret)}
-            row |= {"n_views": len(part), "good": part["good"].mean(), "regret": 100 * regret["regret"].mean()}
+            known = regret.reindex(locations.index)
+            draws.append(100 * bootstrap.ratios(known.fillna(0).to_numpy(), known.notna().to_numpy(float)))
+            row = {"kind": kind, "group": name, "method": method, "n_locations": len(regret), "n_views": len(part)}
+            row |= {"good": part["good"].mean(), "regret": draws[-1][0]}
             row["auc"] = roc_auc_score(part["good"], part[method])
             if is_probability(method):
                 row["ece"] = expected_calibration_error(part[method].to_numpy(), part["good"].to_numpy())
@@ -147,22 +108,21 @@ def summary(views: pd.DataFrame, methods: list[str]) -> pd.DataFrame:
                 right = part[part["right"]]
                 row["real_over_expected"] = right["inliers"].sum() / right[method].sum()
             rows.append(row)
-    table = pd.DataFrame(rows)
-    of_kinds = table.groupby(["kind", "method"], sort=False)[["regret", "auc", "ece"]].mean().reset_index()
-    means = of_kinds.groupby("method", sort=False)[["regret", "auc", "ece"]].mean().reset_index()
-    kinds = table.drop_duplicates("group")[["kind", "group"]]
-    for method in methods:
-        for kind, names in kinds.groupby("kind", sort=False)["group"]:
-            draws[f"all {kind}", method] = np.mean([draws[name, method] for name in names], 0)
-        draws["mean", method] = np.mean([draws[f"all {kind}", method] for kind in kinds["kind"].unique()], 0)
+    table = pd.DataFrame(rows).assign(draws=draws)
+    numbers = {name: "mean" for name in ("regret", "auc", "ece", "draws") if name in table}
+    of_kinds = table.groupby(["kind", "method"], sort=False).agg(numbers | {"draws": _mean}).reset_index()
+    means = of_kinds.groupby("method", sort=False).agg(numbers | {"draws": _mean}).reset_index()
     of_kinds = of_kinds.assign(group="all " + of_kinds["kind"])
     table = pd.concat([table, of_kinds, means.assign(kind="mean", group="mean")], ignore_index=True)
-    for index, group_name, method in zip(table.index, table["group"], table["method"], strict=True):
-        of_row = draws[group_name, method]
-        table.loc[index, ["regret_low", "regret_high"]] = np.quantile(of_row, (0.025, 0.975))
-        difference = of_row - draws[group_name, methods[0]]
-        table.loc[index, ["more_low", "more_high"]] = np.quantile(difference, (0.025, 0.975))
-    return table
+    first = table[table["method"] == methods[0]].set_index("group")["draws"]
+    for index, row_draws, group in zip(table.index, table["draws"], table["group"], strict=True):
+        table.loc[index, ["regret_low", "regret_high"]] = np.quantile(row_draws[1:], (0.025, 0.975))
+        table.loc[index, ["more_low", "more_high"]] = np.quantile((row_draws - first[group])[1:], (0.025, 0.975))
+    return table.drop(columns="draws")
+
+
+def _mean(draws: pd.Series) -> Float:
+    return np.mean(np.stack(draws.to_list()), 0)
 
 
 def main() -> None:

@@ -84,25 +84,25 @@ Sets of looks from a place, localized together. Open the run (+) to compare: in 
     "train": Purpose(
         """\
 What was trained, a run for each time. Compare the last epoch kept by `kept_val_average_precision`, highest first, with
-`method` beside it; the charts of `val_bce` and `train_bce` by step tell whether a network has learnt too long. Weights
+`method` next to it; the charts of `val_bce` and `train_bce` by step show overfitting. Weights
 and `history.csv` are artifacts.""",
         {"trained": View("what was trained, the best first", _KEPT, ("params.method", f"metrics.{AUC}"), "", False)},
     ),
     "learners": Purpose(
         f"""\
-Everything that can learn, on scenes that it has not learnt from. The run's own numbers are those of the learner with
+All learners on scenes that they were not trained on. The run's own numbers are those of the learner with
 the lowest mean regret (tag `best`). Open it (+) to compare: in it is a run for each `learner` × `learnt_from` × `seed`.
 
 - `{REGRET}`, `{AUC}`: on the test scenes; **sort by the first, lowest first**
 - `regret_others`, `average_precision_others`: on scenes by others; `…_validation`: what one may choose a learner by
 
-Runs that differ by `seed` alone tell how much of a difference is luck.""",
+Runs that differ only by `seed` show the spread by chance.""",
         {"learners": View("all learners, the best first", REGRET, _LEARNERS, "params.learner LIKE '%'")},
     ),
     "adapt": Purpose(
         """\
 Weights adapted to single scenes. Compare `regret`, `auc`, `calibration_error` and `log_loss` with the same names ending
-in `_before`: all of views that were not learnt from. `better` is 1 where the adapted weights were kept."""
+in `_before`: all on views that were not trained on. `better` is 1 where the adapted weights were kept."""
     ),
     "paths": Purpose(
         """\

@@ -1,4 +1,4 @@
-"""The paper's two tables with this project's numbers beside the printed ones, as CSV, LaTeX and Markdown."""
+"""The paper's two tables with this project's numbers next to the printed ones, as CSV, LaTeX and Markdown."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ _SOURCES = ("normalized", "normalized_low", "normalized_high", "released")
 
 
 def paper_tables(scores: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """The paper's tables, "vs_others" and "input_variants", with this project's numbers beside the printed ones.
+    """The paper's tables, "vs_others" and "input_variants", with this project's numbers next to the printed ones.
 
     Of a score table (`wheretolook.evaluation.scores.score_table`) the rows over all scenes with N = 1 are taken, those
     of the first occlusion model and the first set of candidates.

@@ -1,7 +1,7 @@
-"""Which figure or table of the paper is drawn from which logged run, and what to run where there is none.
+"""Catalog of figures and tables: the logged run that each is drawn from, and the command that makes this run.
 
-Another item is another entry of `ITEMS`: its name, what it is in the paper, the run and file that it needs, the command
-that makes that run, and a function from `Source` to a figure, or to texts by their files' endings.
+To add one, add an entry to `ITEMS`: its name, its number in the paper, the run and file that it needs, the command that
+makes that run, and a function from `Source` to a figure, or to texts by file suffix.
 """
 
 from __future__ import annotations
@@ -70,19 +70,19 @@ if TYPE_CHECKING:
     from wheretolook.scorers.binned_network import BinnedNetworkScorer
 
 Texts = Mapping[str, str]
-"""A table: its text by the ending of its file, such as "md"."""
+"""A table: its text by file suffix, such as "md"."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """What an item is drawn from: the dataset that it is about, and the newest of each kind of run that it needs."""
+    """Input of an item: its dataset and the newest runs that it needs."""
 
     dataset: Dataset
     tracking: TrackingConfig
     runs: tuple[Run, ...]
 
     def file(self, name: str) -> Path:
-        """An artifact of the first run."""
+        """Return the path of an artifact of the first run."""
         return artifact(self.tracking, self.runs[0].info.run_id, name)
 
 
@@ -94,18 +94,18 @@ class Item:
     """A figure or a table.
 
     Attributes:
-        name: of its files.
-        paper: what it is in the paper, such as "Table 2"; "" if the paper has none.
-        what: it shows, in a few words.
-        notebook: that shows it.
-        draw: makes it.
-        stage: tag of the run that it needs; "" for none.
-        file: artifact that the run must have.
+        name: name of its files.
+        paper: its number in the paper, such as "Table 2"; "" if the paper has none.
+        what: its content in a few words.
+        notebook: the notebook that shows it.
+        draw: draws it.
+        stage: stage of the required run; "" for none.
+        file: required artifact of the run.
         command: makes such a run; {config} stands for the dataset's configuration, {source} for that of the dataset
-            with meshes: of a release, the one that it was copied from.
-        params: parameters that the run must have; "{dataset}" stands for the dataset's name.
-        of_release: whether only a release has it: it shows a scene made anew from its seed, or other datasets' results.
-        of_source: whether a run of the dataset that a release was copied from serves, too.
+            that a release was copied from.
+        params: required parameters of the run; "{dataset}" stands for the dataset's name.
+        of_release: whether only a release has it, because it shows a regenerated scene or results on other datasets.
+        of_source: whether a run of the dataset that a release was copied from is accepted.
     """
 
     name: str
@@ -121,7 +121,7 @@ class Item:
     of_source: bool = False
 
     def runs(self, dataset: Dataset, tracking: TrackingConfig) -> tuple[Run, ...]:
-        """The newest run of those that it can be drawn from; of train runs the newest of each method."""
+        """Return the newest run that it can be drawn from; of train runs the newest of each method."""
         found: dict[str, Run] = {}
         for name in (dataset.name, *([_source_of(dataset)] if self.of_source else [])):
             params = {key: value.format(dataset=name) for key, value in self.params}
@@ -135,19 +135,19 @@ class Item:
         return tuple(found.values())
 
     def command_for(self, dataset: Dataset) -> str:
-        """What to run to make what is missing."""
+        """Return the command that makes the missing run."""
         return self.command.format(config=f"configs/{dataset.name}.yaml", source=f"configs/{_source_of(dataset)}.yaml")
 
 
 def _source_of(dataset: Dataset) -> str:
-    """Name of the dataset that a release was copied from; of another, its own."""
+    """Return the name of the dataset that a release was copied from; of another dataset, its own."""
     return str(read_about(dataset)["source"]) if is_release(dataset) else dataset.name
 
 
 def _of(
     draw: Callable[[pd.DataFrame], Figure], file: str, read: Callable[[Path], pd.DataFrame] = pd.read_csv
 ) -> Drawer:
-    """Draws a figure of the table that lies in an artifact."""
+    """Return a function that draws the table in an artifact."""
 
     def drawer(source: Source) -> Figure:
         return draw(read(source.file(file)))
@@ -193,13 +193,13 @@ _open = lru_cache(maxsize=1)(open_showcase)
 
 
 def _shown(source: Source, weights: str = "") -> tuple[Showcase, Scorer, int]:
-    """The first test scene of a release, a scorer of it, and a place where looking matters."""
+    """Return the first test scene of a release, a scorer, and an instructive location."""
     showcase = _open(source.dataset)
     scorer = load_scorer(source.dataset.root / "weights" / weights, showcase.localization_map)
     return showcase, scorer, showcase.instructive_location()
 
 
-def _learnt(source: Source) -> Learning:
+def _walkthrough(source: Source) -> Learning:
     showcase, scorer, location = _shown(source, f"{method_of_run(source.runs[0])}.safetensors")
     return learning_of(showcase, cast("BinnedNetworkScorer", scorer), location)
 
@@ -209,7 +209,7 @@ def _pipeline(source: Source) -> Figure:
 
 
 def _learning(source: Source) -> Figure:
-    return learning_figure(*_learnt(source))
+    return learning_figure(*_walkthrough(source))
 
 
 def _sampling(source: Source) -> Figure:
@@ -218,7 +218,7 @@ def _sampling(source: Source) -> Figure:
 
 
 def _inputs(source: Source) -> Figure:
-    return inputs_figure(_learnt(source).image)
+    return inputs_figure(_walkthrough(source).image)
 
 
 def _peaks(source: Source) -> Figure:
@@ -278,17 +278,17 @@ ITEMS: tuple[Item, ...] = (
     Item("visibility_scaling", "", "how time and memory grow", "08_runtimes", _of(scaling_figure, SCALING_CSV),
          "benchmark", SCALING_CSV, _BENCH.format(" --scaling"), ()),
 )  # fmt: skip
-"""The paper's in its order, then those that it has none of."""
+"""The paper's in its order, then further ones."""
 
 
 def catalog_text() -> str:
-    """The catalog for people: name, paper's item, what it shows, notebook, stage of its run."""
+    """Format the catalog: name, number in the paper, content, notebook, stage of the run."""
     rows = [[item.name, item.paper or "–", item.what, item.notebook, item.stage or "–"] for item in ITEMS]
     return markdown_table(["name", "paper", "shows", "notebook", "run"], rows)
 
 
 def check_names(config: FiguresConfig) -> None:
-    """Raise ConfigError unless there are all the items that are asked for."""
+    """Raise ConfigError for unknown items."""
     unknown = set(config.only) - {item.name for item in ITEMS}
     if unknown:
         raise ConfigError("unknown figure", value=sorted(unknown), fix="`wheretolook figures --list` names them.")
@@ -298,11 +298,11 @@ def write_items(
     dataset: Dataset, tracking: TrackingConfig, config: FiguresConfig = FiguresConfig(),
     say: Callable[[str], None] = print,
 ) -> dict[str, str]:  # fmt: skip
-    """Write all items about a dataset, figures as several kinds of files, and attach them to their runs.
+    """Write all items of a dataset, figures as several kinds of files, and attach them to their runs.
 
-    The files tell the runs that they were drawn from: figures in their metadata (`wheretolook.figures.style.note_of`),
-    Markdown and TeX in a comment. Returns, for each item that could not be made, the command to run first, or what is
-    wrong. Raises as `check_names`.
+    Files name the runs that they were drawn from: figures in their metadata (`wheretolook.figures.style.note_of`),
+    Markdown and TeX in a comment. Returns, for each item that could not be made, the command to run first, or the
+    error. Raises as `check_names`.
     """
     check_names(config)
     out = config.out or dataset.root / "results" / "figures"

@@ -1,7 +1,7 @@
-"""What a release holds as MLflow runs: notebooks, figures and MLflow's UI then work on a fresh clone at once.
+"""Log the contents of a release as MLflow runs, so that notebooks, figures and MLflow's UI work on a fresh clone.
 
-A release ships the tables of its evaluation, the records of its training and what studies found, but no MLflow store.
-Here they are logged as the stages log them, once: a run with the same file as its artifact is found again.
+A release ships tables of evaluations and studies and records of training, but no MLflow store. They are logged like the
+stages log them, once: a run with the same file as an artifact is reused.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ from wheretolook_paper.release.training_histories import TRAINING_CSV, read_hist
 from wheretolook_paper.release.training_histories import train_runs as runs_of_training
 
 LEARNERS_CSV = "learners.csv"
-"""In a release's `results/`: how all learners do on scenes of validation, test and others, a row for each seed."""
+"""In a release's `results/`: metrics of all learners by seed on validation, test and other scenes."""
 
-_WAIT_S = 600.0  # for another process that logs a release, in seconds
-TAGS = {"logged_from": "release"}  # of runs that were not computed where they are logged
+_WAIT_S = 600.0  # for another process that logs a release
+TAGS = {"logged_from": "release"}  # of runs logged from files
 
 Say = Callable[[str], None]
 Values = dict[str, Any]
@@ -58,7 +58,7 @@ Values = dict[str, Any]
 
 @dataclass
 class ReleaseRuns:
-    """Ids of the runs of a release in a store; None for what the release does not have."""
+    """Ids of a release's runs in a store; None for what the release does not have."""
 
     evaluate: dict[str, str] = field(default_factory=dict)  # by the dataset evaluated on, the release first
     train: dict[str, str] = field(default_factory=dict)  # by the method
@@ -70,28 +70,28 @@ class ReleaseRuns:
 
 
 def log_release(dataset: Dataset, tracking: TrackingConfig, say: Say = lambda text: None) -> ReleaseRuns:
-    """Log those runs of a release that the store lacks. Returns all of them, also those that were there.
+    """Log the runs of a release that the store lacks; return all of them, existing ones included.
 
-    The store is made if there is none. Runs that a killed call left unfinished are deleted first; calls made at the
-    same time wait for each other.
+    The store is created if missing. Unfinished runs of a killed call are deleted first; simultaneous calls wait for
+    each other.
     """
     with hold(tracking.root / ".release.lock", "log-release", wait_s=_WAIT_S):
-        _forget_halves(tracking)
+        _delete_incomplete_runs(tracking)
         return _log_missing(dataset, tracking, say)
 
 
-def _forget_halves(tracking: TrackingConfig) -> None:
-    """Delete the unfinished runs of a release, and those nested in them."""
+def _delete_incomplete_runs(tracking: TrackingConfig) -> None:
+    """Delete the unfinished runs of a release and the runs nested in them."""
     mlflow = client_of(tracking)
-    experiments = experiment_ids(mlflow, tracking)
+    ids = experiment_ids(mlflow, tracking)
 
     def matching(condition: str) -> list[str]:
-        found = mlflow.search_runs(experiments, condition, max_results=10_000) if experiments else ()
-        return [str(run.info.run_id) for run in found]
+        runs = mlflow.search_runs(ids, condition, max_results=10_000) if ids else ()
+        return [str(run.info.run_id) for run in runs]
 
     tagged = " and ".join(f"tags.{name} = '{value}'" for name, value in TAGS.items())
-    for half in matching(f"{tagged} and attributes.status != 'FINISHED'"):
-        for run_id in (*matching(f"tags.`mlflow.parentRunId` = '{half}'"), half):
+    for incomplete in matching(f"{tagged} and attributes.status != 'FINISHED'"):
+        for run_id in (*matching(f"tags.`mlflow.parentRunId` = '{incomplete}'"), incomplete):
             mlflow.delete_run(run_id)
 
 
@@ -99,7 +99,7 @@ def _log_missing(dataset: Dataset, tracking: TrackingConfig, say: Say) -> Releas
     runs = ReleaseRuns()
     results = dataset.root / "results"
 
-    def keep(name: str, found: str | None, make: Callable[..., str], *arguments: Any) -> str:
+    def find_or_log(name: str, found: str | None, make: Callable[..., str], *arguments: Any) -> str:
         if found is not None:
             return found
         say(f"logging {name}")
@@ -107,33 +107,31 @@ def _log_missing(dataset: Dataset, tracking: TrackingConfig, say: Say) -> Releas
         return make(*arguments, tracking)
 
     if (scores := results / SCORES_CSV).is_file():
-        found = _found(tracking, "evaluate", SCORES_CSV, scores.read_bytes())
-        runs.evaluate[dataset.name] = keep("the evaluation", found, _log_scores, dataset)
+        found = _run_with_file(tracking, "evaluate", SCORES_CSV, scores.read_bytes())
+        runs.evaluate[dataset.name] = find_or_log("the evaluation", found, _log_scores, dataset)
     if (others := results / GENERALIZATION_CSV).is_file():
         for key, rows in read_scores(others).groupby("dataset", sort=False):
             name = str(key)
             table = rows.drop(columns=["dataset", "weights_sha256"]).reset_index(drop=True)
-            found = _found(tracking, "evaluate", SCORES_CSV, table.to_csv(index=False).encode())
-            runs.evaluate[name] = keep(f"the evaluation on {name}", found, _log_others, name, table, dataset)
+            found = _run_with_file(tracking, "evaluate", SCORES_CSV, table.to_csv(index=False).encode())
+            what = f"the evaluation on {name}"
+            runs.evaluate[name] = find_or_log(what, found, _log_others, name, table, dataset)
     histories = dict(iter(read_histories(results / TRAINING_CSV).groupby("method")))
     for path, record in records(dataset.root / "weights").items():
         method = record["about"]["method"]
         history = histories.get(method)
         found = _train_run(tracking, path, record, history is not None)
-        runs.train[method] = keep(f"the training of {method}", found, _log_training, dataset, path, record, history)
-    learners = (LEARNERS_CSV, "learners", _log_learners)
-    paths = (PATHS_CSV, "paths", _log_paths)
-    looks = (LOOKS_CSV, "looks", _log_looks)
-    times = (RUNTIMES_CSV, "benchmark", _log_benchmark)
-    for file, stage, log_file in (learners, paths, looks, times):
+        what = f"the training of {method}"
+        runs.train[method] = find_or_log(what, found, _log_training, dataset, path, record, history)
+    for stage, (file, log_file) in _STUDIES.items():
         if (results / file).is_file():
-            found = _found(tracking, stage, file, (results / file).read_bytes())
-            setattr(runs, stage, keep(file, found, log_file, dataset))
+            found = _run_with_file(tracking, stage, file, (results / file).read_bytes())
+            setattr(runs, stage, find_or_log(file, found, log_file, dataset))
     return runs
 
 
-def _found(tracking: TrackingConfig, stage: str, name: str, content: bytes) -> str | None:
-    """Id of the newest run of a stage that has this file as an artifact."""
+def _run_with_file(tracking: TrackingConfig, stage: str, name: str, content: bytes) -> str | None:
+    """Return the id of the newest run of a stage that has this file as an artifact."""
     for run in finished_runs(tracking, stage, file=name):
         if artifact(tracking, run.info.run_id, name).read_bytes() == content:
             return str(run.info.run_id)
@@ -141,7 +139,7 @@ def _found(tracking: TrackingConfig, stage: str, name: str, content: bytes) -> s
 
 
 def _train_run(tracking: TrackingConfig, path: Path, record: dict[str, Any], with_history: bool) -> str | None:
-    """The run that trained these weights, or the one that was logged from their record."""
+    """Return the id of the run that trained these weights, or that was logged from their record."""
     method = record["about"]["method"]
     for _, run in runs_of_training(tracking, method=method, file=HISTORY_CSV if with_history else ""):
         logged = artifact(tracking, run.info.run_id, path.name)
@@ -151,7 +149,7 @@ def _train_run(tracking: TrackingConfig, path: Path, record: dict[str, Any], wit
 
 
 def _log_scores(dataset: Dataset, tracking: TrackingConfig) -> str:
-    """The evaluation on the release's own test scenes, as the evaluate stage logs it, without tables of locations."""
+    """Log the evaluation on the release's test scenes like the evaluate stage, without tables of locations."""
     results = dataset.root / "results"
     scenes = dataset.split("test")
     table = read_scores(results / SCORES_CSV)
@@ -165,7 +163,7 @@ def _log_scores(dataset: Dataset, tracking: TrackingConfig) -> str:
 
 
 def _log_others(name: str, table: pd.DataFrame, dataset: Dataset, tracking: TrackingConfig) -> str:
-    """An evaluation on another dataset, which does not ship."""
+    """Log an evaluation on another dataset, which does not ship."""
     scenes = " ".join(scene for scene in table["scene"].unique() if scene != ALL)
     params = {"dataset": name, "scenes": scenes, "weights": f"of {dataset.name}", **_choices(table)}
     with temporary_folder() as folder:
@@ -175,7 +173,7 @@ def _log_others(name: str, table: pd.DataFrame, dataset: Dataset, tracking: Trac
 
 
 def _choices(table: pd.DataFrame) -> Values:
-    """Those options of an evaluation that its table shows."""
+    """Return the options of an evaluation that its table shows."""
     choices = {name: tuple(table[name].unique().tolist()) for name in ("top_n", "occlusion", "candidates")}
     return {**choices, "reference": table["reference"].iloc[0]}
 
@@ -197,13 +195,13 @@ def _log_evaluation(
 def _log_training(
     dataset: Dataset, path: Path, record: dict[str, Any], history: pd.DataFrame | None, tracking: TrackingConfig
 ) -> str:
-    """A train run as of the release, in which its weights lie, wherever they have learnt."""
+    """Log a train run under the release's name, whatever dataset the weights were trained on."""
     about = {**record["about"], "dataset": dataset.name}
-    learnt_from = {}
+    params = params_of(about)
     if record["about"]["dataset"] != dataset.name:
-        learnt_from = {"learnt_from": record["about"]["dataset"]}
+        params["learnt_from"] = record["about"]["dataset"]
     tags = {**TAGS, "trained_as": str(record["run_id"])}
-    with start_run(tracking, about["method"], "train", params_of(about) | learnt_from, tags=tags) as (mlflow, run):
+    with start_run(tracking, about["method"], "train", params, tags=tags) as (mlflow, run):
         log(mlflow, run, metrics=kept_metrics(record["metrics"]))
         mlflow.log_artifact(run, str(path))
         if history is not None:
@@ -214,14 +212,15 @@ def _log_training(
 
 
 def _log_learners(dataset: Dataset, tracking: TrackingConfig) -> str:
-    """The comparison of learners: nested, one run for each, what it learnt from, and seed.
+    """Log the comparison of learners with a nested run for each learner, training data and seed.
 
-    The run itself has the metrics to sort by of the learner with the least regret, the mean over its seeds.
+    The run itself has the mean metrics over seeds of the learner with the smallest regret.
     """
     path = dataset.root / "results" / LEARNERS_CSV
     table = pd.read_csv(path, dtype=str, keep_default_na=False)
     nested = []
     for key, rows in table.groupby(["learner", "learnt_from", "seed"], sort=False):
+        learner, source, seed = map(str, key)
         numbers: dict[str, float] = {}
         for measure in ("average_precision", "roc_auc", "ece", "regret"):
             values = pd.to_numeric(rows[measure])
@@ -231,21 +230,17 @@ def _log_learners(dataset: Dataset, tracking: TrackingConfig) -> str:
                 numbers |= {f"{measure}/{scene}": float(x) for scene, x in zip(rows["scene"], values, strict=True)}
         sorted_by = {REGRET: "regret_test", AUC: "roc_auc_test"}
         numbers |= {name: numbers[measure] for name, measure in sorted_by.items() if measure in numbers}
-        named = dict(zip(("learner", "learnt_from", "seed"), map(str, key), strict=True))
-        seed = f"seed {named['seed']}" if named["seed"] else ""
-        what = joined(named["learner"], named["learnt_from"], seed)
-        nested.append(NestedRun(what, {"dataset": dataset.name, **named}, numbers))
+        params = {"dataset": dataset.name, "learner": learner, "learnt_from": source, "seed": seed}
+        nested.append(NestedRun(joined(learner, source, f"seed {seed}" if seed else ""), params, numbers))
     by_learner = [{"what": joined(one.params["learner"], one.params["learnt_from"]), **one.metrics} for one in nested]
-    of_learner = pd.DataFrame(by_learner).groupby("what").mean().filter((REGRET, AUC))
+    means = pd.DataFrame(by_learner).groupby("what").mean().filter((REGRET, AUC))
     tags = dict(TAGS)
-    first = {}
-    if REGRET in of_learner:
-        best = str(of_learner[REGRET].idxmin())
-        tags[BEST_TAG] = best
-        first = {str(name): float(of_learner[name][best]) for name in of_learner}
-    about = {"dataset": dataset.name}
-    with start_run(tracking, "all learners", "learners", about, tags=tags) as (mlflow, run):
-        log(mlflow, run, metrics=first)
+    metrics = {}
+    if REGRET in means:
+        tags[BEST_TAG] = str(means[REGRET].idxmin())
+        metrics = {str(name): float(value) for name, value in means.loc[tags[BEST_TAG]].items()}
+    with start_run(tracking, "all learners", "learners", {"dataset": dataset.name}, tags=tags) as (mlflow, run):
+        log(mlflow, run, metrics=metrics)
         mlflow.log_artifact(run, str(path))
         log_nested(tracking, run, "learners", nested, TAGS)
     return run
@@ -257,7 +252,7 @@ def _log_paths(dataset: Dataset, tracking: TrackingConfig) -> str:
 
 
 def _log_looks(dataset: Dataset, tracking: TrackingConfig) -> str:
-    """The comparison of looks on the test scenes, with a nested run for each way to choose and number of looks."""
+    """Log the comparison of view sets on the test scenes."""
     file = dataset.root / "results" / LOOKS_CSV
     table = pd.read_csv(file)
     params = {"dataset": dataset.name, "split": "test"}
@@ -265,8 +260,16 @@ def _log_looks(dataset: Dataset, tracking: TrackingConfig) -> str:
 
 
 def _log_benchmark(dataset: Dataset, tracking: TrackingConfig) -> str:
-    results = dataset.root / "results"
-    times = results / RUNTIMES_CSV
-    scaling = results / SCALING_CSV
+    times = dataset.root / "results" / RUNTIMES_CSV
+    scaling = times.with_name(SCALING_CSV)
     growth = pd.read_csv(scaling) if scaling.is_file() else pd.DataFrame()
     return log_runtimes(tracking, pd.read_csv(times), growth, TAGS, times)
+
+
+_STUDIES: dict[str, tuple[str, Callable[..., str]]] = {
+    "learners": (LEARNERS_CSV, _log_learners),
+    "paths": (PATHS_CSV, _log_paths),
+    "looks": (LOOKS_CSV, _log_looks),
+    "benchmark": (RUNTIMES_CSV, _log_benchmark),
+}
+"""File in `results/` of each stage, and the function that logs it."""

@@ -1,7 +1,7 @@
-"""A scene of the release as figures show it: its mesh made anew from the seed, its map, its viewpoints, what they see.
+"""A scene of the release for figures, with its mesh generated again from the seed.
 
-A release has no meshes. An apartment follows from the release's settings and the seed in the scene's name; that it is
-the one that was labelled shows in its occlusion, which must be what the release has stored.
+A release has no meshes. An apartment follows from the release's settings and the seed in the scene's name; its
+occlusion must equal the stored one, or it is not the scene that was labelled.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_paper.release.copy import read_about
 from wheretolook_rooms.generator import generate_scene
 
-EYE_M = 1.45  # height of the locations that figures show, unless told otherwise: about that of the mapping cameras
-SAME_OCCLUSION = 0.999  # share of the lines of sight that must be as stored; what differs is rounding
+EYE_M = 1.45  # default height of the shown locations, about that of the mapping cameras
+SAME_OCCLUSION = 0.999  # required share of equal lines of sight; rounding may differ
 
 _CHECKED = 16  # locations whose lines of sight are compared
 
@@ -41,7 +41,7 @@ _SEEDED = re.compile(rf"({'|'.join(get_args(SceneKind))})-(\d+)")
 
 
 class Showcase(SceneEnvironment):
-    """A scene of a release with everything that figures need; its mesh tells what is occluded."""
+    """A scene of a release with everything that figures need; occlusion is by its mesh."""
 
     sampling: SampleConfig  # how its viewpoints were sampled
 
@@ -67,12 +67,12 @@ class Showcase(SceneEnvironment):
 
     @property
     def keep(self) -> int:
-        """K, the directions that the paper keeps of each location."""
+        """K, the number of directions that the paper keeps at each location."""
         return self.sampling.keep or SampleConfig().keep
 
     @cached_property
     def house(self) -> Dollhouse:
-        """The scene obliquely from above, cut at the height of eyes."""
+        """The scene from above at an angle, cut at eye height."""
         return dollhouse(self.mesh, cut_m=self._floor + EYE_M, device=self.device)
 
     @cached_property
@@ -85,28 +85,28 @@ class Showcase(SceneEnvironment):
         return float(self.mesh.bounds[0, 2])
 
     def render(self, cam_from_world: ArrayLike) -> NDArray[np.uint8]:
-        """What cameras (B, 3, 4) see, (B, H, W, 3)."""
+        """Render the views of cameras (B, 3, 4), (B, H, W, 3)."""
         return self.renderer.render(self.camera, cam_from_world).rgb
 
     def layer(self, height_m: float = EYE_M) -> NDArray[np.int64]:
-        """Ids of all voxels, free or not, of the layer that holds a height above the floor, (nx ny,)."""
+        """Return the ids (nx ny,) of all voxels of the layer at a height above the floor."""
         nz = self.grid.shape[2]
         z = (self._floor + height_m - self.grid.lower[2]) / self.grid.voxel_m[2]
         ids = np.arange(len(self.grid))
         return ids[ids % nz == np.clip(int(z), 0, nz - 1)]
 
     def center(self, location_id: int) -> Float:
-        """(3,) metres, of a location."""
+        """Return the centre (3,) m of a location."""
         return self.grid.centers()[location_id]
 
     def nearest_location(self, point: ArrayLike) -> int:
-        """The location with viewpoints that is nearest to a world point (3,) m."""
+        """Return the location with viewpoints nearest to a world point (3,) m."""
         ids = np.unique(self.table["location_id"].to_numpy(np.int64))
         apart = np.linalg.norm(self.grid.centers()[ids] - np.asarray(point, dtype=np.float64), axis=1)
         return int(ids[np.argmin(apart)])
 
     def summary(self) -> str:
-        """How much of everything there is, as a sentence."""
+        """Describe the scene's sizes in a sentence."""
         n_locations = self.table["location_id"].nunique()
         good = is_good(self.table).mean()
         cameras = "" if self.mapping_poses is None else f" of {len(self.mapping_poses)} images"
@@ -117,7 +117,7 @@ class Showcase(SceneEnvironment):
         )
 
     def viewpoints(self, location_id: int) -> pd.DataFrame:
-        """Rows of the table at a location. Raises ConfigError if it has none."""
+        """Return the rows of the table at a location. Raises ConfigError without any."""
         rows = self.table[self.table["location_id"] == location_id]
         if len(rows) == 0:
             fix = "Take one of the table's location_id."
@@ -125,18 +125,17 @@ class Showcase(SceneEnvironment):
         return rows
 
     def instructive_location(self, height_m: float = EYE_M) -> int:
-        """The location of a layer where to look matters most; if the layer has no viewpoint, one of any height."""
+        """Return the location of a layer where the choice of view matters most; of any layer if it has no viewpoint."""
         rows = self.table[self.table["location_id"].isin(self.layer(height_m))]
         return instructive_location(rows if len(rows) else self.table)
 
 
 def open_showcase(dataset: Dataset, name: str | None = None, device: str = "cpu") -> Showcase:
-    """A scene of a release of generated apartments, by default the first test scene.
+    """Open a scene of a release of generated apartments, by default the first test scene.
 
     Raises:
         ConfigError: it is no release, its description is damaged, or it has no such scene.
-        SceneError: the scene was not generated from a seed, or what this code makes of the seed is not the scene that
-            was labelled.
+        SceneError: the scene was not generated from a seed, or the seed gives another scene than the labelled one.
     """
     about = dataset.root / RELEASE_FILE
     if not about.is_file():
@@ -160,13 +159,13 @@ def open_showcase(dataset: Dataset, name: str | None = None, device: str = "cpu"
 
 
 def _check_same(scene: SceneEnvironment) -> None:
-    """Raise a SceneError if lines of sight are not those stored."""
+    """Raise a SceneError if lines of sight differ from the stored ones."""
     stored = StoredOcclusion.load(scene.files.occlusion)
     points = scene.landmarks.points
     some = stored.locations[:: max(1, len(stored.locations) // _CHECKED)]
     same = (scene.occlusion.unoccluded(some, points) == stored.unoccluded(some, points)).mean()
     if not same >= SAME_OCCLUSION:
-        problem = "made anew from its seed, the scene is not the one that was labelled"
+        problem = "generated from its seed, the scene is not the one that was labelled"
         value = f"{same:.1%} of the lines of sight are as stored"
         fix = "Check out the version of the code that release.json names."
         raise SceneError(problem, path=scene.files.folder, value=value, fix=fix)

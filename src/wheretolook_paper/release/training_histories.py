@@ -1,4 +1,4 @@
-"""What a train run in the tracking store holds: its parameters, and the metrics of every epoch, its history."""
+"""Train runs in the tracking store: parameters, metrics, and the history of every epoch."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
     from mlflow.entities import Run
 
 TRAINING_CSV = "training.csv"
-"""In a release's `results/`: the histories of all that was trained, one below the other, with a column `method`."""
+"""In a release's `results/`: the histories of all trained methods, with a column `method`."""
 
 
 def method_of_run(run: Run) -> str:
-    """The name of the method that a train run has trained."""
+    """Return the method of a train run."""
     return str(run.data.params.get("method", ""))
 
 
 def train_runs(
     tracking: TrackingConfig, dataset: str = "", method: str = "", file: str = ""
 ) -> Iterator[tuple[str, Run]]:
-    """Finished train runs, the newest first, with the names of their methods; "" is for any."""
+    """Yield methods and finished train runs, the newest first; "" stands for any."""
     for run in finished_runs(tracking, "train", params={"dataset": dataset} if dataset else None, file=file):
         name = method_of_run(run)
         if not method or name == method:
@@ -39,7 +39,7 @@ def train_runs(
 
 
 def histories(tracking: TrackingConfig, dataset: str) -> dict[str, pd.DataFrame]:
-    """The history of the newest run of each method trained on a dataset, by the method; empty without any."""
+    """Return the history of the newest run of each method trained on a dataset, by method."""
     found: dict[str, pd.DataFrame] = {}
     for method, run in train_runs(tracking, dataset, file=HISTORY_CSV):
         if method not in found:
@@ -48,7 +48,7 @@ def histories(tracking: TrackingConfig, dataset: str) -> dict[str, pd.DataFrame]
 
 
 def trained(tracking: TrackingConfig, dataset: str) -> pd.DataFrame:
-    """What the newest run of each method trained on a dataset kept, a row a method, the best first.
+    """Return the metrics of the newest run of each method trained on a dataset, the best first.
 
     Columns: `method`, `epoch` whose weights were kept, and on the validation views `average_precision`, `roc_auc` and
     `calibration_error`, NaN where the learner does not measure it.
@@ -67,7 +67,7 @@ _MEASURES = ("average_precision", "roc_auc", "calibration_error")
 
 
 def records(folder: Path) -> dict[Path, dict[str, Any]]:
-    """Records of training in a folder of weights and the folders in it, by their files. WeightsError if damaged."""
+    """Read the records of training in a folder of weights and its subfolders; raise a WeightsError if damaged."""
     found = {}
     for path in sorted(folder.rglob("*.json")):
         try:
@@ -79,15 +79,15 @@ def records(folder: Path) -> dict[Path, dict[str, Any]]:
 
 
 def read_histories(path: Path) -> pd.DataFrame:
-    """`TRAINING_CSV`; empty if there is none."""
+    """Read `TRAINING_CSV`; empty without one."""
     return pd.read_csv(path) if path.is_file() else pd.DataFrame({"method": []})
 
 
 def keep_histories(release: Dataset, tracking: TrackingConfig) -> pd.DataFrame:
-    """Write `results/training.csv` of a release: histories of what was trained on it, as far as the store has them.
+    """Write `results/training.csv` of a release: the histories of its weights that the store has.
 
-    A history is that of the run that trained the weights, or else of the newest with the same parameters. Methods
-    without any keep the rows that the file has already.
+    A history is that of the run that trained the weights, or of the newest run with the same parameters. Methods
+    without one keep their rows of the file.
     """
     path = release.root / "results" / TRAINING_CSV
     known = read_histories(path)

@@ -25,7 +25,7 @@ from wheretolook.dataset.viewpoint_table import is_good, poses, read_table
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.localization import confidence
 from wheretolook.localization.joint_labels import label_sets
-from wheretolook.looks import set_score as worth
+from wheretolook.looks import set_score
 from wheretolook.looks.joint_visibility import candidate_views, log_position_variance
 from wheretolook.utils.shipped import WEIGHTS, shipped
 from wheretolook.weights.resolve import load_scorer
@@ -87,12 +87,12 @@ def main() -> None:
     fitted = report("confidence", confidence.confidence_features(*(accepted[name] for name in names)), accepted)
     weights = dict(zip(confidence.FEATURE_NAMES, fitted.coef_[0].round(4).tolist(), strict=True))
     print(json.dumps({"weights": weights, "bias": round(float(fitted.intercept_[0]), 4)}, indent=2))
-    probability = np.clip(1 - sets["failed"].to_numpy(), worth.MIN_PROBABILITY, 1 - worth.MIN_PROBABILITY)
+    probability = np.clip(1 - sets["failed"].to_numpy(), set_score.MIN_PROBABILITY, 1 - set_score.MIN_PROBABILITY)
     mixed = np.log(probability / (1 - probability)) - VARIANCE * sets["log_position_variance"].to_numpy()
-    fitted = report("worth", mixed[:, None], sets)
+    fitted = report("set score", mixed[:, None], sets)
     scale = float(fitted.coef_[0, 0])
     bias = float(fitted.intercept_[0])
-    weights = dict(zip(worth.SetScoreModel.names, (round(scale, 4), round(-scale * VARIANCE, 4)), strict=True))
+    weights = dict(zip(set_score.SetScoreModel.names, (round(scale, 4), round(-scale * VARIANCE, 4)), strict=True))
     print(json.dumps({"weights": weights, "bias": round(bias, 4)}, indent=2))
 
 

@@ -192,10 +192,10 @@ def main() -> None:
         map_photographs(settings, model, work / "photographs", workers=args.workers, device=args.device)
     scene = args.name or (args.poses or args.images).resolve().name
     metric = bool(args.poses) or says_metric(model)
-    opened = open_map(model, work / "photographs" / "database.db", metric, scene)
+    photo_map = open_map(model, work / "photographs" / "database.db", metric, scene)
     scoring = Scoring(weights=args.weights, also=tuple(args.also))
     options = {"views": args.views, "workers": args.workers, "device": args.device}
-    result = check_map(opened, work / "check" / "work", scoring, **options)
+    result = check_map(photo_map, work / "check" / "work", scoring, **options)
     result.save(work / "check")
     print("\n".join(result.lines()))
     rows = pd.DataFrame(rows_of(scene, result.numbers, result.method))

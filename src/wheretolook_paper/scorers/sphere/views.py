@@ -48,7 +48,7 @@ class LocationDescriber:
         self, localization_map: LocalizationMap, config: SphereConfig, path: Path = Path("map") / CAMERAS_FILE
     ) -> None:
         if localization_map.mapping_poses is None:
-            fix = "Run the map stage again, copy the release anew, or use `LocalizationMap.from_colmap`."
+            fix = "Run the map stage again, copy the release again, or use `LocalizationMap.from_colmap`."
             raise MapError("it is not known where the map's images were taken from", path=path, fix=fix)
         self.localization_map = localization_map
         self.config = config

@@ -23,6 +23,8 @@ from wheretolook_paper.benchmark.files import read_errors, read_poses
 from wheretolook_paper.benchmark.folder import DRAWN_CAMERA, BenchmarkScene
 from wheretolook_paper.benchmark.round import RoundConfig, SceneRound
 
+pytestmark = pytest.mark.slow
+
 METHODS = ("best", "max-visibility", "max-visibility-shipped")
 
 

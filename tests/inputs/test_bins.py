@@ -11,12 +11,11 @@ from conftest import RandomViews
 from synthetic_dataset import make_landmarks
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import transform
-from wheretolook.inputs.bins import arrange, bin_views, bin_views_plain, count_bins
+from wheretolook.inputs.bins import bin_views, bin_views_plain, count_bins
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, LANDMARK_CHANNELS
 from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews, landmarks_in_view
 
 LOOKING_ALONG_Z = np.eye(3, 4)[None]
@@ -140,14 +139,3 @@ def test_blocks_do_not_change_the_bins(random_views: RandomViews) -> None:
     blocks = bin_views(arguments, bins=6, block_bytes=7 * 36 * 24)
     np.testing.assert_array_equal(whole.means, blocks.means)
     np.testing.assert_array_equal(whole.counts, blocks.counts)
-
-
-def test_compact_layout_moves_filled_bins_to_the_front_in_order() -> None:
-    means = np.zeros((1, 2, 2, 2), dtype=np.float32)
-    means[0, :, 0, 1] = (5, 6)
-    means[0, :, 1, 1] = (7, 8)
-    filled = np.array([[[False, True], [False, True]]])
-    assert arrange(means, filled, "compact").reshape(2, 4).tolist() == [[5, 7, 0, 0], [6, 8, 0, 0]]
-    assert arrange(means, filled, "in_place") is means
-    with pytest.raises(ConfigError, match="layout"):
-        arrange(means, filled, "sideways")  # type: ignore[arg-type]

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from twins.bins import compact as move_to_front_plain
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.inputs.bins import InputStatistics, arrange
+from wheretolook.inputs.bins import InputStatistics
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, LANDMARK_CHANNELS, PAPER_VARIANTS
 from wheretolook.scorers.mlp.network import BinnedInput, NetworkSpec, ViewpointNetwork, add_noise, move_to_front
 
@@ -93,7 +94,7 @@ def test_noise_leaves_what_landmarks_are_like(views: tuple[torch.Tensor, torch.T
 
 def test_compact_layout_is_the_one_of_features(views: tuple[torch.Tensor, torch.Tensor]) -> None:
     means, filled = views
-    expected = arrange(means.numpy(), filled.numpy(), "compact")
+    expected = move_to_front_plain(means.numpy(), filled.numpy())
     np.testing.assert_array_equal(move_to_front(means, filled).numpy(), expected)
     in_place = make_network(views)
     compact = make_network(views, layout="compact")

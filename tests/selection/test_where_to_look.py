@@ -20,7 +20,7 @@ from wheretolook.geometry.poses import rotation_angle_deg, rotation_looking_alon
 from wheretolook.scenes.loading import save_glb
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.set.batched_directions import ScoresAround
-from wheretolook.scorers.set.network import TOLD, SetNetwork
+from wheretolook.scorers.set.network import DEFAULT_STATISTICS, SetNetwork
 from wheretolook.scorers.set.score import SetScorer
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.training.trained_network import TrainedNetwork
@@ -95,7 +95,7 @@ def test_all_that_a_network_is_told_is_told_at_once(sparse: Path) -> None:
     old = load_scorer(WEIGHTS, around)
     assert isinstance(old, SetScorer)
     torch.manual_seed(0)
-    network = SetNetwork(old.network.statistics, hidden=old.network.options["hidden"], told=TOLD)
+    network = SetNetwork(old.network.statistics, hidden=old.network.options["hidden"], told=DEFAULT_STATISTICS)
     network.matchability.load_state_dict(old.network.matchability.state_dict())
     scorer = SetScorer(around, TrainedNetwork("set", network, None))
     assert ScoresAround.serves(scorer.network)

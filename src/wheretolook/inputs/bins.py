@@ -1,8 +1,7 @@
 """The network's input: landmarks in view, averaged in the cells of a grid over the image (paper, Sec. 3.3 "Data").
 
 Every landmark in view falls into one of 30 x 30 bins by its pixel. A bin holds the mean of its landmarks' channels, and
-zero if it is empty, as the paper says. Its released code instead drops empty bins and moves the filled ones to the
-front, so that an input has no fixed place in the image. That layout is kept as "compact".
+zero if it is empty.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from torch import Tensor
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import split_poses
 from wheretolook.inputs.bins_kernel import BinGrid, bin_kernel, count_bins_kernel
-from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, Layout
+from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.warp import start_warp
@@ -62,20 +61,6 @@ class BinnedViews:
         if unknown:
             raise ConfigError("unknown input channel", value=unknown[0], fix=f"There are {', '.join(self.channels)}.")
         return BinnedViews(self.means[:, [self.channels.index(name) for name in channels]], self.counts, channels)
-
-
-def arrange(means: NDArray[np.float32], filled: NDArray[np.bool_], layout: Layout) -> NDArray[np.float32]:
-    """Lay out bins (B, C, bins, bins), which are zero where not `filled` (B, bins, bins), for a network.
-
-    "in_place" keeps every bin where it is; "compact" moves the filled ones to the front, row by row.
-    """
-    if layout == "in_place":
-        return means
-    if layout != "compact":
-        raise ConfigError("unknown bin layout", value=layout, fix="Use in_place or compact.")
-    flat = means.reshape(*means.shape[:2], -1)
-    order = np.argsort(~filled.reshape(len(filled), -1), axis=1, kind="stable")
-    return np.take_along_axis(flat, order[:, None, :], axis=2).reshape(means.shape)
 
 
 def bin_views(

@@ -36,4 +36,4 @@ PAPER_VARIANTS: dict[str, tuple[str, ...]] = {
 """The paper's inputs by name: 1,800, 2,700 and 4,500 values at 30 x 30 bins (its "4220" is a stale number)."""
 
 Layout = Literal["in_place", "compact"]
-"""Order of the bins in a flat input, see `wheretolook.inputs.bins.arrange`."""
+"""Order of the bins in a flat input: each at its place, or filled bins first as in the paper's released code."""

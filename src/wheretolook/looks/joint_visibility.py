@@ -93,10 +93,9 @@ def candidate_views(
         known = scorer.landmark_probabilities(poses, LandmarkSets(ends, rows.astype(np.int32)))
     if known is not None:
         p_detect[view, column] = known.p_detect
-        if known.precision is not None:  # the same from every view: it depends on the distance
-            precision = np.ones(len(landmarks))
-            precision[column] = known.precision
-            terms[:, 1:] *= precision[:, None]
+        precision = np.ones(len(landmarks))
+        precision[column] = known.precision  # the same from every view: it depends on the distance
+        terms[:, 1:] *= precision[:, None]
     p_single = np.zeros(len(poses))
     method = find(scorer.name)
     if scores is not None and not certain and method is not None and method.probability:

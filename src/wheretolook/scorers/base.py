@@ -41,7 +41,7 @@ class LandmarkProbabilities:
 
     rows: NDArray[np.int64]  # (E,) of the landmarks in the map
     p_detect: Float  # (E,) probability that the localizer detects the landmark: matches it as an inlier
-    precision: Float | None  # (E,) one over the variance of its bearing; None if that is unknown
+    precision: Float  # (E,) one over the variance of its bearing
 
 
 class Scorer(ABC):

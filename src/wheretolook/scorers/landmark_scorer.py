@@ -66,9 +66,7 @@ class LandmarkScorer(Scorer):
                 return None
             precision = bearing_precision(described.values, described.attributes)
         return LandmarkProbabilities(
-            described.rows.cpu().numpy(),
-            log_odds.sigmoid().double().cpu().numpy(),
-            None if precision is None else precision.double().cpu().numpy(),
+            described.rows.cpu().numpy(), log_odds.sigmoid().double().cpu().numpy(), precision.double().cpu().numpy()
         )
 
     def _quantities(self, described: ViewLandmarks, n_in_view: Tensor) -> list[Float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 from typing import Literal
 
 from wheretolook.utils.errors import ConfigError
@@ -40,10 +41,9 @@ class SharedConfig:
 
     def __post_init__(self) -> None:
         check_choice(self, "accelerator", "auto", "cpu", "gpu")
-        check_positive(self, "max_error_m", "max_error_deg")
-        check_at_least(self, 1, "devices")
-        if not 0 < self.val_fraction < 1:
-            raise ConfigError("val_fraction must lie strictly between 0 and 1", value=self.val_fraction)
+        check_range(self, "max_error_m", "max_error_deg", above=0)
+        check_range(self, "devices", at_least=1)
+        check_range(self, "val_fraction", above=0, below=1)
 
 
 DECIDING = ("max_error_m", "max_error_deg", "val_fraction", "seed")
@@ -70,9 +70,9 @@ class FittingConfig:
     l2: float = 1e-5
 
     def __post_init__(self) -> None:
-        check_at_least(self, 1, "epochs", "batch_size")
-        check_positive(self, "learning_rate")
-        check_at_least(self, 0, "l2")
+        check_range(self, "epochs", "batch_size", at_least=1)
+        check_range(self, "learning_rate", above=0)
+        check_range(self, "l2", at_least=0)
 
     @property
     def schedule(self) -> Schedule:
@@ -100,27 +100,14 @@ class FittingConfig:
         return ""
 
 
-def check_at_least(options: object, least: float, *names: str) -> None:
-    """Raise a ConfigError unless these options are at least so much."""
+def check_range(options: object, *names: str, at_least: float = -inf, above: float = -inf, below: float = inf) -> None:
+    """Raise a ConfigError unless these options are within the bounds."""
     for name in names:
         value = getattr(options, name)
-        if not value >= least:
-            problem = f"{name} must not be negative" if least == 0 else f"{name} must be at least {least:g}"
-            raise ConfigError(problem, value=value)
-
-
-def check_positive(options: object, *names: str) -> None:
-    """Raise a ConfigError unless these options are greater than 0."""
-    for name in names:
-        if not getattr(options, name) > 0:
-            raise ConfigError(f"{name} must be positive", value=getattr(options, name))
-
-
-def check_share(options: object, *names: str) -> None:
-    """Raise a ConfigError unless these options are at least 0 and less than 1."""
-    for name in names:
-        if not 0 <= getattr(options, name) < 1:
-            raise ConfigError(f"{name} must be at least 0 and less than 1", value=getattr(options, name))
+        if not (value >= at_least and above < value < below):
+            bounds = {"at least": at_least, "above": above, "below": below}
+            text = " and ".join(f"{word} {bound:g}" for word, bound in bounds.items() if abs(bound) < inf)
+            raise ConfigError(f"{name} must be {text}", value=value)
 
 
 def check_choice(options: object, name: str, *choices: str) -> None:

@@ -1,9 +1,8 @@
-"""Fitting a network with Lightning: on one device or several, keeping the best weights and logging every epoch."""
+"""Fit a network with Lightning, on one device or several; keep the best weights and log every epoch."""
 
 from __future__ import annotations
 
 import logging
-import math
 import signal
 import tempfile
 import threading
@@ -12,7 +11,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 import torch
@@ -23,107 +22,103 @@ from torch.multiprocessing.spawn import ProcessException
 from tqdm.auto import tqdm
 
 from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import log_metrics
 from wheretolook.tracking.store import client
 from wheretolook.training.classifier import ViewpointClassifier
 from wheretolook.training.config import FittingConfig, SharedConfig
 from wheretolook.utils.errors import ConfigError, TrackingError, WorkerError
 from wheretolook.utils.files import temporary_folder
 
-if TYPE_CHECKING:
-    from mlflow.entities import Metric
-
-MONITORED = "val_average_precision"  # the metric that tells which epoch was best
-
+MONITORED = "val_average_precision"  # the metric that decides which epoch was best
 LIGHTNING_LOGGERS = ("lightning.pytorch", "lightning.fabric")
-
 LOG_EVERY_S = 2.0  # epochs are logged together after so many seconds: a transaction takes longer than a short epoch
-LOG_AT_MOST = 1000  # metrics MLflow takes at a time
 
 
 def home_device(config: SharedConfig) -> str:
-    """Torch device of the process that calls, "cuda:0" or "cpu"; a ConfigError if there are too few GPUs."""
+    """Return the Torch device of the calling process, "cuda:0" or "cpu"; a ConfigError if there are too few GPUs."""
     gpus = torch.cuda.device_count() if config.accelerator != "cpu" else 0
     wanted = config.devices if gpus or config.accelerator == "gpu" else 0
     if wanted > max(gpus, torch.backends.mps.is_available()):
-        fix = "Ask for fewer, or set train.accelerator to cpu to train in processes on the CPU."
-        raise ConfigError(f"train.devices asks for more GPUs than there are: {gpus}", value=config.devices, fix=fix)
+        fix = "Request fewer, or set train.accelerator to cpu to train in processes on the CPU."
+        raise ConfigError(f"train.devices exceeds the number of GPUs, {gpus}", value=config.devices, fix=fix)
     return "cuda:0" if gpus else "cpu"
 
 
 def fit(classifier: ViewpointClassifier, data: LightningDataModule, record: EpochRecord, config: SharedConfig) -> None:
-    """Train a classifier; afterwards `record` has the history and the weights to keep.
+    """Train a classifier; afterwards `record` has the history and the best weights.
 
-    With `config.devices > 1`, every device has its own process, started here and ended here: a script that calls this
-    needs the usual `if __name__ == "__main__":`, and an interactive session cannot call it.
+    With `config.devices > 1`, every device has its own spawned process: a script that calls this needs the usual
+    `if __name__ == "__main__":`, and an interactive session cannot call it.
     """
     options = classifier.options
     callbacks: list[Callback] = [record]
     if options.patience is not None:
         callbacks.append(EarlyStopping(MONITORED, mode="max", patience=options.patience))
-    several = config.devices > 1
+    default_tempdir = tempfile.tempdir
     with _quiet(), temporary_folder() as folder:
-        if several:
-            record.file = folder / "record.pt"
         where: dict[str, Any] = {"accelerator": config.accelerator, "devices": config.devices}
-        if several:  # spawned processes run nothing but the fit; those that run the program anew would repeat all else
-            where["strategy"] = _Spawned(start_method="spawn")
-            where["strategy"].temporary = str(folder)
+        if config.devices > 1:
+            record.file = folder / "record.pt"
+            tempfile.tempdir = str(folder)  # a process that outlives this one writes its error to a temporary file
             where["accelerator"] = "cpu" if home_device(config) == "cpu" else config.accelerator
-        quiet: dict[str, Any] = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
-        how: dict[str, Any] = {"max_epochs": options.epochs, "callbacks": callbacks, "num_sanity_val_steps": 0}
-        trainer = Trainer(**where, **how, **quiet, default_root_dir=folder)
-        usual = tempfile.tempdir
-        if several:  # a process that outlives this one writes down its error as a temporary file
-            tempfile.tempdir = str(folder)
+            where["strategy"] = _SpawnedStrategy(start_method="spawn")
+            where["strategy"].tempdir = str(folder)
         try:
-            trainer.fit(classifier, datamodule=data)
+            Trainer(
+                **where,
+                max_epochs=options.epochs,
+                callbacks=callbacks,
+                num_sanity_val_steps=0,
+                logger=False,
+                enable_progress_bar=False,
+                enable_model_summary=False,
+                default_root_dir=folder,
+            ).fit(classifier, datamodule=data)
         except ProcessException as error:
             problem = f"a training process ended before its work was done: {error}"
             fix = "There may be too little memory: lower train.devices."
             raise WorkerError(problem, value=f"train.devices {config.devices}", fix=fix) from error
         finally:
-            tempfile.tempdir = usual
-        record.collect()
-    data.trainer = None  # who asks for batches from now on gets whole ones, not one process's share
+            tempfile.tempdir = default_tempdir
+        if record.file is not None:
+            record.load(record.file)
+    data.trainer = None  # later batches are whole, not one process's share
 
 
 class RunLog:
     """Logs the metrics of epochs to an open MLflow run, several epochs at a time.
 
-    A store that fails does not end the training: nothing more is logged, and `failed` holds the error.
+    A store that fails does not end the training: nothing more is logged, and `failed` is the error.
     """
 
     def __init__(self, tracking: TrackingConfig, run_id: str) -> None:
         self.tracking = tracking
         self.run_id = run_id
         self.failed: TrackingError | None = None
-        self._waiting: list[Metric] = []
+        self._pending: list[tuple[int, dict[str, float]]] = []
         self._flushed = time.monotonic()
 
     def add(self, epoch: int, metrics: dict[str, float]) -> None:
-        """Log the metrics of an epoch, now or soon. Those that are not finite are left out."""
-        from mlflow.entities import Metric
-
-        now = int(time.time() * 1000)
-        self._waiting += [Metric(name, value, now, epoch) for name, value in metrics.items() if math.isfinite(value)]
-        if time.monotonic() - self._flushed > LOG_EVERY_S or len(self._waiting) > LOG_AT_MOST // 2:
+        """Log the finite metrics of an epoch, now or soon."""
+        self._pending.append((epoch, metrics))
+        if time.monotonic() - self._flushed > LOG_EVERY_S:
             self.flush()
 
     def flush(self) -> None:
-        """Log what waits."""
-        if self._waiting and self.failed is None:
+        """Log the pending epochs."""
+        if self._pending and self.failed is None:
             try:
-                client(self.tracking).log_batch(self.run_id, metrics=self._waiting)
+                log_metrics(client(self.tracking), self.run_id, self._pending)
             except TrackingError as error:
                 self.failed = error
-        self._waiting = []
+        self._pending = []
         self._flushed = time.monotonic()
 
 
 class EpochRecord(Checkpoint):
-    """Keeps, shows and logs each epoch's metrics (`rows`), and keeps the weights of the epoch asked for (`kept`).
+    """Records, shows and logs the metrics of each epoch, and keeps the weights of the best epoch, or of the last.
 
-    In `file` a process that trains leaves the record for the one that started it; None if they are the same.
+    A spawned process leaves its record in `file`; None where training runs in the calling process.
     """
 
     def __init__(self, title: str, options: FittingConfig, progress: bool, run_log: RunLog | None = None) -> None:
@@ -144,12 +139,12 @@ class EpochRecord(Checkpoint):
         return pd.DataFrame(self.rows)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Show the bar."""
+        """Show the progress bar."""
         hidden = not (self.progress and trainer.is_global_zero)
         self._bar = tqdm(total=self.epochs, desc=self.title, unit="epoch", disable=hidden)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Note the epoch's metrics; keep its weights if it is the best so far."""
+        """Record the epoch's metrics, and its weights if they are to be kept."""
         metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
         best = max((row[MONITORED] for row in self.rows), default=float("-inf"))
         self.rows.append({"epoch": float(trainer.current_epoch), **metrics})
@@ -163,43 +158,42 @@ class EpochRecord(Checkpoint):
         self._bar.update()
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Hand the record over."""
+        """Save the record for the process that spawned this one."""
         if self.file is not None and trainer.is_global_zero:
             torch.save((self.rows, self.kept, self._weights), self.file)
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Close the bar and log what is not logged yet."""
+        """Close the progress bar and log the pending epochs."""
         if self._bar is not None:
             self._bar.close()
         if self.run_log is not None and trainer.is_global_zero:
             self.run_log.flush()
 
-    def collect(self) -> None:
-        """Take over what the process that trained has left."""
-        if self.file is not None:
-            self.rows, self.kept, self._weights = torch.load(self.file, map_location="cpu", weights_only=True)
+    def load(self, file: Path) -> None:
+        """Load the record of a spawned process."""
+        self.rows, self.kept, self._weights = torch.load(file, map_location="cpu", weights_only=True)
 
     def restore(self, classifier: ViewpointClassifier) -> dict[str, float]:
-        """Put the kept weights into the classifier and return the metrics of their epoch."""
+        """Load the kept weights into the classifier and return the metrics of their epoch."""
         classifier.load_state_dict(self._weights)
         return dict(self.rows[self.kept])
 
 
-class _Spawned(DDPStrategy):
-    """Lightning's DDP in spawned processes, which are as quiet as the one that starts them."""
+class _SpawnedStrategy(DDPStrategy):
+    """Lightning's DDP in spawned processes that are as quiet as the calling one."""
 
-    temporary: str | None = None  # folder for temporary files, of which Lightning leaves some
+    tempdir: str | None = None
 
     def setup_environment(self) -> None:
-        """Silence this process, which does nothing but train, and join the others."""
+        """Silence this process and join the others."""
         _silence()
-        tempfile.tempdir = self.temporary
+        tempfile.tempdir = self.tempdir
         super().setup_environment()
 
 
 def _silence() -> None:
-    for logger in map(logging.getLogger, LIGHTNING_LOGGERS):
-        logger.setLevel(logging.WARNING)
+    for name in LIGHTNING_LOGGERS:
+        logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`")  # between Lightning and PyTorch
 
 

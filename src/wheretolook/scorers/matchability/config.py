@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from math import inf
 
 from wheretolook.inputs.channels import ATTRIBUTES, OF_SIZE
-from wheretolook.training.config import FittingConfig, check_at_least
+from wheretolook.training.config import FittingConfig, check_range
 from wheretolook.utils.errors import ConfigError
 
 
@@ -29,7 +29,7 @@ class LandmarksConfig(FittingConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_at_least(self, 1, "landmarks", "width")
+        check_range(self, "landmarks", "width", at_least=1)
         if not 1 <= self.enlarged < inf:
             raise ConfigError("scenes can be enlarged by a factor of 1 or more", value=self.enlarged)
         if unknown := [name for name in self.hidden if name not in ATTRIBUTES]:

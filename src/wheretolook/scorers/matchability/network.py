@@ -1,4 +1,4 @@
-"""Whether a landmark in view will be found, and what landmarks tell of the pose."""
+"""Network for the probability that a landmark is detected, and the information of landmarks on the pose."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from wheretolook.training.attribute_statistics import AttributeStatistics, mean_
 from wheretolook.training.trained_network import StoredNetwork
 from wheretolook.utils.errors import WeightsError
 
-LIKELY = -2.0
-"""Log-odds of being found that an untrained network gives a landmark: about one in eight, as in real views."""
+INITIAL_LOG_ODDS = -2.0  # of detection, by an untrained network: about one in eight, as in real views
+REQUIRED = ("across", "down", "distance", "pixel_angle", "pixel_size_ratio")  # attributes that locate a landmark
 
 
 class LandmarkNetwork(StoredNetwork):
-    """A network over single landmarks. It takes those of their attributes that its statistics name, in that order.
+    """A network over single landmarks, whose inputs are the attributes named by its statistics, in that order.
 
-    With its statistics and options it can be built anew.
+    It is rebuilt from its statistics and options.
     """
 
     def __init__(self, statistics: AttributeStatistics, **options: Any) -> None:
@@ -32,36 +32,33 @@ class LandmarkNetwork(StoredNetwork):
 
     @property
     def attributes(self) -> tuple[str, ...]:
-        """Names of the A attributes that it takes."""
+        """Names of its A input attributes."""
         return self.statistics.attributes
 
     def description(self) -> dict[str, Any]:
-        """Attributes, their statistics, and the options."""
+        """Return the attributes, their statistics, and the options."""
         stored = asdict(self.statistics)
         return {"attributes": list(stored.pop("attributes")), "statistics": stored, "options": self.options}
 
     @classmethod
     def of_description(cls, stored: Mapping[str, Any]) -> Self:
-        """The untrained network of a description.
+        """Build the untrained network of a description.
 
-        Raises a WeightsError if it asks for an attribute that this version's maps do not know, or lacks one that tells
-        where a landmark lies.
+        Raises a WeightsError if it names an attribute that this version's maps lack, or none that locates a landmark.
         """
         names = tuple(stored["attributes"])
         statistics = stored["statistics"]
-        for name in names:
-            if name not in ATTRIBUTES:
-                fix = "Use the version that wrote them, or train again."
-                raise WeightsError("these weights ask for an unknown attribute of landmarks", value=name, fix=fix)
-        for name in ("across", "down", "distance", *(("pixel_size_ratio",) if "pixel_angle" in names else ())):
-            if name not in names:
-                raise WeightsError("these weights do not ask where a landmark lies", value=name)
+        if unknown := {*names} - {*ATTRIBUTES}:
+            fix = "Use the version that wrote them, or train again."
+            raise WeightsError("these weights need an unknown attribute of landmarks", value=min(unknown), fix=fix)
+        if missing := {*REQUIRED} - {*names}:
+            raise WeightsError("these weights lack an attribute that locates a landmark", value=min(missing))
         options = {name: tuple(x) if isinstance(x, list) else x for name, x in stored["options"].items()}
         return cls(AttributeStatistics(*mean_and_std(statistics, names), names), **options)
 
 
 class StandardAttributes(nn.Module):
-    """Attributes of landmarks, standardized; what is not known or hidden becomes 0, the mean of its kind."""
+    """Standardizes attributes of landmarks; unknown and hidden values become 0, the mean."""
 
     mean: Tensor
     scale: Tensor
@@ -75,24 +72,24 @@ class StandardAttributes(nn.Module):
         self.register_buffer("scale", torch.tensor(scale), persistent=False)
 
     def forward(self, values: Tensor) -> Tensor:
-        """Standardized values of landmarks' values (..., A), in the same shape."""
+        """Return standardized values (..., A) of landmarks' attributes (..., A)."""
         return ((values - self.mean) * self.scale).nan_to_num(nan=0.0)
 
 
 class MatchabilityNetwork(LandmarkNetwork):
-    """Whether a landmark in view is found: matched, and an inlier of the pose. It has two layers of `width` units."""
+    """Predicts whether a visible landmark is matched as an inlier, with two layers of `width` units."""
 
     def __init__(self, statistics: AttributeStatistics, width: int = 48, hidden: tuple[str, ...] = ()) -> None:
         super().__init__(statistics, width=width, hidden=hidden)
         self.input = StandardAttributes(statistics, hidden)
         last = nn.Linear(width, 1)
-        nn.init.constant_(last.bias, LIKELY)
+        nn.init.constant_(last.bias, INITIAL_LOG_ODDS)
         self.layers = nn.Sequential(
             nn.Linear(len(self.attributes), width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), last
         )
 
     def forward(self, values: Tensor) -> Tensor:
-        """Log-odds (...,) of landmarks (..., A)."""
+        """Return log-odds of detection (...) of landmarks (..., A)."""
         return self.layers(self.input(values)).squeeze(-1)
 
 
@@ -100,21 +97,18 @@ REFERENCE_FOCAL_PX = 320.0
 """A pixel of this focal length is the unit of a bearing's noise, so information does not depend on image sizes."""
 
 
-def bearing_precision(values: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) -> Tensor | None:
-    """How sharply each landmark (..., A) tells where it is seen, (...): one over its bearing's variance, by the pixels.
+def bearing_precision(values: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) -> Tensor:
+    """Return one over the variance of each landmark's bearing (...), from attributes (..., A).
 
-    A keypoint is off by a pixel, and the landmark by what a pixel of the images that mapped it covers: whichever is
-    larger there counts most. None where pixels are not among the attributes, as in weights of before there were any.
+    A keypoint is off by a pixel of the camera, and the landmark by what a pixel of the mapping images covers.
     """
-    if "pixel_angle" not in attributes:
-        return None
     pixel = values[..., attributes.index("pixel_angle")] + log(REFERENCE_FOCAL_PX)
     ratio = values[..., attributes.index("pixel_size_ratio")].nan_to_num(nan=0.0)
     return (-2 * pixel).exp() / (1 + (-2 * ratio).exp())
 
 
 def bearing_numbers(values: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) -> Tensor:
-    """`fisher.information.bearing_numbers` (..., 15) of landmarks (..., A), in the camera's axes."""
+    """Return `geometry.pose_information.bearing_numbers` (..., 15) of landmarks (..., A), along the camera's axes."""
     across, down, log_distance = (values[..., attributes.index(name)] for name in ("across", "down", "distance"))
     bearing = torch.stack([across, down, torch.ones_like(across)], -1)
     bearing = bearing / bearing.norm(dim=-1, keepdim=True)
@@ -124,14 +118,13 @@ def bearing_numbers(values: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) ->
     return torch.cat([plane * inverse**2, bearing * inverse, plane], -1)
 
 
-N_EXPECTED = 1 + 15 + 5  # numbers that `expected_parts` gives of a landmark
+N_EXPECTED = 1 + 15 + 5  # detection, information and image moments of a landmark, see `expected_parts`
 
 
 def expected_parts(values: Tensor, log_odds: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) -> Tensor:
-    """What landmarks (..., A) add to a view's sums, (..., N_EXPECTED), by their log-odds of being found (...,)."""
-    found = log_odds.sigmoid()[..., None]
-    precision = bearing_precision(values, attributes)
-    told = found if precision is None else found * precision[..., None]
+    """Return what landmarks (..., A) with log-odds of detection (...) add to a view's sums, (..., N_EXPECTED)."""
+    p_detect = log_odds.sigmoid()[..., None]
+    weight = p_detect * bearing_precision(values, attributes)[..., None]
     across, down = (values[..., attributes.index(name), None] for name in ("across", "down"))
     moments = torch.cat([across, down, across * across, across * down, down * down], -1)
-    return torch.cat([found, told * bearing_numbers(values, attributes), found * moments], -1)
+    return torch.cat([p_detect, weight * bearing_numbers(values, attributes), p_detect * moments], -1)

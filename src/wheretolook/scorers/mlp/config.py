@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from wheretolook.inputs.channels import Layout
-from wheretolook.training.config import FittingConfig, Keep, Schedule, check_at_least, check_choice, check_share
+from wheretolook.training.config import FittingConfig, Keep, Schedule, check_choice, check_range
 from wheretolook.utils.errors import ConfigError
 
 RELEASED_SETTINGS: dict[str, Any] = {
@@ -75,9 +75,9 @@ class MlpConfig(FittingConfig):
         check_choice(self, "schedule", "constant", "cosine")
         check_choice(self, "layout", "in_place", "compact")
         check_choice(self, "keep", "best", "last")
-        check_at_least(self, 1, "bins")
-        check_at_least(self, 0, "noise_px", "noise_m")
-        check_share(self, "dropout", "input_dropout")
+        check_range(self, "bins", at_least=1)
+        check_range(self, "noise_px", "noise_m", at_least=0)
+        check_range(self, "dropout", "input_dropout", at_least=0, below=1)
         if min(self.hidden, default=1) < 1:
             raise ConfigError("hidden layers must be at least one unit wide", value=self.hidden)
         if self.patience is not None and self.patience < 1:

@@ -55,7 +55,7 @@ class BinnedInput(nn.Module):
 
 
 def move_to_front(values: Tensor, filled: Tensor) -> Tensor:
-    """`wheretolook.inputs.bins.arrange` of "compact", for tensors (B, C, bins, bins) that are zero in empty bins."""
+    """Return means (B, C, bins, bins), zero in empty bins, with the filled bins first: the layout "compact"."""
     flat = filled.flatten(1)
     n_filled = flat.sum(1, keepdim=True)
     # the k-th filled bin goes to place k, the k-th empty bin behind all filled ones: a permutation

@@ -238,12 +238,8 @@ class ScoresAround:
         size_ratio = log_distance + self._pixel_angle - mapped[:, 4]
         values = torch.stack([log_distance, angle, log_distance - mapped[:, 3], size_ratio], 1)
         base = self._first[rows].addmm_((values - self._mean).nan_to_num_(nan=0.0), self._of_location)
-        weight = torch.ones_like(distance)
-        if "pixel_angle" in self.trained.network.attributes:
-            pixels = torch.stack([torch.full_like(size_ratio, self._pixel_angle), size_ratio], 1)
-            precision = bearing_precision(pixels, ("pixel_angle", "pixel_size_ratio"))
-            assert precision is not None
-            weight = precision
+        pixels = torch.stack([torch.full_like(size_ratio, self._pixel_angle), size_ratio], 1)
+        weight = bearing_precision(pixels, ("pixel_angle", "pixel_size_ratio"))
         x, y, z = bearing.unbind(1)
         told = torch.empty((len(x), 16), device=self.device)
         told[:, 0] = 1

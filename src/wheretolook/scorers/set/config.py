@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from wheretolook.scorers.matchability.config import LandmarksConfig
-from wheretolook.training.config import check_at_least, check_share
+from wheretolook.training.config import check_range
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class SetConfig(LandmarksConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_at_least(self, 1, "head")
-        check_at_least(self, 0, "landmark_loss", "pooled")
-        check_share(self, "dropout")
+        check_range(self, "head", at_least=1)
+        check_range(self, "landmark_loss", "pooled", at_least=0)
+        check_range(self, "dropout", at_least=0, below=1)
 
     @property
     def starts_from(self) -> str:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cache
-from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -46,21 +45,19 @@ EXPECTED = (
     *(f"log_variance_{axis}" for axis in "xyz"),  # of the position, along the camera's axes
     "log_spread",  # area of the image the landmarks expected to be found spread over: det of their second moment
 )
-"""What `expected_statistics` gives of a view."""
+"""Outputs of `expected_statistics`."""
 
-TOLD_ONCE = (*EXPECTED, "axis_height")
-"""What the deciding layers of weights are told that do not say what they are."""
+ALL_STATISTICS = (*EXPECTED, "axis_height", "log_expected_cells")
+"""All statistics of a view; the last is log(1 + cells of the sphere expected to hold a detected landmark)."""
 
-ALL_TOLD = (*TOLD_ONCE, "log_expected_cells")  # the last: log(1 + cells of the sphere with a landmark to be found)
-
-TOLD = (
+DEFAULT_STATISTICS = (
     "log_expected_inliers",
     "log_visible",
     "log_position_variance",
     "log_orientation_variance",
     "log_expected_cells",
 )
-"""What the layers that decide are told of a view: chosen by cross-validation over configs/cameras.yaml's scenes."""
+"""Inputs of the head by default: chosen by cross-validation over the scenes of configs/cameras.yaml."""
 
 CELLS = 30
 """Cells that 180 degrees are cut into, across and down: 6 degrees each, the same for every camera."""
@@ -78,7 +75,7 @@ class SetNetwork(LandmarkNetwork):
 
     `width` and `head` are units of the layers that look at single landmarks and of those that decide; `hidden` names
     attributes not to look at. Of "across", "down" and "distance" the information remains. `told` names the
-    statistics of a view, of `ALL_TOLD`, that the deciding layers are given. Given more, they learn
+    statistics of a view, of `ALL_STATISTICS`, that the deciding layers are given. Given more, they learn
     their training scenes by heart and choose worse elsewhere than the expected inliers alone.
     """
 
@@ -90,12 +87,12 @@ class SetNetwork(LandmarkNetwork):
         head: int = 48,
         dropout: float = 0.1,
         hidden: tuple[str, ...] = (),
-        told: tuple[str, ...] = TOLD,
+        told: tuple[str, ...] = DEFAULT_STATISTICS,
     ) -> None:
         options = {"width": width, "pooled": pooled, "head": head, "dropout": dropout}
         super().__init__(statistics, **options, hidden=hidden, told=told)
         self.pose_variances = pose_variances  # replaced where there is no Cholesky decomposition
-        self._told = [ALL_TOLD.index(name) for name in told]
+        self._told = [ALL_STATISTICS.index(name) for name in told]
         self._cells = "log_expected_cells" in told
         self.matchability = MatchabilityNetwork(statistics, width, hidden)
         self.attention = None
@@ -109,11 +106,6 @@ class SetNetwork(LandmarkNetwork):
         self.linear = nn.Linear(n_features, 1)
         first = nn.Linear(n_features, head), nn.ReLU(), nn.Dropout(dropout)
         self.decide = nn.Sequential(*first, nn.Linear(head, head), nn.ReLU(), nn.Linear(head, 1))
-
-    @classmethod
-    def of_description(cls, stored: Mapping[str, Any]) -> Self:
-        """The untrained network of a description; one that names nothing that it is told is told `TOLD_ONCE`."""
-        return super().of_description({**stored, "options": {"told": TOLD_ONCE, **stored["options"]}})
 
     def forward(
         self, values: Tensor, taken: Tensor, n_visible: Tensor, axis_height: Tensor, found: Tensor | None = None

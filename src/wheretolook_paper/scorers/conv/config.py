@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from wheretolook.training.config import FittingConfig, check_at_least, check_share
+from wheretolook.training.config import FittingConfig, check_range
 from wheretolook.utils.errors import ConfigError
 
 
@@ -26,5 +26,5 @@ class ConvConfig(FittingConfig):
         super().__post_init__()
         if not self.widths or min(self.widths) < 1:
             raise ConfigError("there must be a convolution, and each at least one channel wide", value=self.widths)
-        check_at_least(self, 1, "bins")
-        check_share(self, "dropout")
+        check_range(self, "bins", at_least=1)
+        check_range(self, "dropout", at_least=0, below=1)

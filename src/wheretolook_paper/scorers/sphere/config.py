@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from wheretolook.training.config import FittingConfig, check_at_least, check_share
+from wheretolook.training.config import FittingConfig, check_range
 from wheretolook.utils.errors import ConfigError
 
 
@@ -33,7 +33,7 @@ class SphereConfig(FittingConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_at_least(self, 1, "points", "cameras", "width", "heads", "layers")
-        check_share(self, "dropout")
+        check_range(self, "points", "cameras", "width", "heads", "layers", at_least=1)
+        check_range(self, "dropout", at_least=0, below=1)
         if self.width % self.heads:
             raise ConfigError("sphere needs a width that is a multiple of heads", value=(self.width, self.heads))

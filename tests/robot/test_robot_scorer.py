@@ -86,11 +86,9 @@ def random_network(
     return TrainedNetwork("set", network, None, 0.8, -0.3, training_range)
 
 
-WITHOUT_PIXELS = tuple(name for name in ATTRIBUTES if "pixel" not in name)
 NETWORKS = {
     "default": {"hidden": ("distance", "mapped_distance", "mapped_pixel_size")},
     "attention": {"pooled": 5, "told": set_network.ALL_STATISTICS, "dropout": 0.5, "width": 24, "head": 16},
-    "without pixels": {"attributes": WITHOUT_PIXELS},
     "another order": {"attributes": ATTRIBUTES[::-1], "told": ("axis_height", "log_visible", "log_variance_z")},
 }
 

@@ -318,20 +318,6 @@ def rotations_looking_along(directions: ArrayLike) -> Array:
     return np.stack([right, np.cross(forward, right), forward], axis=1)
 
 
-def cam_from_world_of(position: ArrayLike, orientation_xyzw: ArrayLike) -> Array:
-    """Return the pose (3, 4) of a camera at a position (3,) m with an orientation (4,) in the world, as in ROS.
-
-    The orientation rotates the axes of the optical frame into the world; it need not be of unit length.
-    """
-    quaternion = np.asarray(orientation_xyzw, dtype=np.float64)
-    quaternion = quaternion / np.linalg.norm(quaternion)
-    x, y, z, w = quaternion
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    world_from_cam = np.eye(3) + 2 * w * cross + 2 * cross @ cross
-    rotation = world_from_cam.T
-    return np.concatenate([rotation, -rotation @ np.asarray(position, dtype=np.float64)[:, None]], axis=1)
-
-
 def quaternion_xyzw(rotation: ArrayLike) -> Array:
     """Return the unit quaternion (4,), w >= 0, of a rotation (3, 3), by Shepperd's method."""
     r = np.asarray(rotation, dtype=np.float64)

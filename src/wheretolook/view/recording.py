@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -89,12 +88,7 @@ def record(shared: Shared, path: Path, state: ViewState = ViewState()) -> None:
     Paths are on the timeline "step". Raises StorageError if the file cannot be written, TableError if the state's
     location is outside the map.
     """
-    state = replace(
-        state,
-        method=state.method or shared.viewed.methods[0],
-        occlusion=state.occlusion or shared.viewed.occlusions[0],
-        height=shared.usual_m if state.height is None else state.height,
-    )
+    state = shared.complete(state)
     with open_recording(path) as recording:
         _record_scene(recording, shared, state)
         _record_floor(recording, shared, state)
@@ -139,7 +133,7 @@ def _record_floor(recording: Recording, shared: Shared, state: ViewState) -> Non
 
 def _record_location(recording: Recording, shared: Shared, state: ViewState, position: Float) -> None:
     rerun = recording.rerun
-    location = score_location(shared.selector(state.method, state.occlusion), position, state.n)
+    location = score_location(shared.viewed.selector(state.method, state.occlusion), position, state.n)
     points = position + shared.marker_m * location.directions
     colors = drawing.score_colors(location.scores)
     recording.log("world/place/sphere", rerun.Points3D(points, colors=colors, radii=0.1 * shared.marker_m))
@@ -151,7 +145,7 @@ def _record_location(recording: Recording, shared: Shared, state: ViewState, pos
 
 def _record_path(recording: Recording, shared: Shared, state: ViewState, name: str, poses: Float) -> None:
     recording.log_line(f"world/path/{name}", camera_centers(poses))
-    scores = shared.selector(state.method, state.occlusion).scorer.score(poses)
+    scores = shared.viewed.selector(state.method, state.occlusion).scorer.score(poses)
     for step, pose in enumerate(tqdm(poses, desc=name, unit="view")):
         recording.stream.set_time("step", sequence=step)
         _record_view(recording, shared, state, f"world/path/{name}/camera", pose)
@@ -161,7 +155,7 @@ def _record_path(recording: Recording, shared: Shared, state: ViewState, name: s
 
 def _record_view(recording: Recording, shared: Shared, state: ViewState, entity: str, pose: Float) -> None:
     """Record a camera pose (3, 4) and its image with visible landmarks."""
-    scorer = shared.selector(state.method, state.occlusion).scorer
+    scorer = shared.viewed.selector(state.method, state.occlusion).scorer
     landmarks = visible_landmarks(scorer, pose, shared.landmark_scorer(state.occlusion))
     image, _ = shared.viewed.picture(pose, landmarks)
     recording.log_camera(entity, pose, drawing.small_camera(shared.viewed.camera), image)

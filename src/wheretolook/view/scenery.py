@@ -190,7 +190,7 @@ class Scenery:
             self.scene.remove_by_name("/labels")
             self.controls.label_summary.content = ""
             return
-        scorer = self.shared.selector(state.method, state.occlusion).scorer
+        scorer = self.shared.viewed.selector(state.method, state.occlusion).scorer
         labels = yield from score_labels(scorer, table, LIMITS[self.controls.limits.value], state.threshold)
         colors = np.where(labels.good[:, None], drawing.TRUE_POSITIVE, drawing.TRUE_NEGATIVE)
         summary = f"{len(labels.good):,} labelled views, {100 * labels.good.mean():.0f} % localize."

@@ -39,22 +39,19 @@ def require(package: str) -> None:
 
 
 def check_port(host: str, port: int) -> None:
-    """Raise InUseError if a port is in use, ConfigError if port or host are invalid on this machine."""
+    """Raise InUseError if a port is in use, ConfigError if this machine cannot serve at host and port."""
     if not 0 <= port <= 65535:
         raise ConfigError("a port is a number from 0 to 65535", value=port, fix="Such as --port 8081.")
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind, protocol) as probe:
+        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)
-    except PermissionError as error:
-        raise ConfigError("no permission to use this port", value=port, fix="Use another: --port 8081.") from error
-    except socket.gaierror as error:
-        raise ConfigError("there is no such host", value=host, fix="Such as --host 127.0.0.1.") from error
     except OSError as error:
-        if error.errno == errno.EADDRNOTAVAIL:
-            raise ConfigError("this machine has no such address", value=host, fix="Such as --host 0.0.0.0.") from error
-        raise _in_use(port) from error
+        if error.errno == errno.EADDRINUSE:
+            raise _in_use(port) from error
+        fix = "Such as --host 0.0.0.0 --port 8081."
+        raise ConfigError(f"this address cannot be served: {error}", value=f"{host}:{port}", fix=fix) from error
 
 
 def _in_use(port: int) -> InUseError:

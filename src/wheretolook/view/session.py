@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+HEADROOM_M = 0.35  # above the floor, where a mesh is cut by default
 NOTICE_S = 0.5  # minimum time between two error notifications
 
 
@@ -41,7 +42,10 @@ class Session:
         self.host = host
         self.scene = client.scene
         self.viewed = shared.viewed
-        self.state = self._complete(state)
+        self.state = shared.complete(state)
+        if state.cut is None and shared.viewed.mesh is not None:
+            top = float(shared.viewed.mesh.bounds[1, 2])
+            self.state = replace(self.state, cut=min((self.state.height or 0.0) + HEADROOM_M, top))
         self.closed = False
         self._lock = Lock()
         self._inbox = Worker(f"client {client.client_id}")
@@ -56,20 +60,10 @@ class Session:
         if state.place is not None:
             self.place.select(np.array(state.place), None if state.yaw is None else (state.yaw, state.pitch or 0.0))
 
-    def _complete(self, state: ViewState) -> ViewState:
-        """Fill in what a state leaves to the viewer, and replace methods and models that are not available."""
-        viewed = self.viewed
-        height = self.shared.usual_m if state.height is None else state.height
-        if state.cut is None and viewed.mesh is not None:
-            state = replace(state, cut=min(height + 0.35, float(viewed.mesh.bounds[1, 2])))
-        method = state.method if state.method in viewed.methods else viewed.methods[0]
-        occlusion = state.occlusion if state.occlusion in viewed.occlusions else viewed.occlusions[0]
-        return replace(state, method=method, occlusion=occlusion, height=height)
-
     @property
     def selector(self) -> WhereToLook:
         """The view selector of the chosen method and occlusion model; for the worker thread."""
-        return self.shared.selector(self.state.method, self.state.occlusion)
+        return self.viewed.selector(self.state.method, self.state.occlusion)
 
     def _connect(self) -> None:
         c = self.controls

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
+from dataclasses import replace
 from threading import Lock
 from typing import TYPE_CHECKING, TypeVar
 
@@ -14,6 +15,7 @@ from wheretolook.utils.errors import WhereToLookError
 from wheretolook.view.drawing import mesh_glb, scene_size
 from wheretolook.view.paths import Paths
 from wheretolook.view.scores import FLOOR_DIRECTIONS, Floor, floor_at, height_range
+from wheretolook.view.state import ViewState
 from wheretolook.view.viewed_map import ViewedMap
 from wheretolook.view.worker import Worker
 
@@ -30,7 +32,7 @@ V = TypeVar("V")
 
 
 class Shared:
-    """State shared by all clients. `floor`, `selector` and `landmark_scorer` are for the worker thread only."""
+    """State shared by all clients. `floor` and `landmark_scorer` are for the worker thread only."""
 
     def __init__(self, viewed: ViewedMap, paths: Paths | None = None) -> None:
         self.viewed = viewed
@@ -62,9 +64,15 @@ class Shared:
         known = find(method)
         return known is not None and known.probability
 
-    def selector(self, method: str, occlusion: str) -> WhereToLook:
-        """Return the view selector of a method and an occlusion model."""
-        return self.viewed.selector(method, occlusion)
+    def complete(self, state: ViewState) -> ViewState:
+        """Fill in method, occlusion model and height where a state leaves them open or they are not available."""
+        viewed = self.viewed
+        return replace(
+            state,
+            method=state.method if state.method in viewed.methods else viewed.methods[0],
+            occlusion=state.occlusion if state.occlusion in viewed.occlusions else viewed.occlusions[0],
+            height=self.usual_m if state.height is None else state.height,
+        )
 
     def floor(self, method: str, occlusion: str, height_m: float) -> tuple[Floor, WhereToLook]:
         """Return the floor at a height, one object for all clients, and the selector that scores its cells."""
@@ -85,7 +93,7 @@ class Shared:
     def landmark_scorer(self, occlusion: str) -> Scorer | None:
         """Return the scorer of the best weights, which gives landmark probabilities for methods that have none."""
         try:
-            return self.selector("", occlusion).scorer
+            return self.viewed.selector("", occlusion).scorer
         except WhereToLookError:
             return None
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -56,8 +56,7 @@ def film(shared: Shared, path: Path, state: ViewState = ViewState()) -> int:
         if viewed.mesh is None or len(shared.paths) < 2:
             fix = "Give --path of a scene with a mesh."
             raise ConfigError("a film needs a mesh, and two paths to compare", path=path, fix=fix)
-        method = state.method or viewed.methods[0]
-        frames = list(_frames(shared, replace(state, method=method, occlusion=state.occlusion or viewed.occlusions[0])))
+        frames = list(_frames(shared, shared.complete(state)))
     finally:
         shared.worker.stop()
     save_moving(frames, [FRAME_MS] * (len(frames) - 1) + [LAST_MS], path)
@@ -67,7 +66,7 @@ def film(shared: Shared, path: Path, state: ViewState = ViewState()) -> int:
 def _frames(shared: Shared, state: ViewState) -> Iterator[drawing.Rgb]:
     viewed = shared.viewed
     assert viewed.mesh is not None
-    scorer = shared.selector(state.method, state.occlusion).scorer
+    scorer = viewed.selector(state.method, state.occlusion).scorer
     named = list(shared.paths.items())
     paths = []
     for name, path in (named[0], named[-1]):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from wheretolook.figures.config import KINDS
+from wheretolook.figures import KINDS
 from wheretolook.figures.style import new_figure, note_of, save_figure, scene_label
 from wheretolook.scorers.styles import method_style
 from wheretolook.utils.errors import ConfigError

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from wheretolook.commands.options import Log, Progress, SceneOptions, ignore_pro
 from wheretolook.commands.preconditions import load_dataset, open_scene
 from wheretolook.dataset.dataset_lock import reads_dataset
 from wheretolook.dataset.layout import Dataset
-from wheretolook.geometry.camera import Camera, PinholeCamera
+from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.planning.config import PlanConfig
 from wheretolook.tracking.config import TrackingConfig
@@ -67,6 +66,7 @@ class Plan(SceneOptions):
             TrackingError: the tracking store cannot be used.
         """
         from wheretolook.planning.method_paths import path_views, plan_by_methods
+        from wheretolook.view.server import require
 
         dataset = load_dataset(self, "map")
         config = self.plan
@@ -74,7 +74,8 @@ class Plan(SceneOptions):
         if config.start is None or config.goal is None:
             fix = "Give plan.start and plan.goal, such as --plan.start '[1, 1, 1.4]'."
             raise ConfigError("a path needs a start and a goal", value=(config.start, config.goal), fix=fix)
-        rerun = _rerun() if config.rerun else None
+        if config.rerun:
+            require("rerun")
         check_store(self.tracking)
         scene = open_scene(self, files)
         methods = (*(name for name in config.against if name != config.method), config.method)
@@ -88,8 +89,8 @@ class Plan(SceneOptions):
             written = _draw(views, scene.landmarks.points, f"{scene.name}, {method}", folder, config.film)
             table = _table(path, stopping=config.stops.looks > 1)
             write_text(folder / "path.csv", table.to_csv(index=False, lineterminator="\n"))
-            if rerun is not None:
-                _record(rerun, views[method], scene.landmarks.points, scene.camera, folder / "path.rrd")
+            if config.rerun:
+                _record(views[method], scene.landmarks.points, scene.camera, folder / "path.rrd")
                 written.append("path.rrd")
             written.insert(0, "path.csv")
             with kept_if_not_logged(f"the path in {folder}"):
@@ -185,33 +186,15 @@ def _describe_stops(path: PlannedPath) -> str:
     return f", {stops} with {looks} further looks: mean score {score_text(float(path.scores_with_stops.mean()))}"
 
 
-def _rerun() -> Any:  # the package is no dependency
-    try:
-        return import_module("rerun")
-    except ImportError as error:
-        raise ConfigError("Rerun is not installed", fix="pip install rerun-sdk, or leave plan.rerun out.") from error
+def _record(views: list[PathView], landmarks: np.ndarray, camera: Camera, file: Path) -> None:
+    """Write a Rerun recording: landmarks, path, and the camera moving along it with image, landmarks and score."""
+    from wheretolook.view.recording import open_recording
 
-
-def _record(rerun: Any, seen: list[PathView], landmarks: np.ndarray, camera: Camera, file: Path) -> None:
-    """A recording for the Rerun viewer: landmarks, path, the camera moving along it, its image, its score."""
-    stream = rerun.RecordingStream("wheretolook")
-    stream.save(str(file))
-    stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    stream.log("world/landmarks", rerun.Points3D(landmarks, radii=0.008), static=True)
-    stream.log("world/path", rerun.LineStrips3D([np.array([view.position for view in seen])]), static=True)
-    # Rerun knows no distortion
-    focal_px = (camera.fx, camera.fy) if isinstance(camera, PinholeCamera) else camera.mean_focal_px
-    for number, view in enumerate(seen):
-        stream.set_time("view", sequence=number)
-        pose = poses_looking_along(view.position, view.axis)
-        stream.log("world/camera", rerun.Transform3D(translation=view.position, mat3x3=pose[:, :3].T))
-        size = {"width": camera.width, "height": camera.height}
-        pinhole = rerun.Pinhole(
-            focal_length=focal_px, principal_point=camera.principal_point, camera_xyz=rerun.ViewCoordinates.RDF, **size
-        )
-        stream.log("world/camera/image", pinhole)
-        if view.rgb is not None:
-            stream.log("world/camera/image", rerun.Image(view.rgb).compress(jpeg_quality=85))
-        stream.log("world/camera/image/landmarks", rerun.Points2D(view.pixels))
-        stream.log("score", rerun.Scalars(view.score))
-    stream.flush()
+    with open_recording(file) as recording:
+        recording.log_landmarks(landmarks, 0.008)
+        recording.log_line("world/path", np.array([view.position for view in views]))
+        for number, view in enumerate(views):
+            recording.stream.set_time("view", sequence=number)
+            recording.log_camera("world/camera", poses_looking_along(view.position, view.axis), camera, view.rgb)
+            recording.stream.log("world/camera/landmarks", recording.rerun.Points2D(view.pixels))
+            recording.log_score("score", view.score)

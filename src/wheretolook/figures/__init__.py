@@ -1,1 +1,3 @@
-"""Every figure, drawn from logged runs."""
+"""Figures of labels, scores, calibration, scenes and paths."""
+
+KINDS = ("png", "pdf", "svg")  # file formats of figures

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
-from wheretolook.figures.config import KINDS
+from wheretolook.figures import KINDS
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import write_bytes
 

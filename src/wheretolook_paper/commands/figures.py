@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, ClassVar
 
 from wheretolook.commands.options import DatasetOptions, Log
 from wheretolook.dataset.dataset_lock import reads_dataset
-from wheretolook.figures.config import FiguresConfig
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.utils.errors import MissingRunError
+from wheretolook_paper.figures.config import FiguresConfig
 
 if TYPE_CHECKING:
     from wheretolook.dataset.layout import Dataset

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, ClassVar
 from wheretolook.commands.options import DatasetOptions, Log
 from wheretolook.dataset.dataset_lock import reads_dataset
 from wheretolook.dataset.names import RELEASE_FILE
-from wheretolook.figures.config import FiguresConfig
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import ui_command
 from wheretolook.tracking.store import check_store
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import temporary_folder
+from wheretolook_paper.figures.config import FiguresConfig
 
 if TYPE_CHECKING:
     from wheretolook.dataset.layout import Dataset

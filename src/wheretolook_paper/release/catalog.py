@@ -21,7 +21,6 @@ from wheretolook.evaluation.report import score_markdown
 from wheretolook.evaluation.results import CALIBRATION_CSV, SCORES_CSV
 from wheretolook.evaluation.scores import read_scores
 from wheretolook.figures.calibration import calibration_figure
-from wheretolook.figures.config import FiguresConfig
 from wheretolook.figures.path_film import methods_figure
 from wheretolook.figures.scores import regret_figure, score_figure
 from wheretolook.figures.style import save_figure
@@ -36,6 +35,7 @@ from wheretolook.utils.markdown import markdown_table
 from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.evaluation.comparisons import comparisons_markdown
 from wheretolook_paper.evaluation.looks import LOOKS_CSV
+from wheretolook_paper.figures.config import FiguresConfig
 from wheretolook_paper.figures.inputs import inputs_figure
 from wheretolook_paper.figures.lattices import fibonacci_figure
 from wheretolook_paper.figures.looks import looks_figure

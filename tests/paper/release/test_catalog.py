@@ -16,7 +16,6 @@ from synthetic_scores import make_scores
 from wheretolook.cli import main
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.thresholds import ALL
-from wheretolook.figures.config import FiguresConfig
 from wheretolook.figures.style import note_of
 from wheretolook.planning.config import PathConfig, PlanConfig
 from wheretolook.planning.routes import PathView
@@ -24,6 +23,7 @@ from wheretolook.scorers.styles import method_style
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import newest_artifact, newest_run
 from wheretolook.utils.errors import ConfigError
+from wheretolook_paper.figures.config import FiguresConfig
 from wheretolook_paper.figures.top_n import ROWS, top_n_figure, top_n_table
 from wheretolook_paper.release.catalog import ITEMS, write_items
 from wheretolook_paper.release.paper_architecture import paper_architecture_table

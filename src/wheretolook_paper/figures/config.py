@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from wheretolook.figures import KINDS
 from wheretolook.utils.errors import ConfigError
-
-KINDS = ("png", "pdf", "svg")  # file formats of figures
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ from wheretolook.mapping.rendered_map import build_map
 from wheretolook.mapping.walk import plan_walk
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.utils.errors import MapError
-from wheretolook.utils.processes import WorkerPool
 
 CAMERA = PinholeCamera(320, 240, 160.0)
 CONFIG = MapConfig(n_images=14, walk=WalkConfig(image_spacing_m=0.35), keep_database=True, keep_images=True)
@@ -128,29 +127,6 @@ def test_same_seed_same_bytes_whatever_the_workers(built, room, room_free_space,
     for name in names:
         if name.name not in ("report.json", "database.db"):
             assert (folder / name).read_bytes() == (again / name).read_bytes(), name
-
-
-@pytest.mark.slow
-def test_no_two_threads_match_in_one_process(room, room_free_space, renderer, tmp_path, monkeypatch):
-    """pycolmap's BLAS would give them the same buffer once in many maps."""
-    threads = []
-    match = pycolmap.match_image_pairs
-
-    def watched(database, options, *arguments, **named):
-        threads.append(options.num_threads)
-        return match(database, options, *arguments, **named)
-
-    monkeypatch.setattr(pycolmap, "match_image_pairs", watched)
-    monkeypatch.setattr(WorkerPool, "map", lambda self, function, items: map(function, items))  # where it is watched
-    build_map(room, renderer, room_free_space, CAMERA, CONFIG, SEED, tmp_path / "map", workers=3, progress=False)
-    assert set(threads) == {1}
-
-
-def test_other_peoples_folders_are_not_replaced(room, room_free_space, renderer, tmp_path):
-    (tmp_path / "thesis.tex").write_text("precious")
-    with pytest.raises(MapError):
-        build_map(room, renderer, room_free_space, CAMERA, CONFIG, SEED, tmp_path, progress=False)
-    assert (tmp_path / "thesis.tex").read_text() == "precious"
 
 
 def test_scene_without_texture_gives_no_map(room, room_free_space, tmp_path):

@@ -9,7 +9,7 @@ import pytest
 
 from mapping.test_landmarks import CENTERS, hand_written_model
 from synthetic_dataset import CAMERA, make_mapping_poses, make_scene
-from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.dataset.layout import SceneFolder
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import load_mapping_poses, save_mapping_poses
@@ -44,13 +44,6 @@ def test_a_model_tells_the_poses_where_there_is_no_file(scene: SceneFolder) -> N
     np.testing.assert_allclose(found[:, 2, :3], np.tile([0.0, 1.0, 0.0], (3, 1)), atol=1e-6)
     of_model = LocalizationMap.from_colmap(scene.map, CAMERA, max_reprojection_error_px=5.0).mapping_poses
     np.testing.assert_array_equal(of_model, found)
-
-
-def test_the_file_leaves_a_datasets_fingerprint_alone(scene: SceneFolder) -> None:
-    dataset = Dataset(scene.folder.parent, (scene,))
-    before = dataset.fingerprint()
-    scene.mapping_cameras.unlink()
-    assert dataset.fingerprint() == before  # weights trained before there was such a file stay valid
 
 
 def test_damage_is_named(scene: SceneFolder) -> None:

@@ -111,20 +111,6 @@ def test_attributes_of_a_hand_written_model(tmp_path, text):
     assert [k.dtype for k in kinds] == [np.int64, np.float64, np.int32, np.float32]
 
 
-def test_filter_takes_the_mean_reprojection_error(model_dir):
-    assert list(load_colmap_landmarks(model_dir, max_reprojection_error_px=0.29).ids) == [10, 40]
-    assert list(load_colmap_landmarks(model_dir, max_reprojection_error_px=0.31).ids) == [10, 20, 40]
-    assert list(load_colmap_landmarks(model_dir, max_reprojection_error_px=3).ids) == [10, 20, 30, 40]
-
-
-def test_errors_written_by_colmap_are_taken_as_they_are(tmp_path):
-    model, _ = hand_written_model()
-    model.update_point_3d_errors()
-    model.points3D[10].error = 7.5
-    model.write_binary(str(tmp_path))
-    assert list(load_colmap_landmarks(tmp_path, max_reprojection_error_px=0.5).ids) == [20, 40]
-
-
 def test_descriptors_are_means_over_the_track(tmp_path, model_dir):
     model, keypoints = hand_written_model()
     descriptors = random_descriptors([len(k) for k in keypoints])

@@ -11,7 +11,7 @@ import pycolmap
 import pytest
 
 from mapping.test_landmarks import hand_written_model, random_descriptors, write_database
-from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
+from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import model_arrays, read_model
@@ -144,14 +144,6 @@ def test_missing_and_incomplete_models_are_rejected(tmp_path):
             read_model(path)
 
 
-def test_images_without_a_pose_and_of_any_name_are_passed_over(tmp_path):
-    model = hand_written_model()[0]
-    model.add_image_with_trivial_frame(pycolmap.Image(name="Küche 1/ä.png", camera_id=1, image_id=77))
-    folder = written(model, tmp_path / "model")
-    found = LocalizationMap.from_colmap(folder, camera=1)
-    assert found.mapping_poses.shape == (3, 3, 4) and len(found.landmarks) == 4
-
-
 def test_a_database_tells_ambiguity_and_is_not_written_to(tmp_path):
     model, keypoints = hand_written_model()
     folder = written(model, tmp_path / "model")
@@ -224,33 +216,3 @@ def test_scale_and_axes_are_doubted_where_they_are_implausible():
         assert axes_doubt(np.concatenate([poses[:, :, :3] @ np.array(turn, float).T, poses[:, :, 3:]], axis=2))
     above = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0), [30.0]), -1).reshape(-1, 3)
     assert axes_doubt(poses_looking_along(above, np.tile([1e-3, 0, -1.0], (25, 1)))) == ""  # looking down
-
-
-def test_from_colmap_warns_of_a_scaled_and_turned_model(tmp_path):
-    model = rig_model()
-    LocalizationMap.from_colmap(written(model, tmp_path / "good"), camera=1)  # warnings are errors here
-    model.transform(
-        pycolmap.Sim3d(37.0, pycolmap.Rotation3d(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])), np.zeros(3))
-    )
-    folder = written(model, tmp_path / "bad")
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        LocalizationMap.from_colmap(folder, camera=1)
-    assert sum(warning.category is MapWarning for warning in said) == 2
-
-
-def test_a_camera_with_distortion_is_the_models_own(tmp_path):
-    model = pycolmap.Reconstruction()
-    params = [300.0, 310.0, 320.0, 240.0, 0.01, 0.0, 0.0, 0.0]
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(camera_id=3, model="OPENCV", width=640, height=480, params=params)
-    )
-    source = hand_written_model()[0]
-    for image_id, image in source.images.items():
-        copy = pycolmap.Image(name=image.name, camera_id=3, image_id=image_id)
-        copy.points2D = pycolmap.Point2DList([pycolmap.Point2D(point.xy) for point in image.points2D])
-        model.add_image_with_trivial_frame(copy, image.cam_from_world())
-    for point_id, point in source.points3D.items():
-        model.add_point3D_with_id(point_id, pycolmap.Point3D(xyz=point.xyz, track=point.track))
-    found = LocalizationMap.from_colmap(written(model, tmp_path / "model"))
-    assert isinstance(found.camera, ColmapCamera) and found.camera.params == tuple(params)

@@ -6,7 +6,7 @@ import numpy as np
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.mapping.triangulation import DEPTH_STRIDE, choose_pairs, shrink_depth, surface_overlap
+from wheretolook.mapping.triangulation import choose_pairs, shrink_depth, surface_overlap
 
 CAMERA = PinholeCamera(320, 240, 160.0)
 
@@ -38,13 +38,6 @@ def test_no_overlap_without_parallax_behind_walls_or_from_the_other_side():
     assert overlap[0, 3] == 0  # something hides the wall from the last camera
     empty = surface_overlap(CAMERA, poses_looking_along(centers, directions), 0 * shrink_depth(depth))
     assert (empty == 0).all()
-
-
-def test_shrunk_depth_is_the_depth_at_known_pixels():
-    depth = np.arange(240 * 320, dtype=np.float32).reshape(240, 320)
-    small = shrink_depth(depth)
-    assert small.shape == (60, 80)
-    assert small[3, 5] == depth[3 * DEPTH_STRIDE + 2, 5 * DEPTH_STRIDE + 2]
 
 
 def test_pairs_are_each_images_best_partners():

@@ -16,7 +16,7 @@ from wheretolook.mapping.photographs import (
     read_photograph,
     reduce_photograph,
 )
-from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.errors import ConfigError
 
 ORIENTATION = 0x0112
 EXIF_IFD = 0x8769
@@ -47,17 +47,6 @@ def test_photographs_are_listed_by_name(tmp_path: Path) -> None:
         save(tmp_path / name, sized(20, 30))
     (tmp_path / "notes.txt").write_text("not a photograph")
     assert list_photographs(tmp_path) == ["a.png", "b.JPG", "hall/c.jpg"]
-
-
-def test_folders_without_photographs_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(MapError):
-        list_photographs(tmp_path / "nothing")
-    save(tmp_path / "one.jpg", sized(20, 30))
-    with pytest.raises(MapError):
-        list_photographs(tmp_path)
-    (tmp_path / "two.jpg").write_bytes(b"\xff\xd8 truncated")
-    with pytest.raises(MapError):
-        read_photograph(tmp_path / "two.jpg")
 
 
 def test_photographs_are_turned_upright_and_reduced(tmp_path: Path) -> None:
@@ -111,10 +100,3 @@ def test_few_are_matched_all_with_all_and_many_in_turn() -> None:
     steps = pairs[:, 1] - pairs[:, 0]
     assert set(steps.tolist()) == {*range(1, 11), 16, 32, 64}
     assert len(np.unique(pairs, axis=0)) == len(pairs) < 100 * 13
-
-
-def test_settings_out_of_range_are_refused() -> None:
-    for settings in ({"max_side_px": -1}, {"overlap": 0}, {"up_in_camera": (0.0, 0.0, 0.0)},
-                     {"max_reprojection_error_px": 0.0}):  # fmt: skip
-        with pytest.raises(ConfigError):
-            PhotographsConfig(**settings)

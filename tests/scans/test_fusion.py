@@ -216,26 +216,6 @@ def test_frames_that_cannot_be_used_are_counted(seven_scenes, tmp_path):
     }
 
 
-def test_lost_poses_and_late_images_of_tum_are_counted(tum, tmp_path):
-    folder = tmp_path / "some"
-    folder.mkdir()
-    for path in sorted(tum.rglob("*")):
-        if path.is_file():
-            (folder / path.relative_to(tum)).parent.mkdir(exist_ok=True)
-            (folder / path.relative_to(tum)).write_bytes(path.read_bytes())
-    truth = folder / "groundtruth.txt"
-    lines = truth.read_text().splitlines()
-    lines[1] = lines[1].split()[0] + " nan nan nan nan nan nan nan"
-    lines[2] = lines[2].split()[0] + " 0 0 0 0 0 0 0"
-    del lines[3]
-    truth.write_text("\n".join(lines))
-    depth = folder / "depth.txt"
-    depth.write_text("\n".join(depth.read_text().splitlines()[:-1]))
-    found = scan(folder)
-    expected = {"whose pose is lost (not finite, or no rotation)": 2, "without a pose": 1, "without a depth image": 1}
-    assert found.frames.skipped.reasons == expected
-
-
 def test_up_can_be_given_and_a_wrong_one_is_warned_of(seven_scenes):
     with warnings.catch_warnings():
         warnings.simplefilter("error", MapWarning)

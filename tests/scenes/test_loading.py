@@ -94,15 +94,6 @@ def test_glb_factors_and_vertex_colors(tmp_path, texture):
     np.testing.assert_array_equal(mesh.vertex_colors, colors[:, :3])
 
 
-def test_a_part_without_colour_beside_a_textured_one_is_white(tmp_path, texture):
-    scene = trimesh.Scene([textured(texture), trimesh.Trimesh(VERTICES + 5, FACES, process=False)])
-    scene.export(tmp_path / "a.glb")
-    mesh = load_mesh(tmp_path / "a.glb")
-    high = mesh.vertices[mesh.triangles][:, :, 0].min(axis=1) >= 5
-    np.testing.assert_array_equal(mesh.textures[mesh.triangle_texture[high][0]], [[[255, 255, 255]]])
-    np.testing.assert_array_equal(mesh.textures[mesh.triangle_texture[~high][0]], texture)
-
-
 OBJ = """mtllib a.mtl
 v 0 0 0
 v 2 0 0
@@ -195,15 +186,6 @@ def test_up_axis_becomes_z_without_mirroring(tmp_path, texture, up, axis):
     np.testing.assert_allclose(mesh.vertices[:, 2], VERTICES @ axis, atol=1e-6)
     a, b, c = mesh.vertices[1:] - mesh.vertices[0]
     assert np.dot(np.cross(a, b), c) == pytest.approx(np.linalg.det(VERTICES[1:] - VERTICES[0]))
-
-
-def test_habitat_matterport_folder(tmp_path, texture):
-    folder = tmp_path / "00800-TEEsavR23oF"
-    folder.mkdir()
-    with pytest.raises(SceneError):
-        load_mesh(folder)
-    textured(texture).export(folder / "TEEsavR23oF.glb")
-    assert_is_the_quad(load_mesh(folder), texture)
 
 
 def test_degenerate_triangles_and_loose_vertices_are_dropped(tmp_path, texture):

@@ -55,15 +55,6 @@ def test_both_methods_find_the_same_keypoints():
     assert abs(np.median(colmap.pixels[close] - opencv.pixels[nearest[close]], axis=0)).max() < 0.03
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_descriptors_are_unit_length_and_nonnegative(method):
-    keypoints = KeypointExtractor(ExtractorConfig(method=method)).extract(textured_image())
-    assert keypoints.pixels.dtype == keypoints.descriptors.dtype == np.float32
-    assert keypoints.descriptors.shape == (len(keypoints), 128)
-    np.testing.assert_allclose(np.linalg.norm(keypoints.descriptors, axis=1), 1, atol=1e-6)
-    assert keypoints.descriptors.min() >= 0
-
-
 def test_colmap_method_gives_the_keypoints_of_colmaps_own_feature_extraction(tmp_path):
     """Over an image file, through COLMAP's C++ pipeline, which does its own reading and conversion to grey."""
     from PIL import Image
@@ -85,28 +76,6 @@ def test_colmap_method_gives_the_keypoints_of_colmaps_own_feature_extraction(tmp
     theirs = np.column_stack([pixels.astype(np.float32), descriptors])
     assert len(mine) == len(theirs)
     np.testing.assert_array_equal(mine[np.lexsort(mine.T)], theirs[np.lexsort(theirs.T)])
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_cap_keeps_the_first_of_the_full_order(method):
-    image = textured_image()
-    everything = KeypointExtractor(ExtractorConfig(method=method, max_keypoints=100_000)).extract(image)
-    few = KeypointExtractor(ExtractorConfig(method=method, max_keypoints=50)).extract(image)
-    assert len(everything) > 100 and len(few) == 50
-    np.testing.assert_array_equal(few.pixels, everything.pixels[:50])
-    np.testing.assert_array_equal(few.descriptors, everything.descriptors[:50])
-    if method == "colmap":
-        assert (np.diff(everything.scales_px) <= 0).all()
-
-
-def test_first_octave_minus_one_adds_small_keypoints():
-    image = textured_image()
-    for method in METHODS:
-        coarse, fine = (
-            KeypointExtractor(ExtractorConfig(method=method, first_octave=o)).extract(image) for o in (0, -1)
-        )
-        assert len(fine) > 1.5 * len(coarse)
-        assert fine.scales_px.min() < 0.75 * coarse.scales_px.min()
 
 
 @pytest.mark.parametrize("method", ["opencv", pytest.param("colmap", marks=pytest.mark.slow)])

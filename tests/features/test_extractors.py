@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +10,12 @@ import pytest
 from twins.features import mutual_matches
 from wheretolook.features.aliked_batch import detect_and_describe, detect_by_kornia
 from wheretolook.features.config import ExtractorConfig
-from wheretolook.features.descriptors import quantize_descriptors, unit_descriptors
+from wheretolook.features.descriptors import unit_descriptors
 from wheretolook.features.extraction import KeypointExtractor
-from wheretolook.features.registry import all_kinds, kind_of, runnable_extractors
+from wheretolook.features.registry import all_kinds, kind_of
 from wheretolook.features.similarity import SimilarityMatcher
-from wheretolook.localization.config import LabelConfig, LocalizerConfig
-from wheretolook.utils.errors import ConfigError, WeightsError
+from wheretolook.localization.config import LocalizerConfig
+from wheretolook.utils.errors import WeightsError
 
 LEARNED = ("aliked", "disk", "xfeat")
 
@@ -35,12 +34,6 @@ def test_stored_descriptors_come_back_as_they_were_stored(kind):
     assert kind.store(kind.restore(kind.none())).shape == (0, kind.dimension)
 
 
-def test_sift_is_stored_as_colmap_stores_it():
-    values = np.abs(unit(20, 128))
-    np.testing.assert_array_equal(kind_of("opencv").store(values), quantize_descriptors(values))
-    assert kind_of("opencv") is kind_of("colmap")
-
-
 def test_the_records_of_older_maps_and_labels_stay_valid():
     """Stages are done again when a record changes: a new option may not change that of everybody's maps."""
     constants = {"first_octave": -1, "max_keypoints": 2048, "peak_threshold": 0.02 / 3, "edge_threshold": 10.0}
@@ -49,36 +42,6 @@ def test_the_records_of_older_maps_and_labels_stay_valid():
     old |= {"confidence": 0.9999, "min_trials": 100, "max_trials": 10_000}
     assert LocalizerConfig().record() == old
     assert LocalizerConfig(min_similarity=0.7).record() == {**old, "min_similarity": 0.7}
-
-
-def test_what_is_in_weights_decides_not_where_they_lie(tmp_path):
-    for name, content in (("a", b"1"), ("b", b"1"), ("c", b"2")):
-        (tmp_path / name).write_bytes(content)
-    a, b, c = (ExtractorConfig("aliked", weights=str(tmp_path / name)).record() for name in "abc")
-    assert a == b != c
-
-
-@pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        ({"method": "orb"}, "opencv, colmap, aliked, disk, xfeat"),
-        ({"method": "superpoint"}, "unknown extractor"),  # known from files alone
-        ({"method": "opencv", "weights": "a.pth"}, "no weights"),
-    ],
-)
-def test_settings_that_no_extractor_has(options, told):
-    with pytest.raises(ConfigError):
-        ExtractorConfig(**options)
-
-
-def test_a_similarity_is_a_cosine():
-    with pytest.raises(ConfigError):
-        LocalizerConfig(min_similarity=1.5)
-
-
-def test_lightglue_needs_the_database_which_does_not_travel_to_ray():
-    with pytest.raises(ConfigError):
-        LabelConfig(LocalizerConfig(lightglue="aliked_lightglue.pth"), engine="ray")
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 700, 2000])
@@ -100,14 +63,6 @@ def test_mutual_nearest_neighbours_are_those_of_all_products(n, monkeypatch):
         assert len(set(rows.tolist())) == len(rows) and (np.diff(keypoints) > 0).all()
     if n > 2:
         assert n // 4 < len(rows) <= n // 2  # of twins, the nearer
-
-
-def test_without_kornia_the_extra_to_install_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "kornia", None)
-    monkeypatch.setitem(sys.modules, "kornia.feature", None)
-    for method in LEARNED:
-        with pytest.raises(ConfigError):
-            KeypointExtractor(ExtractorConfig(method))
 
 
 def untrained(method: str, folder: Path) -> Path:
@@ -199,23 +154,6 @@ def test_matches_of_images_that_go_together_are_those_of_each_alone(monkeypatch)
             np.testing.assert_array_equal(rows, expected[1])
 
 
-def test_images_that_go_together_hold_as_much_as_their_pixels(tmp_path):
-    extractor = KeypointExtractor(ExtractorConfig("xfeat", max_keypoints=50, weights=str(untrained("xfeat", tmp_path))))
-    alone = list(extractor.extract_many(image(seed) for seed in range(5)))
-    network = extractor._extraction
-    network.batch = 2  # as on a GPU
-    extractor.on_gpu = True
-    sizes = []
-    detect = network.detect
-    network.detect = lambda images: sizes.append(len(images)) or detect(images)
-    assert (extractor.batch_of(640, 480), extractor.batch_of(1280, 480), extractor.batch_of(9999, 9999)) == (2, 1, 1)
-    together = list(extractor.extract_many(image(seed) for seed in range(5)))
-    assert sizes == [5]  # of 140 x 100, forty would go together
-    for a, b in zip(alone, together, strict=True):
-        assert len(a) and np.abs(a.pixels - b.pixels).max() < 0.01
-        np.testing.assert_allclose(a.descriptors, b.descriptors, atol=1e-3)
-
-
 @pytest.mark.parametrize("method", LEARNED)
 def test_weights_that_are_not_the_networks(method, tmp_path, monkeypatch):
     weights = untrained(method, tmp_path)
@@ -244,7 +182,3 @@ def test_weights_that_are_not_the_networks(method, tmp_path, monkeypatch):
     monkeypatch.setattr("kornia.core.download.load_state_dict_from_url", offline)
     with pytest.raises(WeightsError):
         KeypointExtractor(ExtractorConfig(method))
-
-
-def test_every_extractor_that_extracts_says_so():
-    assert runnable_extractors() == ("opencv", "colmap", *LEARNED)

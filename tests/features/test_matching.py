@@ -65,13 +65,6 @@ def test_nearest_two_agree_with_their_twin_at_every_size(device: str, make) -> N
         assert_nearest_two(device, make(40, seed=n + 1), make(n, seed=n))
 
 
-@KINDS
-def test_no_keypoint_and_one(device: str, make) -> None:  # type: ignore[no-untyped-def]
-    for n in (2, 64, 300):
-        assert_nearest_two(device, make(1, seed=1), make(n))
-        assert [len(part) for part in DescriptorMatcher(make(n), device).nearest_two(make(0))] == [0, 0, 0]
-
-
 @pytest.mark.parametrize("n", [1, 63, 64, 65, 127, 128, 129, 500])
 def test_blocks_leave_no_seam(device: str, n: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks of 64 descriptors, or of one where the product of more does not fit."""
@@ -125,15 +118,6 @@ def test_several_images_at_once_are_matched_as_one_by_one(device: str) -> None:
         np.testing.assert_array_equal(found[1], rows)
 
 
-@pytest.mark.parametrize("n_landmarks", [0, 1])
-def test_without_a_second_landmark_nothing_matches(device: str, n_landmarks: int) -> None:
-    landmarks = sift_like_descriptors(n_landmarks)
-    matcher = DescriptorMatcher(landmarks, device)
-    for queries in (sift_like_descriptors(5), sift_like_descriptors(0)):
-        for keypoints, rows in match(matcher, [queries, queries], 1.0):
-            assert len(keypoints) == len(rows) == 0
-
-
 def test_nothing_to_match(device: str) -> None:
     matcher = DescriptorMatcher(sift_like_descriptors(50), device)
     assert match(matcher, [], 0.85) == []
@@ -161,18 +145,3 @@ def test_a_cpu_whose_byte_products_saturate_finds_the_same(instructions: str) ->
         "print('done')\n"
     )
     assert run_python(code, ONEDNN_MAX_CPU_ISA=instructions) == "done"
-
-
-def test_a_thread_keeps_to_the_cores_it_was_told() -> None:
-    """With four cores, OpenMP would start three more threads for each thread that multiplies."""
-    code = (
-        "import os, threading, torch\n"
-        "from features.test_matching import DescriptorMatcher, random_descriptors\n"
-        "torch.set_num_threads(1)\n"
-        "matcher = DescriptorMatcher(random_descriptors(5000))\n"
-        "before = len(os.listdir('/proc/self/task'))\n"
-        "thread = threading.Thread(target=matcher.nearest_two, args=(random_descriptors(500),))\n"
-        "thread.start(), thread.join()\n"
-        "print(len(os.listdir('/proc/self/task')) - before)\n"
-    )
-    assert int(run_python(code, OMP_NUM_THREADS="4")) <= 1  # the thread itself, if it is not yet gone

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import socket
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -61,17 +60,6 @@ def test_without_ray_the_extra_to_install_is_named(room: MappedRoom, monkeypatch
     shard = Shard(room.job, Path("shard.parquet"), facing(POSTER, 1, 1.5))
     with pytest.raises(ConfigError):
         next(ray_engine.run_ray([shard]))
-
-
-@SLOW
-def test_an_address_without_a_cluster_is_refused_at_once(room: MappedRoom) -> None:
-    """Without the check, Ray would try for many minutes."""
-    pytest.importorskip("ray")
-    shard = Shard(room.job, Path("shard.parquet"), facing(POSTER, 1, 1.5))
-    with socket.socket() as taken:  # but not listening
-        taken.bind(("127.0.0.1", 0))
-        with pytest.raises(ConfigError):
-            next(ray_engine.run_ray([shard], address=f"127.0.0.1:{taken.getsockname()[1]}"))
 
 
 @pytest.fixture(scope="module")

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from holdout.corridor import HEIGHT, WIDTH, write_corridor
+from holdout.corridor import write_corridor
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.registry import all_kinds
-from wheretolook.geometry.camera import PinholeCamera, cameras_by_id
+from wheretolook.geometry.camera import cameras_by_id
 from wheretolook.geometry.poses import pose_error
 from wheretolook.holdout.holdout import leave_out
 from wheretolook.holdout.holdout_blocks import choose_blocks
@@ -22,7 +21,6 @@ from wheretolook.localization.localizer import Localizer
 from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import load_colmap_landmarks
-from wheretolook.utils.errors import ConfigError, MapError, WeightsError
 
 KIND = all_kinds()["aliked"]
 
@@ -76,23 +74,6 @@ def test_a_query_is_localized_by_the_images_that_see_the_same(corridor, tmp_path
     assert found.status == "localized" and error_m < 0.02 and error_deg < 0.3
     nothing = Keypoints.none(KIND.dimension)
     assert [len(part) for part in localizer.match([nothing])[0]] == [0, 0]
-
-
-def test_what_lightglue_needs(corridor, tmp_path, monkeypatch):
-    landmarks = load_colmap_landmarks(corridor, corridor / "database.db")
-    camera = PinholeCamera(WIDTH, HEIGHT, 160.0)
-    config = LocalizerConfig(lightglue=str(nearest_neighbour_weights(tmp_path / "lightglue.pth")))
-    with pytest.raises(MapError):
-        Localizer(landmarks, camera, config, map_dir=tmp_path)
-    with pytest.raises(WeightsError):
-        Localizer(landmarks, camera, LocalizerConfig(lightglue="missing.pth"), map_dir=corridor)
-    sparse, database = write_corridor(tmp_path / "sift")
-    with pytest.raises(ConfigError):
-        Localizer(load_colmap_landmarks(sparse, database), camera, config, map_dir=sparse)
-    monkeypatch.setitem(sys.modules, "kornia", None)
-    monkeypatch.setitem(sys.modules, "kornia.feature", None)
-    with pytest.raises(ConfigError):
-        Localizer(landmarks, camera, config, map_dir=corridor)
 
 
 def test_photographs_left_out_of_a_map_of_learned_features_are_localized(corridor, tmp_path):

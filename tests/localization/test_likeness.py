@@ -8,7 +8,7 @@ import pytest
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.localization.estimation import PoseEstimator
-from wheretolook.localization.pose_ambiguity import PoseAmbiguity, most_likely, preference, strongest_rival
+from wheretolook.localization.pose_ambiguity import PoseAmbiguity, most_likely, strongest_rival
 from wheretolook.localization.rig import Look, rig_of
 from wheretolook.localization.rig_localization import JointLocalizer
 
@@ -76,12 +76,6 @@ def test_evidence_of_its_own_outweighs_inliers_that_likeness_explains(n_column):
     assert found.n_inliers == (90 + 12 if n_column else 180)
     assert found.unique_support[1] == 0 and (found.unique_support[0] > 0) == (n_column > 0)
     assert found.rival_support == pytest.approx(180 if n_column else 90, abs=1)
-
-
-def test_preference_is_for_own_places_then_for_support():
-    assert preference((0, 0), (100, 50)) > 0 > preference((0, 0), (50, 100))
-    assert preference((8, 0), (50, 100)) > 0 and preference((0, 8), (100, 50)) < 0
-    assert preference((3, 4), (90, 90)) == pytest.approx(-preference((4, 3), (90, 90)))
 
 
 def test_the_pose_is_taken_whose_strongest_rival_is_weakest():

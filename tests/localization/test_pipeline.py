@@ -36,34 +36,6 @@ def test_order_is_kept_whichever_item_takes_longest() -> None:
     assert list(run_pipeline([], steps)) == []
 
 
-def test_steps_overlap_and_their_time_is_counted() -> None:
-    seconds: dict[str, float] = {}
-    start = time.perf_counter()
-    steps = [Step("a", slowly(0.05).run), Step("b", slowly(0.05).run), Step("c", slowly(0.05).run)]
-    assert list(run_pipeline(range(10), steps, seconds)) == list(range(10))
-    wall = time.perf_counter() - start
-    assert list(seconds) == ["a", "b", "c"]
-    assert min(seconds.values()) >= 0.5
-    assert wall < 0.8 * sum(seconds.values())  # 0.6 s of 1.5 s on an idle machine
-
-
-def test_the_source_is_read_no_further_than_the_queues_are_long() -> None:
-    read = 0
-
-    def source() -> Iterator[int]:
-        nonlocal read
-        for item in range(1000):
-            read += 1
-            yield item
-
-    run = run_pipeline(source(), [Step("a", abs), Step("b", abs)], depth=2)
-    for taken in range(1, 6):
-        next(run)
-        time.sleep(0.1)
-        assert read <= taken + 3 * 2 + 3  # three queues of two, and what each of three threads holds
-    run.close()
-
-
 class OwnError(BaseException):
     """A BaseException that is not an Exception."""
 

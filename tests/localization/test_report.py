@@ -23,7 +23,7 @@ from wheretolook.dataset.viewpoint_table import (
     write_table,
 )
 from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.localization.report import POSITIVE, label_markdown, label_summary, threshold_sentence
+from wheretolook.localization.report import POSITIVE, label_markdown, label_summary
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import artifact, newest_run
 from wheretolook.utils.errors import TableError
@@ -102,20 +102,6 @@ def test_bands_by_hand(summary) -> None:  # type: ignore[no-untyped-def]
     np.testing.assert_allclose(visible[POSITIVE[-1]], [0, 0, NAN, 1 / 2, 1, 1, 1, 1])
 
 
-def test_bands_of_height_widen_in_a_tower() -> None:
-    tower = pd.concat([HALL, table([(9, 30.0, 7, LOCALIZED, 0.001, 0.01)])], ignore_index=True)
-    height = label_summary({"tower": tower}, {"tower": "val"}).by_height
-    assert list(height["low"]) == [0, 5, 10, 15, 20, 25, 30]
-    assert list(height["n_views"]) == [8, 0, 0, 0, 0, 0, 1]
-
-
-def test_views_of_a_location_share_a_band() -> None:
-    rng = np.random.default_rng(0)
-    rows = [(0, 0.1 + rng.normal(0, 1e-12), 1, LOCALIZED, 0.1, 0.1) for _ in range(50)]
-    rows += [(1, 0.6 + rng.normal(0, 1e-12), 1, LOCALIZED, 0.1, 0.1) for _ in range(50)]
-    assert list(label_summary({"a": table(rows)}, {"a": "val"}).by_height["n_views"]) == [50, 50]
-
-
 def test_error_histograms_by_hand(summary) -> None:  # type: ignore[no-untyped-def]
     metres = summary.errors_m
     degrees = summary.errors_deg
@@ -132,35 +118,6 @@ def test_error_histograms_by_hand(summary) -> None:  # type: ignore[no-untyped-d
 def one_kind(good: int, finer: int, bad: int) -> pd.DataFrame:
     rows = [(0, 0.0, 1, LOCALIZED, 0.003, 0.05)] * good + [(0, 0.0, 1, LOCALIZED, 1.0, 3.0)] * finer
     return table(rows + [(0, 0.0, 1, LOCALIZED, 12.0, 80.0)] * bad)
-
-
-@pytest.mark.parametrize(
-    ("good", "coarse", "verdict"),
-    [
-        (19, 1, "The thresholds all but coincide:"),
-        (16, 4, "The thresholds differ little:"),
-        (15, 5, "The thresholds differ:"),
-    ],
-)
-def test_words_follow_from_the_numbers(good: int, coarse: int, verdict: str) -> None:
-    summary = label_summary({"a": one_kind(good, coarse, bad=20)}, {"a": "train"})
-    sentence = threshold_sentence(summary)
-    assert sentence.startswith(verdict)
-    assert f"{100 - 2.5 * coarse:.1f} % of the viewpoints have the same label at all 4" in sentence
-    assert f"Of those within 5 m, 10°, {5 * good:.1f} % are within 5 cm, 0.4°" in sentence
-    assert "median errors are 3.0 mm, 0.05°; those of the other poses found are 12.0 m, 80°." in sentence
-    assert sentence in label_markdown(summary)
-
-
-def test_labels_of_one_class_are_told_without_numbers_that_are_none() -> None:
-    bad = label_summary({"a": table([(0, 0.0, 1, TOO_FEW_MATCHES, NAN, NAN)] * 3)}, {"a": "train"})
-    assert threshold_sentence(bad) == "No viewpoint is within 5 m, 10°: all are negative at every threshold."
-    assert np.isnan(bad.overall["finest_of_coarsest"])
-    assert bad.errors_m[["localized", "disbelieved"]].to_numpy().sum() == 0
-    good = label_summary({"a": one_kind(3, 0, 0)}, {"a": "train"})
-    assert threshold_sentence(good).endswith("Their median errors are 3.0 mm, 0.05°.")
-    for summary in (bad, good):
-        assert "nan" not in label_markdown(summary)
 
 
 def test_markdown_has_a_row_for_every_scene_split_and_band(summary) -> None:  # type: ignore[no-untyped-def]

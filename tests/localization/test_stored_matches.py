@@ -12,9 +12,7 @@ import pytest
 
 from localization.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, file_bytes, label, times
 from wheretolook.dataset.viewpoint_table import (
-    LOCALIZED,
     MATCH_FIELDS,
-    NO_POSE,
     SCHEMA,
     TOO_FEW_MATCHES,
     is_good,
@@ -82,40 +80,6 @@ def test_labels_are_the_same_with_and_without(
     views: pd.DataFrame, matched: pd.DataFrame, expected: bytes, tmp_path: Path
 ) -> None:
     assert file_bytes(matched.drop(columns=MATCH_FIELDS.names), tmp_path / "bare") == expected
-
-
-def test_matches_of_every_status_are_told(room: MappedRoom, monkeypatch: pytest.MonkeyPatch) -> None:
-    table = facing(POSTER, 1, 1.5)
-    image = WarpRenderer(load_mesh(room.mesh)).render(CAMERA, poses(table)).rgb[0]
-    landmarks = Landmarks.load(room.landmarks)
-    many = 10_000
-    for name, status in (("", LOCALIZED), ("min_inliers", NO_POSE), ("min_matches", TOO_FEW_MATCHES)):
-        with monkeypatch.context() as changed:
-            config = LocalizerConfig(min_inliers=many if name == "min_inliers" else 10)
-            if name == "min_matches":
-                changed.setattr(LocalizerConfig, name, many)
-            found = Localizer(landmarks, CAMERA, config).localize(image)
-        assert found.status == status and found.matched_rows.dtype == np.int64
-        assert found.matched_rows.shape == (found.n_matches,) and found.n_matches > 50
-        assert (len(found.inlier_rows) > 0) == (status != TOO_FEW_MATCHES)
-
-
-def test_rows_of_earlier_labels_do_not_survive(room: MappedRoom, matched: pd.DataFrame, tmp_path: Path) -> None:
-    localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
-    stale = matched[:2].assign(matched_rows=[np.array([7])] * 2, inlier_rows=[np.array([7])] * 2)
-    renderer = WarpRenderer(load_mesh(room.mesh))
-    assert list(label_rows(stale, renderer, localizer, CAMERA).columns) == SCHEMA.names
-    again = label_rows(stale, renderer, localizer, CAMERA, store_matches=True)
-    assert file_bytes(again, tmp_path / "again") == file_bytes(matched[:2], tmp_path / "first")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("workers", "shard_size"), [(1, 24), (2, 5)])
-def test_workers_and_shards_do_not_change_the_rows(
-    room: MappedRoom, views: pd.DataFrame, expected_matches: bytes, tmp_path: Path, workers: int, shard_size: int
-) -> None:
-    shards = tmp_path / "shards"
-    assert label(views, room, shards, workers=workers, shard_size=shard_size, store_matches=True) == expected_matches
 
 
 @pytest.mark.usefixtures("in_this_process")

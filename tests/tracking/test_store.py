@@ -75,11 +75,6 @@ def test_any_other_path_serves(name: str, tmp_path: Path, made: bytes) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {name, "a.txt"}
 
 
-def test_a_folder_that_is_a_file_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "mlruns").write_text("")
-    assert str(tmp_path / "mlruns") in str(refused(TrackingConfig(str(tmp_path / "mlruns"))))
-
-
 def test_another_programs_database_is_refused(tmp_path: Path) -> None:
     (tmp_path / "mlflow.db").write_text("no database, but a text that is longer than any header of one " * 5)
     refused(TrackingConfig(str(tmp_path)))
@@ -149,14 +144,6 @@ def test_results_outlive_a_store_that_fails_while_they_are_logged(tmp_path: Path
         assert not note.exists()
         (run,) = finished_runs(tracking, "train")
         assert artifact(tracking, run.info.run_id, "result.bin").stat().st_size == 2**20
-
-
-def test_an_error_of_the_block_itself_is_none_of_the_store(store: TrackingConfig) -> None:
-    with pytest.raises(ZeroDivisionError), kept_if_not_logged("the result"), start_run(store, "a", "train"):
-        raise ZeroDivisionError
-    with pytest.raises(PermissionError), start_run(store, "a", "train"):
-        raise PermissionError
-    assert not list(finished_runs(store, "train"))
 
 
 MAKE = """

@@ -1,7 +1,8 @@
-"""Matches queries with mapping images by LightGlue (Lindenberger et al., ICCV 2023), as hloc localizes."""
+"""Matches queries with mapping images by LightGlue (Lindenberger et al., ICCV 2023), as hloc does."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.learned import kornia_feature, load_state, one_thread
@@ -20,7 +21,7 @@ from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import ConfigError, MapError
 
-OWN = "kornia"  # in place of a file: kornia's own weights
+KORNIA_WEIGHTS = "kornia"  # in place of a file
 _DATABASE = "database.db"
 
 
@@ -30,15 +31,15 @@ class _MappingImages:
 
     stored: list[tuple[NDArray[np.float32], NDArray[Any]]]
     sizes: NDArray[np.int64]  # (I, 2) width and height
-    rows: list[NDArray[np.int64]]  # of each keypoint its landmark's row, -1 for none
+    rows: list[NDArray[np.int64]]  # landmark row of each keypoint, -1 for none
     start: NDArray[np.int64]  # (N + 1,); observers[start[i] : start[i + 1]] are the images that observe landmark i
     observers: NDArray[np.int64]
 
 
 class LightGlueMatcher:
-    """Matches queries with the mapping images that observe most of the landmarks they seem to show.
+    """Matches queries with the mapping images that observe most of the landmarks that the query matched.
 
-    Raises ConfigError if LightGlue does not know the map's features or kornia is not installed, MapError if the map's
+    Raises ConfigError if LightGlue does not support the map's features or kornia is missing, MapError if the map's
     folder has no model or database, WeightsError if the weights cannot be used.
     """
 
@@ -51,55 +52,55 @@ class LightGlueMatcher:
         named = {record.descriptors.name: record.lightglue for record in records if record.lightglue}
         if landmarks.features not in named:
             fix = f"Leave label.localizer.lightglue out, or map with one of {', '.join(named)}."
-            raise ConfigError("LightGlue is not known for these features", value=landmarks.features, fix=fix)
-        self._network = _network(named[landmarks.features], "" if weights == OWN else weights).to(self.device)
+            raise ConfigError("LightGlue does not support these features", value=landmarks.features, fix=fix)
+        self._network = _network(named[landmarks.features], "" if weights == KORNIA_WEIGHTS else weights).to(
+            self.device
+        )
         if map_dir is None or not (map_dir / _DATABASE).is_file():
             fix = "Map again with --map.keep_database true."
-            raise MapError("LightGlue matches mapping images, whose keypoints are not there", path=map_dir, fix=fix)
+            raise MapError("LightGlue needs the database of the mapping images", path=map_dir, fix=fix)
 
-    def match(self, query: Keypoints, size: tuple[int, int], likely: NDArray[np.int64], n_images: int) -> Matches:
-        """2D-3D matches of a query of some width and height, given rows (M,) of landmarks that it seems to show.
+    def match(
+        self, query: Keypoints, size: tuple[int, int], landmark_rows: NDArray[np.int64], n_images: int
+    ) -> Matches:
+        """2D-3D matches of a query of some width and height, given preliminary landmark matches (M,).
 
-        Of a keypoint that several images lead to different landmarks the surest counts, and so of a landmark.
+        If several images lead to different landmarks for a keypoint, or keypoints for a landmark, the best score wins.
         """
         images = self._images
-        spans = [images.observers[images.start[row] : images.start[row + 1]] for row in likely]
-        votes = np.bincount(np.concatenate([*spans, np.zeros(0, np.int64)]), minlength=len(images.stored))
+        observers = [images.observers[images.start[row] : images.start[row + 1]] for row in landmark_rows]
+        votes = np.bincount(np.concatenate([*observers, np.zeros(0, np.int64)]), minlength=len(images.stored))
         best = np.argsort(-votes, kind="stable")[:n_images]
-        found = [self._with(query, size, int(image)) for image in best[votes[best] > 0]]
-        none = np.zeros(0, dtype=np.int64)
-        if not found:
-            return none, none
-        keypoints, rows, scores = (np.concatenate(part) for part in zip(*found, strict=True))
-        surest = np.lexsort((rows, keypoints, -scores))
+        matches = [self._match_image(query, size, int(image)) for image in best[votes[best] > 0]]
+        if not matches:
+            return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        keypoints, rows, scores = (np.concatenate(part) for part in zip(*matches, strict=True))
+        order = np.lexsort((rows, keypoints, -scores))
         for values in (keypoints, rows):  # each keypoint once, then each landmark once
-            surest = surest[np.sort(np.unique(values[surest], return_index=True)[1])]
-        order = surest[np.argsort(keypoints[surest])]
+            order = order[np.sort(np.unique(values[order], return_index=True)[1])]
+        order = order[np.argsort(keypoints[order])]
         return keypoints[order], rows[order]
 
-    def _with(
+    def _match_image(
         self, query: Keypoints, size: tuple[int, int], image: int
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
-        """Keypoints, landmarks and scores of matches with one mapping image."""
+        """Keypoints, landmark rows and scores of matches with one mapping image."""
         pixels, stored = self._images.stored[image]
-        sides = (
-            (query.pixels, query.descriptors, size),
-            (pixels, self.kind.restore(stored), self._images.sizes[image]),
-        )
-        data = {}
-        for name, (at, descriptors, width_height) in zip(("image0", "image1"), sides, strict=True):
-            limit = np.asarray(width_height, dtype=np.float32)
-            data[name] = {
-                "keypoints": torch.from_numpy(np.clip(at, 0, limit)).to(self.device)[None],
-                "descriptors": torch.from_numpy(descriptors).to(self.device)[None],
-                "image_size": torch.from_numpy(limit).to(self.device)[None],
-            }
+        data = {
+            "image0": self._input(query.pixels, query.descriptors, size),
+            "image1": self._input(pixels, self.kind.restore(stored), self._images.sizes[image]),
+        }
         with torch.inference_mode(), one_thread():
-            said = self._network(data)
-        pairs = said["matches"][0].cpu().numpy()
-        scores = said["scores"][0].float().cpu().numpy()
+            output = self._network(data)
+        pairs = output["matches"][0].cpu().numpy()
+        scores = output["scores"][0].float().cpu().numpy()
         rows = self._images.rows[image][pairs[:, 1]]
         return pairs[rows >= 0, 0], rows[rows >= 0], scores[rows >= 0]
+
+    def _input(self, pixels: NDArray[Any], descriptors: NDArray[Any], size: ArrayLike) -> dict[str, torch.Tensor]:
+        limit = np.asarray(size, dtype=np.float32)
+        arrays = {"keypoints": np.clip(pixels, 0, limit), "descriptors": descriptors, "image_size": limit}
+        return {name: torch.from_numpy(array).to(self.device)[None] for name, array in arrays.items()}
 
     @cached_property
     def _images(self) -> _MappingImages:
@@ -127,21 +128,19 @@ class LightGlueMatcher:
 
 
 def _network(features: str, weights: str) -> Any:
-    """LightGlue for some features, with weights from a file, or kornia's own."""
-    made = kornia_feature().LightGlue
-    settings = {name: value for name, value in made.features[features].items() if name != "weights"}
-    network = made(features=None, **settings)
+    """LightGlue for some features, with weights from a file or, without one, kornia's."""
+    light_glue = kornia_feature().LightGlue
+    settings = {name: value for name, value in light_glue.features[features].items() if name != "weights"}
+    network = light_glue(features=None, **settings)
     name = "xfeat-lighterglue.pt" if features == "xfeat" else f"{features}_lightglue.pth"
     url = f"https://huggingface.co/kornia/lightglue/resolve/main/{name}"
 
     def prepare(state: dict[str, Any]) -> dict[str, Any]:
-        own = network.state_dict()
-        renamed = {}
-        for key, value in state.items():
-            words = key.removeprefix("matcher.").split(".")
-            if words[0] in ("self_attn", "cross_attn"):  # as the authors' files call them
-                words = ["transformers", words[1], words[0], *words[2:]]
-            renamed[".".join(words)] = value
-        return {key: value for key, value in renamed.items() if key in own}  # XFeat's file holds its extractor, too
+        """Rename the authors' keys to kornia's; XFeat's file holds its extractor, too, which is dropped."""
+        names = {
+            key: re.sub(r"^(?:matcher\.)?(self_attn|cross_attn)\.(\d+)", r"transformers.\2.\1", key) for key in state
+        }
+        renamed = {names[key].removeprefix("matcher."): value for key, value in state.items()}
+        return {key: value for key, value in renamed.items() if key in network.state_dict()}
 
     return load_state(network, weights, name, [url], prepare, "--label.localizer.lightglue").eval()

@@ -1,9 +1,10 @@
-"""Report on the labels of a dataset: their balance, the pose errors, and how much the labels depend on thresholds."""
+"""Reports on the labels of a dataset: class balance, pose errors, and dependence on thresholds."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from wheretolook.utils.markdown import markdown_table
 LABELS_CSV = "labels.csv"
 LABELS_MD = "labels.md"
 LABELS_PNG = "labels.png"
-"""Files of a report on labels, in `<dataset>/results/` and as artifacts of its run."""
+"""Files of the report, in `<dataset>/results/` and as artifacts of its run."""
 
 STATUSES = (LOCALIZED, TOO_FEW_MATCHES, NO_POSE)
 POSITIVE = tuple(f"positive_{threshold_key(threshold)}" for threshold in THRESHOLDS)
@@ -28,17 +29,17 @@ POSITIVE = tuple(f"positive_{threshold_key(threshold)}" for threshold in THRESHO
 Positives at one threshold are positives at all coarser ones.
 """
 
-BINS_A_DECADE = 5
-ERROR_EDGES_M = np.logspace(-4, 2, 6 * BINS_A_DECADE + 1)
+BINS_PER_DECADE = 5
+ERROR_EDGES_M = np.logspace(-4, 2, 6 * BINS_PER_DECADE + 1)
 ERROR_EDGES_DEG = np.logspace(-3, 2.4, 27 + 1)
 """Edges of the error histograms, metres and degrees. Errors beyond an end count in the last bin there."""
 
 VISIBLE_EDGES = (0, 1, 10, 30, 100, 300, 1000, 3000, np.inf)
-"""Edges of the bands of the number of landmarks in view."""
+"""Edges of the bands of the number of visible landmarks."""
 
 HEIGHT_BANDS_M = (0.5, 1.0, 2.0, 5.0, 10.0)
 MAX_HEIGHT_BANDS = 7
-"""Possible widths of a height band, of which the narrowest is taken that gives at most this many bands."""
+"""Possible widths of a height band; the narrowest with at most this many bands is used."""
 
 COINCIDE = 0.95
 NEARLY_COINCIDE = 0.8
@@ -148,7 +149,8 @@ def _by_band(views: pd.DataFrame, values: Float, edges: Float) -> pd.DataFrame:
 
 def _histogram(views: pd.DataFrame, column: str, edges: Float) -> pd.DataFrame:
     counts = {}
-    for name, rows in (("localized", views["status"] == LOCALIZED), ("disbelieved", views["status"] != LOCALIZED)):
+    localized = views["status"] == LOCALIZED
+    for name, rows in (("localized", localized), ("disbelieved", ~localized)):
         error = views.loc[rows, column].dropna().to_numpy(np.float64)
         bins = np.clip(np.digitize(error, edges) - 1, 0, len(edges) - 2)
         counts[name] = np.bincount(bins, minlength=len(edges) - 1)
@@ -161,25 +163,21 @@ def threshold_sentence(summary: LabelSummary) -> str:
     labels = _labels()
     if not row[POSITIVE[-1]]:
         return f"No viewpoint is within {labels[-1]}: all are negative at every threshold."
-    if row["finest_of_coarsest"] >= COINCIDE:
-        verdict = "The thresholds all but coincide"
-    elif row["finest_of_coarsest"] >= NEARLY_COINCIDE:
-        verdict = "The thresholds differ little"
-    else:
-        verdict = "The thresholds differ"
-    shares = [_percent(row[name] / row[POSITIVE[-1]]) for name in POSITIVE[:-1]]
-    finer = [f"{share} % are within {label}" for share, label in zip(shares, labels[:-1], strict=True)]
-    medians = [(row[f"median_{name}_m"], row[f"median_{name}_deg"]) for name in ("within", "beyond")]
-    within, beyond = (_median_error(*median) for median in medians)
-    errors = f"Their median errors are {within}"
+    verdicts = {COINCIDE: " all but coincide", NEARLY_COINCIDE: " differ little"}
+    verdict = next((text for limit, text in verdicts.items() if row["finest_of_coarsest"] >= limit), " differ")
+    finer = [
+        f"{_percent(row[name] / row[POSITIVE[-1]])} % are within {label}"
+        for name, label in zip(POSITIVE[:-1], labels[:-1], strict=True)
+    ]
+    errors = f"Their median errors are {_median_error(row, 'within')}"
     if pd.notna(row["median_beyond_m"]):
-        errors += f"; those of the other poses found are {beyond}"
+        errors += f"; those of the other poses found are {_median_error(row, 'beyond')}"
     same = f"{_percent(row['same_label_share'])} % of the viewpoints have the same label at all {len(POSITIVE)}"
-    return f"{verdict}: {same}. Of those within {labels[-1]}, {', '.join(finer)}. {errors}."
+    return f"The thresholds{verdict}: {same}. Of those within {labels[-1]}, {', '.join(finer)}. {errors}."
 
 
 def label_markdown(summary: LabelSummary, title: str = "Labels") -> str:
-    """The summary as tables in Markdown, under a title and `threshold_sentence`."""
+    """The summary as Markdown tables, under a title and `threshold_sentence`."""
     row = summary.overall
     labels = _labels()
     header = ["scene", "split", "views", "locations", *labels, "locations with a positive"]
@@ -190,7 +188,6 @@ def label_markdown(summary: LabelSummary, title: str = "Labels") -> str:
         counts = [f"{part['n_views']:,}", f"{part['n_locations']:,}"]
         shares = [_percent(part[name]) for name in percents]
         lines.append([part["scene"], part["split"], *counts, *shares, _or_dash(part["spearman"], ".2f")])
-    errors = (("position error (m)", summary.errors_m), ("rotation error (°)", summary.errors_deg))
     sections = [
         f"# {title}",
         threshold_sentence(summary),
@@ -201,24 +198,20 @@ def label_markdown(summary: LabelSummary, title: str = "Labels") -> str:
         "correlation of the first and the last label.",
         markdown_table(header, lines),
         "## By height of the camera above its scene's lowest location",
-        markdown_table(["height (m)", "views", *labels], _band_lines(summary.by_height, _height_label)),
+        _band_table("height (m)", summary.by_height, lambda low, high: f"{low:g}–{high:g}"),
         "## By number of visible landmarks",
-        markdown_table(["visible landmarks", "views", *labels], _band_lines(summary.by_visible, _visible_label)),
+        _band_table("visible landmarks", summary.by_visible, _visible_label),
         "## Errors of the poses found",
         f"In % of all viewpoints; {_percent(row['without_pose'])} % have no pose at all. Disbelieved poses have too "
         "few inliers and count as not localized. Errors beyond the first and the last row count there.",
+        _error_table("position error (m)", summary.errors_m, row["n_views"]),
+        _error_table("rotation error (°)", summary.errors_deg, row["n_views"]),
     ]
-    for name, bins in errors:
-        sections.append(markdown_table([name, "localized", "disbelieved"], _error_lines(bins, row["n_views"])))
     return "\n\n".join(sections) + "\n"
 
 
-def _height_label(low: float, high: float) -> str:
-    return f"{low:g}–{high:g}"
-
-
 def _visible_label(low: float, high: float) -> str:
-    """Name of a band of the number of landmarks in view: `low` to `high`, exclusive."""
+    """Name of a band of visible landmarks from `low` to `high`, exclusive."""
     if np.isinf(high):
         return f"≥ {low:,.0f}"
     return f"{low:,.0f}" if high == low + 1 else f"{low:,.0f}–{high - 1:,.0f}"
@@ -229,28 +222,29 @@ def _labels() -> list[str]:
     return [threshold_label(threshold_key(threshold)) for threshold in THRESHOLDS]
 
 
-def _band_lines(bands: pd.DataFrame, name: Any) -> list[list[str]]:
-    lines = []
-    for band in bands.to_dict("records"):
-        shares = [_percent(band[column]) for column in POSITIVE]
-        lines.append([name(band["low"], band["high"]), f"{band['n_views']:,}", *shares])
-    return lines
+def _band_table(title: str, bands: pd.DataFrame, name: Callable[[float, float], str]) -> str:
+    lines = [
+        [name(band["low"], band["high"]), f"{band['n_views']:,}", *(_percent(band[column]) for column in POSITIVE)]
+        for band in bands.to_dict("records")
+    ]
+    return markdown_table([title, "views", *_labels()], lines)
 
 
-def _error_lines(errors: pd.DataFrame, n_views: int) -> list[list[str]]:
+def _error_table(title: str, errors: pd.DataFrame, n_views: int) -> str:
     """Histogram bins, summed by decades."""
-    starts = np.arange(0, len(errors), BINS_A_DECADE)
-    lows = errors["low"].to_numpy()[starts]
-    highs = [*errors["low"].to_numpy()[starts[1:]], None]
-    counts = np.add.reduceat(errors[["localized", "disbelieved"]].to_numpy(), starts, axis=0)
-    names = [f"≥ {low:g}" if high is None else f"{low:g}–{high:g}" for low, high in zip(lows, highs, strict=True)]
-    return [[name, *[_percent(count / n_views) for count in row]] for name, row in zip(names, counts, strict=True)]
+    decade = np.arange(len(errors)) // BINS_PER_DECADE
+    lows = errors["low"].groupby(decade).first().tolist()
+    counts = errors[["localized", "disbelieved"]].groupby(decade).sum().to_numpy()
+    names = [f"{low:g}–{high:g}" for low, high in pairwise(lows)] + [f"≥ {lows[-1]:g}"]
+    lines = [[name, *(_percent(count / n_views) for count in row)] for name, row in zip(names, counts, strict=True)]
+    return markdown_table([title, "localized", "disbelieved"], lines)
 
 
-def _median_error(error_m: float, error_deg: float) -> str:
+def _median_error(row: Mapping[str, Any], name: str) -> str:
+    error_m = row[f"median_{name}_m"]
+    error_deg = row[f"median_{name}_deg"]
     unit, scale = ("mm", 1000) if error_m < 0.01 else ("cm", 100) if error_m < 1 else ("m", 1)
-    distance = f"{scale * error_m:.1f} {unit}"
-    return f"{distance}, {error_deg:.2f}°" if error_deg < 1 else f"{distance}, {error_deg:.0f}°"
+    return f"{scale * error_m:.1f} {unit}, {error_deg:.{2 if error_deg < 1 else 0}f}°"
 
 
 def _percent(share: float) -> str:

@@ -76,18 +76,20 @@ def atomic_folder(folder: Path, before_replace: Callable[[], None] = lambda: Non
     with storage_errors(folder, partial):
         partial.mkdir(parents=True)
     try:
-        with moved_later(partial, folder):
-            yield partial
+        yield partial
         before_replace()
         with storage_errors(folder, partial):
             if folder.exists():
                 os.replace(folder, old)
             os.replace(partial, folder)
         shutil.rmtree(old, ignore_errors=True)
-    except BaseException:
+    except BaseException as error:
         if old.exists() and not folder.exists():
             os.replace(old, folder)
         shutil.rmtree(partial, ignore_errors=True)
+        if isinstance(error, StorageError) and error.path and Path(error.path).is_relative_to(partial):
+            path = folder / Path(error.path).relative_to(partial)
+            raise StorageError(error.problem, path=path, value=error.value, fix=error.fix) from error
         raise
 
 
@@ -101,18 +103,6 @@ def storage_errors(path: Path, partial: Path | None = None) -> Iterator[None]:
         concerned = path if named == partial else named
         reason = os.strerror(error.errno) if error.errno else str(error)
         raise StorageError(f"cannot be written: {reason}", path=concerned, fix=STORAGE_FIX) from error
-
-
-@contextmanager
-def moved_later(folder: Path, place: Path) -> Iterator[None]:
-    """Let StorageErrors about files in `folder` name their final paths in `place`."""
-    try:
-        yield
-    except StorageError as error:
-        if error.path is None or not Path(error.path).is_relative_to(folder):
-            raise
-        path = place / Path(error.path).relative_to(folder)
-        raise StorageError(error.problem, path=path, value=error.value, fix=error.fix) from error
 
 
 @contextmanager

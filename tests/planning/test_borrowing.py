@@ -11,7 +11,7 @@ import pytest
 from planning.test_path_planning import BOUNDS, Room, looking_north
 from wheretolook.planning.config import PathConfig
 from wheretolook.planning.rrt import plan_path
-from wheretolook.planning.scene_map import fill_partially_free_voxels, shares_below
+from wheretolook.planning.scene_map import fill_partially_free_voxels
 from wheretolook.utils.errors import MapFormatError
 
 
@@ -33,7 +33,7 @@ def known_west_and_east() -> tuple:
     )  # fmt: skip
 
 
-def test_nothing_is_borrowed_through_walls() -> None:
+def test_views_are_not_taken_through_walls() -> None:
     centers, own = known_west_and_east()
     lent = fill_partially_free_voxels(own, BoundedRoom())
     assert (own.row_of_voxel < 0).sum() > (lent.row_of_voxel < 0).sum()
@@ -53,7 +53,7 @@ def test_nothing_is_borrowed_through_walls() -> None:
     assert (east >= 0).all() and (lent.scores[east] == 0.75).all()
 
 
-def test_a_planner_has_scores_where_it_had_none() -> None:
+def test_filled_voxels_have_scores() -> None:
     _, own = known_west_and_east()
     config = PathConfig(time_s=0.5, pitch_deg=(-30, 30))
     ends = (1.5, 1.0, 1.1), (2.2, 2.5, 1.1)
@@ -62,14 +62,10 @@ def test_a_planner_has_scores_where_it_had_none() -> None:
     np.testing.assert_allclose(plan_path(*ends, BoundedRoom(), BOUNDS, lent, config, progress=False).scores, 0.25)
 
 
-def test_a_map_fill_partially_free_voxels_is_told_from_the_original(tmp_path: Path) -> None:
-    _, own = known_west_and_east()
-    lent = fill_partially_free_voxels(own, BoundedRoom())
-    assert own.origin.derived == "" and lent.origin.derived == "views borrowed by neighbours"
-    ranks = fill_partially_free_voxels(shares_below(own), BoundedRoom())
-    assert ranks.origin.derived == "scores replaced by ranks; views borrowed by neighbours"
-    with pytest.raises(MapFormatError, match="views borrowed by neighbours"):
-        lent.save(tmp_path / "map")
-    for name in ("voxel_of_row", "locations"):
-        with pytest.raises(ValueError, match="voxels share rows"):
-            getattr(lent, name)
+def test_a_filled_map_is_derived(tmp_path: Path) -> None:
+    filled = fill_partially_free_voxels(known_west_and_east()[1], BoundedRoom())
+    assert filled.origin.derived
+    with pytest.raises(MapFormatError):
+        filled.save(tmp_path / "map")
+    with pytest.raises(ValueError):
+        _ = filled.locations

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import struct
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -65,36 +64,6 @@ def test_a_loaded_map_can_be_updated_and_saved_over_itself(folder: Path) -> None
     update_viewpoint_map(mapped, make_scorer("bins", room_map(landmarks)))[0].save(folder)
     np.testing.assert_array_equal(mapped.n_visible, before)  # who has mapped the old files keeps them
     np.testing.assert_array_equal(ViewpointMap.load(folder).n_visible, build(landmarks).n_visible)
-
-
-def test_the_layout_is_all_that_a_reader_needs(viewpoint_map: ViewpointMap, folder: Path) -> None:
-    """Reads as LAYOUT.txt says, with no help of NumPy's format."""
-    about = json.loads((folder / DESCRIPTION).read_text())
-    grid = about["grid"]
-    sizes = about["sizes"]
-
-    def number(name: str, kind: str, index: int) -> float:
-        data = (folder / f"{name}.npy").read_bytes()
-        assert data[:8] == b"\x93NUMPY\x01\x00"
-        begin = 10 + struct.unpack("<H", data[8:10])[0]
-        assert begin % 64 == 0
-        return struct.unpack_from("<" + kind, data, begin + index * struct.calcsize("<" + kind))[0]
-
-    for point in np.random.default_rng(0).uniform(GRID.lower, GRID.upper, (40, 3)):
-        voxel = 0
-        for axis in range(3):
-            size = (grid["upper"][axis] - grid["lower"][axis]) / grid["shape"][axis]
-            step = min(int((point[axis] - grid["lower"][axis]) // size), grid["shape"][axis] - 1)
-            voxel = voxel * grid["shape"][axis] + step
-        row = number("row_of_voxel", "i", voxel)
-        best = viewpoint_map.best(point)
-        assert (row < 0) == (best is None)
-        if best is not None:
-            direction = number("ranked", "H", int(row) * sizes["D"])
-            assert direction == best.direction_id
-            assert number("scores", "f", int(row) * sizes["D"] + int(direction)) == best.score
-            assert number("n_visible", "I", int(row) * sizes["D"] + int(direction)) == best.n_visible
-            assert number("directions", "d", int(direction) * 3 + 1) == best.axis[1]
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")

@@ -27,10 +27,11 @@ import pandas as pd
 from IPython.display import Markdown, display
 
 from wheretolook.figures.path_film import methods_figure, still_figure
-from wheretolook.planning.config import PathConfig, PathsConfig, PlanConfig
+from wheretolook.planning.config import PathConfig, PlanConfig
 from wheretolook.planning.method_paths import path_views, plan_by_methods
 from wheretolook.tracking.runs import newest_artifact
 from wheretolook_paper.figures.paths import paths_figure
+from wheretolook_paper.paths.config import PathsConfig
 from wheretolook_paper.paths.path_report import path_markdown
 from wheretolook_paper.release.notebook import open_release, open_store
 from wheretolook_paper.release.showcase import open_showcase

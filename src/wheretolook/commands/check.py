@@ -100,8 +100,8 @@ class Check(OcclusionOptions, ScorerOptions):
         self._check_names()
         from wheretolook.figures.style import save_figure
         from wheretolook.holdout import photo_map as sources
-        from wheretolook.holdout.checking import check_map
         from wheretolook.holdout.figure import check_figure
+        from wheretolook.holdout.report import check_map
         from wheretolook.holdout.scores import Scoring
         from wheretolook.training.weights import read_training
         from wheretolook.utils.devices import usable_device

@@ -14,7 +14,6 @@ from wheretolook.geometry.poses import camera_centers
 from wheretolook.holdout.holdout import HoldoutResult
 from wheretolook.holdout.metrics import places_of
 from wheretolook.holdout.photo_map import MAX_ERROR_M, PhotographedMap
-from wheretolook.holdout.report import place_radius
 from wheretolook.holdout.scores import Scoring, maps_without, score_views
 from wheretolook.scorers.adapted.gp_correction import LocalizedViews
 from wheretolook.scorers.adapted.score import log_odds_of
@@ -34,7 +33,7 @@ def photographed_views(
     block = views["block"].to_numpy(np.int64)
     poses = source.poses[row]
     centers = camera_centers(poses)
-    place = places_of(centers, block, place_radius(source))
+    place = places_of(centers, block, source.place_radius)
     log_odds = log_odds_of(views["score"].to_numpy(np.float64))
     good = views["good"].to_numpy(bool)
     return LocalizedViews(log_odds, good, centers, poses[:, 2, :3], block, row, place)
@@ -58,6 +57,6 @@ def evaluated_photographs(
     for one in results:
         maps += [(begin + rows, remaining) for rows, remaining in maps_without(source, one, occlusion, device)]
         begin += len(one.views)
-    place = places_of(camera_centers(poses), views["block"].to_numpy(np.int64), place_radius(source))
+    place = places_of(camera_centers(poses), views["block"].to_numpy(np.int64), source.place_radius)
     error_m = views["error_m"] * (MAX_ERROR_M / views["limit_m"])
     return HeldOutPhotographs(scene, views.assign(photograph=views["row"], place=place, error_m=error_m), poses, maps)

@@ -20,9 +20,6 @@ from wheretolook.evaluation.calibration import BINS, bins_of
 from wheretolook.geometry.poses import Float
 
 RESAMPLES = 2000
-PLACE_OF_DEPTH = 0.1
-"""Views whose cameras are within this share of the map's median depth (0.5 m in a room of 5 m) share a place: what can
-be seen hardly changes within it, so that mostly the direction decides."""
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,9 @@ MAX_ERROR_OF_DEPTH = 0.01  # instead of MAX_ERROR_M where metres are unknown: of
 DEPTH_M = MAX_ERROR_M / MAX_ERROR_OF_DEPTH
 """Median depth that a map without metres is scaled to. There the two limits on the position agree, and scorers, which
 were trained in rooms, see distances as in rooms."""
+PLACE_OF_DEPTH = 0.1
+"""Views whose cameras are within this share of the map's median depth (0.5 m in a room of 5 m) share a place: what can
+be seen hardly changes within it, so that mostly the direction decides."""
 CHECKS = "checks"  # folder of the folders of checks, next to the datasets
 WORK = "work"  # folder of cached work, in that of a check
 MIN_PHOTOGRAPHS = 20  # with fewer, blocks are too small
@@ -91,6 +94,11 @@ class PhotographedMap:
             return np.full(len(self.poses), MAX_ERROR_M)
         typical = float(np.nanmedian(self.depth_m))
         return MAX_ERROR_OF_DEPTH * np.where(np.isfinite(self.depth_m), self.depth_m, typical)
+
+    @property
+    def place_radius(self) -> float:
+        """Maximum distance in m of the cameras of views that share a place."""
+        return PLACE_OF_DEPTH * (DEPTH_M if not self.is_metric else float(np.nanmedian(self.depth_m)))
 
     @property
     def is_turned(self) -> bool:

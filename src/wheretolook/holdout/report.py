@@ -11,12 +11,15 @@ import numpy as np
 import pandas as pd
 
 from wheretolook.evaluation.scores import is_probability
-from wheretolook.holdout.holdout import HoldoutResult
-from wheretolook.holdout.metrics import PLACE_OF_DEPTH, measure
-from wheretolook.holdout.photo_map import DEPTH_M, MAX_ERROR_DEG, MAX_ERROR_M, MAX_ERROR_OF_DEPTH, PhotographedMap
-from wheretolook.holdout.scores import VISIBLE
+from wheretolook.holdout.holdout import HoldoutResult, left_out_blocks
+from wheretolook.holdout.holdout_blocks import VIEWS
+from wheretolook.holdout.metrics import measure
+from wheretolook.holdout.photo_map import MAX_ERROR_DEG, MAX_ERROR_M, MAX_ERROR_OF_DEPTH, PhotographedMap
+from wheretolook.holdout.scores import VISIBLE, Scoring, check_place, score_views
 from wheretolook.holdout.weak_regions import WeakPart, weak_parts
 from wheretolook.utils.files import write_json, write_text
+from wheretolook.visibility.hidden_points import HiddenPointRemoval
+from wheretolook.visibility.occlusion import OcclusionModel
 
 MAX_PARTS_PRINTED = 5  # all are in the files
 
@@ -139,26 +142,30 @@ class CheckReport:
         return lines
 
 
-def make_report(
+def check_map(
     source: PhotographedMap,
-    results: Sequence[HoldoutResult],
-    method: str,
-    views: pd.DataFrame,
-    also: Sequence[str] = (),
+    work: Path,
+    scoring: Scoring = Scoring(),
+    occlusion: OcclusionModel | None = None,
+    max_views: int = VIEWS,
+    workers: int = 1,
+    device: str = "cpu",
 ) -> CheckReport:
-    """Measure, and find the parts that relocalize badly, from the views of `score_views`."""
-    methods = list(dict.fromkeys([method, *(name for name in also if name != VISIBLE), VISIBLE]))
+    """Hold blocks of a map's photographs out, localize them against the rest, score them, and compare.
+
+    Finished blocks are cached in `work`. The default occlusion model is hidden-point removal; at most `max_views` of a
+    block are localized. Raises MapError if blocks leave no map; WeightsError if weights cannot be used.
+    """
+    check_place(source, scoring, device)
+    results = left_out_blocks(source, work, max_views, workers, device)
+    method, views = score_views(source, results, scoring, occlusion or HiddenPointRemoval(), device)
+    methods = list(dict.fromkeys([method, *(name for name in scoring.also if name != VISIBLE), VISIBLE]))
     columns = ["score" if name == method else name for name in methods]
     centers = (source.own_centers * source.from_model.scale)[views["row"].to_numpy()]
-    numbers = measure(views, methods, columns, centers, place_radius(source), is_probability(method))
-    parts = weak_parts(source, list(results), views)
+    numbers = measure(views, methods, columns, centers, source.place_radius, is_probability(method))
+    parts = weak_parts(source, results, views)
     photographs = _photographs(source, views, parts)
     return CheckReport(source, method, views, photographs, _blocks(source, results, views), numbers, parts)
-
-
-def place_radius(source: PhotographedMap) -> float:
-    """Return the radius of a place, see `PLACE_OF_DEPTH`."""
-    return PLACE_OF_DEPTH * (DEPTH_M if not source.is_metric else float(np.nanmedian(source.depth_m)))
 
 
 def _photographs(source: PhotographedMap, views: pd.DataFrame, parts: Sequence[WeakPart]) -> pd.DataFrame:

@@ -17,7 +17,7 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.planning.config import MAX_DIRECTIONS
 from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
 from wheretolook.scorers.base import Scorer
-from wheretolook.utils.errors import ConfigError, MapError, SceneError
+from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
 from wheretolook.visibility.survey import SurveyOptions, survey
 
@@ -46,18 +46,17 @@ def build_viewpoint_map(
 
     Raises:
         SceneError: no voxel is free, or the centre of one lies inside geometry.
-        MapError: the map has no landmarks, or one whose position is not finite.
-        ConfigError: more than 65,536 directions, ids outside the grid, or neither ids nor a mask of its voxels.
+        MapError: the map has no landmarks.
+        ConfigError: more than 65,536 directions, or ids outside the grid.
         ValueError: directions that are not (D, 3), not finite or of length 0.
     """
     axes = _unit(directions)
-    rows = _ids(free, len(grid))
+    rows = _ids(free)
     if len(rows) == 0:
         raise SceneError("no voxel is free", value=len(grid), fix="Refine the grid, or check where it lies.")
     if rows[0] < 0 or rows[-1] >= len(grid):
         raise ConfigError("ids of free voxels lie outside the grid", value=(int(rows[0]), int(rows[-1])))
     landmarks = scorer.localization_map.landmarks
-    _check_landmarks(landmarks)
     row_of_voxel = np.full(len(grid), -1, dtype=np.int32)
     row_of_voxel[rows] = np.arange(len(rows))
     by_row = _score_and_count(scorer, grid.centers()[rows], axes, progress)
@@ -87,7 +86,6 @@ def update_viewpoint_map(
     if derived := old.origin.derived:
         fix = "Update the one it was derived from, and derive it again."
         raise ConfigError("a viewpoint map derived from another cannot be updated", value=derived, fix=fix)
-    _check_landmarks(landmarks)
     digests = landmark_digests(landmarks)
     origin = _origin(scorer, old.origin.lattice, digests)
     for name in ("scorer", "camera", "occlusion"):
@@ -152,25 +150,10 @@ def _score_exactly(scorer: Scorer, locations: Float, directions: Float) -> Float
     return scorer.score(poses).reshape(len(locations), len(directions))
 
 
-def _ids(free: ArrayLike, n_voxels: int) -> NDArray[np.int64]:
-    """Return the ids of free voxels, ascending, each once, from ids or a mask."""
+def _ids(free: ArrayLike) -> NDArray[np.int64]:
+    """Return the ids of free voxels, ascending, each once, from ids or a mask of all voxels."""
     given = np.asarray(free)
-    if given.dtype == bool:
-        if given.shape != (n_voxels,):
-            fix = f"Give one of shape ({n_voxels},), in the order of VoxelGrid.centers."
-            raise ConfigError("a mask of free voxels has a value for each voxel", value=given.shape, fix=fix)
-        return np.flatnonzero(given)
-    if given.size and not np.issubdtype(given.dtype, np.integer):
-        fix = "Give integers, or a boolean for each voxel."
-        raise ConfigError("free voxels are given by ids or a mask", value=str(given.dtype), fix=fix)
-    return np.unique(given.astype(np.int64))
-
-
-def _check_landmarks(landmarks: Landmarks) -> None:
-    for row in np.flatnonzero(~np.isfinite(landmarks.points).all(axis=1)):
-        problem = f"the position of landmark {landmarks.ids[row]} is not finite"
-        value = landmarks.points[row].tolist()
-        raise MapError(problem, value=tuple(value), fix="Remove it, or run the map stage again.")
+    return np.flatnonzero(given) if given.dtype == bool else np.unique(given.astype(np.int64))
 
 
 def _unit(directions: ArrayLike) -> Float:

@@ -10,11 +10,11 @@ from wheretolook.commands.options import LabelOptions, Log, Progress, SceneOptio
 from wheretolook.commands.preconditions import extractor_of, load_dataset, open_scene
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.planning.config import PathsConfig
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.store import check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.files import atomic_write, write_text
+from wheretolook_paper.paths.config import PathsConfig
 
 if TYPE_CHECKING:
     import pandas as pd

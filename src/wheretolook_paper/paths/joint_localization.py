@@ -12,9 +12,9 @@ from tqdm.auto import tqdm
 
 from wheretolook.dataset.viewpoint_table import pose_columns, poses
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
-from wheretolook.planning.config import PathsConfig
 from wheretolook.scorers.base import Scorer
 from wheretolook.utils.errors import ConfigError
+from wheretolook_paper.paths.config import PathsConfig
 from wheretolook_paper.paths.odometry import noisy_steps, rig_of_last
 
 KEY = ["pair", "task", "method"]

@@ -12,7 +12,7 @@ import pandas as pd
 from wheretolook.dataset.thresholds import ALL
 from wheretolook.dataset.viewpoint_table import LOCALIZED
 from wheretolook.evaluation.bootstrap import ClusterBootstrap, divide
-from wheretolook.planning.config import FORWARD, PathsConfig
+from wheretolook.planning.config import FORWARD
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import (
     ALL_METHODS,
@@ -28,6 +28,7 @@ from wheretolook.tracking.runs import (
     start_run,
 )
 from wheretolook.utils.markdown import markdown_table
+from wheretolook_paper.paths.config import PathsConfig
 
 PATHS_CSV = "paths.csv"
 PATHS_MD = "paths.md"

@@ -17,12 +17,13 @@ from wheretolook.dataset.viewpoint_table import SCHEMA, UNLABELLED
 from wheretolook.localization.joint_labels import label_sets
 from wheretolook.localization.labeller import MANIFEST, LabelTask
 from wheretolook.localization.shard import SceneJob
-from wheretolook.planning.config import FORWARD, PathsConfig
+from wheretolook.planning.config import FORWARD
 from wheretolook.planning.scene_map import planner_map, planner_scorer
 from wheretolook.planning.stops import can_stop
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.files import fingerprint
 from wheretolook.utils.reading import read_json_object
+from wheretolook_paper.paths.config import PathsConfig
 from wheretolook_paper.paths.joint_localization import (
     OUTCOME,
     STOP_COLUMNS,

@@ -13,7 +13,7 @@ from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, outcome_in_
 from wheretolook.figures.overview import View, rendered_views
 from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
 from wheretolook.inputs.channels import CHANNELS
-from wheretolook.planning.config import PathsConfig, PlanConfig
+from wheretolook.planning.config import PlanConfig
 from wheretolook.planning.method_paths import path_views, plan_by_methods
 from wheretolook.planning.routes import PathView
 from wheretolook.scorers.base import Scorer
@@ -25,6 +25,7 @@ from wheretolook_paper.figures.inputs import BinnedImage
 from wheretolook_paper.figures.peaks import spread_extrema
 from wheretolook_paper.figures.pipeline import Pipeline
 from wheretolook_paper.figures.sampling import Sampling
+from wheretolook_paper.paths.config import PathsConfig
 from wheretolook_paper.paths.path_comparison import draw_pairs
 from wheretolook_paper.release.showcase import EYE_M, Showcase
 

@@ -30,8 +30,8 @@ from tqdm.auto import tqdm
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, camera_centers, invert_poses, pose_error
-from wheretolook.holdout.checking import check_map
 from wheretolook.holdout.photo_map import open_map, says_metric
+from wheretolook.holdout.report import check_map
 from wheretolook.holdout.scores import Scoring
 from wheretolook.mapping.colmap_model import colmap_poses, holds_model
 from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG, MapConfig, PhotographsConfig

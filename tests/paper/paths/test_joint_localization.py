@@ -13,8 +13,9 @@ from wheretolook.dataset.viewpoint_table import pose_columns
 from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.localization.estimation import PoseEstimator
 from wheretolook.localization.joint_labels import label_sets
-from wheretolook.planning.config import PathsConfig, StopConfig
+from wheretolook.planning.config import StopConfig
 from wheretolook_paper.figures.paths import paths_figure
+from wheretolook_paper.paths.config import PathsConfig
 from wheretolook_paper.paths.joint_localization import OUTCOME, joint_paths, localize_last_views, localize_stops
 from wheretolook_paper.paths.odometry import chained, noisy_steps, rig_of_last
 from wheretolook_paper.paths.path_comparison import ComparedPaths

@@ -13,7 +13,7 @@ from box_scenes import furnished_room
 from planning.rooms import build, patiently, room_landmarks
 from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.geometry.poses import camera_centers
-from wheretolook.planning.config import PathConfig, PathsConfig
+from wheretolook.planning.config import PathConfig
 from wheretolook.planning.scene_map import shares_below
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.tracking.config import TrackingConfig
@@ -21,6 +21,7 @@ from wheretolook.tracking.runs import finished_runs
 from wheretolook.tracking.store import client
 from wheretolook.utils.errors import ConfigError, PlanningError, SceneError
 from wheretolook_paper.figures.paths import paths_figure
+from wheretolook_paper.paths.config import PathsConfig
 from wheretolook_paper.paths.path_comparison import ComparedPaths, Reachability, draw_pairs, plan_pairs
 from wheretolook_paper.paths.path_report import log_paths, summarize_paths
 

@@ -1,0 +1,69 @@
+"""Settings of the comparison of methods by planned paths."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from wheretolook.planning.config import FORWARD, MappedLattice, PathConfig, StopConfig
+from wheretolook.utils.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class PathsConfig(MappedLattice):
+    """How methods are compared by planned paths.
+
+    Args:
+        scenes: names of the scenes; none for all of the test split.
+        pairs: starts and goals in each scene.
+        seed: seed of the starts and goals.
+        min_distance_m: least distance of a goal from its start.
+        height_m: range of the heights of starts and goals above the floor.
+        methods: methods to compare: forward, the shortest path, and some that score views. See `wheretolook evaluate
+            --list-methods`. Scores that are no probabilities enter by their ranks.
+        weights: file of weights, for a method that has learnt. By default, and for methods of another kind, the best of
+            each method in the dataset, or else of those that ship.
+        max_turn_deg: along a path that is given, the camera turns by no more from one waypoint to the next.
+        max_error_m: a view is good if it localizes with a smaller error of its position.
+        max_error_deg: and with a smaller error of its orientation.
+        resamples: of the pairs, for 95 % intervals.
+        planner: costs and limits of the paths, time to plan each.
+        stops: where one look will not do; adds rows "METHOD with stops" for methods whose scores are probabilities.
+        last_views: views along the way localized as one rig. The present one and those before it; adds rows "METHOD
+            last N together". 1 for none.
+        odometry_m_per_m: how well the rig knows how far it went from view to view. One standard deviation along each
+            axis, in metres for each metre.
+        odometry_deg_per_deg: and how far it turned. Degrees for each degree.
+    """
+
+    scenes: tuple[str, ...] = ()
+    pairs: int = 20
+    seed: int = 0
+    min_distance_m: float = 3.0
+    height_m: tuple[float, float] = (1.2, 1.6)
+    methods: tuple[str, ...] = (FORWARD, "fisher-trace-gp", "set")
+    weights: Path | None = None
+    max_turn_deg: float = 30.0
+    max_error_m: float = 0.25
+    max_error_deg: float = 2.0
+    resamples: int = 2000
+    planner: PathConfig = field(default_factory=PathConfig)
+    stops: StopConfig = field(default_factory=StopConfig)
+    last_views: int = 1
+    odometry_m_per_m: float = 0.01
+    odometry_deg_per_deg: float = 0.01
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("pairs", "min_distance_m", "max_turn_deg", "max_error_m", "max_error_deg", "resamples"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name} must be positive", value=getattr(self, name))
+        if not 0 < self.height_m[0] <= self.height_m[1]:
+            raise ConfigError("height_m needs a range above 0", value=self.height_m)
+        if self.last_views < 1:
+            raise ConfigError("last_views must be at least 1", value=self.last_views)
+        for name in ("odometry_m_per_m", "odometry_deg_per_deg"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ConfigError(f"{name} must be at least 0 and below 1", value=getattr(self, name))
+        if FORWARD not in self.methods or len(set(self.methods)) < len(self.methods):
+            raise ConfigError(f'methods need "{FORWARD}" to compare with, and every name once', value=self.methods)

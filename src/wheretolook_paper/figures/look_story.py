@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,7 +13,7 @@ from matplotlib.style import context
 from numpy.typing import ArrayLike
 
 from wheretolook.dataset.thresholds import THRESHOLDS
-from wheretolook.figures.animation import Pixels
+from wheretolook.figures.animation import Pixels, pixels_of
 from wheretolook.figures.dollhouse import Dollhouse, draw_house, draw_segments, frustum_segments
 from wheretolook.figures.style import BLUE, GREEN, RC, VERMILION, Style, new_figure
 from wheretolook.geometry.camera import Camera
@@ -24,6 +25,8 @@ from wheretolook.localization.rig_localization import JointLocalization, JointLo
 from wheretolook.utils.errors import PoseError
 
 MAX_ERROR_M, MAX_ERROR_DEG = THRESHOLDS[0]
+FRAME_MS = 2200
+LAST_MS = 4000  # the frame of all views
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,17 +121,35 @@ def story_figure(story: LookStory, house: Dollhouse) -> Figure:
         n = len(story.single)
         figure = new_figure(4.2 * (n + 1), 4.6)
         grid = figure.add_gridspec(2, n + 1, height_ratios=(1.5, 1.0))
-        for column, estimate in enumerate((*story.single, story.joint)):
-            above = figure.add_subplot(grid[0, column])
-            shown = slice(column, column + 1) if column < n else slice(None)
-            _draw_plan(above, story.camera, house, story.cam_from_world[shown], estimate)
-            name = f"look {column + 1}" if column < n else "together"
-            above.set_title(f"{name}: {estimate.summary}", color=estimate.color, fontsize=10)
-            below = grid[1, column].subgridspec(1, 1 if column < n else n)
-            for k, number in enumerate(range(n)[shown]):
-                axes = figure.add_subplot(below[k])
-                _draw_image(axes, story.images[number], estimate.pixels[k], estimate.color)
+        for column in range(n + 1):
+            images = grid[1, column].subgridspec(1, 1 if column < n else n)
+            _draw_result(figure, story, house, column, grid[0, column], images)
         return figure
+
+
+def film_frames(story: LookStory, house: Dollhouse) -> Iterator[tuple[Pixels, int]]:
+    """Yield frames (H, W, 3) and their durations in ms: each view with its estimate, then all views jointly."""
+    n = len(story.single)
+    for column in range(n + 1):
+        with context(RC):
+            figure = new_figure(8.4, 4.2)
+            grid = figure.add_gridspec(1, 2, width_ratios=(1.5, 1.0))
+            images = grid[1].subgridspec(1 if column < n else n, 1)
+            _draw_result(figure, story, house, column, grid[0], images)
+            yield pixels_of(figure), FRAME_MS if column < n else LAST_MS
+
+
+def _draw_result(figure: Figure, story: LookStory, house: Dollhouse, column: int, plan: Any, images: Any) -> None:
+    """Draw the result of one view, or of all jointly (the last column), into cells of grids."""
+    n = len(story.single)
+    estimate = (*story.single, story.joint)[column]
+    shown = [column] if column < n else [*range(n)]
+    above = figure.add_subplot(plan)
+    _draw_plan(above, story.camera, house, story.cam_from_world[shown], estimate)
+    name = f"look {column + 1}" if column < n else "together"
+    above.set_title(f"{name}: {estimate.summary}", color=estimate.color, fontsize=10)
+    for k, number in enumerate(shown):
+        _draw_image(figure.add_subplot(images[k]), story.images[number], estimate.pixels[k], estimate.color)
 
 
 def _draw_plan(axes: Axes, camera: Camera, house: Dollhouse, poses: Float, estimate: Estimate) -> None:

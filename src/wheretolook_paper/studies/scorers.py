@@ -30,7 +30,6 @@ from wheretolook.commands.train import train_methods as train
 from wheretolook.dataset.layout import Dataset
 from wheretolook.inputs.landmark_features import ATTRIBUTES
 from wheretolook.scorers.mlp.config import MlpConfig
-from wheretolook.scorers.set import learn as set_learner
 from wheretolook.scorers.set.config import SetConfig
 from wheretolook.scorers.set.learn import SetDataModule, learn_set
 from wheretolook.scorers.train_config import TrainConfig
@@ -81,16 +80,6 @@ class Table:
 def seeds(dataset: Dataset, args: argparse.Namespace, tracking: TrackingConfig) -> None:
     """Train every learner with every seed."""
     table = Table(args.out / "seeds.csv")
-    described: dict[str, SetDataModule] = {}
-
-    def described_once(task: Task) -> SetDataModule:
-        if not described:
-            described["all"] = SetDataModule(task)
-        described["all"].config = task.config
-        described["all"].options = task.options
-        return described["all"]
-
-    set_learner.SetDataModule = described_once  # type: ignore[assignment,misc]
     for seed in args.seeds:
         for method in args.methods:
             if table.has(method=method, seed=seed):

@@ -19,6 +19,7 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.scorers.styles import method_style
 from wheretolook_paper.figures.inputs import BinnedImage, inputs_figure
 from wheretolook_paper.figures.lattices import covering_radius_deg, fibonacci_figure, nearest_angles_deg
+from wheretolook_paper.figures.look_story import Estimate, LookStory, film_frames, story_figure
 from wheretolook_paper.figures.looks import looks_figure
 from wheretolook_paper.figures.network_walkthrough import learning_figure
 from wheretolook_paper.figures.occlusion import occlusion_figure
@@ -184,3 +185,15 @@ def test_viewer_geometries_hold_the_scene() -> None:
     assert {"landmarks", "cameras", "path"} < {*parts}
     assert sum(len(part.triangles) for name, part in parts.items() if "mesh" in name) == len(mesh.triangles)
     np.testing.assert_allclose(np.asarray(parts["landmarks"].points), landmarks)
+
+
+def test_a_story_of_views_is_a_figure_and_a_film() -> None:
+    poses = poses_looking_along([[1.0, 1, 1]] * 2, [[1.0, 0, 0], [0, 1.0, 0]])
+    good = Estimate(poses[:1], (np.ones((5, 2)),), 0.9, 0.01, 0.1)
+    none = Estimate(None, (np.zeros((0, 2)),), 0.0, np.inf, np.inf)
+    joint = Estimate(poses, (np.ones((5, 2)), np.ones((2, 2))), 0.9, 0.01, 0.1)
+    assert (good.is_good, good.n_inliers, none.is_good, joint.n_inliers) == (True, 5, False, 7)
+    story = LookStory(CAMERA, poses, np.stack([RGB, RGB]), (good, none), joint)
+    house = dollhouse(furnished_room(), width_px=100)
+    assert len(story_figure(story, house).axes) == 3 + 4
+    assert len([*film_frames(story, house)]) == 3

@@ -63,7 +63,7 @@ def test_pairs_are_far_apart_and_free(space: FreeSpace) -> None:
     heights = pairs.reshape(-1, 3)[:, 2] - space.floor_below(pairs.reshape(-1, 3))
     assert ((heights > 0.999) & (heights < 1.401)).all()
     np.testing.assert_array_equal(draw_pairs(space, replace(QUICK, pairs=3)), pairs)
-    with pytest.raises(SceneError, match=r"found only 0 .*min_distance_m"):
+    with pytest.raises(SceneError):
         draw_pairs(space, replace(QUICK, min_distance_m=50.0))
 
 

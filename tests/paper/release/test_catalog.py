@@ -22,7 +22,6 @@ from wheretolook.planning.routes import PathView
 from wheretolook.scorers.styles import method_style
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import newest_artifact, newest_run
-from wheretolook.utils.errors import ConfigError
 from wheretolook_paper.figures.config import FiguresConfig
 from wheretolook_paper.figures.top_n import ROWS, top_n_figure, top_n_table
 from wheretolook_paper.release.catalog import ITEMS, write_items
@@ -33,7 +32,6 @@ from wheretolook_paper.release.showcase_figures import planned_views
 from wheretolook_paper.release.table_view import latest_paper_table, paper_cells, paper_styler
 
 RELEASE = Path(__file__).parents[3] / "data" / "release"
-PAPER = {f"Fig. {n}" for n in range(1, 8)} | {f"Table {n}" for n in (1, 2, 3)}
 OF_SCENES = {"pipeline", "learning", "viewpoint_generation", "planning", "inputs", "peaks"}
 """What needs a scene that can be made anew from its seed, which the tiny release has not."""
 
@@ -51,12 +49,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, TrackingCo
     tracking = TrackingConfig(str(folder / "mlruns"))
     log_release(release, tracking)
     return release, tracking
-
-
-def test_the_catalog_names_the_papers_items() -> None:
-    assert {item.paper for item in ITEMS} >= PAPER
-    assert len({item.name for item in ITEMS}) == len(ITEMS)
-    assert all(item.command and item.notebook[:2].isdigit() for item in ITEMS)
 
 
 @pytest.mark.slow
@@ -108,13 +100,6 @@ def test_scenes_of_the_release_are_drawn_with_the_runs_of_their_weights(tmp_path
     assert np.linalg.norm(np.diff(ends[0], axis=0)) > 4  # the farthest of ten pairs
 
 
-def test_chosen_items_are_made_alone(store: tuple[Dataset, TrackingConfig], tmp_path: Path) -> None:
-    assert write_items(*store, FiguresConfig(tmp_path, ("calibration",), ("svg",)), quiet) == {}
-    assert [path.name for path in tmp_path.iterdir()] == ["calibration.svg"]
-    with pytest.raises(ConfigError, match="figures --list"):
-        write_items(*store, FiguresConfig(tmp_path, ("calibrations",)), quiet)
-
-
 @pytest.mark.slow
 def test_the_command_says_what_is_missing(
     store: tuple[Dataset, TrackingConfig], tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -140,15 +125,6 @@ def test_the_command_says_what_is_missing(
     (tmp_path / "data" / "release" / "release.json").unlink()
     assert main(["log-release", "--config", str(config)]) == 2
     assert "no release" in capsys.readouterr().err
-
-
-def test_the_catalog_is_listed_and_explained(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["figures", "--list"]) == 0
-    listed = capsys.readouterr().out
-    assert all(item.name in listed and item.notebook in listed for item in ITEMS)
-    for command, text in (("figures", "exit code is 2"), ("log-release", "make ui")):
-        assert main([command, "--help"]) == 0
-        assert text in capsys.readouterr().out
 
 
 def test_marks_of_several_viewpoints_are_the_tables() -> None:

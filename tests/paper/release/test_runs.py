@@ -21,13 +21,8 @@ from wheretolook.evaluation.scores import read_scores
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import experiment_ids, experiments, finished_runs, newest_artifact, newest_run
 from wheretolook.tracking.store import client
-from wheretolook.training.run_record import HISTORY_CSV
-from wheretolook.utils.errors import MissingRunError
-from wheretolook_paper.release.notebook import open_store
 from wheretolook_paper.release.runs import ReleaseRuns, log_release
 from wheretolook_paper.release.training_histories import histories, keep_histories, trained
-
-PAGE = Path(__file__).parents[3] / "mlruns" / "README.md"
 
 
 @pytest.fixture(scope="module")
@@ -127,33 +122,6 @@ def test_each_dataset_and_purpose_has_an_experiment_that_says_what_to_look_at(
                 assert any(value is not None for value in values), (experiment.name, column)
 
 
-def test_parents_carry_the_numbers_of_the_best(logged: tuple[Dataset, TrackingConfig, ReleaseRuns]) -> None:
-    release, tracking, runs = logged
-    parent = client(tracking).get_run(runs.evaluate["release"]).data
-    scores = read_scores(release.root / "results" / "scores.csv")
-    rows = scores.query("scene == 'all' and top_n == 1 and occlusion == 'mesh' and method not in ('oracle', 'random')")
-    best = rows.loc[rows["regret_0.05m_0.4deg"].idxmin()]
-    assert parent.tags["best"] == best["method"] and sorted(parent.metrics)[:3] == ["1_auc", "1_regret", "1_share"]
-    assert parent.metrics["1_regret"] == best["regret_0.05m_0.4deg"] == rows["regret_0.05m_0.4deg"].min()
-    assert parent.metrics["1_share"] == best["raw_0.05m_0.4deg"] and parent.metrics["1_auc"] == best["roc_auc"]
-    assert len(parent.metrics) == 6
-    learners = client(tracking).get_run(str(runs.learners)).data
-    assert learners.metrics.keys() == {"1_auc", "1_regret"} and learners.tags["best"] in ("bins", "set, apartments")
-    paths = client(tracking).get_run(str(runs.paths)).data
-    assert paths.tags["best"] in ("forward", "bins") and paths.metrics["localized"] == 0.5
-    (trained_run,) = (client(tracking).get_run(run) for run in runs.train.values())
-    assert trained_run.info.run_name == "mlp-2d+3d (train release)" and trained_run.data.metrics["1_auc"] == 0.8
-
-
-def test_a_deleted_experiment_does_not_come_back(store: tuple[Dataset, TrackingConfig]) -> None:
-    release, tracking = store
-    (paths,) = (one for one in experiments(client(tracking), tracking) if one.name == "release: paths")
-    client(tracking).delete_experiment(paths.experiment_id)
-    assert log_release(release, tracking).new == 1 and log_release(release, tracking).new == 0
-    names = [one.name for one in experiments(client(tracking), tracking)]
-    assert "release: paths" not in names and f"release: paths at {tracking.root}" in names
-
-
 def test_a_release_is_logged_as_its_evaluation_was(tmp_path: Path) -> None:
     """The same names, parameters and metrics; and in the store of the evaluation itself its run is found."""
     dataset = make_dataset(tmp_path / "tiny", ("test", "test"), n_locations=4, n_directions=6)
@@ -174,17 +142,6 @@ def test_a_release_is_logged_as_its_evaluation_was(tmp_path: Path) -> None:
         assert params.items() - theirs[name][0].items() <= {("reference", "")}
     logged = client(other).get_run(runs.evaluate["tiny"]).data.metrics
     assert logged == client(own).get_run(evaluated.info.run_id).data.metrics
-
-
-def test_only_what_is_new_is_logged(store: tuple[Dataset, TrackingConfig]) -> None:
-    release, tracking = store
-    table = pd.read_csv(release.root / "results" / "runtimes.csv")
-    table.assign(median_s=9.0).to_csv(release.root / "results" / "runtimes.csv", index=False)
-    before = client(tracking).get_run(newest_run(tracking, "benchmark").info.run_id)  # type: ignore[union-attr]
-    runs = log_release(release, tracking)
-    assert runs.new == 1 and runs.benchmark != before.info.run_id
-    times = client(tracking).get_run(str(runs.benchmark)).data.metrics
-    assert set(times.values()) == {9.0}
 
 
 def test_histories_travel_with_a_release(store: tuple[Dataset, TrackingConfig]) -> None:
@@ -221,32 +178,3 @@ def test_an_interrupted_run_is_not_taken_for_a_finished_one(store: tuple[Dataset
     assert runs.new == 1 and runs.paths != run.info.run_id
     assert names("tags.stage = 'paths'") == before and len(before) > 1  # none twice
     assert log_release(release, tracking).new == 0
-
-
-def test_notebooks_open_a_filled_store(
-    logged: tuple[Dataset, TrackingConfig, ReleaseRuns], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("WHERETOLOOK_MLRUNS", str(tmp_path / "mlruns"))
-    monkeypatch.setenv("WHERETOLOOK_RELEASE", str(logged[0].root))
-    tracking = open_store()
-    assert tracking.root == tmp_path / "mlruns"
-    assert newest_run(tracking, "train", params={"method": "mlp-2d+3d"}, file="mlp-2d+3d.json") is not None
-    assert newest_run(tracking, "train", file=HISTORY_CSV) is None
-    with pytest.raises(MissingRunError, match="no run of train with nothing"):
-        newest_artifact(tracking, "train", "nothing")
-
-
-def test_searches_of_the_page_on_runs_find_something(logged: tuple[Dataset, TrackingConfig, ReleaseRuns]) -> None:
-    text = PAGE.read_text()
-    tracking = logged[1]
-    queries = re.findall(r"^```\n(tags.*?)\n```", text, re.MULTILINE)
-    queries += re.findall(r"^\| [a-z][^|]* \| `+ ?((?:tags|params|metrics).*?) ?`+(?: \||,)", text, re.MULTILINE)
-    assert len(queries) == 7
-    ids = experiment_ids(client(tracking), tracking)
-    for query in queries:
-        assert client(tracking).search_runs(ids, query), query
-    best = client(tracking).search_runs(ids, queries[0], order_by=["metrics.`1_regret` ASC"])
-    values = [run.data.metrics["1_regret"] for run in best]
-    assert values == sorted(values) and len(values) == len(METHODS)
-    for picture in re.findall(r"\]\((images/.*?)\)", text):
-        assert (PAGE.parent / picture).stat().st_size < 150_000

@@ -1,4 +1,4 @@
-"""What every method of scoring viewpoints has in common."""
+"""Base classes of all scorers."""
 
 from __future__ import annotations
 
@@ -20,19 +20,17 @@ if TYPE_CHECKING:
     from wheretolook.visibility.frustum import LandmarkSets
 
 BLOCK = 4096  # views scored at a time: about 80 MB of bins
-FIELD_OF_VIEW_TOLERANCE = (
-    1e-3  # relative difference in size / focal length, and of the principal point, up to which they are the same
-)
+FIELD_OF_VIEW_TOLERANCE = 1e-3  # relative difference in size / focal length and of the principal point
 
 
 @dataclass(frozen=True, eq=False)
 class ViewReport:
-    """What a scorer tells of B views."""
+    """Scores of B views and what else the scorer knows of them."""
 
     score: Float  # (B,)
-    expected_inliers: Float  # (B,) landmarks expected to be found; NaN where the method does not tell
-    n_visible: NDArray[np.int64]  # (B,) landmarks in view
-    in_range: NDArray[np.bool_]  # (B,) whether the view is like those that the scorer has learnt from
+    expected_inliers: Float  # (B,) landmarks expected to be detected; NaN where it is unknown
+    n_visible: NDArray[np.int64]  # (B,) visible landmarks
+    in_range: NDArray[np.bool_]  # (B,) whether the view is in the range of the training views
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,15 +43,14 @@ class LandmarkProbabilities:
 
 
 class Scorer(ABC):
-    """A method that says how well a camera would localize: the paper's f_P(R, t) -> [0, 1].
+    """Scores how well a camera would localize from a pose: the paper's f_P(R, t) -> [0, 1].
 
-    A scorer is built from a map, the camera that will look, and whatever else the method needs. It answers for any
-    batch of poses. The score of a pose depends on the pose alone: not on its place in the batch, nor on the other
-    poses; the same scorer gives the same scores to the same poses. Higher is better. Scores lie in [0, 1] where the
-    method allows; only their order counts for choosing a view.
+    A scorer is built from a localization map, with the camera to localize, and what else the method needs. The score of
+    a pose depends on that pose alone, not on the batch, and is deterministic. Higher is better; scores are in [0, 1]
+    where the method allows, but only their order matters for choosing a view.
 
     A new method is one file with a subclass and a record (`wheretolook.scorers.method.Method`), named in
-    `registry.MODULES`. One that needs binned landmarks derives from `BinnedScorer` instead.
+    `registry.MODULES`. One that needs binned landmarks derives from `BinnedScorer`.
     """
 
     name: str
@@ -67,30 +64,27 @@ class Scorer(ABC):
         """Score poses (B, 3, 4). Returns (B,) float64, finite. Raises PoseError if a pose is not finite."""
 
     def in_range(self, cam_from_world: Float) -> NDArray[np.bool_]:
-        """Which poses (B, 3, 4) see what is like the views that the scorer has learnt from, (B,) bool.
-
-        All do where nothing was learnt, or nothing is known of the views it was learnt from.
-        """
+        """Return which poses (B, 3, 4) have views in the range of the training views, (B,) bool; all if there is none."""
         return np.ones(len(check_poses(cam_from_world)), dtype=bool)
 
     def score_around(self, locations: Float, directions: Float) -> Float:
-        """Scores (L, D) of cameras without roll at locations (L, 3) m that look along each of directions (D, 3).
+        """Score cameras without roll at locations (L, 3) m along each of directions (D, 3). Returns (L, D).
 
-        They rank the directions of a location; what stands on samples of landmarks may differ from `score` by little.
+        Methods that sample landmarks may differ slightly from `score`.
         """
         at = np.repeat(locations, len(directions), axis=0)
         axes = np.tile(directions, (len(locations), 1))
         return self.score(poses_looking_along(at, axes)).reshape(len(locations), len(directions))
 
     def report(self, cam_from_world: Float) -> ViewReport:
-        """Score poses (B, 3, 4), and tell what there is to know of them."""
+        """Score poses (B, 3, 4) and report what else is known of their views."""
         starts, _ = self.localization_map.in_view_on_device(cam_from_world)
         n_visible = np.diff(starts)
         expected = self.expected_inliers(cam_from_world)
         return ViewReport(self.score(cam_from_world), expected, n_visible, self.in_range(cam_from_world))
 
     def expected_inliers(self, cam_from_world: Float) -> Float:
-        """How many landmarks poses (B, 3, 4) can be expected to find, (B,); NaN where the method does not tell."""
+        """Return how many landmarks poses (B, 3, 4) are expected to detect, (B,); NaN if that is unknown."""
         return np.full(len(cam_from_world), np.nan)
 
     def landmark_probabilities(
@@ -103,12 +97,12 @@ class Scorer(ABC):
         return None
 
     def score_binned(self, cam_from_world: Float, binned: BinnedViews) -> Float:
-        """What `score` gives, (B,), for poses that the map's `bin_views` has binned already, with all `CHANNELS`."""
+        """Return `score` (B,) of poses whose views are binned already, with all `CHANNELS`."""
         return self.score(cam_from_world)
 
 
 class BinnedScorer(Scorer):
-    """Scores a view by its binned landmarks alone: `CHANNELS` or `ALL_CHANNELS` of `bins` x `bins` bins."""
+    """Scores a view from its landmarks in `bins` x `bins` bins, with `CHANNELS` or `ALL_CHANNELS`."""
 
     def __init__(self, localization_map: LocalizationMap, bins: int = 30, landmark_channels: bool = False) -> None:
         super().__init__(localization_map)
@@ -125,7 +119,7 @@ class BinnedScorer(Scorer):
         return scores
 
     def score_binned(self, cam_from_world: Float, binned: BinnedViews) -> Float:
-        """Score binned views; views with another number of bins, or without channels it needs, are binned again."""
+        """Score binned views (B,); views with other bins, or without a channel it needs, are binned again."""
         wanted = ALL_CHANNELS if self.landmark_channels else CHANNELS
         if binned.counts.shape[-1] != self.bins or not {*wanted} <= {*binned.channels}:
             return self.score(cam_from_world)
@@ -133,11 +127,11 @@ class BinnedScorer(Scorer):
 
     @abstractmethod
     def score_bins(self, binned: BinnedViews) -> Float:
-        """Score binned views with all channels that it asks for. Returns (B,) float64, finite."""
+        """Score binned views with all of its channels. Returns (B,) float64, finite."""
 
 
 class CountingScorer(BinnedScorer):
-    """A method that scores a view by how many landmarks and filled bins there are."""
+    """Scores a view by its numbers of landmarks and filled bins."""
 
     def score(self, cam_from_world: Float) -> Float:
         """Score poses (B, 3, 4). Returns (B,) float64."""
@@ -149,11 +143,11 @@ class CountingScorer(BinnedScorer):
 
     @abstractmethod
     def score_counts(self, n_visible: NDArray[np.int32], n_filled: NDArray[np.int32]) -> Float:
-        """Score views by their landmarks and filled bins, (B,) each. Returns (B,) float64, finite."""
+        """Score views from their numbers of landmarks and filled bins, (B,) each. Returns (B,) float64, finite."""
 
 
 def check_field_of_view(trained: Camera | None, camera: Camera) -> Camera:
-    """The camera of the training views; a CameraError if its field of view is not that of the camera that looks."""
+    """Return the camera of the training views; a CameraError if its field of view is not that of `camera`."""
     if trained is None or not same_field_of_view(trained, camera):
         of = "several cameras" if trained is None else f"a camera of {describe_camera(trained)}"
         fix = "Use a pinhole camera with that field of view, or train with this one."
@@ -162,7 +156,7 @@ def check_field_of_view(trained: Camera | None, camera: Camera) -> Camera:
 
 
 def same_field_of_view(trained: Camera, camera: Camera) -> bool:
-    """Whether two pinholes see the same: their image is the same but for its resolution."""
+    """Return whether two pinhole cameras have the same field of view, up to resolution."""
     if isinstance(camera, ColmapCamera) or isinstance(trained, ColmapCamera):
         return False
     spans = [(c.width / c.fx, c.height / c.fy, c.cx / c.width, c.cy / c.height) for c in (trained, camera)]

@@ -1,4 +1,4 @@
-"""Networks over binned landmarks: what is stored of their input, and the score of a trained one."""
+"""Networks over binned landmarks, their input statistics, and the scorer of a trained one."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from wheretolook.utils.errors import WeightsError
 
 
 class BinnedNetwork(StoredNetwork):
-    """A network that takes the means (B, C, bins, bins) of its channels and filled bins (B, bins, bins)."""
+    """A network with inputs means (B, C, bins, bins) of its channels and filled bins (B, bins, bins)."""
 
     statistics: InputStatistics
     bins: int
@@ -31,12 +31,12 @@ class BinnedNetwork(StoredNetwork):
 
 
 def stored_statistics(stored: Mapping[str, Any]) -> InputStatistics:
-    """Input statistics from the header of weights; a WeightsError where this version's bins lack a channel."""
+    """Return input statistics from the header of weights; a WeightsError for an unknown channel."""
     values = stored["statistics"]
     for name in values["channels"]:
         if name not in ALL_CHANNELS:
             fix = "Use the version that wrote them, or train again."
-            raise WeightsError("these weights ask for an unknown channel of the bins", value=name, fix=fix)
+            raise WeightsError("these weights need an unknown channel of the bins", value=name, fix=fix)
     channels = tuple(values["channels"])
     return InputStatistics(channels, *mean_and_std(values, channels))
 
@@ -44,8 +44,8 @@ def stored_statistics(stored: Mapping[str, Any]) -> InputStatistics:
 class StandardBins(nn.Module):
     """Standardizes the channels of binned views by the mean and deviation of their kind (paper, Sec. 3.3 "Data").
 
-    Empty bins are exactly zero afterwards, that is, the mean of their kind; so are landmark channels where a value is
-    not known. Where landmarks lie, in the first channels, is always known: a NaN there is an error that must show.
+    Empty bins become zero, the mean; so do unknown values of landmark channels. Positions, in the first channels, are
+    always known: a NaN there stays, since it is an error.
     """
 
     mean: Tensor
@@ -55,12 +55,12 @@ class StandardBins(nn.Module):
         super().__init__()
         channels = statistics.channels
         self.n_certain = next((i for i, name in enumerate(channels) if name not in CHANNELS), len(channels))
-        # these follow from the description that is stored beside the weights: persistent=False
+        # not persistent: the header of weights stores them
         self.register_buffer("mean", torch.tensor(statistics.mean)[:, None, None], persistent=False)
         self.register_buffer("std", torch.tensor(statistics.std)[:, None, None], persistent=False)
 
     def forward(self, means: Tensor, filled: Tensor) -> Tensor:
-        """Means (B, C, bins, bins), standardized, of bins (B, bins, bins) that are filled or not."""
+        """Return standardized means (B, C, bins, bins), zero where bins are not `filled` (B, bins, bins)."""
         values = (means - self.mean) / self.std * filled[:, None]
         if values.shape[1] > self.n_certain:
             of_landmarks = values[:, self.n_certain :]
@@ -69,11 +69,10 @@ class StandardBins(nn.Module):
 
 
 class BinnedNetworkScorer(BinnedScorer):
-    """The probability that a view localizes, by a network over its binned landmarks.
+    """Predicts the probability that a view localizes, by a network over its binned landmarks.
 
-    A network knows the field of view it was trained with. A camera of another resolution but the same field of view is
-    served by scaling its pixels; another is refused with a CameraError, since the network has never seen one. Views are
-    in range if the depths of their bins are like those learnt from, where the weights tell; `score` warns once.
+    Pixels of a camera with another resolution but the training camera's field of view are scaled; a camera with another
+    field of view raises a CameraError. Views are in range if the mean depth of their bins is; `score` warns once if not.
     """
 
     local = True
@@ -84,13 +83,13 @@ class BinnedNetworkScorer(BinnedScorer):
         super().__init__(localization_map, network.bins, not {*self.channels} <= {*CHANNELS})
         camera = localization_map.camera
         self.device = localization_map.device
-        seen = check_field_of_view(trained.camera, camera)
+        trained_camera = check_field_of_view(trained.camera, camera)
         self.name = trained.method
         self.trained = trained
         self.training_range = trained.training_range or TrainingRange({})
         self._watch = RangeWatch(self.training_range)
         self.network: Any = network.to(self.device).eval()
-        pixels = {"u": seen.width / camera.width, "v": seen.height / camera.height}
+        pixels = {"u": trained_camera.width / camera.width, "v": trained_camera.height / camera.height}
         scales = [pixels.get(name, 1.0) for name in self.channels]
         self._scale = torch.tensor(scales, device=self.device)[:, None, None]
 
@@ -113,7 +112,7 @@ class BinnedNetworkScorer(BinnedScorer):
         return scores
 
     def in_range(self, cam_from_world: Float) -> NDArray[np.bool_]:
-        """Which poses (B, 3, 4) see depths like those of the views learnt from, (B,) bool."""
+        """Return which poses (B, 3, 4) have depths in the range of the training views, (B,) bool."""
         cam_from_world = check_poses(cam_from_world)
         inside = np.ones(len(cam_from_world), dtype=bool)
         for begin in range(0, len(inside) if self.training_range.bounds else 0, BLOCK):

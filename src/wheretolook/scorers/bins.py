@@ -1,4 +1,4 @@
-"""Reprojections with bins: landmarks spread over much of the image win."""
+"""Reprojections with bins: prefers landmarks spread over the image."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from wheretolook.scorers.method import MethodStyle, rule
 
 
 class BinsScorer(CountingScorer):
-    """Share of the image's bins with a landmark in view in them (paper, Sec. 4.1, "reprojection with bins").
+    """Share of the image's bins that hold a landmark (paper, Sec. 4.1, "reprojection with bins").
 
-    Among views with as many filled bins, the one that sees more landmarks scores higher, by less than one bin is worth.
+    Views with equally many filled bins are ordered by their number of landmarks.
     """
 
     name = "bins"

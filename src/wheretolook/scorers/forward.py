@@ -1,4 +1,4 @@
-"""The camera looks where the robot goes."""
+"""Prefers views along the robot's heading."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 
 class ForwardScorer(Scorer):
-    """Views by how near they look to a heading: the classical camera that knows nothing of the map (paper, Sec. 4.3).
+    """Views by their angle to a heading: the classical camera without a map (paper, Sec. 4.3).
 
-    The heading is where the robot drives to, in the world: (3,) everywhere, of any length but zero; or (W, 3) waypoints
-    of a path in metres, W > 1, for the direction of the leg that is nearest to the camera. None is for a horizontal
-    heading drawn for each location, by the seed. Raises a ValueError if a heading is zero or not finite, or two
-    waypoints in a row are the same.
+    The heading, in the world, is a direction (3,) of any length but zero; or the direction of the nearest leg of a path
+    of waypoints (W, 3) in metres, W > 1. None draws a horizontal heading for each location from the seed.
+
+    Raises a ValueError if a heading is zero or not finite, or two consecutive waypoints are equal.
     """
 
     name = "forward"
@@ -44,7 +44,7 @@ class ForwardScorer(Scorer):
             self._legs = legs
 
     def headings(self, centers: ArrayLike) -> Float:
-        """The headings (B, 3), of unit length, of camera centres (B, 3)."""
+        """Return the headings (B, 3), of unit length, at camera centres (B, 3)."""
         at = np.asarray(centers, dtype=np.float64)
         if len(self._legs) == 0:
             angle = 2 * np.pi * uniform(at, self.seed)
@@ -55,7 +55,7 @@ class ForwardScorer(Scorer):
         return np.asarray((self._legs / np.linalg.norm(self._legs, axis=-1, keepdims=True))[leg])
 
     def score(self, cam_from_world: Float) -> Float:
-        """(B,) in [0, 1]: half of one plus the cosine between optical axis and heading."""
+        """Return (1 + cosine between optical axis and heading) / 2, (B,), of poses (B, 3, 4)."""
         poses = check_poses(cam_from_world)
         cosines = np.einsum("bi,bi->b", poses[:, 2, :3], self.headings(camera_centers(poses)))
         return np.asarray((1 + np.clip(cosines, -1, 1)) / 2)

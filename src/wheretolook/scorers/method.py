@@ -1,4 +1,4 @@
-"""What a method is: one record that says how it is named, drawn, configured, learnt, loaded and scored."""
+"""The record of a method: how it is named, drawn, configured, trained, loaded and built."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from wheretolook.training.learner import Learnt, Task
 
 Group = Literal["learned", "rules", "Fisher", "probes"]
-"""Kinds of methods. Probes are no methods to choose views by: they choose what a Fisher field says not to."""
+"""Groups of methods in figures. Probes test a Fisher field: they choose the views that it ranks last."""
 
 
 @dataclass(frozen=True)
 class MethodStyle:
-    """How a method is named and drawn, the same in every figure and table."""
+    """How a method is named and drawn in every figure and table."""
 
-    label: str  # name for people
+    label: str  # display name
     color: str = "#7F3C8D"  # from the palette of Okabe and Ito (2008), or a shade of one of its colours
     marker: str = "3"  # Matplotlib marker
     dashes: Any = (0, (2, 1))  # Matplotlib line style
@@ -31,80 +31,68 @@ class MethodStyle:
 
 @dataclass(frozen=True)
 class ScorerOptions:
-    """What some methods need beside the map."""
+    """What some methods need besides the map."""
 
-    seed: int = 0  # for methods with randomness
-    weights: Path | None = None  # for methods that score with what was learnt
-    # for methods that look where a robot goes: one direction, or the waypoints of a path; empty for one drawn for each
-    # location
-    heading: tuple[tuple[float, float, float], ...] = ()
-    anywhere: bool = False  # whether weights that are adapted to one place may score in another
+    seed: int = 0  # of random methods
+    weights: Path | None = None  # of learned methods
+    heading: tuple[tuple[float, float, float], ...] = ()  # one direction, a path's waypoints, or none
+    anywhere: bool = False  # whether weights adapted to one scene may score in another
 
 
 def no_params(camera: Camera) -> dict[str, Any]:
-    """Nothing to log."""
+    """Return no parameters to log."""
     return {}
 
 
 @dataclass(frozen=True)
 class Method:
-    """A method of scoring viewpoints, or something learnt that methods build on.
+    """A method of scoring viewpoints, or a trained model that methods build on.
 
-    A method of this package has its record in a module that `registry.MODULES` names; anybody else's is found by the
-    entry-point group `wheretolook.methods`. What imports PyTorch or Warp does so inside the functions given here, so
-    that the command line can list methods at once.
+    A method of this package has its record in a module that `registry.MODULES` names; others are found through the
+    entry-point group `wheretolook.methods`. PyTorch and Warp are imported inside the functions given here, so that the
+    command line lists methods at once.
     """
 
-    name: str  # its one name: in options, tables, runs, and that of its weights' file
+    name: str  # in options, tables, runs, and of its weights file
     about: str  # one sentence, for `wheretolook evaluate --list-methods`
-    style: MethodStyle  # how it is named and drawn
-    group: Group = "rules"  # in figures
-    # makes its scorer from a map and options; of a method that needs weights, these are given and of the right kind.
-    # None for what scores no views by itself
+    style: MethodStyle
+    group: Group = "rules"
+    # builds its scorer; weights are given and of the right method if it needs any. None if it scores no views by itself
     build: Callable[[LocalizationMap, ScorerOptions], Scorer] | None = None
     weights: str = ""  # name of the learned method whose weights it scores with; "" if it needs none
-    position: int = 1000  # in tables and lists; equal ones keep the order in which they are registered
-    family: str = ""  # name that stands for all methods of the family where methods are asked for; "" for none
+    position: int = 1000  # in tables and lists
+    family: str = ""  # name that stands for all methods of the family in options
     probability: bool = False  # whether its score is the probability that a view localizes
-    by_chance: bool = False  # whether it is drawn at random: an evaluation then tells the exact expectation
-    only_if_named: bool = False  # whether an evaluation has it only if it is named
-    # whether a figure of a few methods shows it: of a family, the first of those that are evaluated
-    of_the_few: bool = False
-    fallback: bool = False  # whether a viewpoint map has its scores where no method is named and there are no weights
-    # of the learned methods evaluated, the one with the highest number is what others are compared with unless told
-    # otherwise
-    reference: int = 0
-    learn: Callable[[Task], Learnt] | None = None  # learns it; None for a method that learns nothing
-    config: type | None = None  # class of its options, a frozen dataclass whose defaults can be made without arguments
-    folder: str = ""  # name of these options' group in `train`; methods with the same folder share them
-    settings: Mapping[str, Any] = field(default_factory=dict)  # options that it has whatever its group says
-    trained_unasked: bool = False  # whether the train stage learns it unless told what to learn
-    one_place: bool = False  # whether its weights serve only the map that they were adapted to
-    one_camera: bool = False  # whether its weights serve only cameras with the field of view of their training views
-    # whether a release may ship it: as the best of all; as the paper's network, of which the best one ships in half
-    # precision; or not at all, as it is trained to compare with only
+    by_chance: bool = False  # whether it is a random baseline, evaluated by its exact expectation
+    only_if_named: bool = False  # whether an evaluation includes it only by name
+    of_the_few: bool = False  # whether summary figures show it: of a family, the first that is evaluated
+    fallback: bool = False  # whether it scores viewpoint maps where neither a method nor weights are given
+    reference: int = 0  # of the learned methods evaluated, the highest is the one others are compared with
+    learn: Callable[[Task], Learnt] | None = None  # trains it
+    config: type | None = None  # frozen dataclass of its training options, with defaults
+    folder: str = ""  # group of these options in `train`; methods with the same folder share them
+    settings: Mapping[str, Any] = field(default_factory=dict)  # options it overrides
+    trained_unasked: bool = False  # whether the train command trains it by default
+    one_place: bool = False  # whether its weights serve only the scene that they were adapted to
+    one_camera: bool = False  # whether its weights serve only the field of view of their training views
+    # whether a release may ship it: as the best of all, as the paper's network (in half precision), or never
     ships: Literal["best", "network", "never"] = "best"
-    # what an evaluation logs about it as parameters, by the camera
-    params: Callable[[Camera], dict[str, Any]] = no_params
+    params: Callable[[Camera], dict[str, Any]] = no_params  # logged by an evaluation, by the camera
 
 
 def rule(scorer: type[Scorer], style: MethodStyle, **fields: Any) -> Method:
-    """The record of a method that is built of a map alone, unless `build` is given; its docstring says what it is."""
+    """Return the record of a method that is built from a map alone, described by its class's docstring."""
     about = " ".join((getdoc(scorer) or "").partition("\n\n")[0].split())
     return Method(scorer.name, about, style, **{"build": lambda map, options: scorer(map), **fields})
 
 
 def imported(reference: str) -> Callable[..., Any]:
-    """The function or class `module:name`, imported when called: PyTorch takes seconds to load."""
-
-    def call(*given: Any) -> Any:
-        return resolve_name(reference)(*given)
-
-    return call
+    """Return the function or class `module:name`, imported when called: PyTorch takes seconds to load."""
+    return lambda *arguments: resolve_name(reference)(*arguments)
 
 
 def network_scorer(scorer: str, network: str, *methods: str) -> Callable[[LocalizationMap, ScorerOptions], Scorer]:
-    """Builds a scorer from the weights of a network that serves one of these methods; both classes as in `imported`."""
+    """Return a function that builds a scorer from weights of these methods; both classes as in `imported`."""
 
     def build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
         from wheretolook.training.trained_network import TrainedNetwork
@@ -112,7 +100,7 @@ def network_scorer(scorer: str, network: str, *methods: str) -> Callable[[Locali
         assert options.weights is not None
         network_class: Any = resolve_name(network)
         trained = TrainedNetwork.load(options.weights, network_class, *methods, device=localization_map.device)
-        built: Scorer = imported(scorer)(localization_map, trained)
+        built: Scorer = resolve_name(scorer)(localization_map, trained)
         return built
 
     return build

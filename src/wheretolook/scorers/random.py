@@ -1,4 +1,4 @@
-"""A score without knowledge: what any method must beat."""
+"""Random scores: the baseline that every method must beat."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ POSE_DECIMALS = 6  # poses that agree to this many decimals (of a metre, and in 
 
 
 class RandomScorer(Scorer):
-    """Uniform random scores, a function of pose and seed, so that they do not depend on the order of the batch."""
+    """Uniform random scores, a function of pose and seed."""
 
     name = "random"
     local = True
@@ -33,7 +33,7 @@ class RandomScorer(Scorer):
 
 
 def uniform(values: Float, seed: int) -> Float:
-    """Uniform numbers (B,) in [0, 1), a function of rows (B, K), up to `POSE_DECIMALS`, and the seed."""
+    """Return uniform numbers (B,) in [0, 1), a function of rows (B, K), up to `POSE_DECIMALS`, and the seed."""
     numbers = np.round(values * 10**POSE_DECIMALS).astype(np.int64)
     state = np.full(len(numbers), seed, dtype=np.uint64)
     for column in numbers.T:

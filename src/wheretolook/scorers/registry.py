@@ -1,8 +1,8 @@
-"""All methods, by name: those of this package and those that other packages register."""
+"""All methods by name: those of this package and those that other packages register."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
@@ -15,82 +15,79 @@ from wheretolook.scorers.method import Method, ScorerOptions
 from wheretolook.utils.errors import CameraError, ConfigError, WeightsError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.scorers.base import Scorer
 
 MODULES = ("random", "forward", "visible", "bins", "mlp", "matchability", "set", "adapted")
-"""Modules of `wheretolook.scorers` whose `METHODS` are the package's own, in the order of tables."""
+"""Modules of `wheretolook.scorers` whose `METHODS` are the package's own."""
 
-GROUP = "wheretolook.methods"  # entry points of this group give a `Method`, or several, of another package
+GROUP = "wheretolook.methods"  # entry points of this group are a `Method`, or several, of another package
 
 
 @cache
 def all_methods() -> Mapping[str, Method]:
-    """Every method by its name, this package's own first.
+    """Return every method by its name, in the order of tables.
 
     Raises a ConfigError if what another package registers cannot be loaded, is no method, or has the name of another.
     """
-    found: dict[str, Method] = {}
+    methods: dict[str, Method] = {}
     for module in MODULES:
         for method in import_module(f"wheretolook.scorers.{module}").METHODS:
-            _add(found, method, f"wheretolook.scorers.{module}")
+            _add(methods, method, f"wheretolook.scorers.{module}")
     for entry in entry_points(group=GROUP):
-        for method in _loaded(entry):
-            _add(found, method, f"the entry point {entry.name} = {entry.value}")
-    return MappingProxyType(dict(sorted(found.items(), key=lambda item: item[1].position)))
+        for method in _load(entry):
+            _add(methods, method, f"the entry point {entry.name} = {entry.value}")
+    return MappingProxyType(dict(sorted(methods.items(), key=lambda item: item[1].position)))
 
 
-def _loaded(entry: EntryPoint) -> Iterable[Method]:
+def _load(entry: EntryPoint) -> Iterable[Method]:
     try:
-        given = entry.load()
-        methods = [given] if isinstance(given, Method) else list(given)
+        loaded = entry.load()
+        methods = [loaded] if isinstance(loaded, Method) else list(loaded)
     except Exception as error:  # whatever a foreign module raises
         problem = f"a method of another package cannot be loaded: {type(error).__name__}: {error}"
-        fix = "Mend or uninstall that package."
-        raise ConfigError(problem, value=f"{entry.name} = {entry.value}", fix=fix) from error
-    for method in methods:
-        if not isinstance(method, Method):
-            fix = f"The entry point must give a wheretolook.scorers.method.Method, or several, not {type(method)}."
-            raise ConfigError("no method", value=f"{entry.name} = {entry.value}", fix=fix)
+        raise ConfigError(problem, value=f"{entry.name} = {entry.value}", fix="Fix or uninstall it.") from error
+    if not all(isinstance(method, Method) for method in methods):
+        fix = "The entry point must be one or several wheretolook.scorers.method.Method."
+        raise ConfigError("no method", value=f"{entry.name} = {entry.value}", fix=fix)
     return methods
 
 
-def _add(found: dict[str, Method], method: Method, source: str) -> None:
-    if method.name in found or any(method.name == other.family for other in found.values()):
-        fix = f"Rename the one of {source}, or uninstall its package."
-        raise ConfigError("two methods have the same name", value=method.name, fix=fix)
-    if " " in method.name or not method.name:
-        raise ConfigError("a method's name is one word", value=method.name, fix=f"Rename the one of {source}.")
-    if (method.learn is None) != (method.config is None) or (method.learn is not None and not method.folder):
-        fix = f"Complete the one of {source}."
-        raise ConfigError("a method that learns needs learn, config and folder", value=method.name, fix=fix)
-    found[method.name] = method
+def _add(methods: dict[str, Method], method: Method, source: str) -> None:
+    problem = ""
+    if method.name in methods or any(method.name == other.family for other in methods.values()):
+        problem = "two methods have the same name"
+    elif " " in method.name or not method.name:
+        problem = "a method's name is one word"
+    elif (method.learn is None) != (method.config is None) or (method.learn is not None and not method.folder):
+        problem = "a learned method needs learn, config and folder"
+    if problem:
+        raise ConfigError(problem, value=method.name, fix=f"Change that of {source}, or uninstall its package.")
+    methods[method.name] = method
 
 
 def find(name: str) -> Method | None:
-    """The method of a table's row, named before any space; None for the oracle, and for what is not installed here."""
+    """Return the method of a table's row, named before any space; None for the oracle and for unknown methods."""
     return all_methods().get(name.partition(" ")[0])
 
 
 def scorers() -> dict[str, Method]:
-    """The methods that score views, by name."""
+    """Return the methods that score views, by name."""
     return {name: method for name, method in all_methods().items() if method.build is not None}
 
 
 def fallback() -> Method:
-    """What scores a viewpoint map where no method is named and there are no weights."""
+    """Return the method of viewpoint maps where neither a method nor weights are given."""
     return next(method for method in scorers().values() if method.fallback)
 
 
 def learned() -> dict[str, Method]:
-    """What can be trained, by name."""
+    """Return the methods that can be trained, by name."""
     return {name: method for name, method in all_methods().items() if method.learn is not None}
 
 
 def members(name: str, among: Mapping[str, Method]) -> list[Method]:
-    """The methods that a name stands for: one, or those of a family; empty if there are none among these."""
+    """Return the methods that a name stands for: one, or those of a family; empty for an unknown name."""
     if name in among:
         return [among[name]]
     family = [method for method in among.values() if method.family == name and not method.only_if_named]
@@ -98,9 +95,9 @@ def members(name: str, among: Mapping[str, Method]) -> list[Method]:
 
 
 def methods_named(names: Iterable[str], among: Mapping[str, Method]) -> list[Method]:
-    """The methods that names of methods and families stand for, each once, in the order asked for.
+    """Return the methods that names of methods and families stand for, each once, in the order of the names.
 
-    Raises a ConfigError if a name is not known or stands there twice, or there is none.
+    Raises a ConfigError if a name is unknown or repeated, or there is none.
     """
     names = tuple(names)
     parts = {name: members(name, among) for name in names}
@@ -112,12 +109,12 @@ def methods_named(names: Iterable[str], among: Mapping[str, Method]) -> list[Met
 
 
 def describe_methods() -> dict[str, str]:
-    """What each method that scores views is, by its name, in one sentence."""
+    """Return a sentence on each method that scores views, by its name."""
     return {name: method.about for name, method in scorers().items()}
 
 
 def check_method(name: str) -> Method:
-    """The method of a name; a ConfigError if no method that scores views has it."""
+    """Return the scoring method of a name; a ConfigError if there is none."""
     if name not in scorers():
         raise ConfigError("unknown method", value=name, fix=f"There are {', '.join(scorers())}.")
     return scorers()[name]
@@ -170,9 +167,8 @@ def build_scorer(method: Method, localization_map: LocalizationMap, options: Sco
         fix = f"{error.fix} Weights of {', '.join(others)} serve every camera, as do methods without weights."
         raise CameraError(error.problem, path=options.weights, value=error.value, fix=fix) from None
     except WeightsError as error:
-        if error.path is not None or options.weights is None:
-            raise
-        raise WeightsError(error.problem, path=options.weights, value=error.value, fix=error.fix) from None
+        path = error.path or options.weights
+        raise WeightsError(error.problem, path=path, value=error.value, fix=error.fix) from None
     scorer.name = method.name
     if options.weights is not None:
         warn_of_features(localization_map.landmarks.features, options.weights, stacklevel=3)

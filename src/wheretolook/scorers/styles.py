@@ -1,4 +1,4 @@
-"""How methods are named and drawn, the same in every figure and table."""
+"""Styles of methods in figures and tables."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import replace
 from wheretolook.scorers.method import Group, MethodStyle
 from wheretolook.scorers.registry import find
 
-ORACLE = "oracle"  # name of what knows the labels and chooses the best there is, in tables and figures
+ORACLE = "oracle"  # the best views by their labels, in tables and figures
 
 _ORACLE_STYLE = MethodStyle("oracle", "#000000", "*", "-")
 
 _SPARE = (("#CC79A7", "8", (0, (1, 1))), ("#F0E442", "H", (0, (4, 2))), ("#7F3C8D", "3", (0, (2, 1))))
-"""Of methods that are not installed here."""
+"""Styles of methods that are not installed."""
 
 
 def method_style(name: str) -> MethodStyle:
-    """Style of a method. What follows a space in its name, such as a file of weights, is added to the label."""
+    """Return the style of a method; what follows a space in its name, such as a weights file, is added to the label."""
     if name == ORACLE:
         return _ORACLE_STYLE
     method = find(name)
@@ -27,6 +27,6 @@ def method_style(name: str) -> MethodStyle:
 
 
 def method_group(name: str) -> Group:
-    """Which group a method belongs to; one that is not known is a rule."""
+    """Return the group of a method; "rules" for an unknown one."""
     method = find(name)
     return "rules" if method is None else method.group

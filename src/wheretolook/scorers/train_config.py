@@ -1,4 +1,4 @@
-"""Options of the train stage: those that all learners share, and a group for each learner's own."""
+"""Options of the train command: those that all learners share, and a group for each learner's own."""
 
 from __future__ import annotations
 
@@ -6,14 +6,9 @@ from dataclasses import dataclass, field, fields, make_dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.scorers.method import Method
-from wheretolook.scorers.mlp.config import MlpConfig
 from wheretolook.scorers.registry import learned, methods_named
 from wheretolook.training.config import SharedConfig
 from wheretolook.utils.errors import ConfigError
-
-MOVED = {f"train.{option.name}": f"train.mlp.{option.name}" for option in fields(MlpConfig)}
-MOVED["train.variants"] = "It is train.methods now, with the names of methods: mlp-2d+z for 2d+z."
-"""Where options have gone that had another name before."""
 
 
 def _trained_unasked() -> tuple[str, ...]:
@@ -29,16 +24,16 @@ class _NamedMethods(SharedConfig):
         methods_named(self.methods, learned())
 
     def chosen(self) -> list[Method]:
-        """The methods to train, in the order asked for."""
+        """Return the methods to train, in the order of the option."""
         return methods_named(self.methods, learned())
 
     def options_of(self, method: Method) -> Any:
-        """The options that a method is trained with: those of its group, but for what it sets itself."""
+        """Return the options of a method: those of its group, with its own `settings`."""
         return replace(getattr(self, method.folder), **method.settings)
 
 
 def _train_config() -> type:
-    """`SharedConfig` with a field for the options of each folder of learned methods."""
+    """Make `SharedConfig` with a field for the options of each folder of learned methods."""
     groups: dict[str, type] = {}
     for method in learned().values():
         assert method.config is not None
@@ -59,7 +54,7 @@ def _train_config() -> type:
 if TYPE_CHECKING:
 
     class TrainConfig(_NamedMethods):
-        """Options of the train stage; made of the methods there are."""
+        """Options of the train command, made from the registered methods."""
 
         def __init__(self, **options: Any) -> None: ...
 

@@ -1,4 +1,4 @@
-"""The most visible landmarks win."""
+"""Prefers views with the most visible landmarks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from wheretolook.scorers.method import MethodStyle, rule
 
 
 class VisibleScorer(CountingScorer):
-    """Share of the map's landmarks that a view sees (paper, Sec. 3.2)."""
+    """Share of the map's landmarks that are visible (paper, Sec. 3.2)."""
 
     name = "visible"
 

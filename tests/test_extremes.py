@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from open3d_renderer import Open3DRenderer
 from planning.rooms import CAMERA, DIRECTIONS, GRID, room_landmarks
 from selection.room import WEIGHTS
 from synthetic_dataset import make_landmarks
+from twins.open3d_renderer import Open3DRenderer
 from twins.visibility import count_plain
 from wheretolook.cli import main
 from wheretolook.dataset.sampling import sample_viewpoints
@@ -28,7 +28,6 @@ from wheretolook.scorers.registry import make_scorer, scorers
 from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils import memory
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.visibility.counting import FrustumCounter
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import NoOcclusion
 from wheretolook.visibility.survey import SurveyOptions, survey
@@ -74,11 +73,6 @@ def test_flat_and_tiny_maps_are_scored_by_every_method(name: str) -> None:
     counts = survey(CAMERA, rotation_looking_along(FORWARD), np.zeros((1, 3)), landmarks.points, NoOcclusion()).counts
     assert counts[0, 0] == seen[0] or hides.name != "none"
     assert np.isfinite(MappedSpace(landmarks.points, [(0.5, 0.5, 0.0)]).bounds).all()
-
-
-def test_landmarks_that_coincide_are_free_together() -> None:
-    assert HiddenPointRemoval().unoccluded(np.zeros((1, 3)), MAPS["coincident"].points).all()
-    assert HiddenPointRemoval().unoccluded(np.zeros((1, 3)), MAPS["coplanar"].points).any()
 
 
 def test_a_view_exactly_on_a_landmark() -> None:
@@ -147,16 +141,6 @@ def test_more_directions_than_memory_holds_are_refused_at_once() -> None:
             refused()
 
 
-def test_the_cells_of_very_many_directions_stay_few() -> None:
-    many = FrustumCounter(CAMERA, np.broadcast_to(np.eye(3), (70_000, 3, 3)), 10)
-    assert many.size == 8
-    from wheretolook.visibility.sphere_cells import MOST_CELLS, choose_size
-
-    assert choose_size(2_000_000) == 256
-    assert choose_size(2_000_000, 70_000) ** 2 * 70_000 <= MOST_CELLS
-    assert choose_size(2_000_000, 500) == 256
-
-
 def test_a_grid_of_a_hundred_thousand_along_each_side_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -171,14 +155,6 @@ def test_a_grid_of_a_hundred_thousand_along_each_side_is_refused(
         VoxelGrid((0, 0, 0), (1, 1, 1), huge).centers()
     assert main(["sample", "--data", str(tmp_path), "--sample.grid", "[100000, 100000, 100000]"]) == 2
     assert "would fit" in capsys.readouterr().err
-
-
-def test_short_sides_of_a_grid_too_large_stay(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "available_bytes", lambda: 200_000_000)
-    with pytest.raises(ConfigError) as caught:
-        check_voxels((100_000, 3, 100_000))
-    assert caught.value.fix is not None and ", 3, " in caught.value.fix
-    check_voxels((100, 100, 100))
 
 
 def test_more_counts_or_viewpoints_than_memory_holds_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

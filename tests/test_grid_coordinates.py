@@ -12,9 +12,9 @@ import pytest
 
 from box_scenes import ROOM, furnished_room
 from mapping.conftest import BoxFreeSpace, box_room
-from open3d_renderer import Open3DRenderer
 from planning.rooms import CAMERA, DIRECTIONS, GRID, free_voxels, room_landmarks
 from selection.room import POINTS, WEIGHTS, write_room
+from twins.open3d_renderer import Open3DRenderer
 from wheretolook import WhereToLook
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.geometry.camera import PinholeCamera

@@ -6,14 +6,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from wheretolook.dataset.sampling import free_locations, sample_viewpoints
+from wheretolook.dataset.sampling import sample_viewpoints
 from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.viewpoint_table import SCHEMA, poses
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.geometry.poses import camera_centers, transform
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility.occlusion import NoOcclusion, StoredOcclusion
 
 CAMERA = PinholeCamera(320, 240, 160.0)
@@ -103,15 +103,6 @@ def test_directions_may_differ_by_split() -> None:
     for bad in ({"train": 3}, {"train": 3, "val": 1, "test": -1}, -1):
         with pytest.raises(ConfigError, match="max_directions"):
             SampleConfig(max_directions=bad)  # type: ignore[arg-type]
-
-
-def test_a_scene_without_free_space_says_so() -> None:
-    class Solid:
-        def is_free(self, points: np.ndarray) -> np.ndarray:
-            return np.zeros(len(points), dtype=bool)
-
-    with pytest.raises(SceneError, match="none of the 32 locations is in free space"):
-        free_locations(GRID, Solid())  # type: ignore[arg-type]
 
 
 def test_negative_numbers_are_refused() -> None:

@@ -20,7 +20,7 @@ from wheretolook.geometry.camera import (
     read_cameras,
     write_cameras,
 )
-from wheretolook.utils.errors import ConfigError, TableError
+from wheretolook.utils.errors import ConfigError
 
 FISHEYE = ColmapCamera("OPENCV_FISHEYE", 640, 480, (220.0, 221.0, 318.0, 242.0, 0.01, -0.002, 0.0, 0.0))
 OFF_CENTER = PinholeCamera(1280, 720, 900.0, 910.0, (620.0, 371.0))
@@ -76,18 +76,6 @@ def test_the_papers_camera_is_the_default() -> None:
 def test_what_is_no_camera_is_told(options: dict[str, object], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         _ = CameraConfig(**options).camera  # type: ignore[arg-type]
-
-
-def test_a_damaged_list_of_cameras_is_named(tmp_path: Path) -> None:
-    for line in (
-        "1 PINHOLE 640 480 320",
-        "one PINHOLE 640 480 320 320 320 240",
-        "1 PINHOLE 0 480 320 320 320 240",
-        "1",
-    ):
-        (tmp_path / "cameras.txt").write_text(line)
-        with pytest.raises(TableError, match=r"cameras\.txt"):
-            read_cameras(tmp_path / "cameras.txt")
 
 
 def test_drawn_cameras_are_those_that_people_have() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera, cameras_by_id, only_camera
 from wheretolook.mapping.colmap_model import read_model
-from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.errors import MapError
 
 
 def test_opencv_model_projects_as_opencv() -> None:
@@ -22,14 +22,6 @@ def test_opencv_model_projects_as_opencv() -> None:
     seen = camera.sees(points)
     assert seen.mean() > 0.9
     np.testing.assert_allclose(camera.project(points)[seen], expected[seen, 0], atol=1e-9)
-
-
-def test_a_pinhole_of_colmap_is_our_pinhole() -> None:
-    ours = PinholeCamera(640, 480, 320.0)
-    colmap = ColmapCamera("SIMPLE_PINHOLE", 640, 480, (320.0, 320.0, 240.0))
-    points = np.random.default_rng(0).normal(size=(5000, 3))
-    in_front = points[:, 2] > 1e-3
-    np.testing.assert_array_equal(colmap.sees(points), in_front & ours.in_image(ours.project(points)))
 
 
 def test_distortion_that_turns_back_does_not_bring_the_side_into_view() -> None:
@@ -78,10 +70,3 @@ def test_the_camera_of_a_map(tmp_path: Path) -> None:
         only_camera(cameras_by_id(read_model(tmp_path).cameras, tmp_path), tmp_path)
     with pytest.raises(MapError, match="nowhere"):
         read_model(tmp_path / "nowhere")
-
-
-def test_unknown_models_and_wrong_parameters_are_named() -> None:
-    with pytest.raises(ConfigError, match="PLENOPTIC"):
-        ColmapCamera("PLENOPTIC", 640, 480, (1.0,))
-    with pytest.raises(ConfigError, match="fx, fy, cx, cy, k1, k2, p1, p2"):
-        ColmapCamera("OPENCV", 640, 480, (300.0,))

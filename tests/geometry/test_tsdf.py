@@ -46,17 +46,6 @@ def test_a_depth_camera_may_have_two_focal_lengths_and_its_own_centre() -> None:
         DepthImage(depth, ColmapCamera("RADIAL", 320, 240, (200.0, 160.0, 120.0, 0.1, 0.0)), pose)
 
 
-def test_a_depth_image_must_fit_its_camera() -> None:
-    pose = np.eye(4)[:3]
-    with pytest.raises(ConfigError, match=r"240 x 320 pixels.*\(got \(320, 240\)\)"):
-        DepthImage(np.ones((320, 240)), CAMERA, pose)
-    with pytest.raises(ConfigError, match="uint16"):
-        DepthImage(np.ones((240, 320), np.uint16), CAMERA, pose)
-    for bad in (np.eye(4), 2 * pose, np.full((3, 4), np.nan), pose * [[-1.0], [1], [1]]):
-        with pytest.raises(ConfigError, match="rigid transform"):
-            DepthImage(np.ones((240, 320)), CAMERA, bad)
-
-
 def test_voxels_that_do_not_fit_the_memory_are_refused_before_the_fusion(
     images: list[DepthImage], volume: TsdfVolume, monkeypatch: pytest.MonkeyPatch
 ) -> None:

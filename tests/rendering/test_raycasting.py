@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from box_scenes import CABINET, ROOM, furnished_room, random_triangles
-from open3d_renderer import raycasting_scene
+from twins.open3d_renderer import raycasting_scene
 from wheretolook.rendering.raycasting import MeshRaycaster
 
 
@@ -50,26 +50,6 @@ def test_cast_in_a_box_in_closed_form():
     assert np.isinf(outside.distance_m[0]) and outside.triangle[0] == -1 and not outside.front[0]
     with pytest.raises(ValueError, match="origins"):
         raycaster.cast(np.zeros((2, 3)), np.zeros((3, 3)))
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_occlusion_agrees_with_open3d(seed, device):
-    rng = np.random.default_rng(seed)
-    mesh = random_triangles(seed, n_triangles=60)
-    margin_m = 0.05
-    origins = rng.uniform(-3, 3, (7, 3))
-    points = rng.uniform(-3, 3, (900, 3))
-    occluded = MeshRaycaster(mesh, device).occluded(origins, points, margin_m)
-    rays = points[None] - origins[:, None]
-    distance_m = np.linalg.norm(rays, axis=-1)
-    reach = (1 - margin_m / distance_m)[..., None]
-    start = np.broadcast_to(origins[:, None], rays.shape)
-    expected = raycasting_scene(mesh).test_occlusions(open3d_rays(start, rays * reach), tnear=0, tfar=1).numpy()
-    expected &= distance_m > margin_m
-    assert 0.1 < expected.mean() < 0.9
-    assert np.mean(occluded == expected) > 0.999
-    blocked = MeshRaycaster(mesh, device, block_rays=1000).occluded(origins, points, margin_m)
-    np.testing.assert_array_equal(blocked, occluded)
 
 
 def test_occlusion_margin():

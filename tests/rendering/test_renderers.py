@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
-from multiprocessing import get_context
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from box_scenes import furnished_room, quads_mesh, random_texture, random_triangles
-from open3d_renderer import Open3DRenderer
+from twins.open3d_renderer import Open3DRenderer
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along, transform
+from wheretolook.rendering.registry import make_renderer
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.utils.errors import ConfigError, SceneError
 
@@ -85,26 +84,6 @@ def test_one_texel_a_pixel_reproduces_the_texture(renderer):
 
 
 @RENDERERS
-def test_texture_coordinates_repeat_and_interpolate(renderer):
-    # A texture of 2 x 1 texels over 8 pixels: texel centres fall between pixels 1|2 and 5|6.
-    camera = PinholeCamera(8, 4, 10.0)
-    texture = np.array([[[0] * 3, [240] * 3]], dtype=np.uint8)
-    image = renderer(facing_wall(camera, texture, texels_per_pixel=(0.25, 0.25))).render(camera, LOOK_ALONG_Y).rgb[0]
-    np.testing.assert_array_equal(image[1:3, :, 0], [[90, 30, 30, 90, 150, 210, 210, 150]] * 2)
-
-
-@RENDERERS
-def test_minified_texture_is_box_averaged(renderer):
-    # A pixel covers 4 x 4 texels: mip level 2 exactly, whose texels are the averages of 4 x 4.
-    camera = PinholeCamera(16, 12, 20.0)
-    texture = random_texture(np.random.default_rng(1), 48, 64)
-    wall = facing_wall(camera, texture, texels_per_pixel=(4, 4))
-    expected = texture.reshape(12, 4, 16, 4, 3).mean(axis=(1, 3))
-    image = renderer(wall).render(camera, LOOK_ALONG_Y).rgb[0]
-    assert np.abs(image - expected).max() <= 1.5  # two roundings to whole numbers
-
-
-@RENDERERS
 def test_stretched_footprint_is_averaged_along_its_long_side_only(renderer):
     camera = PinholeCamera(16, 12, 20.0)
     texture = random_texture(np.random.default_rng(2), 12, 64)
@@ -112,20 +91,6 @@ def test_stretched_footprint_is_averaged_along_its_long_side_only(renderer):
     expected = texture.reshape(12, 16, 4, 3).mean(axis=2)
     image = renderer(wall).render(camera, LOOK_ALONG_Y).rgb[0]
     assert np.abs(image - expected).max() <= 1
-
-
-@RENDERERS
-@pytest.mark.parametrize("direction", [(0, 1, 0), (0.6, 0.8, 0), (0.3, 0.4, 0.6)])
-def test_fine_checkerboard_far_away_is_grey(renderer, direction):
-    camera = PinholeCamera(40, 30, 20.0)
-    checker = np.repeat(np.indices((64, 64)).sum(0)[:, :, None] % 2 * 255, 3, axis=2).astype(np.uint8)
-    quad = [(-50, 4, -50), (50, 4, -50), (50, 4, 50), (-50, 4, 50)]
-    images = renderer(quads_mesh([quad], [checker], repeat=100.0)).render(
-        camera, poses_looking_along([[0, 0, 0]], [direction])
-    )
-    seen = images.rgb[images.depth_m > 0]
-    assert len(seen) > 500
-    assert np.abs(seen - 127.5).max() <= 2
 
 
 @RENDERERS
@@ -167,29 +132,6 @@ def test_blocks_do_not_change_the_images(device):
     assert WarpRenderer(mesh).render(camera, poses[:0]).rgb.shape == (0, 30, 40, 3)
 
 
-def test_blocks_are_smaller_where_a_mesh_has_many_vertices(monkeypatch):
-    mesh = random_triangles(1)
-    camera = PinholeCamera(8, 6, 5.0)
-    renderer = WarpRenderer(mesh, block_bytes=3 * (8 * 6 * 15 + 24 * len(mesh.vertices)))
-    sizes = []
-    draw = renderer._rasterize
-    monkeypatch.setattr(
-        renderer, "_rasterize", lambda camera, poses, *images: (sizes.append(len(poses)), draw(camera, poses, *images))
-    )
-    renderer.render(camera, np.repeat(LOOK_ALONG_Y, 7, axis=0))
-    assert sizes == [3, 3, 1]
-
-
-@pytest.mark.parametrize("method", ["raster", "rays"])
-def test_a_mesh_without_triangles_is_refused(method):
-    mesh = random_triangles(0)
-    nothing = replace(
-        mesh, triangles=mesh.triangles[:0], corner_uvs=mesh.corner_uvs[:0], triangle_texture=mesh.triangle_texture[:0]
-    )
-    with pytest.raises(SceneError, match="no triangle"):
-        WarpRenderer(nothing, method=method)
-
-
 def test_a_plane_through_the_camera_is_not_seen():
     # Edge-on, and in the plane of a row of pixels' rays.
     camera = PinholeCamera(41, 31, 20.0)
@@ -201,29 +143,6 @@ def test_a_plane_through_the_camera_is_not_seen():
         pose = LOOK_ALONG_Y.copy()
         pose[0, :, :3] = pose[0, :, :3] @ turn.T
         assert (WarpRenderer(mesh).render(camera, pose).rgb == 200).all()
-
-
-@RENDERERS
-def test_bad_poses_are_refused(renderer):
-    scene = renderer(random_triangles(0))
-    with pytest.raises(ValueError, match=r"\(B, 3, 4\)"):
-        scene.render(PinholeCamera(), np.eye(4)[None])
-    with pytest.raises(ValueError, match="NaN"):
-        scene.render(PinholeCamera(), np.full((1, 3, 4), np.nan))
-
-
-def test_unknown_device_is_refused():
-    with pytest.raises(ConfigError, match="no such device"):
-        WarpRenderer(random_triangles(0), device="cuda:99")
-
-
-def test_rasterizing_is_refused_on_a_gpu(device):
-    if device == "cpu":
-        assert WarpRenderer(random_triangles(0)).method == "raster"
-    else:
-        assert WarpRenderer(random_triangles(0), device).method == "rays"
-        with pytest.raises(ConfigError, match="CPU alone"):
-            WarpRenderer(random_triangles(0), device, method="raster")
 
 
 @pytest.mark.parametrize("turn", range(4))
@@ -244,26 +163,12 @@ def test_rasterizing_leaves_no_gap_on_edges_through_pixel_centres(turn):
         np.testing.assert_allclose(image.depth_m, 2.0, rtol=1e-6)
 
 
-def test_rasterizing_a_triangle_through_the_camera_plane():
-    # A floor from far behind the camera to far before it: depth is the height over the ray's slope, up to its far end.
-    camera = PinholeCamera(40, 31, 20.0)
-    corners = [(-1e3, -1e3, -1.5), (1e3, -1e3, -1.5), (1e3, 1e3, -1.5), (-1e3, 1e3, -1.5)]
-    floor = quads_mesh([corners], [np.full((1, 1, 3), 90, np.uint8)])
-    depth_m = WarpRenderer(floor).render(camera, LOOK_ALONG_Y).depth_m[0]
-    below = (np.arange(31) + 0.5 - 15.5) / 20.0
-    np.testing.assert_array_equal(depth_m[below <= 0], 0)
-    expected = np.broadcast_to(1.5 / below[below > 0, None], depth_m[below > 0].shape)
-    np.testing.assert_allclose(depth_m[below > 0], expected, rtol=1e-5)
-
-
-def _render_in_worker(seed):
-    camera = PinholeCamera(20, 15, 12.0)
-    return WarpRenderer(random_triangles(seed)).render(camera, LOOK_ALONG_Y).rgb
-
-
-@pytest.mark.slow
-def test_renders_in_spawned_processes():
-    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        images = list(pool.map(_render_in_worker, [0, 1]))
-    for seed, image in enumerate(images):
-        np.testing.assert_array_equal(image, _render_in_worker(seed))
+def test_invalid_input() -> None:
+    with pytest.raises(SceneError):
+        WarpRenderer(replace(furnished_room(), triangles=np.zeros((0, 3), np.int32)))
+    with pytest.raises(ConfigError):
+        WarpRenderer(furnished_room(), "cuda:99")
+    with pytest.raises(ConfigError):
+        make_renderer(furnished_room(), name="unknown")
+    with pytest.raises(ValueError):
+        make_renderer(furnished_room()).render(PinholeCamera(8, 6, 4.0), np.full((1, 3, 4), np.nan))

@@ -125,13 +125,6 @@ def test_floor_below():
     np.testing.assert_array_equal(free_space.bounds, [(0, 0, 0), ROOM])
 
 
-def test_a_steep_surface_is_no_floor():
-    ramp = [[(0, 0, 0), (1, 0, 3), (1, 5, 3), (0, 5, 0)]]  # 72 degrees
-    room = box_quads((0, 0, 0), ROOM, inward=True)
-    mesh = quads_mesh(np.concatenate([room, ramp]), [np.zeros((1, 1, 3), np.uint8)])
-    assert np.isnan(FreeSpace(mesh, FreeSpaceConfig(two_sided=True)).floor_below([(0.3, 2, 2)])).all()
-
-
 def test_bad_config():
     with pytest.raises(ConfigError, match="positive"):
         FreeSpaceConfig(clearance_m=0.0)

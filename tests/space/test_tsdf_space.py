@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 
 from depth_room import CAMERA, ROOM, depth_images, room
-from planning.rooms import patiently
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.geometry.tsdf import DepthImage, TsdfConfig, TsdfVolume
-from wheretolook.planning.config import PathConfig
-from wheretolook.planning.rrt import plan_path
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.space.config import FreeSpaceConfig
 from wheretolook.space.free_space import FreeSpace
@@ -54,30 +51,6 @@ def test_a_camera_is_free_where_it_is_by_the_mesh_but_never_near_a_surface(
     assert free[away & by_mesh].mean() > 0.995
 
 
-def test_ways_never_come_near_a_surface(space: TsdfSpace) -> None:
-    ends = random_points(4000, seed=2, beyond_m=0.0)
-    ends = ends[space.is_free(ends)]
-    a = ends[: len(ends) // 2]
-    b = ends[len(ends) // 2 : len(ends) // 2 * 2]
-    free = space.segments_are_free(a, b)
-    raycaster = MeshRaycaster(room())
-    assert not free[~raycaster.segments_are_clear(a, b, CLEARANCE_M - VOXEL_M)].any()
-    clear = raycaster.segments_are_clear(a, b, CLEARANCE_M + VOXEL_M)
-    assert clear.sum() > 50 and (~clear).sum() > 50 and free[clear].mean() > 0.9
-    np.testing.assert_array_equal(space.segments_are_free(b, a), free)
-    assert space.segments_are_free(a[:3], a[:3]).all() and len(space.segments_are_free(a[:0], a[:0])) == 0
-
-
-def test_few_images_leave_holes_but_no_way_through_them(images: list[DepthImage]) -> None:
-    """A part of the ceiling that no image saw is not free either."""
-    space = space_of(images[::4])
-    points = random_points(6000, beyond_m=0.0)
-    free = space.is_free(points)
-    distance = MeshRaycaster(room()).distance_to_surface(points, 1.0)
-    assert not free[distance < CLEARANCE_M - VOXEL_M].any()
-    assert 0.2 < free[FreeSpace(room()).is_free(points)].mean() < 0.95
-
-
 def test_what_no_image_saw_is_not_free(images: list[DepthImage]) -> None:
     """The cameras are on one side of the wall, from where a part of the other side is hidden."""
     west = [image for image in images if -image.cam_from_world[:, :3].T[0] @ image.cam_from_world[:, 3] < 1.8]
@@ -109,15 +82,3 @@ def test_an_image_sees_up_to_its_readings() -> None:
     points = np.array([[0.1, 1.9, 0], [0.1, 2.1, 0], [0.1, -1.0, 0], [-0.1, 1.0, 0], [0.5, 0.1, 0], [0.1, 1.0, 1.5]])
     np.testing.assert_array_equal(seen_through(points, [image], 10.0, False), [True, *[False] * 5])
     assert not seen_through(points, [image], 1.5, False).any()
-
-
-def test_a_path_is_planned_in_it(space: TsdfSpace) -> None:
-    start = (0.7, 0.7, 1.2)  # either side of the wall
-    goal = (3.3, 0.7, 1.2)
-    path = patiently(
-        lambda seconds: plan_path(start, goal, space, space.bounds, config=PathConfig(time_s=seconds), progress=False),
-        seconds=1.0,
-    )
-    np.testing.assert_allclose(path.positions[[0, -1]], [start, goal])
-    clear = MeshRaycaster(room()).segments_are_clear(path.positions[:-1], path.positions[1:], CLEARANCE_M - VOXEL_M)
-    assert clear.all() and path.positions[:, 1].max() > 2 and space.is_free(path.positions).all()

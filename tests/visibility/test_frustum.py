@@ -8,12 +8,10 @@ import pytest
 from conftest import RandomViews
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import rotation_looking_along, transform
-from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility.frustum import (
     MIN_DEPTH_M,
     LandmarkSets,
     PosedViews,
-    _starts,
     in_view,
     landmarks_in_view,
     landmarks_in_view_plain,
@@ -28,11 +26,6 @@ def test_sparse_rows_of_a_mask() -> None:
     sets = LandmarkSets.from_mask(mask)
     assert sets.starts.tolist() == [0, 2, 2, 4]
     assert [sets[row].tolist() for row in range(len(sets))] == [[0, 2], [], [1, 2]]
-
-
-def test_more_entries_than_an_int32_counts_are_refused() -> None:
-    with pytest.raises(ConfigError, match="4294967294"):
-        _starts(np.array([2**31 - 1, 2**31 - 1]))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import TableError
-from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion, StoredOcclusion
+from wheretolook.visibility.occlusion import MeshOcclusion, StoredOcclusion
 
 
 def screen(size_m: float = 1.0) -> TexturedMesh:
@@ -43,10 +43,6 @@ def test_a_landmark_on_a_surface_is_not_hidden_by_it() -> None:
     points = np.array([[1.0, 0, 0], [1.03, 0.1, 0.1], [1.3, 0, 0]])
     seen = MeshOcclusion(MeshRaycaster(screen()), margin_m=0.05).unoccluded(np.zeros((1, 3)), points)
     assert seen.tolist() == [[True, True, False]]
-
-
-def test_without_occlusion_all_is_seen() -> None:
-    assert NoOcclusion().unoccluded(np.zeros((2, 3)), np.zeros((5, 3))).all()
 
 
 def test_stored_occlusion_comes_back_by_location(tmp_path: Path) -> None:

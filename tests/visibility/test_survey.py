@@ -135,14 +135,6 @@ def test_points_on_the_device_can_be_used_again(random_views: RandomViews, devic
         np.testing.assert_array_equal(seen.counts, plain)
 
 
-def test_a_distorted_camera_surveys(random_views: RandomViews, device: str) -> None:
-    v = random_views
-    camera = ColmapCamera("RADIAL", 640, 480, (300.0, 320.0, 240.0, -0.2, 0.03))
-    rotations = rotation_looking_along(v.directions)
-    seen = survey(camera, rotations, v.locations, v.points, Given(v.locations, v.mask), SurveyOptions(device=device))
-    np.testing.assert_array_equal(seen.counts, count_plain(camera, rotations, v.locations, v.points, v.mask))
-
-
 class Untouchable(NoOcclusion):
     def unoccluded_on_device(self, locations: Float, points: DevicePoints) -> None:
         raise AssertionError("long work")

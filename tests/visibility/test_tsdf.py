@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from depth_room import CAMERA, depth_images, free_points, room
 from mask_agreement import MaskAgreement
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.tsdf import DepthImage, TsdfConfig, TsdfVolume
+from wheretolook.geometry.tsdf import DepthImage, TsdfVolume
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.visibility.occlusion import MeshOcclusion
@@ -65,60 +64,11 @@ def test_thin_walls_seen_from_both_sides(wall_m: float, precision: float, recall
     assert agreement.recall >= recall
 
 
-def test_pixels_without_reading_neither_occlude_nor_carve(images: list[DepthImage]) -> None:
-    rng = np.random.default_rng(5)
-    marks = np.array([0, np.nan, np.inf, -np.inf, -1, 1e6], dtype=np.float32)
-    holed = []
-    for image in images:
-        hole = rng.random(image.depth_m.shape) < 0.02
-        top = rng.integers(0, 180)
-        left = rng.integers(0, 240)
-        hole[top : top + 60, left : left + 80] = True
-        depth = np.where(hole, rng.choice(marks, image.depth_m.shape), image.depth_m)
-        holed.append(DepthImage(depth, image.camera, image.cam_from_world))
-    blind = DepthImage(np.full((240, 320), np.nan, np.float32), CAMERA, images[0].cam_from_world)
-    volume = TsdfVolume.from_images([blind, *holed], progress=False)
-    locations, points, truth = lines_of_sight(room(), seed=2)
-    agreement = MaskAgreement.between(TsdfOcclusion(volume).unoccluded(locations, points), truth)
-    assert agreement.precision >= 0.98
-    assert agreement.recall >= 0.98
-
-
 def test_what_nothing_has_seen_hides_nothing() -> None:
     wall = DepthImage(np.full((240, 320), 2.0), CAMERA, np.eye(4)[:3])  # the plane z = 2 m, about 4 m wide
     occlusion = TsdfOcclusion(TsdfVolume.from_images([wall], progress=False))
     points = np.array([[0, 0, 1.9], [0, 0, 2.03], [0, 0, 3], [0, 0, -3], [9, 0, 3.0]])
     assert occlusion.unoccluded(np.zeros((1, 3)), points).tolist() == [[True, True, False, True, True]]
-
-
-def test_more_blocks_than_expected_change_nothing(images: list[DepthImage]) -> None:
-    config = TsdfConfig(voxel_size_m=0.04)
-    small = TsdfVolume(config, expected_blocks=16)
-    large = TsdfVolume(config, expected_blocks=1 << 15)
-    for image in images[:30]:
-        small.integrate(image)
-        large.integrate(image)
-    assert len(small) == len(large) > 500
-    locations, points, _ = lines_of_sight(room(), seed=6)
-    mask = TsdfOcclusion(small).unoccluded(locations, points)
-    np.testing.assert_array_equal(mask, TsdfOcclusion(large).unoccluded(locations, points))
-    assert TsdfOcclusion(large).unoccluded(locations[:0], points).shape == (0, len(points))
-    assert TsdfOcclusion(large).unoccluded(locations, points[:0]).shape == (len(locations), 0)
-
-
-def test_moving_the_world_changes_little(images: list[DepthImage]) -> None:
-    turn = Rotation.from_euler("zyx", [0.7, -0.4, 0.3]).as_matrix()
-    shift = np.array([12.3, -45.6, 7.8])
-    moved = []
-    for image in images:
-        rotation = image.cam_from_world[:, :3] @ turn.T
-        translation = image.cam_from_world[:, 3] - rotation @ shift
-        moved.append(DepthImage(image.depth_m, CAMERA, np.column_stack([rotation, translation])))
-    occlusion = TsdfOcclusion(TsdfVolume.from_images(moved, progress=False))
-    locations, points, truth = lines_of_sight(room(), seed=2)
-    agreement = MaskAgreement.between(occlusion.unoccluded(locations @ turn.T + shift, points @ turn.T + shift), truth)
-    assert agreement.precision >= 0.98
-    assert agreement.recall >= 0.98
 
 
 def test_a_location_inside_geometry_is_refused(occlusion: TsdfOcclusion) -> None:
@@ -133,13 +83,6 @@ def test_a_location_inside_geometry_is_refused(occlusion: TsdfOcclusion) -> None
         with pytest.raises(SceneError, match=r"inside geometry|not finite") as caught:
             occlusion.check(np.vstack([free, location]), free)
         assert repr(tuple(np.float64(location).tolist())) in str(caught.value)
-
-
-def test_voxels_larger_than_the_scene_show_no_surface(images: list[DepthImage]) -> None:
-    with pytest.raises(SceneError, match="no surface"):
-        TsdfOcclusion(
-            TsdfVolume.from_images(images[:20], TsdfConfig(voxel_size_m=20.0, max_depth_m=20.0), progress=False)
-        )
 
 
 def test_a_margin_and_a_volume_without_sense_are_refused(volume: TsdfVolume) -> None:

@@ -1,4 +1,4 @@
-"""Which stages may run on a dataset beside which: one that changes it runs alone, those that only read it together."""
+"""Read and write locks of a dataset: a stage that changes it runs alone, stages that read it run together."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ R = TypeVar("R")
 
 
 def changes_dataset(stage: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Of a function of an experiment: while it runs, no other stage runs on the dataset. InUseError if one does."""
+    """Decorate a function of an experiment to hold the write lock. It raises InUseError if another stage runs."""
     return _holding(stage, shared=False)
 
 
 def reads_dataset(stage: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Of a function of an experiment: while it runs, no stage changes the dataset. InUseError if one does."""
+    """Decorate a function of an experiment to hold the read lock. It raises InUseError if a stage changes the dataset."""
     return _holding(stage, shared=True)
 
 
 @contextmanager
 def changing(root: Path, stage: str) -> Iterator[None]:
-    """Within this block no other stage runs on the dataset in this folder. Raises InUseError if one does.
+    """Hold the write lock of the dataset in a folder, and remove partial files of killed runs.
 
-    What killed runs left half written is removed first: nobody writes it any more.
+    Raises InUseError if another stage runs on it.
     """
     with hold(root / LOCK, stage):
         _remove_leftovers(root)
@@ -39,9 +39,10 @@ def changing(root: Path, stage: str) -> Iterator[None]:
 
 @contextmanager
 def reading(root: Path, stage: str, makes: str = "") -> Iterator[None]:
-    """Nothing changes the dataset in this folder while a stage reads it; what it makes of it, it alone makes.
+    """Hold the read lock of the dataset in a folder, and the write lock of one kind of result.
 
-    Raises InUseError if another stage changes the dataset, or makes the same: "weights", "results" or "paths".
+    `makes` is "weights", "results" or "paths". Raises InUseError if another stage changes the dataset, or makes the
+    same kind of result.
     """
     with hold(root / LOCK, stage, shared=True):
         if not makes or not root.is_dir():  # without a dataset nothing is made
@@ -55,7 +56,7 @@ def _remove_leftovers(root: Path) -> None:
     for pattern in (f".?*{LOCK}", "*.partial", "*/*.partial", "*/*/*.partial", "*/*/*/*.partial"):
         for path in root.glob(pattern):
             if not path.parent.resolve().is_relative_to(root.resolve()):
-                continue  # a link leads there, which the stage will refuse
+                continue  # only files within the dataset are deleted
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path, ignore_errors=True)
             else:
@@ -64,9 +65,9 @@ def _remove_leftovers(root: Path) -> None:
 
 
 def _holding(stage: str, shared: bool) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    def of(function: Callable[P, R]) -> Callable[P, R]:
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
         @wraps(function)
-        def alone(*args: P.args, **kwargs: P.kwargs) -> R:
+        def locked(*args: P.args, **kwargs: P.kwargs) -> R:
             experiment: Any = args[0] if args else kwargs["experiment"]
             try:
                 with (reading if shared else changing)(experiment.root, stage):
@@ -75,6 +76,6 @@ def _holding(stage: str, shared: bool) -> Callable[[Callable[P, R]], Callable[P,
                 with suppress(OSError):  # made for the lock of a stage that then found nothing to work on
                     experiment.root.rmdir()
 
-        return alone
+        return locked
 
-    return of
+    return decorate

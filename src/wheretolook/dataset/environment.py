@@ -382,7 +382,7 @@ class ColmapEnvironment(Environment):
         self.config = replace(config, occlusion=replace(config.occlusion, model=name))
 
     @cached_property
-    def _opened(self) -> OpenedMap:
+    def _map(self) -> OpenedMap:
         from wheretolook.mapping.opened_map import open_colmap
 
         files = self.files
@@ -392,17 +392,17 @@ class ColmapEnvironment(Environment):
     @property
     def camera(self) -> Camera:  # type: ignore[override]
         """The camera that will look."""
-        return self._opened.camera
+        return self._map.camera
 
     @property
     def landmarks(self) -> Landmarks:
         """The map's landmarks."""
-        return self._opened.landmarks
+        return self._map.landmarks
 
     @property
     def mapping_poses(self) -> Float:
         """Poses cam_from_world (M, 3, 4) of the mapping images."""
-        return self._opened.mapping_poses
+        return self._map.mapping_poses
 
     @property
     def has_mesh(self) -> bool:
@@ -442,10 +442,10 @@ class ColmapEnvironment(Environment):
         """The input of scorers; warns if the mesh seems to be in another frame."""
         from wheretolook.mapping.sanity import warn_of_mesh
 
-        opened = super().localization_map
+        result = super().localization_map
         if self.files.mesh is not None:
             warn_of_mesh(self.files.mesh, self.landmarks.points, self.raycaster)
-        return opened
+        return result
 
 
 class RenderedDepth(Sequence["DepthImage"]):

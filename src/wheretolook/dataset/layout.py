@@ -15,7 +15,7 @@ from wheretolook.dataset.names import NO_DATASET
 from wheretolook.dataset.sampling_config import Split
 from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of_record, read_cameras
 from wheretolook.geometry.poses import Float
-from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, compact_poses, holds_model, load_mapping_poses
+from wheretolook.mapping.colmap_model import CAMERAS_FILE, holds_model, load_mapping_poses
 from wheretolook.mapping.georeference import read_scale
 from wheretolook.utils.artifact_cache import ArtifactCache
 from wheretolook.utils.confine import safe_child
@@ -42,8 +42,8 @@ class SceneFolder:
 
     folder: Path  # `<data>/<dataset>/<scene>`
     split: Split  # the whole scene belongs to it
-    camera: Camera = PinholeCamera()  # the one that looks, where a viewpoint names none of `cameras.txt`
-    own_camera: bool = False  # whether that is the map's own, which settings that name no camera leave as it is
+    camera: Camera = PinholeCamera()  # of all viewpoints, unless they name one of `cameras.txt`
+    own_camera: bool = False  # it is the map's camera, which default settings keep
 
     @property
     def name(self) -> str:
@@ -57,7 +57,7 @@ class SceneFolder:
 
     @property
     def map(self) -> Path:
-        """Folder of the COLMAP model, with `landmarks.npz` and `cameras.npz` beside it."""
+        """Folder of the COLMAP model, `landmarks.npz` and `cameras.npz`."""
         return self.folder / "map"
 
     @property
@@ -77,11 +77,11 @@ class SceneFolder:
 
     @property
     def cameras_file(self) -> Path:
-        """Cameras that viewpoints name by their `camera_id`, in COLMAP's text format; only if there are several."""
+        """Cameras of viewpoints by `camera_id`, in COLMAP's text format; only if there are several."""
         return self.folder / "cameras.txt"
 
     def cameras(self) -> dict[int, Camera]:
-        """The cameras that look, by `camera_id`: those of `cameras.txt`, or the scene's one camera as number 0.
+        """The cameras of viewpoints by `camera_id`: those of `cameras.txt`, or the scene's one camera as number 0.
 
         Raises:
             TableError: the file is damaged.
@@ -126,25 +126,25 @@ class SceneFolder:
         return ArtifactCache(self.folder, key, stage, "stages.json", STAGES)
 
     def mapped_floor(self) -> MappedFloor:
-        """What `save_mapped_floor` has kept. Raises SceneError if its file is damaged."""
-        if not self._about.is_file():
+        """The floor that `save_mapped_floor` wrote. Raises SceneError if its file is damaged."""
+        if not self._description.is_file():
             return ()
         try:
-            rectangles = read_json_object(self._about)["mapped_floor"]
+            rectangles = read_json_object(self._description)["mapped_floor"]
             return tuple((float(x0), float(y0), float(x1), float(y1)) for x0, y0, x1, y1 in rectangles)
         except (ValueError, KeyError, TypeError) as error:
-            fix = "Remove it with the mesh beside it, and run the scenes stage again."
-            raise SceneError("damaged description of a scene", path=self._about, fix=fix) from error
+            fix = "Remove it and the mesh, and run the scenes stage again."
+            raise SceneError("damaged description of a scene", path=self._description, fix=fix) from error
 
     def save_mapped_floor(self, floor: MappedFloor) -> None:
-        """Keep the floor that the map is to be made from, as `scene.json` beside the mesh, if it is not all."""
+        """Write the floor that the map is to be made from to `scene.json`, unless it is all."""
         if floor:
-            write_json(self._about, {"mapped_floor": floor})
+            write_json(self._description, {"mapped_floor": floor})
         else:
-            self._about.unlink(missing_ok=True)
+            self._description.unlink(missing_ok=True)
 
     @property
-    def _about(self) -> Path:
+    def _description(self) -> Path:
         return self.folder / "scene.json"
 
     def read_table(self, matches: bool = False) -> pd.DataFrame:
@@ -154,14 +154,8 @@ class SceneFolder:
         return read_table(self.table, matches)
 
     def mapping_poses(self) -> Float | None:
-        """Poses cam_from_world (M, 3, 4) of the mapping images; None if neither their file nor a model is left.
-
-        Maps made before there was such a file have a COLMAP model, which tells the same. Raises MapError if the file or
-        the model is damaged.
-        """
-        if self.mapping_cameras.is_file():
-            return load_mapping_poses(self.mapping_cameras)
-        return compact_poses(colmap_poses(self.map)) if holds_model(self.map) else None
+        """Poses cam_from_world (M, 3, 4) of the mapping images; None if unknown. Raises MapError if damaged."""
+        return load_mapping_poses(self.mapping_cameras) if self.mapping_cameras.is_file() else None
 
     def read_landmarks(self) -> Landmarks:
         """The map's landmarks. Raises MapError if there is no file of them, or it is damaged."""
@@ -170,14 +164,14 @@ class SceneFolder:
         landmarks = Landmarks.load(self.landmarks)
         if landmarks.mapping_focal_px is not None:
             return landmarks
-        # before it was told, the camera that looks was the one that mapped
+        # in the release, viewpoints have the camera of the mapping images
         focal_px = np.full(len(landmarks), self.camera.mean_focal_px, dtype=np.float32)
         return replace(landmarks, mapping_focal_px=focal_px)
 
     def localization_map(self, camera: Camera | None = None, device: str = "cpu") -> LocalizationMap:
         """The scene's map with the occlusion stored for its sampled locations; the mesh is not needed.
 
-        For the scene's camera, unless another one looks.
+        Uses the scene's camera unless another one is given.
         """
         from wheretolook.inputs.localization_map import LocalizationMap
         from wheretolook.visibility.occlusion import StoredOcclusion
@@ -190,31 +184,23 @@ class SceneFolder:
 def views_by_camera(
     scene: SceneFolder, table: pd.DataFrame, at_most: int = 0
 ) -> Iterator[tuple[Camera, NDArray[np.int64]]]:
-    """Rows of a table of a scene's viewpoints that look with one camera, ascending, and this camera.
-
-    With `at_most` the rows come in blocks of so many.
+    """Yield each camera of a scene with the ascending rows of its viewpoints, in blocks of `at_most` unless that is 0.
 
     Raises:
-        TableError: a viewpoint names a camera that the scene has not.
+        TableError: a viewpoint names no camera of the scene.
     """
-    cameras = scene.cameras()
     from wheretolook.dataset.viewpoint_table import CAMERA_ID
 
-    if CAMERA_ID not in table:
-        numbers = np.full(len(table), next(iter(cameras)))
-        if len(cameras) > 1:
-            problem = "the scene has several cameras, and its viewpoints name none"
-            fix = "Run the sample stage again."
-            raise TableError(problem, path=scene.table, fix=fix)
-    else:
-        numbers = table[CAMERA_ID].to_numpy()
-    for number in np.unique(numbers).tolist():
-        if number not in cameras:
-            fix = "Run the sample stage again."
-            raise TableError("a viewpoint's camera is missing", path=scene.cameras_file, value=number, fix=fix)
-        rows = np.flatnonzero(numbers == number)
-        for begin in range(0, len(rows), at_most or len(rows)):
-            yield cameras[number], rows[begin : begin + (at_most or len(rows))]
+    cameras = scene.cameras()
+    ids = table[CAMERA_ID].to_numpy() if CAMERA_ID in table else np.full(len(table), next(iter(cameras)))
+    if (CAMERA_ID not in table and len(cameras) > 1) or not np.isin(ids, list(cameras)).all():
+        fix = "Run the sample stage again."
+        raise TableError("viewpoints name no camera of the scene", path=scene.cameras_file, fix=fix)
+    for number in np.unique(ids).tolist():
+        rows = np.flatnonzero(ids == number)
+        block = at_most or len(rows)
+        for begin in range(0, len(rows), block):
+            yield cameras[number], rows[begin : begin + block]
 
 
 @dataclass(frozen=True)
@@ -226,28 +212,24 @@ class Dataset:
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
-        """All that look in its scenes, each once."""
+        """All cameras of its scenes, each once."""
         return tuple(dict.fromkeys(camera for scene in self.scenes for camera in scene.cameras().values()))
 
     @property
     def camera(self) -> Camera:
-        """The camera that looks in all scenes. Raises ConfigError if there are several, or none."""
+        """The camera of all scenes. Raises ConfigError if there are several, or none."""
         if len(self.cameras) != 1:
             fix = "Use a method that serves every camera, such as set, or a dataset of one camera."
-            raise ConfigError("not one camera looks in this dataset", path=self.root, value=len(self.cameras), fix=fix)
+            raise ConfigError("this dataset has not one camera", path=self.root, value=len(self.cameras), fix=fix)
         return self.cameras[0]
 
     @property
     def features(self) -> str:
-        """Name of the features that all its maps are by; "" if they differ, or there is no map.
-
-        Raises:
-            MapError: a file of landmarks is damaged.
-        """
+        """Name of the features of all its maps; "" if they differ, or there is no map. Raises MapError if damaged."""
         from wheretolook.mapping.landmarks import features_of
 
-        found = {features_of(scene.landmarks) for scene in self.scenes if scene.landmarks.is_file()}
-        return found.pop() if len(found) == 1 else ""
+        names = {features_of(scene.landmarks) for scene in self.scenes if scene.landmarks.is_file()}
+        return names.pop() if len(names) == 1 else ""
 
     @property
     def name(self) -> str:
@@ -296,7 +278,7 @@ class Dataset:
     def load(cls, root: Path) -> Dataset:
         """Read a dataset folder.
 
-        Raises TableError if there is no valid `dataset.json`, ConfigError if a link in the folder leads out of it.
+        Raises TableError if there is no valid `dataset.json`.
         """
         path = root / "dataset.json"
         try:

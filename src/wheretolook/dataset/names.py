@@ -1,4 +1,4 @@
-"""Names in a folder of datasets: known without opening any, so that a wrong one is refused at once."""
+"""Names of datasets and scenes, checked without opening a dataset."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from wheretolook.utils.confine import safe_child
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.reading import read_json_object
 
-RELEASE = "release"  # name of the dataset, beside all others, that ships with its weights
+RELEASE = "release"  # name of the released dataset
 RELEASE_FILE = "release.json"  # what a release was made from; the file that makes a dataset one
 NO_DATASET = "Run the scenes stage first, or for a map of your own `wheretolook map --model SPARSE`."
 LOCK = ".lock"  # in a dataset's folder: held by stages that change it, shared by those that read it
 
 
 def check_scene_name(data: Path, name: str, dataset: str = "") -> None:
-    """Raise ConfigError if no dataset in a folder, or not the one named, has a folder of a scene's name.
+    """Check that a scene exists in a named dataset, or in any dataset of the folder `data`.
 
-    Also if a name would lead out of its folder; TableError if the dataset named is none.
+    Raises ConfigError if there is no such scene or a name leads out of its folder, TableError if the dataset is none.
     """
     if dataset:
         roots = [safe_child(data, dataset, "a dataset's name")]
@@ -33,14 +33,14 @@ def check_scene_name(data: Path, name: str, dataset: str = "") -> None:
 
 
 def no_such_scene(path: Path, name: str, roots: Iterable[Path]) -> NoReturn:
-    """Raise the ConfigError that lists the scenes of datasets instead."""
+    """Raise a ConfigError that lists the existing scenes."""
     scenes = [scene for root in roots for scene in scene_names(root)]
     fix = f"There are {', '.join(scenes)}." if scenes else "Make one with `wheretolook map --name NAME --model SPARSE`."
     raise ConfigError("there is no such scene", path=path, value=name, fix=fix)
 
 
 def scene_names(root: Path) -> list[str]:
-    """Names of a dataset's scenes as its description has them; none if that is damaged."""
+    """Names of a dataset's scenes; none if `dataset.json` is unreadable."""
     with suppress(OSError, ValueError, KeyError, TypeError):
         return [str(entry["name"]) for entry in read_json_object(root / "dataset.json")["scenes"]]
     return []

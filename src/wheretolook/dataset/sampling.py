@@ -73,8 +73,8 @@ def sample_viewpoints(
     numbers = np.array(list(several))[np.arange(len(ids)) % len(several)]
     if len(several) > 1:
         rng.shuffle(numbers)
-    around = (rotation_looking_along(directions), locations, landmarks.points, occlusion)
-    seen = _survey_by_camera(several, numbers, *around, options)
+    inputs = (rotation_looking_along(directions), locations, landmarks.points, occlusion)
+    seen = _survey_by_camera(several, numbers, *inputs, options)
     counts = seen.counts
     rank = np.full(seen.counts.shape, -1, dtype=np.int32)
     np.put_along_axis(rank, seen.best, np.arange(seen.best.shape[1])[None], axis=1)

@@ -1,4 +1,4 @@
-"""Limits of the pose error below which a viewpoint counts as localized."""
+"""Limits of the pose error for a viewpoint to count as localized."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def threshold_key(threshold: tuple[float, float]) -> str:
 
 
 def threshold_label(key: str) -> str:
-    """What `threshold_key` gives, for people: "5 cm, 0.4°"."""
+    """Display name of a `threshold_key`, such as "5 cm, 0.4°"."""
     metres, degrees = key.removesuffix("deg").split("m_")
     distance = f"{float(metres) * 100:g} cm" if float(metres) < 0.5 else f"{float(metres):g} m"
     return f"{distance}, {degrees}°"

@@ -1,4 +1,4 @@
-"""The table of viewpoints: one Parquet file a scene, one row a viewpoint, joined by ids and never by file order.
+"""Reads and writes the table of viewpoints: one Parquet file a scene, one row a viewpoint, joined by ids.
 
 A compact table holds the same rows in a third of the space; `read_table` reads both. The landmarks that each view
 matched can be stored too, see `MATCH_FIELDS`.
@@ -6,6 +6,7 @@ matched can be stored too, see `MATCH_FIELDS`.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,9 @@ from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import atomic_write
 from wheretolook.utils.parquet_files import open_parquet, read_columns
 
-POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
+QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
+TRANSLATION_COLUMNS = ("tx", "ty", "tz")
+POSE_COLUMNS = (*QUATERNION_COLUMNS, *TRANSLATION_COLUMNS)
 CENTER_COLUMNS = ("x_m", "y_m", "z_m")
 
 _COLUMNS = {"viewpoint_id": pa.int64(), "location_id": pa.int32(), "direction_id": pa.int32()}
@@ -32,7 +35,7 @@ direction that sees most landmarks at its location. Until a viewpoint is labelle
 it is "localized", "too_few_matches" or "no_pose". Errors are those of the pose that RANSAC found, even if it has too
 few inliers to be accepted ("no_pose"); NaN if there is none."""
 
-_COMPACT_NAMES = dict(zip(POSE_COLUMNS[4:], CENTER_COLUMNS, strict=True))
+_COMPACT_NAMES = dict(zip(TRANSLATION_COLUMNS, CENTER_COLUMNS, strict=True))
 COMPACT_SCHEMA = pa.schema([field.with_name(_COMPACT_NAMES.get(field.name, field.name)) for field in SCHEMA])
 """Columns of a compact table: in place of the translation, which differs in every row, the camera's centre in the world
 (metres), which the viewpoints of a location share. The translation follows: t = -R c."""
@@ -70,8 +73,8 @@ NO_POSE = "no_pose"
 
 def poses(table: pd.DataFrame) -> Float:
     """cam_from_world poses (B, 3, 4) of a table's rows."""
-    rotation = rotation_from_quaternion(table[list(POSE_COLUMNS[:4])].to_numpy(np.float64))
-    return np.concatenate([rotation, table[list(POSE_COLUMNS[4:])].to_numpy(np.float64)[..., None]], axis=-1)
+    rotation = rotation_from_quaternion(table[list(QUATERNION_COLUMNS)].to_numpy(np.float64))
+    return np.concatenate([rotation, table[list(TRANSLATION_COLUMNS)].to_numpy(np.float64)[..., None]], axis=-1)
 
 
 def pose_columns(cam_from_world: Float) -> dict[str, Float]:
@@ -128,13 +131,12 @@ def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
     Columns are those of `SCHEMA`, and of `CAMERA_FIELD`, `MATCH_FIELDS` and `PIXEL_FIELD` if they are there. A
     compact table has `COMPACT_SCHEMA`, about 18 bytes a row; read back, its poses agree to 1e-12 and all else exactly.
     """
-    schema, options = (COMPACT_SCHEMA, _COMPACT_FORMAT) if compact else (SCHEMA, {})
     if compact:
         table = table.assign(**dict(zip(CENTER_COLUMNS, _shared_centers(table).T, strict=True)))
-    further = [CAMERA_FIELD] if compact else [CAMERA_FIELD, MATCH_FIELDS, PIXEL_FIELD]
-    schema = pa.schema(
-        [*schema, *(field for part in further if set(part.names) <= set(table.columns) for field in part)]
-    )
+    optional = [CAMERA_FIELD] if compact else [CAMERA_FIELD, MATCH_FIELDS, PIXEL_FIELD]
+    extra = [name for part in optional if set(part.names) <= set(table.columns) for name in part.names]
+    schema = _schema(compact, extra)
+    options = _COMPACT_FORMAT if compact else {}
     content = pa.Table.from_pandas(table, schema=schema, preserve_index=False)
     content = content.replace_schema_metadata(None)  # it describes the data frame, not the rows
     with atomic_write(path) as partial:
@@ -160,50 +162,53 @@ def has_matches(path: Path, pixels: bool = False) -> bool:
 
 
 def read_table(path: Path, matches: bool = False, pixels: bool = False) -> pd.DataFrame:
-    """Read the columns of `SCHEMA` of a table of viewpoints, compact or not, and of `CAMERA_FIELD` if it has that.
+    """Read the columns of `SCHEMA`, and of `CAMERA_FIELD` if present, of a table of viewpoints, compact or not.
 
     With `matches` also those of `MATCH_FIELDS`: in each row two int32 arrays, (M,) of the landmarks matched and (I,) of
-    the inliers among them; with `pixels` also that of `PIXEL_FIELD`, (2 M,) float32. Raises TableError if the file is
-    missing, truncated, not a Parquet file, or lacks columns that were asked for.
+    the inliers among them; with `pixels` also `PIXEL_FIELD`, (2 M,) float32. Raises TableError if the file is missing,
+    truncated, no Parquet file, or lacks columns that were asked for.
     """
     if not path.is_file():
         raise TableError("there is no table of viewpoints", path=path, fix="Run the sample stage first.")
+    requested = (MATCH_FIELDS.names if matches or pixels else []) + (PIXEL_FIELD.names if pixels else [])
     try:
         with open_parquet(path, page_checksum_verification=True) as file:
-            names = file.schema_arrow.names  # matches take long to read, so only if they are asked for
-            unwanted = ([] if matches or pixels else MATCH_FIELDS.names) + ([] if pixels else PIXEL_FIELD.names)
-            table = read_columns(file, path, [name for name in names if name not in unwanted])
+            names = file.schema_arrow.names
+            compact = any(name in names for name in CENTER_COLUMNS)
+            extra = [*(name for name in CAMERA_FIELD.names if name in names), *requested]
+            schema = _schema(compact, extra)
+            _check_columns(path, [name for name in schema.names if name not in names], requested)
+            frame: pd.DataFrame = read_columns(file, path, schema.names).cast(schema).to_pandas()
     except ValueError as error:
-        fix = "It may be truncated: get it anew, or delete it and run the stage that writes it."
-        raise TableError(f"not a readable Parquet file: {error}", path=path, fix=fix) from error
-    compact = any(name in names for name in CENTER_COLUMNS)
-    schema, columns = (COMPACT_SCHEMA, CENTER_COLUMNS) if compact else (SCHEMA, POSE_COLUMNS[4:])
-    missing = [name for name in schema.names if name not in names]
-    if missing:
-        raise TableError("columns are missing", path=path, value=missing, fix="Run the sample stage again.")
-    wanted = (MATCH_FIELDS.names if matches or pixels else []) + (PIXEL_FIELD.names if pixels else [])
-    further = [name for name in CAMERA_FIELD.names if name in names] + wanted
-    if further:
-        extra = pa.unify_schemas([CAMERA_FIELD, MATCH_FIELDS, PIXEL_FIELD])
-        schema = pa.schema([*schema, *(extra.field(name) for name in further)])
-    if missing := [name for name in wanted if name not in names]:
+        fix = "It may be truncated or of another program: run the stage that writes it again."
+        raise TableError(f"not a readable table of viewpoints: {error}", path=path, fix=fix) from error
+    _check_poses(path, frame, CENTER_COLUMNS if compact else TRANSLATION_COLUMNS)
+    if compact:
+        rotation = rotation_from_quaternion(frame[list(QUATERNION_COLUMNS)].to_numpy())
+        translation = -(rotation @ frame[list(CENTER_COLUMNS)].to_numpy()[..., None])[..., 0]
+        frame = frame.assign(**dict(zip(TRANSLATION_COLUMNS, translation.T, strict=True)))
+    return frame[[*SCHEMA.names, *extra]]
+
+
+def _schema(compact: bool, extra: Iterable[str]) -> pa.Schema:
+    """The columns of a table with the named ones of `CAMERA_FIELD`, `MATCH_FIELDS` and `PIXEL_FIELD`."""
+    optional = pa.unify_schemas([CAMERA_FIELD, MATCH_FIELDS, PIXEL_FIELD])
+    return pa.schema([*(COMPACT_SCHEMA if compact else SCHEMA), *(optional.field(name) for name in extra)])
+
+
+def _check_columns(path: Path, missing: list[str], requested: list[str]) -> None:
+    if set(missing) & set(requested):
         option = "pixels" if PIXELS in missing else "matches"
         fix = f"Label again with `--label.store_{option} true`; compact tables never hold them."
-        raise TableError("it is not stored which landmarks were matched", path=path, value=missing, fix=fix)
-    try:
-        frame: pd.DataFrame = table.select(schema.names).cast(schema).to_pandas()
-    except pa.ArrowException as error:
-        raise TableError(f"columns of another type: {error}", path=path, fix="Run the sample stage again.") from error
-    length = np.linalg.norm(frame[list(POSE_COLUMNS[:4])].to_numpy(), axis=1)
-    position = frame[list(columns)].to_numpy()
-    bad = ~(np.abs(length - 1) < 1e-6) | ~np.isfinite(position).all(1)
+        raise TableError("the matched landmarks are not stored", path=path, value=missing, fix=fix)
+    if missing:
+        raise TableError("columns are missing", path=path, value=missing, fix="Run the sample stage again.")
+
+
+def _check_poses(path: Path, frame: pd.DataFrame, position: tuple[str, ...]) -> None:
+    length = np.linalg.norm(frame[list(QUATERNION_COLUMNS)].to_numpy(), axis=1)
+    bad = ~(np.abs(length - 1) < 1e-6) | ~np.isfinite(frame[list(position)].to_numpy()).all(1)
     if bad.any():
-        first = [float(value) for value in frame[[*POSE_COLUMNS[:4], *columns]].iloc[int(np.argmax(bad))]]
+        first = [float(value) for value in frame[[*QUATERNION_COLUMNS, *position]].iloc[int(np.argmax(bad))]]
         fix = "The file is damaged: run the sample stage again."
         raise TableError("a pose is no rigid transform", path=path, value=first, fix=fix)
-    if compact:
-        rotation = rotation_from_quaternion(frame[list(POSE_COLUMNS[:4])].to_numpy())
-        translation = -(rotation @ position[..., None])[..., 0]
-        frame = frame.assign(**dict(zip(POSE_COLUMNS[4:], translation.T, strict=True)))
-        frame = frame[[*SCHEMA.names, *further]]
-    return frame

@@ -68,16 +68,16 @@ class FreeSpace:
         if len(points) > AT_ONCE:
             parts = [self._is_enclosed(points[start : start + AT_ONCE]) for start in range(0, len(points), AT_ONCE)]
             return np.concatenate(parts)
-        hits = self._look_around(points)
+        hits = self._cast_sphere(points)
         surface = np.isfinite(hits.distance_m) & (hits.front | self.two_sided)
         enclosed: NDArray[np.bool_] = surface.mean(axis=1) >= self.config.min_enclosure
         if self.two_sided:
             enclosed &= np.mean(hits.distance_m[:, :16] >= self.config.min_sight_m, axis=1) >= 0.25
         return enclosed
 
-    def _look_around(self, points: NDArray[np.float64]) -> RayHits:
+    def _cast_sphere(self, points: NDArray[np.float64]) -> RayHits:
         """Hits (N, 34) of rays in all directions; the 16 level ones come first."""
-        directions = _around()
+        directions = _sphere_directions()
         shape = (len(points), len(directions))
         hits = self.raycaster.cast(np.repeat(points, shape[1], axis=0), np.tile(directions, (shape[0], 1)))
         return RayHits(hits.distance_m.reshape(shape), hits.triangle.reshape(shape), hits.front.reshape(shape))
@@ -86,7 +86,7 @@ class FreeSpace:
         """Whether most of the points that are free in a two-sided scene see mostly fronts."""
         low, high = self.bounds
         points = np.random.default_rng(0).uniform(low, high, size=(_N_SIDEDNESS_POINTS, 3))
-        hits = self._look_around(points[self.is_free(points)])
+        hits = self._cast_sphere(points[self.is_free(points)])
         hit = np.isfinite(hits.distance_m)
         if not hit.any():
             return False
@@ -94,7 +94,7 @@ class FreeSpace:
         return bool(np.mean(front_share > 0.8) > 0.5)
 
 
-def _around() -> NDArray[np.float64]:
+def _sphere_directions() -> NDArray[np.float64]:
     """Unit directions (34, 3): 16 level, 8 rising and 8 falling by 45 degrees, up, down."""
     rings = []
     for count, elevation in ((16, 0.0), (8, np.pi / 4), (8, -np.pi / 4)):

@@ -82,7 +82,7 @@ def in_view_by_table(posed: PosedViews, points: Any, device: str = "cpu") -> Lan
 
 
 def compile_kernels(device: str) -> None:
-    """Compile the kernels that scoring around places launches, or load them from Warp's cache.
+    """Compile the kernels that scoring candidates places launches, or load them from Warp's cache.
 
     Compiling takes seconds of one core, once on a machine; other threads can work meanwhile. One of them only may load
     kernels at a time, so this has to end before a `FrustumLister` is made. The device is Warp's, of `start_warp`.
@@ -115,39 +115,41 @@ class FrustumLister(FrustumCounter):
         wp.launch(listing_kernel.rows_kernel, places.shape, inputs, [rows], device=self.device)
         return Surroundings(landmarks, rows)
 
-    def lengths(self, around: Surroundings, views: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
+    def lengths(self, candidates: Surroundings, views: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
         """How many landmarks views see, (V,). Those are included that only a COLMAP camera itself could decide."""
         lengths: Any = wp.empty(len(views), dtype=wp.int64, device=self.device)
         none = [wp.empty(0, dtype=dtype, device=self.device) for dtype in (wp.int64, wp.int32, wp.vec2)]
-        self._launch(around, views, False, none[0], lengths, none[1], none[2])
+        self._launch(candidates, views, False, none[0], lengths, none[1], none[2])
         return np.asarray(lengths.numpy())
 
-    def list(self, around: Surroundings, views: NDArray[np.integer[Any]], lengths: NDArray[np.int64]) -> ListedViews:
+    def list(
+        self, candidates: Surroundings, views: NDArray[np.integer[Any]], lengths: NDArray[np.int64]
+    ) -> ListedViews:
         """What views see, by the lengths (V,) that `lengths` gives of them."""
         starts = np.concatenate([[0], np.cumsum(lengths)])
         entries: Any = wp.empty(int(starts[-1]), dtype=wp.int32, device=self.device)
         image: Any = wp.empty(int(starts[-1]), dtype=wp.vec2, device=self.device)
         first: Any = wp.array(starts[:-1], dtype=wp.int64, device=self.device)
         self._launch(
-            around, views, True, first, wp.empty(len(views), dtype=wp.int64, device=self.device), entries, image
+            candidates, views, True, first, wp.empty(len(views), dtype=wp.int64, device=self.device), entries, image
         )
         listed = ListedViews(starts, entries, image)
-        return self._decided(listed, around, views) if isinstance(self.camera, ColmapCamera) else listed
+        return self._decided(listed, candidates, views) if isinstance(self.camera, ColmapCamera) else listed
 
     def _launch(
-        self, around: Surroundings, views: Any, write: bool, first: Any, lengths: Any, entries: Any, image: Any
+        self, candidates: Surroundings, views: Any, write: bool, first: Any, lengths: Any, entries: Any, image: Any
     ) -> None:
         asked: Any = wp.array(np.asarray(views, dtype=np.int32), dtype=wp.vec2i, device=self.device)
         outputs = [lengths, entries, image]
         if self._field is not None:
-            inputs = [asked, self._axes, self._depth, self._field.size, around.sorted, write, first]
+            inputs = [asked, self._axes, self._depth, self._field.size, candidates.sorted, write, first]
             wp.launch(listing_kernel.list_field_kernel, len(views), inputs, outputs, device=self.device)
             return
         least = wp.float64(frustum.MIN_DEPTH_M)
-        inputs = [asked, self._axes, self._sides, around.sorted, self._rounding, least, write, first]
+        inputs = [asked, self._axes, self._sides, candidates.sorted, self._rounding, least, write, first]
         wp.launch(listing_kernel.list_kernel, len(views), inputs, outputs, device=self.device)
 
-    def _decided(self, listed: ListedViews, around: Surroundings, views: NDArray[np.integer[Any]]) -> ListedViews:
+    def _decided(self, listed: ListedViews, candidates: Surroundings, views: NDArray[np.integer[Any]]) -> ListedViews:
         """Without the landmarks that the table left to the camera and the camera does not see."""
         assert isinstance(self.camera, ColmapCamera)
         entries = listed.entries.numpy()
@@ -156,7 +158,7 @@ class FrustumLister(FrustumCounter):
             return listed
         entries[unsure] = -1 - entries[unsure]
         of_view = np.searchsorted(listed.starts, unsure, side="right") - 1
-        offsets = around.offsets.numpy()
+        offsets = candidates.offsets.numpy()
         kept = np.ones(len(entries), dtype=bool)
         for begin in range(0, len(unsure), ASKED_AT_ONCE):
             part = slice(begin, begin + ASKED_AT_ONCE)

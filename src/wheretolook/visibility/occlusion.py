@@ -193,16 +193,16 @@ class MeshOcclusion(OcclusionModel):
         at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
         inside = self.raycaster.distance_to_surface(at, ON_SURFACE_M) <= ON_SURFACE_M
         if not self.two_sided:
-            _, backs = self._sides_around(at)
+            _, backs = self._sides_seen(at)
             inside |= backs.mean(1) > 0.5
         return np.asarray(inside)
 
-    def _sides_around(self, locations: Float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def _sides_seen(self, locations: Float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Which of 32 rays around each location (L, 3) m meet a front first, and which a back; each (L, 32)."""
-        around = fibonacci_sphere(32)
-        hits = self.raycaster.cast(np.repeat(locations, len(around), axis=0), np.tile(around, (len(locations), 1)))
+        rays = fibonacci_sphere(32)
+        hits = self.raycaster.cast(np.repeat(locations, len(rays), axis=0), np.tile(rays, (len(locations), 1)))
         hit = np.isfinite(hits.distance_m)
-        return (hit & hits.front).reshape(-1, len(around)), (hit & ~hits.front).reshape(-1, len(around))
+        return (hit & hits.front).reshape(-1, len(rays)), (hit & ~hits.front).reshape(-1, len(rays))
 
 
 class StoredOcclusion(OcclusionModel):

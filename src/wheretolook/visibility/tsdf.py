@@ -41,7 +41,7 @@ class TsdfOcclusion(MeshOcclusion):
         wall, or outside of the observed space. If no ray meets a surface, the location counts as free.
         """
         at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
-        fronts, backs = self._sides_around(at)
+        fronts, backs = self._sides_seen(at)
         behind = backs.sum(1) > fronts.sum(1)
         close = self.raycaster.distance_to_surface(at, self._too_close_m) <= self._too_close_m
         return np.asarray(behind | close)

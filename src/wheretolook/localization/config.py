@@ -15,27 +15,22 @@ class LocalizerConfig:
     """Settings of matching and pose estimation.
 
     Args:
-        max_ratio: Lowe's ratio, for SIFT: below it, a match counts. The nearest landmark's descriptor distance over the
-            second nearest's.
-        min_similarity: of learned features: a keypoint and a landmark that are each other's nearest match if the cosine
-            between their descriptors is at least this; the extractor's own limit if none is given.
-        lightglue: file of LightGlue's weights for the map's features (aliked_lightglue.pth), or kornia for its copy. A
-            query is then matched with the mapping images that see most of the landmarks it seems to show, as hloc
-            localizes, instead of with landmarks. Needs a map with its database (`map.keep_database`) and the extra
-            `learned`.
-        lightglue_images: how many mapping images that is.
-        max_error_px: reprojection error under which RANSAC counts a match as an inlier.
-        min_inliers: inliers that a pose needs. With fewer it is taken for an accident: RANSAC finds some pose for
-            almost any image.
-        seed: seed of RANSAC. The same for every image, so that a label depends on its viewpoint alone.
+        max_ratio: Lowe's ratio for SIFT: maximum ratio of the descriptor distances to the nearest and second nearest
+            landmark.
+        min_similarity: minimum cosine of mutual nearest neighbours for learned features; by default the extractor's.
+        lightglue: file of LightGlue weights for the map's features (aliked_lightglue.pth), or kornia for its copy. A
+            query is then matched with mapping images, as in hloc, instead of with landmarks. Needs a map with its
+            database (`map.keep_database`) and the extra `learned`.
+        lightglue_images: number of these mapping images: those that observe most of the landmarks matched first.
+        max_error_px: maximum reprojection error of an inlier in RANSAC.
+        min_inliers: inliers that a pose needs: RANSAC finds some pose with a few for almost any image.
+        seed: seed of RANSAC, the same for every image, so that a label depends only on its viewpoint.
 
     Attributes:
-        min_matches: with fewer matches no pose is sought; four is the least that determines and checks one.
-        confidence: RANSAC stops when it has drawn three inliers at once with this probability, if no pose has more
-            inliers than the best so far.
-        min_trials: trials of RANSAC at least, as of COLMAP's.
-        max_trials: trials of RANSAC at most, as of COLMAP's: where a tenth of the matches are inliers, it misses one
-            pose in 20,000.
+        min_matches: matches needed to estimate a pose: four determine and check one.
+        confidence: RANSAC stops when it has drawn three inliers together with this probability.
+        min_trials: minimum trials of RANSAC, as in COLMAP.
+        max_trials: maximum trials of RANSAC, as in COLMAP: with a tenth of inliers it misses one pose in 20,000.
     """
 
     max_ratio: float = 0.85
@@ -63,14 +58,14 @@ class LocalizerConfig:
             )
 
     def record(self) -> dict[str, Any]:
-        """What decides which labels come out, as JSON values."""
+        """Settings that decide the labels, as JSON values."""
         record = asdict(self)
-        # options that older labels do not know, where they leave everything as it was
+        # options at their defaults that older labels do not have
         if self.min_similarity is None:
             del record["min_similarity"]
         if not self.lightglue:
             del record["lightglue"], record["lightglue_images"]
-        elif Path(self.lightglue).is_file():  # what is in it, not where it lies
+        elif Path(self.lightglue).is_file():
             record["lightglue"] = sha256(Path(self.lightglue))
         return record
 
@@ -81,17 +76,16 @@ class LabelConfig:
 
     Args:
         localizer: matching and pose estimation.
-        engine: where labels are made: local, in processes here, or ray, on a Ray cluster. Both give the same labels;
-            ray needs `pip install ray`.
-        ray_address: address of the Ray cluster; empty starts one on this machine. Such as "auto" on one of its
-            machines, or "ray://head:10001" from elsewhere (which needs `pip install 'ray[client]'`).
-        workers: worker processes on this machine; 0 for one on each CPU core that it may use.
-        shard_size: viewpoints in a shard; on a GPU at least 16 for each of several cameras. An interruption loses at
-            most the shards that were being labelled.
-        store_matches: keep which landmarks each view matched; needed to learn matchability. Their rows are in
-            the column matched_rows, those that agree with the view's pose in inlier_rows.
-        store_pixels: keep also where in its image each view matched them, in the column matched_pixels; needed to
-            localize several looks from a place together.
+        engine: local, in processes on this machine, or ray, on a Ray cluster (needs `pip install ray`). Both give the
+            same labels.
+        ray_address: address of the Ray cluster, such as "auto" on one of its machines, or "ray://head:10001" from
+            another (needs `pip install 'ray[client]'`); empty starts one on this machine.
+        workers: worker processes on this machine; 0 for one per CPU core.
+        shard_size: viewpoints in a shard; on a GPU at least 16 for each of several cameras. An interruption loses the
+            shards in progress.
+        store_matches: store the rows of the landmarks that each view matched (matched_rows) and of the inliers
+            (inlier_rows); needed to train matchability.
+        store_pixels: store also the pixels of the matches (matched_pixels); needed to localize several looks jointly.
     """
 
     localizer: LocalizerConfig = field(default_factory=LocalizerConfig)

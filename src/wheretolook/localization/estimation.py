@@ -1,4 +1,4 @@
-"""The pose of one image from its 2D-3D matches: what every localization here, of one look or several, stands on."""
+"""Estimates the pose of one image from its 2D-3D matches."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from wheretolook.geometry.poses import Float
 from wheretolook.localization.config import LocalizerConfig
 
 REFINEMENT = {"loss_type": "CAUCHY", "loss_scale": 1.0}
-"""Keypoints are accurate to a fraction of a pixel. PoseLib's own scale is half of RANSAC's limit, as if outliers just
-within the limit were accurate, too: poses are then worse."""
+"""Keypoints are accurate to a fraction of a pixel. PoseLib's default scale, half of RANSAC's limit, weighs outliers just
+within the limit as accurate ones, which makes poses worse."""
 
 
 class PoseEstimator:
-    """Estimates the pose of an image from its matches with points (N, 3) m: P3P in PoseLib's LO-RANSAC, then refined.
+    """Estimates the pose of an image from matches with points (N, 3) m by P3P in PoseLib's LO-RANSAC and refinement.
 
-    It computes in metres from `origin`, so that the coordinates of a national grid lose nothing.
+    It computes in metres from `origin`, so that coordinates of a national grid lose no precision.
     """
 
     def __init__(self, points: Float, config: LocalizerConfig | None = None) -> None:
@@ -40,38 +40,35 @@ class PoseEstimator:
     def estimate(
         self, pixels: Float, rows: NDArray[np.int64], camera: Camera
     ) -> tuple[Float, NDArray[np.bool_]] | None:
-        """cam_from_world (3, 4), and which of the matches agree with it, (M,); None if RANSAC finds no pose.
+        """Estimate cam_from_world (3, 4) and the inlier mask (M,) from pixels (M, 2) and rows (M,) of the points.
 
-        The matches are pixels (M, 2) of the camera's image, and rows (M,) of the points; at least four.
+        Needs four matches or more. Returns None if RANSAC finds no pose.
         """
-        found = self.estimate_local(pixels, self.points[rows], camera)
-        return None if found is None else (poses_from(found[0], -self.origin), found[1])
+        result = self.estimate_local(pixels, self.points[rows], camera)
+        return None if result is None else (poses_from(result[0], -self.origin), result[1])
 
     def estimate_local(
-        self, pixels: Float, points: Float, camera: Camera, trials: int | None = None
+        self, pixels: Float, points: Float, camera: Camera, max_trials: int | None = None
     ) -> tuple[Float, NDArray[np.bool_]] | None:
-        """As `estimate`, of points (M, 3) in metres from `origin`; the pose is of the world with that origin.
-
-        RANSAC makes so many trials at most, as many as the settings say unless given.
-        """
-        taken_with, seen = poselib_camera(camera.colmap, np.asarray(pixels, dtype=np.float64))
-        options = {**self.ransac, "max_iterations": trials or self.config.max_trials}
-        pose, found = poselib.estimate_absolute_pose(seen, points, taken_with, options, REFINEMENT)
-        if found["num_inliers"] < 3 or not np.isfinite(pose.Rt).all():  # no three matches determine a pose
+        """Estimate as `estimate`, but points (M, 3) and pose are in metres from `origin`."""
+        camera_options, pixels = poselib_camera(camera.colmap, np.asarray(pixels, dtype=np.float64))
+        options = {**self.ransac, "max_iterations": max_trials or self.config.max_trials}
+        pose, info = poselib.estimate_absolute_pose(pixels, points, camera_options, options, REFINEMENT)
+        if info["num_inliers"] < 3 or not np.isfinite(pose.Rt).all():  # fewer than three do not determine a pose
             return None
-        return pose.Rt, np.asarray(found["inliers"], dtype=bool)
+        return pose.Rt, np.asarray(info["inliers"], dtype=bool)
 
 
-POSELIBS_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
+POSELIB_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
 
 
 def poselib_camera(camera: ColmapCamera, pixels: Float) -> tuple[dict[str, Any], Float]:
-    """A camera as PoseLib takes it, and pixels (M, 2) of its image.
+    """Convert a camera and pixels (M, 2) of its image to what PoseLib takes.
 
-    Of a model that PoseLib does not know, pixels become those of a pinhole with the same focal length, by their rays.
-    Rays that it would not see, more than 84 degrees off its axis, go far outside, where they are nobody's inliers.
+    For a model that PoseLib does not support, pixels become those of a pinhole camera with the same focal length. Those
+    more than 84 degrees off the axis are moved far outside the image, where they are never inliers.
     """
-    if camera.model in POSELIBS_MODELS:
+    if camera.model in POSELIB_MODELS:
         return camera.record(), pixels
     pinhole = PinholeCamera(camera.width, camera.height, camera.mean_focal_px)
     rays = camera.unproject(pixels)

@@ -1,4 +1,4 @@
-"""Global localization of an image against a map of landmarks, without a prior on its pose."""
+"""Localizes images globally against a map of landmarks, without a prior on the pose."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ class Localization:
             status is "no_pose".
         n_matches: number of 2D-3D matches.
         inlier_rows: (I,) rows of the landmarks that were matched and agree with the pose.
-        matched_rows: (M,) rows of all landmarks that were matched, whatever the status.
-        matched_pixels: (M, 2) float32, where in the image each of them was.
+        matched_rows: (M,) rows of all matched landmarks.
+        matched_pixels: (M, 2) float32, their pixels in the image.
     """
 
     status: str
@@ -54,11 +54,10 @@ class Localization:
 class Localizer:
     """Localizes images against landmarks (paper, Sec. 3.3 "Self-supervision").
 
-    Keypoints are extracted and matched to the landmarks' mean descriptors, SIFT's with Lowe's ratio test, learned ones
-    where both are each other's nearest; PoseLib estimates the pose by P3P in LO-RANSAC and refines it on the inliers.
-    The extractor must be what the map was made with, and may be left out where nothing is extracted; it and matching
-    run on the device, "cpu" or a CUDA device. `map_dir` is the folder of the map, which LightGlue needs
-    (`LocalizerConfig.lightglue`). Raises MapError if the landmarks have no descriptors, or others than the extractor's.
+    Keypoints are matched to the landmarks' mean descriptors, SIFT with Lowe's ratio test, learned ones as mutual nearest
+    neighbours; the pose is estimated by `PoseEstimator`. The extractor must be that of the map, and may be omitted if
+    nothing is extracted. The device is "cpu" or a CUDA device. `map_dir` is the folder of the map, which LightGlue needs
+    (`LocalizerConfig.lightglue`). Raises MapError if the landmarks have no descriptors, or not the extractor's.
     """
 
     def __init__(
@@ -76,11 +75,11 @@ class Localizer:
         self.config = config or LocalizerConfig()
         self.kind = all_kinds()[landmarks.features]
         if extractor is not None:
-            self._refuse_other(extractor)
+            self._check_kind(extractor)
         self._extract_with = extractor
         self._device = device
-        by_ratio = self.kind.in_bytes
-        self._matcher = (DescriptorMatcher if by_ratio else SimilarityMatcher)(landmarks.descriptors, device)
+        matcher = DescriptorMatcher if self.kind.in_bytes else SimilarityMatcher
+        self._matcher = matcher(landmarks.descriptors, device)
         self._guided: LightGlueMatcher | None = None
         if self.config.lightglue:
             from wheretolook.localization.lightglue import LightGlueMatcher
@@ -91,15 +90,15 @@ class Localizer:
 
     @cached_property
     def extractor(self) -> KeypointExtractor:
-        """What finds keypoints in queries. Made when first asked for: keypoints may also be given."""
+        """Extractor for queries, built when first used."""
         config = self._extract_with or ExtractorConfig()
-        self._refuse_other(config)
+        self._check_kind(config)
         return KeypointExtractor(config, self._device)
 
-    def _refuse_other(self, extractor: ExtractorConfig) -> None:
+    def _check_kind(self, extractor: ExtractorConfig) -> None:
         if kind_of(extractor.method) != self.kind:
-            problem = f"the map's landmarks are described by {self.kind.name}: other keypoints match none of them"
-            fix = "Map again with what queries are to have, --map.extractor.method."
+            problem = f"the map has {self.kind.name} descriptors"
+            fix = "Use this extractor for queries, or map again with --map.extractor.method."
             raise MapError(problem, value=extractor.method, fix=fix)
 
     def localize(self, rgb: NDArray[np.uint8]) -> Localization:
@@ -108,30 +107,26 @@ class Localizer:
         return self.estimate(keypoints, *self.match([keypoints])[0])
 
     def extract(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
-        """Step 1: keypoints of images, each (H, W, 3) uint8 and all of one size."""
+        """Step 1: extract keypoints from images, each (H, W, 3) uint8 and all of one size."""
         return self.extractor.extract_batch(images)
 
     def match(self, keypoints: Sequence[Keypoints], camera: Camera | None = None) -> list[Matches]:
-        """Step 2: 2D-3D matches of several images at once; those of one image do not depend on the others.
-
-        The images are of the localizer's camera, or of the one given.
-        """
+        """Step 2: match keypoints of several images with landmarks. The result for an image does not depend on the others."""
         matches = self._match(keypoints)
         if self._guided is None:
             return matches
-        seen_by = camera or self._camera
-        n_images = self.config.lightglue_images
-        size = (seen_by.width, seen_by.height)
+        camera = camera or self._camera
+        size = (camera.width, camera.height)
         return [
-            self._guided.match(of_image, size, rows, n_images)
-            for of_image, (_, rows) in zip(keypoints, matches, strict=True)
+            self._guided.match(query, size, rows, self.config.lightglue_images)
+            for query, (_, rows) in zip(keypoints, matches, strict=True)
         ]
 
     def _match(self, keypoints: Sequence[Keypoints]) -> list[Matches]:
         descriptors = [self.kind.store(of_image.descriptors) for of_image in keypoints]
         if isinstance(self._matcher, SimilarityMatcher):
-            least = self.config.min_similarity
-            return self._matcher.match(descriptors, self.kind.min_similarity if least is None else least)
+            limit = self.config.min_similarity
+            return self._matcher.match(descriptors, self.kind.min_similarity if limit is None else limit)
         return match(self._matcher, descriptors, self.config.max_ratio)
 
     def estimate(
@@ -141,18 +136,15 @@ class Localizer:
         landmark_rows: NDArray[np.int64],
         camera: Camera | None = None,
     ) -> Localization:
-        """Step 3: the pose of one image from its matches, rows (M,) of its keypoints and rows (M,) of the landmarks.
-
-        The image is of the localizer's camera, or of the one given.
-        """
+        """Step 3: estimate the pose of an image from its matches, rows (M,) of keypoints and rows (M,) of landmarks."""
         n_matches = len(keypoint_rows)
         matched_pixels = keypoints.pixels[keypoint_rows]
         matched: dict[str, Any] = {"matched_rows": landmark_rows, "matched_pixels": matched_pixels}
         if n_matches < self.config.min_matches:
             return Localization(TOO_FEW_MATCHES, None, n_matches, **matched)
-        found = self.estimator.estimate(matched_pixels, landmark_rows, camera or self._camera)
-        if found is None:
+        result = self.estimator.estimate(matched_pixels, landmark_rows, camera or self._camera)
+        if result is None:
             return Localization(NO_POSE, None, n_matches, **matched)
-        cam_from_world, inliers = found
+        cam_from_world, inliers = result
         status = LOCALIZED if inliers.sum() >= self.config.min_inliers else NO_POSE
         return Localization(status, cam_from_world, n_matches, landmark_rows[inliers], **matched)

@@ -1,4 +1,4 @@
-"""Steps that run at the same time, each in a thread of its own, with few items under way."""
+"""Runs the steps of a pipeline concurrently, each in its own thread, on few items at a time."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from typing import Any
 
 _END = object()
-"""Passed through the steps after the last item."""
+"""Marks the end of the items."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """A step of a pipeline: the name its time is counted under, and a function of what the step before returned."""
+    """A step of a pipeline: a name for its time, and a function of the previous step's result."""
 
     name: str
     run: Callable[[Any], Any]
@@ -24,25 +24,24 @@ class Step:
 def run_pipeline(
     items: Iterable[Any], steps: list[Step], seconds: dict[str, float] | None = None, depth: int = 2
 ) -> Iterator[Any]:
-    """Pass items through steps; while one item is in the second step, the next is in the first.
+    """Pass items through steps and yield the results of the last step in the order of the items.
 
-    Steps that wait for a GPU, or that release Python's lock, overlap; items are read in a thread of their own. The time
-    spent in each step is added to `seconds`, by the step's name. `depth` bounds the memory: how many items are under
-    way for each step and for the source. Yields what the last step returns, in the order of the items; raises whatever
-    a step or the source raised, and stops the other threads then.
+    Steps that wait for a GPU or release the interpreter lock overlap; items are read in a thread of their own. The
+    seconds spent in each step are added to `seconds`. `depth` is the number of items in flight for each step and for
+    the source. Errors of a step or the source are raised here, and end the other threads.
     """
     iterator = iter(items)
     seconds = {} if seconds is None else seconds
-    under_way: deque[Future[Any]] = deque()
+    in_flight: deque[Future[Any]] = deque()
     threads = [ThreadPoolExecutor(1) for _ in range(len(steps) + 1)]
     try:
         while True:
-            while len(under_way) < depth * len(threads):
+            while len(in_flight) < depth * len(threads):
                 future = threads[0].submit(next, iterator, _END)
                 for thread, step in zip(threads[1:], steps, strict=True):
                     future = thread.submit(_run, step, future, seconds)
-                under_way.append(future)
-            item = under_way.popleft().result()
+                in_flight.append(future)
+            item = in_flight.popleft().result()
             if item is _END:
                 return
             yield item

@@ -48,17 +48,6 @@ def test_reliability_is_that_of_scikit_learn() -> None:
     assert negative_log_likelihood(probability, good) == pytest.approx(log_loss(good, probability))
 
 
-def test_calibration_error_of_what_is_calibrated_and_of_what_is_not() -> None:
-    rng = np.random.default_rng(1)
-    probability = rng.random(400_000)
-    # a bin's share is off by about its standard deviation, which averages sqrt(15 / 400,000) x E|N(0, 1)| x pi / 8
-    assert expected_calibration_error(probability, draw(rng, probability)) < 0.004
-    # predicted p where p^2 is true: too sure everywhere, by the integral of p - p^2
-    assert expected_calibration_error(probability, draw(rng, probability**2)) == pytest.approx(1 / 6, abs=0.004)
-    assert expected_calibration_error(np.full(10, 0.9), np.arange(10) < 4) == pytest.approx(0.5)
-    assert np.isnan(expected_calibration_error(np.empty(0), np.empty(0, dtype=bool)))
-
-
 @pytest.mark.parametrize("factor", [0.5, 1.0, 3.0])
 def test_temperature_is_recovered(factor: float) -> None:
     rng = np.random.default_rng(2)

@@ -21,7 +21,6 @@ from wheretolook.evaluation.results import latest_scores, runs_of_rows
 from wheretolook.holdout.holdout import left_out_blocks
 from wheretolook.holdout.holdout_views import evaluated_photographs
 from wheretolook.holdout.photo_map import WORK, open_map
-from wheretolook.scorers.adapted.network import AdaptedNetwork
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import finished_runs
@@ -81,25 +80,6 @@ def test_weights_that_hope_too_little_are_adapted_by_photographs_alone(
     assert "may have learnt from these photographs" in capsys.readouterr().out
     content = json.loads((data / "checks" / "corridor" / "check.json").read_text())
     assert content["method"] == "adapted" and content["ece"]["value"] < told["before"]["calibration_error"] / 2
-
-
-@pytest.mark.slow
-def test_where_photographs_teach_nothing_the_weights_stay(
-    checked: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Weights that are calibrated here already are not bettered."""
-    out = tmp_path / "mine.safetensors"
-    assert adapt(checked, tmp_path, "--out", str(out)) == 0
-    learnt = TrainedNetwork.load(out, AdaptedNetwork, "adapted")
-    calibrated = TrainedNetwork.load(SET, SetNetwork, "set")
-    calibrated.scale *= learnt.scale
-    calibrated.offset = learnt.scale * calibrated.offset + learnt.offset
-    calibrated.save(tmp_path / "calibrated.safetensors", read_training(SET))
-    capsys.readouterr()
-    again = tmp_path / "again.safetensors"
-    assert adapt(checked, tmp_path, "--weights", str(tmp_path / "calibrated.safetensors"), "--out", str(again)) == 0
-    assert "does not make the weights better" in capsys.readouterr().out
-    assert not again.exists() and again.with_suffix(".md").is_file()
 
 
 def test_photographs_have_rows_beside_rendered_views(checked: tuple[Path, Path, Path], tmp_path: Path) -> None:

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from planning.test_path_planning import BOUNDS, Room, looking_north
-from wheretolook.planning.config import PathConfig
-from wheretolook.planning.rrt import plan_path
 from wheretolook.planning.scene_map import fill_partially_free_voxels
 from wheretolook.utils.errors import MapFormatError
 
@@ -51,15 +49,6 @@ def test_views_are_not_taken_through_walls() -> None:
     assert (west >= 0).all() and (lent.scores[west] == 0.25).all()
     east = lent.row_of_voxel[beside_the_wall & (centers[:, 0] > 3)]
     assert (east >= 0).all() and (lent.scores[east] == 0.75).all()
-
-
-def test_filled_voxels_have_scores() -> None:
-    _, own = known_west_and_east()
-    config = PathConfig(time_s=0.5, pitch_deg=(-30, 30))
-    ends = (1.5, 1.0, 1.1), (2.2, 2.5, 1.1)
-    assert (plan_path(*ends, BoundedRoom(), BOUNDS, own, config, progress=False).scores == 0).all()
-    lent = fill_partially_free_voxels(own, BoundedRoom())
-    np.testing.assert_allclose(plan_path(*ends, BoundedRoom(), BOUNDS, lent, config, progress=False).scores, 0.25)
 
 
 def test_a_filled_map_is_derived(tmp_path: Path) -> None:

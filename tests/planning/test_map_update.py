@@ -61,15 +61,6 @@ def test_added_landmarks_change_the_voxels_that_see_them(method: str) -> None:
     np.testing.assert_array_equal(old.scores, kept)  # the old map stays as it is
 
 
-def test_other_attributes_of_a_landmark_count_as_a_change() -> None:
-    landmarks = replace(OLD, track_length=np.where(np.arange(400) == 7, 50, OLD.track_length).astype(np.int32))
-    old = build(OLD)
-    new, changed = update_viewpoint_map(old, make_scorer("bins", room_map(landmarks)))
-    sees = occlusion().unoccluded(old.locations, OLD.points[7:8])[:, 0]
-    np.testing.assert_array_equal(changed, old.voxel_of_row[sees])
-    assert_same(new, build(landmarks))
-
-
 @pytest.mark.parametrize("case", ["removed", "moved", "shares"])
 def test_what_can_change_any_voxel_scores_all_of_them_again(case: str) -> None:
     method = "visible" if case == "shares" else "bins"

@@ -38,17 +38,6 @@ def test_a_smooth_maximum_is_found_within_the_last_step() -> None:
     assert np.all(found.scores > found.start_scores)
 
 
-def test_the_angle_keeps_to_its_limit_and_reaches_it() -> None:
-    scorer = Towards(room_map(room_landmarks(10)))
-    start = np.array([[1.0, 0, 0], [0, 0, 1], [0, 0, -1], [0, 1, 0]])
-    found = refine_directions(scorer, np.ones((4, 3)), start, 10)
-    np.testing.assert_allclose(np.linalg.norm(found.axes, axis=1), 1)
-    turned = angle_deg(found.axes, start)
-    assert turned.max() < 10 + 1e-6
-    np.testing.assert_allclose(turned, 10, atol=0.5)
-    np.testing.assert_allclose(angle_deg(found.axes, scorer.axis), angle_deg(start, scorer.axis) - 10, atol=0.5)
-
-
 @pytest.mark.parametrize("method", ["bins", "random"])
 def test_no_method_gets_worse_and_batches_change_nothing(method: str) -> None:
     scorer = make_scorer(method, room_map(room_landmarks(400)))

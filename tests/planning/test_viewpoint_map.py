@@ -127,16 +127,6 @@ def test_the_grid_is_closed_and_what_is_outside_has_no_answer(viewpoint_map: Vie
     assert viewpoint_map.best_many(np.empty((0, 3))).found.shape == (0,)
 
 
-def test_a_mask_and_ids_of_free_voxels_give_the_same_map() -> None:
-    scorer = make_scorer("bins", room_map(room_landmarks(200)))
-    mask = np.zeros(len(GRID), dtype=bool)
-    mask[list(free_voxels())] = True
-    a, b = (build_viewpoint_map(scorer, GRID, free, DIRECTIONS) for free in (mask, free_voxels()[::-1]))
-    np.testing.assert_array_equal(a.voxel_of_row, free_voxels())
-    np.testing.assert_array_equal(a.row_of_voxel, b.row_of_voxel)
-    np.testing.assert_array_equal(a.scores, b.scores)
-
-
 def test_interpolation_lies_between_free_neighbours_and_is_trilinear(viewpoint_map: ViewpointMap) -> None:
     centers = GRID.centers()
     n_between = 0

@@ -147,25 +147,25 @@ def check_map(
     work: Path,
     scoring: Scoring = Scoring(),
     occlusion: OcclusionModel | None = None,
-    max_views: int = VIEWS,
+    views: int = VIEWS,
     workers: int = 1,
     device: str = "cpu",
 ) -> CheckReport:
     """Hold blocks of a map's photographs out, localize them against the rest, score them, and compare.
 
-    Finished blocks are cached in `work`. The default occlusion model is hidden-point removal; at most `max_views` of a
+    Finished blocks are cached in `work`. The default occlusion model is hidden-point removal; at most `views` of a
     block are localized. Raises MapError if blocks leave no map; WeightsError if weights cannot be used.
     """
     check_place(source, scoring, device)
-    results = left_out_blocks(source, work, max_views, workers, device)
-    method, views = score_views(source, results, scoring, occlusion or HiddenPointRemoval(), device)
+    results = left_out_blocks(source, work, views, workers, device)
+    method, scored = score_views(source, results, scoring, occlusion or HiddenPointRemoval(), device)
     methods = list(dict.fromkeys([method, *(name for name in scoring.also if name != VISIBLE), VISIBLE]))
     columns = ["score" if name == method else name for name in methods]
-    centers = (source.own_centers * source.from_model.scale)[views["row"].to_numpy()]
-    numbers = measure(views, methods, columns, centers, source.place_radius, is_probability(method))
-    parts = weak_parts(source, results, views)
-    photographs = _photographs(source, views, parts)
-    return CheckReport(source, method, views, photographs, _blocks(source, results, views), numbers, parts)
+    centers = (source.own_centers * source.from_model.scale)[scored["row"].to_numpy()]
+    numbers = measure(scored, methods, columns, centers, source.place_radius, is_probability(method))
+    parts = weak_parts(source, results, scored)
+    photographs = _photographs(source, scored, parts)
+    return CheckReport(source, method, scored, photographs, _blocks(source, results, scored), numbers, parts)
 
 
 def _photographs(source: PhotographedMap, views: pd.DataFrame, parts: Sequence[WeakPart]) -> pd.DataFrame:

@@ -505,7 +505,6 @@ def test_a_path_is_planned_and_shown(
     assert artifact(TrackingConfig(str(copy / "mlruns")), logged.info.run_id, "methods.png").is_file()
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert run("plan", copy, *options, *ends, "--plan.rerun", "true") == 2
-    assert "pip install rerun-sdk" in capsys.readouterr().err
     assert run("plan", copy, *options) == 2
     assert "needs a start and a goal" in capsys.readouterr().err
     wall = ["--start", "[-99, 0, 1]", "--goal", str(goal.tolist()), "--film", "none", "--method", "forward"]

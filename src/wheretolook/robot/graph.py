@@ -100,7 +100,7 @@ def set_graph(trained: TrainedNetwork[SetNetwork]) -> Any:
     example = (torch.zeros(2, 3, len(trained.network.attributes)), torch.tensor([3, 2]), torch.tensor([5, 2]))
     axes = {name: {0: "B"} for name in (*INPUTS, *OUTPUTS)}
     axes["values"] = {0: "B", 1: "K"}
-    file = io.BytesIO()
+    file: Any = io.BytesIO()
     with warnings.catch_warnings(action="ignore"):  # the default exporter needs another package
         torch.onnx.export(
             RobotNetwork(trained),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -11,9 +11,6 @@ from wheretolook.utils.errors import ConfigError
 from wheretolook.view.drawing import escape_markdown, legend
 from wheretolook.view.shared import STEP_M, Shared
 from wheretolook.view.state import MAX_VIEWS, ViewState
-
-if TYPE_CHECKING:
-    from viser import GuiApi
 
 HINT = "Click a place on the coloured floor: the score of every direction there, and the best views."
 LIMITS = {threshold_label(threshold_key(limits)): limits for limits in THRESHOLDS}
@@ -30,9 +27,9 @@ _BLANK = np.full((270, 360, 3), (38, 40, 46), np.uint8)
 
 
 class Controls:
-    """Handles of all elements of the panel, with one tab per `_add` method."""
+    """Handles of all elements of the panel, which is made by a `viser.GuiApi`."""
 
-    def __init__(self, gui: GuiApi, shared: Shared, state: ViewState) -> None:
+    def __init__(self, gui: Any, shared: Shared, state: ViewState) -> None:
         tabs = gui.add_tab_group()
         with tabs.add_tab("Look"):
             self._add_map(gui, shared, state)
@@ -52,7 +49,7 @@ class Controls:
         with tabs.add_tab("Share"):
             self._add_share(gui, state)
 
-    def _add_map(self, gui: GuiApi, shared: Shared, state: ViewState) -> None:
+    def _add_map(self, gui: Any, shared: Shared, state: ViewState) -> None:
         viewed = shared.viewed
         warnings = "\n\n".join(f"⚠ {escape_markdown(text[0].upper() + text[1:])}." for text in viewed.warnings)
         self.warnings = gui.add_markdown(warnings, visible=bool(warnings))
@@ -66,7 +63,7 @@ class Controls:
         hint = "Places and views below are paler."
         self.threshold = gui.add_slider("good from", 0.0, 1.0, 0.01, threshold, hint=hint)
 
-    def _add_location(self, gui: GuiApi, state: ViewState) -> None:
+    def _add_location(self, gui: Any, state: ViewState) -> None:
         self.summary = gui.add_markdown(HINT)
         self.n = gui.add_slider("best views", 1, MAX_VIEWS, 1, state.n)
         self.view = gui.add_slider("shown", 1, max(2, state.n), 1, 1)
@@ -74,10 +71,10 @@ class Controls:
         self.pitch = gui.add_slider("pitch, °", -90.0, 90.0, 0.5, 0.0)
         hint = "Stand at the place: drag to turn, and the score follows."
         self.inside = gui.add_checkbox("look through it", False, hint=hint)
-        self.picture: Any = gui.add_image(_BLANK, visible=False)
+        self.picture = gui.add_image(_BLANK, visible=False)
         self.picture_caption = gui.add_markdown("")
 
-    def _add_layers(self, gui: GuiApi, shared: Shared, state: ViewState) -> None:
+    def _add_layers(self, gui: Any, shared: Shared, state: ViewState) -> None:
         viewed = shared.viewed
         z = viewed.landmarks.points[:, 2] if viewed.mesh is None else viewed.mesh.bounds[:, 2]
         low = float(z.min())
@@ -94,14 +91,14 @@ class Controls:
         self.limits = gui.add_dropdown("labels within", tuple(LIMITS), visible=has_labels)
         self.label_summary = gui.add_markdown("", visible=has_labels)
 
-    def _add_paths(self, gui: GuiApi, shared: Shared) -> None:
+    def _add_paths(self, gui: Any, shared: Shared) -> None:
         self.play = gui.add_button("Play")
         self.step = gui.add_slider("step", 1, max(map(len, shared.paths.values())), 1, 1)
         for name in shared.paths:
             self.path_captions[name] = gui.add_markdown(f"**{escape_markdown(name)}**")
             self.path_pictures[name] = gui.add_image(_BLANK)
 
-    def _add_waypoints(self, gui: GuiApi) -> None:
+    def _add_waypoints(self, gui: Any) -> None:
         self.placing = gui.add_checkbox("clicks set waypoints", False)
         self.waypoints = gui.add_markdown("No waypoints yet.")
         self.add = gui.add_button("Add the place looked at")
@@ -109,14 +106,14 @@ class Controls:
         self.format = gui.add_dropdown("format", tuple(FILES))
         self.save = gui.add_button("Save with best views")
 
-    def _add_share(self, gui: GuiApi, state: ViewState) -> None:
+    def _add_share(self, gui: Any, state: ViewState) -> None:
         self.photo = gui.add_button("Save a picture")
         self.dark = gui.add_checkbox("dark", False)
         self.link = gui.add_markdown("")
         self.state = gui.add_text("state", state.text(), hint="For wheretolook view --state.")
 
 
-def _height_slider(gui: GuiApi, label: str, low: float, high: float, value: float | None) -> Any:
+def _height_slider(gui: Any, label: str, low: float, high: float, value: float | None) -> Any:
     low = round(np.floor(low / STEP_M) * STEP_M, 3)
     high = round(max(np.ceil(high / STEP_M) * STEP_M, low + STEP_M), 3)
     chosen = high if value is None else round(_clamp(value, low, high) / STEP_M) * STEP_M

@@ -121,8 +121,8 @@ def _compared_paths(path: Path, pair: int) -> Paths:
     paths = {}
     for name in methods:
         rows = chosen[chosen["method"] == name]
-        labelled = "status" in rows and not (rows["status"] == UNLABELLED).any()
-        paths[str(name)] = RecordedPath(poses(rows), is_good(rows, GOOD_M, GOOD_DEG) if labelled else None)
+        has_labels = "status" in rows and not (rows["status"] == UNLABELLED).any()
+        paths[str(name)] = RecordedPath(poses(rows), is_good(rows, GOOD_M, GOOD_DEG) if has_labels else None)
     return paths
 
 

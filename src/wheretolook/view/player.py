@@ -43,8 +43,8 @@ class Player:
         for name, path in self.paths.items():
             line = camera_centers(path.cam_from_world)
             segments = np.stack([line[:-1], line[1:]], axis=1)
-            options = {"thickness": 4.0, "thickness_units": "screen"}
-            session.scene.add_line_segments(f"/path/{name}", segments, self._colors[name], **options)
+            color = self._colors[name]
+            session.scene.add_line_segments(f"/path/{name}", segments, color, thickness=4.0, thickness_units="screen")
         controls = session.controls
         for handle in (controls.step, controls.method, controls.occlusion):
             session.on(handle, lambda: self.show(int(value_of(controls.step, 1)) - 1))

@@ -128,25 +128,25 @@ def model_arrays(reconstruction: Any) -> ModelArrays:
 
     Raises MapError if a track names an image without a pose.
     """
-    stored = _stored_points(reconstruction)
-    if not (stored.errors_px[stored.lengths > 0] >= 0).all():  # COLMAP writes -1 for an unknown error
+    points, elements = _points_and_tracks(reconstruction)
+    if not (points["error"][points["n"] > 0] >= 0).all():  # COLMAP writes -1 for an unknown error
         reconstruction.update_point_3d_errors()
-        stored = _stored_points(reconstruction)
+        points, elements = _points_and_tracks(reconstruction)
     image_ids = np.array(sorted(i for i, image in reconstruction.images.items() if image.has_pose), dtype=np.int64)
     images = [reconstruction.images[i] for i in image_ids]
-    if not np.isin(stored.elements[:, 0], image_ids).all():
+    if not np.isin(elements[:, 0], image_ids).all():
         raise MapError("points were observed by images without a pose", fix=REBUILD)
     return ModelArrays(
-        point_ids=stored.ids,
-        points=stored.points,
-        errors_px=stored.errors_px,
+        point_ids=points["id"].astype(np.int64),
+        points=points["xyz"],
+        errors_px=points["error"],
         image_ids=image_ids,
         image_names=[image.name for image in images],
         image_centers=np.array([image.projection_center() for image in images], dtype=np.float64).reshape(-1, 3),
         image_focal_px=np.array([mean_focal_px(reconstruction.cameras[image.camera_id]) for image in images]),
-        observation_start=np.concatenate([[0], np.cumsum(stored.lengths)]).astype(np.int64),
-        observation_image=np.searchsorted(image_ids, stored.elements[:, 0]),
-        observation_keypoint=stored.elements[:, 1],
+        observation_start=np.concatenate([[0], np.cumsum(points["n"])]).astype(np.int64),
+        observation_image=np.searchsorted(image_ids, elements[:, 0]),
+        observation_keypoint=elements[:, 1],
     )
 
 
@@ -230,29 +230,19 @@ def load_mapping_poses(path: str | Path) -> Float:
     return np.asarray(poses)
 
 
-@dataclass(frozen=True, eq=False)
-class _StoredPoints:
-    """Content of a points3D.bin, sorted by id."""
+def _points_and_tracks(reconstruction: Any) -> tuple[NDArray[Any], NDArray[np.int64]]:
+    """Points (P,) of dtype `POINT`, sorted by id, and their tracks (O, 2) of image id and index of the keypoint.
 
-    ids: NDArray[np.int64]  # (P,)
-    points: NDArray[np.float64]  # (P, 3)
-    errors_px: NDArray[np.float64]  # (P,)
-    lengths: NDArray[np.int64]  # (P,) of the tracks
-    elements: NDArray[np.int64]  # (O, 2) image id and index of the keypoint, track after track
-
-
-def _stored_points(reconstruction: Any) -> _StoredPoints:
-    """Points and tracks of a reconstruction, through a file: reading 500,000 one by one takes 15 seconds."""
+    They are read from a file: reading 500,000 points one by one takes 15 seconds.
+    """
     with temporary_folder() as folder:
         reconstruction.write_binary(folder)
         data = np.fromfile(folder / "points3D.bin", dtype=np.uint8)
         starts = point_starts(folder / "points3D.bin")
-    heads = point_heads(data, starts)
+    points = point_heads(data, starts)
     elements = track_elements(data, starts).astype(np.int64)
-    lengths = heads["n"].astype(np.int64)
-    order = np.argsort(heads["id"])
+    order = np.argsort(points["id"])
+    lengths = points["n"].astype(np.int64)
     ends = np.cumsum(lengths)
     rows = np.repeat((ends - lengths)[order] - np.cumsum(lengths[order]) + lengths[order], lengths[order])
-    elements = elements[rows + np.arange(len(rows))]
-    heads = heads[order]
-    return _StoredPoints(heads["id"].astype(np.int64), heads["xyz"], heads["error"], lengths[order], elements)
+    return points[order], elements[rows + np.arange(len(rows))]

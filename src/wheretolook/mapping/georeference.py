@@ -213,18 +213,14 @@ def read_marker_table(path: Path) -> dict[int, float]:
 
     Raises ConfigError if the file is missing or not such a table, or a marker has two sizes.
     """
-    sizes: dict[int, float] = {}
-    for row in _read_rows(path, ("id", "size_m")):
-        try:
-            marker = int(row["id"])
-            size = float(row["size_m"])
-        except ValueError as error:
-            raise ConfigError("not a marker's id and size", path=path, value=row, fix="Write 7,0.15.") from error
-        if not 0 < size < np.inf:
-            raise ConfigError("a marker's size must be positive", path=path, value=row)
-        if sizes.setdefault(marker, size) != size:
-            raise ConfigError(f"marker {marker} has two sizes", path=path, value=(sizes[marker], size))
-    return sizes
+    rows = _read_rows(path, ("id", "size_m"))
+    try:
+        sizes = {(int(row["id"]), float(row["size_m"])) for row in rows}
+    except ValueError as error:
+        raise ConfigError(f"not a marker's id and size: {error}", path=path, fix="Write 7,0.15.") from error
+    if len(dict(sizes)) < len(sizes) or not all(0 < size < np.inf for _, size in sizes):
+        raise ConfigError("each marker needs one positive size", path=path, value=sorted(sizes))
+    return dict(sizes)
 
 
 def read_positions(path: Path) -> dict[str, Float]:

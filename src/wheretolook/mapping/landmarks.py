@@ -167,20 +167,15 @@ def load_colmap_landmarks(
     Raises MapError if the folder, a file or the database is missing, corrupt or does not match, or no landmark remains.
     """
     reconstruction = reconstruction or read_model(model_dir)
-    if reconstruction.num_points3D() == 0:
-        fix = "Triangulate it, or map with more overlap or texture."
-        raise MapError("the model has no points", path=model_dir, fix=fix)
     model = model_arrays(reconstruction)
     observed = np.diff(model.observation_start) > 0
-    if not observed.any():
-        raise MapError("no point of the model has a track", path=model_dir, fix="Triangulate the model from keypoints.")
     worst_px = np.inf if max_reprojection_error_px is None else max_reprojection_error_px
     keep = np.flatnonzero(observed & (model.errors_px <= worst_px))
     if len(keep) == 0:
-        problem = f"all {observed.sum()} points have more than {max_reprojection_error_px} px mean reprojection error"
-        smallest = f"at least {model.errors_px[observed].min():.2f} px"
-        fix = "Raise max_reprojection_error_px, or check the intrinsics and poses of the model."
-        raise MapError(problem, path=model_dir, value=smallest, fix=fix)
+        problem = f"the model has no points with a track and a reprojection error of at most {worst_px:g} px"
+        value = f"{len(observed)} points, {observed.sum()} with a track"
+        fix = "Triangulate the model, raise max_reprojection_error_px, or check its intrinsics and poses."
+        raise MapError(problem, path=model_dir, value=value, fix=fix)
     _warn_of_omitted(observed, len(keep), worst_px, model_dir)
     model = _select_points(model, keep)
     kind = SIFT
@@ -205,13 +200,13 @@ def load_colmap_landmarks(
 
 def _warn_of_omitted(observed: NDArray[np.bool_], n_kept: int, worst_px: float, model_dir: str | Path) -> None:
     n_unobserved = int((~observed).sum())
-    n_inaccurate = int(observed.sum()) - n_kept
-    if not n_unobserved + n_inaccurate:
-        return
-    reasons = [f"{n_inaccurate:,} with a mean reprojection error of more than {worst_px:g} px"] if n_inaccurate else []
-    reasons += [f"{n_unobserved:,} that no image observes"] if n_unobserved else []
-    text = f"{model_dir}: {n_kept:,} of {len(observed):,} points are landmarks; omitted: {', '.join(reasons)}"
-    warnings.warn(text, MapWarning, stacklevel=3)
+    n_inaccurate = len(observed) - n_unobserved - n_kept
+    if n_unobserved + n_inaccurate:
+        text = (
+            f"{model_dir}: {n_kept:,} of {len(observed):,} points are landmarks; omitted: {n_inaccurate:,} with a mean "
+        )
+        text += f"reprojection error of more than {worst_px:g} px, {n_unobserved:,} that no image observes"
+        warnings.warn(text, MapWarning, stacklevel=3)
 
 
 def nearest_other_cosine(descriptors: NDArray[Any], device: str = "cpu", progress: bool = True) -> NDArray[np.float32]:

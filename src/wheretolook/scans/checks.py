@@ -39,8 +39,7 @@ def check_depth_unit(frames: RgbdFrames) -> None:
     if frames.model is not None:
         factor = landmark_factor(landmark_readings(frames, frames.model))
         if factor is not None and not 1 / _LANDMARK_OFF < factor < _LANDMARK_OFF:
-            problem = "depths are in another unit than the model: its landmarks are "
-            problem += f"{factor:.3g} times as far as the depth images show"
+            problem = f"the model's landmarks are {factor:.3g} times as far as the depth images show"
             fix = f"Give the model metres (`wheretolook map --model`), or {_option(scale / factor)} if its unit is one."
             raise SceneError(problem, path=frames.folder, value=f"{scale:g} units a metre", fix=fix)
     factor = pose_factor(frames.survey_m, frames.camera, frames.cam_from_world)
@@ -48,17 +47,16 @@ def check_depth_unit(frames: RgbdFrames) -> None:
         problem = "neighbouring frames do not show the same surfaces at their poses, whatever the unit of depth"
         fix = "Give poses world_from_cam (not cam_from_world), x right, y down, z forward, of the same frames."
         raise SceneError(problem, path=frames.folder, fix=fix)
+    median_m = float(np.median(frames.survey_m[frames.survey_m > 0]))
     if factor is not None and not 1 / _UNIT_OFF < factor < _UNIT_OFF:
-        problem = "depths are in another unit than poses: neighbouring frames show the same surfaces only if depths "
-        problem += f"are about {factor:.2g} times as large"
+        problem = f"depths seem to be {factor:.2g} times as large in the unit of the poses"
         fix = f"Give {_option(scale / factor)}, or poses in metres."
-        raise SceneError(problem, path=frames.folder, value=f"{scale:g} units a metre", fix=fix)
-    median = float(np.median(frames.survey_m[frames.survey_m > 0]))
-    if not DEPTH_M[0] <= median <= DEPTH_M[1]:
-        problem = f"depths seem not to be in metres: half of the readings are nearer than {median:.3g} m"
-        fix = f"Say how many units make a metre, such as {_option(5000 if scale < 5000 else 1000)}, and give poses in "
-        fix += "metres."
-        raise SceneError(problem, path=frames.folder, value=f"{scale:g} units a metre", fix=fix)
+    elif not DEPTH_M[0] <= median_m <= DEPTH_M[1]:
+        problem = f"depths seem not to be in metres: half of the readings are nearer than {median_m:.3g} m"
+        fix = f"Give the units of a metre, such as {_option(5000 if scale < 5000 else 1000)}, and poses in metres."
+    else:
+        return
+    raise SceneError(problem, path=frames.folder, value=f"{scale:g} units a metre", fix=fix)
 
 
 def landmark_readings(frames: RgbdFrames, model: Any) -> Float:

@@ -39,6 +39,8 @@ from wheretolook.utils.files import atomic_folder
 from wheretolook.utils.images import image_size
 from wheretolook.utils.processes import WorkerPool
 
+_EITHER = "Leave --database out to triangulate again, or --images to keep the model's landmarks."
+_FIX = "Raise map.existing.max_reprojection_error_px, or check the model's poses and intrinsics."
 _PROPORTION_TOLERANCE = 0.01  # between the proportions of a photograph and of its camera
 _EXIF_ORIENTATION = 274
 _SIDEWAYS = (5, 6, 7, 8)  # values of EXIF's orientation for photographs that are stored on a side
@@ -68,54 +70,40 @@ def map_existing(
 ) -> ExistingMapReport:
     """Make a map of the COLMAP model in `config.existing.model`; `reconstruction` is that model, if read already.
 
-    Writes what `build_map` writes: a COLMAP model with `landmarks.npz`, `cameras.npz` and `report.json`, which is also
-    returned. Without images it is the model itself, with its rigs. With `config.photographs.images`, its images have
-    the same poses and names, but ids from 1 and, as in a map of photographs, the reduced size; their keypoints are
-    cached in `work`. A `MapWarning` reports points that are left out, and doubts about metres or z up.
-
-    Raises MapError if the model, the database or an image cannot be used, nothing gives the scale asked for, or
-    `out_dir` holds something that is not a map; ConfigError for settings that exclude one another.
+    Writes what `build_map` writes. Without images it is the model itself, with its rigs. With
+    `config.photographs.images`, its images have the same poses and names, but ids from 1 and the reduced size; their
+    keypoints are cached in `work`. A `MapWarning` reports omitted points, and doubts about metres or z up.
+    Raises MapError if the model, the database or an image cannot be used, nothing gives the requested scale, or
+    `out_dir` holds something else; ConfigError for settings that exclude one another.
     """
     settings = config.existing
     photographs = config.photographs
-    out_dir = Path(out_dir)
-    work = Path(work)
     if settings.model is None:
         raise ConfigError("no model was named", fix="Set map.existing.model.")
     if photographs.images is not None and settings.database is not None:
-        fix = "Leave --database out to triangulate again, or --images to keep the model's landmarks."
-        raise ConfigError("images give new keypoints, which a database does not describe", fix=fix)
-    check_replaceable(out_dir)
+        raise ConfigError("images give new keypoints, which a database does not describe", fix=_EITHER)
+    check_replaceable(Path(out_dir))
     known = KnownScale.read(photographs.scale)
-    with atomic_folder(out_dir) as folder, WorkerPool(workers) as processes:
+    with atomic_folder(Path(out_dir)) as folder, WorkerPool(workers) as processes:
         run = MapRun(config, processes, seed, device, progress)
         clock = run.clock
         with clock("read"):
             model = reconstruction or read_model(settings.model)
-            colmap_poses(settings.model, model)  # raises if there is no image with a pose
             n_points = model.num_points3D()
         database = settings.database
         limit_px = settings.max_reprojection_error_px
         turned = True
         if photographs.images is not None:
             with clock("extract"):
-                work.mkdir(parents=True, exist_ok=True)
-                names = list(registered_names(model).values())
-                for name in names:
-                    path_within(photographs.images, name, "the name of an image of the model")
-                turned = _are_turned(model, photographs.images)
-                features = photograph_features(photographs.images, work, run, names, turned)
+                features, turned = _extract(model, photographs.images, Path(work), run)
             database = folder / DATABASE_FILE
             model = _triangulate(model, features, database, run)
             limit_px = limit_px or photographs.max_reprojection_error_px
         with clock("frame"):
-            scale, to_world = _world(model, known, settings.level, photographs.images, turned, progress)
-            if to_world is not None:
-                to_world.transform_model(model)
-            if limit_px and not all(point.has_error() for point in model.points3D.values()):
-                model.update_point_3d_errors()
-        fix = "Raise map.existing.max_reprojection_error_px, or check the model's poses and intrinsics."
-        draft = MapDraft(model, settings.model, limit_px, fix, database, search_device=device)
+            scale = _move_to_world(model, known, settings.level, photographs.images, turned, progress)
+        if limit_px and not all(point.has_error() for point in model.points3D.values()):
+            model.update_point_3d_errors()
+        draft = MapDraft(model, settings.model, limit_px, _FIX, database, search_device=device)
         landmarks, fields = finish_map(draft, folder, run)
         poses = colmap_poses(settings.model, model)
         report = ExistingMapReport(
@@ -133,17 +121,27 @@ def map_existing(
     return report
 
 
-def _world(
+def _move_to_world(
     model: Any, known: KnownScale, level: bool, images: Path | None, turned: bool, progress: bool
-) -> tuple[MapScale, Similarity | None]:
-    """The scale of a model, and the similarity to the world; None if the model stays as it is."""
+) -> MapScale:
+    """Transform a model to the world frame by its scale and gravity, where they are asked for. Returns the scale."""
     rotation: Float = np.eye(3)
     if level:
         rotation = estimate_gravity(colmap_poses("", model)).rotation
     scale, to_world = find_scale(model, known, Similarity(1.0, rotation, np.zeros(3)), images, turned, progress)
-    if scale.is_metric:
-        return scale, to_world
-    return MapScale("model"), to_world if level else None
+    if scale.is_metric or level:
+        to_world.transform_model(model)
+    return scale if scale.is_metric else MapScale("model")
+
+
+def _extract(model: Any, images: Path, work: Path, run: MapRun) -> tuple[PhotographFeatures, bool]:
+    """Extract keypoints of a model's images in a folder; also returns whether they are turned upright by EXIF."""
+    work.mkdir(parents=True, exist_ok=True)
+    names = list(registered_names(model).values())
+    for name in names:
+        path_within(images, name, "the name of an image of the model")
+    turned = _are_turned(model, images)
+    return photograph_features(images, work, run, names, turned), turned
 
 
 def _triangulate(source: Any, features: PhotographFeatures, database: Path, run: MapRun) -> Any:

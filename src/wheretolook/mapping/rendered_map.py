@@ -18,6 +18,7 @@ from wheretolook.mapping.config import PARTNERS, MapConfig
 from wheretolook.mapping.map_folder import (
     DATABASE_FILE,
     IMAGES_FOLDER,
+    Clock,
     MapDraft,
     MapReport,
     MapRun,
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from wheretolook.rendering.types import Renderer
 
 _RENDER_BATCH = 4
+_FIX = "Map with more images (n_images), or check that the scene has texture."
 
 
 @dataclass(frozen=True)
@@ -69,17 +71,12 @@ def build_map(  # a scene has four parts, and the output and its resources are t
     """Map a scene in metres, z up: walk, render, extract, match, triangulate with known poses, filter.
 
     With `poses` (M, 3, 4), images are rendered there instead of along a walk.
-
-    The result is a COLMAP model (binary) that any COLMAP tool opens, with `landmarks.npz`, `cameras.npz` and
-    `report.json`, which is also returned. The model holds the filtered points only, so that every reader gets the same
-    map. The folder appears when all is done and replaces an earlier map; a failed build leaves nothing behind. The same
-    seed gives the same bytes.
-
+    The result is a binary COLMAP model of the filtered points, with `landmarks.npz`, `cameras.npz` and `report.json`,
+    which is also returned. The folder appears when all is done and replaces an earlier map, right after
+    `before_replace`; a failed build leaves nothing behind. The same seed gives the same bytes.
     `raycaster` measures the distance from landmarks to the mesh. Keypoints are extracted on `device`, "cpu" or a CUDA
-    device, and matched, by `workers` processes; above 1 the caller's script must be guarded by
-    `if __name__ == "__main__":`, as for any of Python's process pools. `before_replace` is called when all is done,
-    right before the folder changes. Raises MapError if the images give no landmark or `out_dir` holds something that is
-    not a map, SceneError if there is no floor to walk on.
+    device, and matched, by `workers` processes, which need `if __name__ == "__main__":` in the caller's script. Raises
+    MapError if the images give no landmark or `out_dir` holds something else, SceneError without floor to walk on.
     """
     config = config or MapConfig()
     out_dir = Path(out_dir)
@@ -99,15 +96,9 @@ def build_map(  # a scene has four parts, and the output and its resources are t
             pairs = triangulation.choose_pairs(overlap, PARTNERS)
         database = folder / DATABASE_FILE
         model = triangulate_known_poses(database, camera, poses, keypoints, colors, pairs, run)
-        fix = "Map with more images (n_images), or check that the scene has texture."
-        draft = MapDraft(model, out_dir, config.max_reprojection_error_px, fix, database)
+        draft = MapDraft(model, out_dir, config.max_reprojection_error_px, _FIX, database)
         landmarks, fields = finish_map(draft, folder, run)
-        with clock("accuracy"):
-            from wheretolook.rendering.raycasting import MeshRaycaster
-
-            limit_m = float(np.linalg.norm(mesh.bounds[1] - mesh.bounds[0]))
-            caster = raycaster or MeshRaycaster(mesh)
-            distance_cm = 100.0 * caster.distance_to_surface(landmarks.points, limit_m).astype(np.float64)
+        distance_cm = _distance_cm(landmarks.points, mesh, raycaster, clock)
         report = RenderedMapReport(
             n_images=len(poses),
             **fields,
@@ -123,6 +114,16 @@ def build_map(  # a scene has four parts, and the output and its resources are t
         )
         report.save(folder)
     return report
+
+
+def _distance_cm(points: Float, mesh: TexturedMesh, raycaster: MeshRaycaster | None, clock: Clock) -> Float:
+    """Distances (N,) in centimetres from points (N, 3) to a mesh."""
+    from wheretolook.rendering.raycasting import MeshRaycaster
+
+    with clock("accuracy"):
+        limit_m = float(np.linalg.norm(mesh.bounds[1] - mesh.bounds[0]))
+        caster = raycaster or MeshRaycaster(mesh)
+        return 100.0 * caster.distance_to_surface(points, limit_m).astype(np.float64)
 
 
 def _walk_and_poses(

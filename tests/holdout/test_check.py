@@ -183,7 +183,7 @@ def test_adapted_weights_are_checked_on_their_map_without_most_of_its_landmarks(
     same, before = (pd.read_csv(folder / "views.csv")["score"] for folder in (tmp_path / "out", checked))
     assert np.abs(same - before).max() < 1e-6
     elsewhere = str(_adapted(tmp_path, place + 0.5))
-    with pytest.raises(WeightsError, match=r"adapted to another place.*--anywhere"):
+    with pytest.raises(WeightsError, match=r"adapted to another scene.*--anywhere"):
         run([*_arguments(*corridor, tmp_path / "new", "--metres", "--weights"), elsewhere])
     assert not [*(tmp_path / "new").glob("work/*")]  # before the work
     run([*arguments, elsewhere, "--anywhere"])

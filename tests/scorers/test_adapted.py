@@ -186,7 +186,7 @@ def test_they_are_refused_in_another_place_unless_forced(place: tuple[Localizati
     landmarks = around.landmarks
     moved = Landmarks(**{**landmarks.__dict__, "points": landmarks.points + np.array([0.5, 0, 0])})
     elsewhere = LocalizationMap(moved, around.camera)
-    with pytest.raises(WeightsError, match="adapted to another place") as caught:
+    with pytest.raises(WeightsError, match="adapted to another scene") as caught:
         load_scorer(path, elsewhere)
     assert caught.value.path == path
     assert load_scorer(path, elsewhere, anywhere=True).name == "adapted"

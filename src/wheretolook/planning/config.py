@@ -41,7 +41,7 @@ class ViewpointMapConfig(MappedLattice):
         weights: file of weights that the train stage wrote, for a method that has learnt. Unless a method is named,
             the best of the dataset, or else of those that ship, for cameras with their field of view.
         out: folder to write; empty for `<data>/<name>/<scene>/viewpoint-map`. Only with a scene.
-        anywhere: let weights that are adapted to another place score here, too.
+        anywhere: let weights that are adapted to another scene score here, too.
     """
 
     scene: str = ""
@@ -130,7 +130,7 @@ class PlanConfig(MappedLattice):
         against: further methods to plan by, drawn beside it. Such as forward and fisher-trace-gp; in `methods.png`.
         film: kind of film to make: gif, mp4 or none.
         rerun: write a recording for the Rerun viewer too. Needs `pip install rerun-sdk`.
-        anywhere: let weights that are adapted to another place score here, too.
+        anywhere: let weights that are adapted to another scene score here, too.
         planner: costs and limits of the path, time to plan.
         stops: where one look will not do.
     """

@@ -105,7 +105,7 @@ class WhereToLook:
             lattice: how they are spread: "fibonacci" evenly; "yaw-pitch" 6 pitches x 18 yaws as in ActLoc.
             max_reprojection_error_px: landmarks with a larger mean error are left out; None for the map's own default.
             device: "auto" for a GPU if there is one, "cpu", or "cuda:0".
-            anywhere: whether weights that are adapted to another place may score here.
+            anywhere: whether weights that are adapted to another scene may score here.
 
         Raises:
             MapError: no usable model in the folder, or database.

@@ -1,4 +1,4 @@
-"""The set network, adapted to one place by views that were localized there."""
+"""The set network, adapted to one scene by views that were localized there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Nearness of views: how much one that was localized tells of another."""
+"""Kernel between views, and the correction of log-odds by localized views."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from scipy.spatial import cKDTree
 
 from wheretolook.geometry.poses import Float
 
-REACH = 4.0  # lengths beyond which a view tells nothing: there the kernel is below 4e-4
+REACH = 4.0  # lengths beyond which the kernel, below 4e-4, is cut to zero
 
 
 def nearness(
     centers: Float, axes: Float, other_centers: Float, other_axes: Float, length_m: float, sharpness: float
 ) -> Float:
-    """The kernel (B, N) between views (B, 3) m and (N, 3) m with unit optical axes, 1 for the same view.
+    """Return the kernel (B, N) between views (B, 3) m and (N, 3) m with unit optical axes, 1 for the same view.
 
     A Gaussian of the distance between the cameras, with standard deviation `length_m`, times a von Mises-Fisher kernel
     of the angle between their axes, exp(sharpness (cos - 1)); 0 beyond `REACH` lengths.
@@ -25,9 +25,9 @@ def nearness(
 
 
 class Correction:
-    """The sum over N views of their weights (N,), each times its nearness to the view asked for.
+    """The sum over N views of their weights (N,), each times its kernel with the query view.
 
-    `grid` is for many directions at the same places: what the distance tells is computed once for all.
+    `grid` computes the distances of many directions at the same locations once.
     """
 
     def __init__(self, centers: Float, axes: Float, weights: Float, length_m: float, sharpness: float) -> None:
@@ -39,23 +39,23 @@ class Correction:
         self._tree = cKDTree(centers) if len(centers) else None
 
     def at(self, centers: Float, axes: Float) -> Float:
-        """The correction (B,) of views (B, 3), (B, 3)."""
-        found = np.zeros(len(centers))
+        """Return the correction (B,) of views at centers (B, 3) m with optical axes (B, 3)."""
+        values = np.zeros(len(centers))
         _, row = np.unique(centers, axis=0, return_inverse=True)
         order = np.argsort(row.reshape(-1), kind="stable")
         for rows in np.split(order, np.flatnonzero(np.diff(row.reshape(-1)[order])) + 1):
             if len(rows):
-                found[rows] = self._around(centers[rows[0]], axes[rows])
-        return found
+                values[rows] = self._at_location(centers[rows[0]], axes[rows])
+        return values
 
     def grid(self, locations: Float, directions: Float) -> Float:
-        """The correction (L, D) of views at locations (L, 3) along each of directions (D, 3)."""
-        found = np.empty((len(locations), len(directions)))
+        """Return the correction (L, D) of views at locations (L, 3) m along each of directions (D, 3)."""
+        values = np.empty((len(locations), len(directions)))
         for row, location in enumerate(locations):
-            found[row] = self._around(location, directions)
-        return found
+            values[row] = self._at_location(location, directions)
+        return values
 
-    def _around(self, location: Float, axes: Float) -> Float:
+    def _at_location(self, location: Float, axes: Float) -> Float:
         near = self._near(location)
         if not len(near):
             return np.zeros(len(axes))

@@ -1,4 +1,4 @@
-"""What weights adapted to a place hold: the network they start from, and how its log-odds are corrected there."""
+"""Scene-adapted weights: the base network, and the correction of its log-odds."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import torch
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.trained_network import StoredNetwork
 
-MAX_SUPPORT = 1_000_000  # views that a correction may stand on: more are no weights of this program
+MAX_SUPPORT = 1_000_000  # of views and landmarks: more are no weights of this program
 
 
 class AdaptedNetwork(StoredNetwork):
     """A set network, its calibration, and a correction of its log-odds that depends on the pose.
 
-    The correction at a pose is the sum over N localized views of `support_weights`, each times the nearness of that
-    view to the pose, see `wheretolook.scorers.adapted.kernel`. Poses and `place`, some of the map's landmarks by which
-    the place is known again, are in the map's frame, in metres.
+    The correction at a pose is the sum over N localized views of `support_weights`, each times its kernel with the pose,
+    see `wheretolook.scorers.adapted.kernel`. `place` holds some of the map's landmarks, by which the scene is recognized,
+    in the map's frame in metres.
     """
 
     support_centers: torch.Tensor  # (N, 3) float64 m
@@ -42,14 +42,14 @@ class AdaptedNetwork(StoredNetwork):
             self.register_buffer(name, torch.zeros(shape, dtype=torch.float64))
 
     def description(self) -> dict[str, Any]:
-        """All that defines the network but its weights, as JSON values."""
+        """See `StoredNetwork.description`."""
         base = {"network": self.network.description(), "scale": self.base_scale, "offset": self.base_offset}
         kernel = {"length_m": self.length_m, "sharpness": self.sharpness}
         return {"base": base, "kernel": kernel, "support": len(self.support_weights), "place": len(self.place)}
 
     @classmethod
     def of_description(cls, stored: Mapping[str, Any]) -> Self:
-        """The network with this description, without weights. Raises what a damaged one makes Python raise."""
+        """See `StoredNetwork.of_description`."""
         base = stored["base"]
         kernel = stored["kernel"]
         sizes = int(stored["support"]), int(stored["place"])

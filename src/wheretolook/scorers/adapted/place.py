@@ -1,4 +1,4 @@
-"""Whether a map is of the place that weights were adapted to."""
+"""Check that a map is of the scene that weights were adapted to."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from wheretolook.geometry.poses import Float
 
 SAME_M = 0.05
 LEAST_SAME = 0.5
-"""A map is of the place if so large a share of the landmarks that are known has one of the map's within this distance:
-a map with other filters, or made anew in the same frame, still is."""
+"""A map is of the scene if this share of the stored landmarks has one of the map's within this distance. A map with
+other filters, or reconstructed again in the same frame, still is."""
 
 
 def share_of_place(place: Float, landmarks: Float) -> float:
-    """The share of a place's landmarks (P, 3) m that a map's (N, 3) m has too; 1 if none are known."""
+    """Return the share of stored landmarks (P, 3) m that a map's landmarks (N, 3) m contain; 1 if none are stored."""
     if len(place) == 0:
         return 1.0
     return float((cKDTree(landmarks).query(place)[0] <= SAME_M).mean()) if len(landmarks) else 0.0

@@ -1,4 +1,4 @@
-"""The score of weights that are adapted to a place."""
+"""Scorer of scene-adapted weights."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import WeightsError
 from wheretolook.utils.probability import finite_log_odds
 
-TINY = 1e-12  # chances are kept this far from 0 and 1, so that their log-odds are finite
+TINY = 1e-12  # distance of probabilities from 0 and 1, so that their log-odds are finite
 
 
 def adapted_scorer(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
-    """The scorer of a file of adapted weights; a WeightsError if the map is of another place."""
+    """Build the scorer of adapted weights; a WeightsError if the map is of another scene."""
     assert options.weights is not None
     trained = TrainedNetwork.load(options.weights, AdaptedNetwork, "adapted", device="cpu")
     return AdaptedScorer(localization_map, trained, anywhere=options.anywhere)
 
 
 class AdaptedScorer(Scorer):
-    """The set network adapted to one place: its log-odds, calibrated there, and corrected where it was wrong nearby."""
+    """The set network with log-odds calibrated and corrected by localized views of one scene."""
 
     name = "adapted"
 
@@ -56,43 +56,43 @@ class AdaptedScorer(Scorer):
         return self._corrected(self.base.score(poses), self.correction.at(camera_centers(poses), poses[:, 2, :3]))
 
     def score_around(self, locations: Float, directions: Float) -> Float:
-        """(L, D) probabilities, as of the network that it starts from."""
+        """Return probabilities (L, D); see `SetScorer.score_around`."""
         locations = check_locations(locations)
         return self._corrected(
             self.base.score_around(locations, directions), self.correction.grid(locations, directions)
         )
 
     def report(self, cam_from_world: Float) -> ViewReport:
-        """As of the network that it starts from, but for the score."""
+        """Return the base network's report with the corrected score."""
         poses = check_poses(cam_from_world)
-        told = self.base.report(poses)
+        report = self.base.report(poses)
         correction = self.correction.at(camera_centers(poses), poses[:, 2, :3])
-        return replace(told, score=self._corrected(told.score, correction))
+        return replace(report, score=self._corrected(report.score, correction))
 
     def in_range(self, cam_from_world: Float) -> NDArray[np.bool_]:
-        """Which poses (B, 3, 4) see what is like the views that the network has learnt from, (B,)."""
+        """Return which poses (B, 3, 4) have views in the range of the training views, (B,)."""
         return self.base.in_range(cam_from_world)
 
     def expected_inliers(self, cam_from_world: Float) -> Float:
-        """How many landmarks poses (B, 3, 4) can be expected to find, (B,)."""
+        """Return how many landmarks poses (B, 3, 4) are expected to detect, (B,)."""
         return self.base.expected_inliers(cam_from_world)
 
-    def _corrected(self, chance: Float, correction: Float) -> Float:
-        return np.asarray(expit(self.trained.scale * log_odds_of(chance) + self.trained.offset + correction))
+    def _corrected(self, probability: Float, correction: Float) -> Float:
+        return np.asarray(expit(self.trained.scale * log_odds_of(probability) + self.trained.offset + correction))
 
 
-def log_odds_of(chance: Float) -> Float:
-    """Finite log-odds of chances in [0, 1]."""
-    return finite_log_odds(chance, TINY)
+def log_odds_of(probability: Float) -> Float:
+    """Return finite log-odds of probabilities in [0, 1]."""
+    return finite_log_odds(probability, TINY)
 
 
 def _check_place(place: Float, localization_map: LocalizationMap) -> None:
     same = share_of_place(place, localization_map.landmarks.points)
     if same < LEAST_SAME:
         fix = (
-            "Adapt to this map, or use weights that are for any place, such as those that ship. To insist: --anywhere "
+            "Adapt to this map, or use weights for any scene, such as the bundled ones. To use them anyway: --anywhere "
             "(select, check), --viewpoint_map.anywhere true, --plan.anywhere true, --evaluate.anywhere true, in Python "
             "anywhere=True."
         )
-        problem = f"these weights are adapted to another place: of its landmarks this map has {same:.0%}"
+        problem = f"these weights are adapted to another scene, of whose landmarks this map has {same:.0%}"
         raise WeightsError(problem, fix=fix)

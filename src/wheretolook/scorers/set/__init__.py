@@ -1,4 +1,4 @@
-"""A network over the set of landmarks in view."""
+"""A network over the set of visible landmarks."""
 
 from __future__ import annotations
 

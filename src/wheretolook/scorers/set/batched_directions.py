@@ -1,8 +1,8 @@
-"""Scores of all directions at a location at once: what the location alone tells of a landmark is computed once.
+"""Score all directions at a location at once, computing what depends on the location only once.
 
-Of what the network is told of a landmark, only where it lies in the image depends on the camera's orientation. So the
-rest of its first layer, and the landmark's information on the pose, serve all directions at the location. The
-information is summed in the world's axes, in which the expected variances that the network looks at are the same.
+Only a landmark's position in the image depends on the camera's orientation. The rest of the first layer, and the
+landmark's information on the pose, serve all directions at the location. The information is summed along the world's
+axes, which leaves the variances that the network uses unchanged.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ SERVED = {
     "axis_height",
     "log_expected_cells",
 }
-"""What a network may be told of a view: the rest depends on the camera's axes."""
+"""Statistics of a view that do not depend on the camera's axes."""
 
 OF_LOCATION = ("distance", "mapped_angle", "distance_ratio", "pixel_size_ratio")
-"""Attributes of a landmark that depend on where the camera is, but not on where it looks."""
+"""Attributes of a landmark that depend on the camera's location, but not on its orientation."""
 
 IMAGE = ("across", "down")
-"""Attributes of a landmark that depend on where the camera looks."""
+"""Attributes of a landmark that depend on the camera's orientation."""
 
 ROOM = {"cpu": 1 << 13, "cuda": 1 << 22}  # landmarks in view that pass the network at once: fits the cache, or 2 GB
 AROUND = {"cpu": 1, "cuda": 1 << 23}  # landmarks around the locations of a block; of a location at least
@@ -56,8 +56,8 @@ LEAST_CELLS = 64  # along a side of the sphere's map: of larger cells too many l
 class ScoresAround:
     """Scores the same directions (D, 3), unit vectors in the world, at any location.
 
-    A view that sees more than `most` landmarks is judged by every second of the map's, every fourth, and so on, along
-    a curve through space (`DevicePoints`), so that between half of `most` and `most` remain.
+    A view of more than `most` landmarks is scored from every second of the map's, every fourth, and so on, along a
+    curve through space (`DevicePoints`), so that between half of `most` and `most` remain.
     """
 
     def __init__(
@@ -182,7 +182,7 @@ class ScoresAround:
     def _of_listed(
         self, listed: ListedViews, around: Surroundings, stride: int, n_visible: Float, heights: Float
     ) -> Float:
-        """Scores (V,) of listed views that see `n_visible` (V,) landmarks in all, and whose axes rise by `heights`."""
+        """Return scores (V,) of listed views of `n_visible` (V,) landmarks in all, whose axes have z `heights` (V,)."""
         network = self.trained.network
         starts = listed.starts
         entries = wp.to_torch(listed.entries)
@@ -193,7 +193,7 @@ class ScoresAround:
         used[entries] = True
         place = used.cumsum(0, dtype=torch.int32) - 1
         seen = used.nonzero()[:, 0]
-        base, told = self._described(offsets[seen], rows[seen] * stride)
+        base, terms = self._described(offsets[seen], rows[seen] * stride)
         n = len(n_visible)
         kept = torch.from_numpy(np.diff(starts)).to(self.device).clamp(min=1)
         sums = torch.zeros((n, N_EXPECTED), device=self.device)
@@ -215,8 +215,8 @@ class ScoresAround:
             hidden = torch.mm(hidden, weight).add_(bias).relu_()
             log_odds = torch.mv(hidden, last.weight[0]).add_(last.bias)
             lengths = torch.from_numpy((starts[begin : end + 1] - starts[begin]).astype(np.int32)).to(self.device)
-            found = torch.sparse_csr_tensor(lengths, here, log_odds.sigmoid(), size=(end - begin, len(told)))
-            sums[views, :16] = found @ told
+            p_detect = torch.sparse_csr_tensor(lengths, here, log_odds.sigmoid(), size=(end - begin, len(terms)))
+            sums[views, :16] = p_detect @ terms
             if self._asks_for_cells:
                 of_view = torch.arange(end - begin, device=self.device).repeat_interleave(lengths.diff())
                 cells[views] = expected_cells(image[span], log_odds, of_view, each[views], IMAGE)
@@ -226,9 +226,9 @@ class ScoresAround:
         return np.asarray(self.trained.calibrated(logits).sigmoid().cpu().numpy())
 
     def _described(self, offsets: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """The first layer (M, W) of landmarks but for where they lie in the image, and what they add to sums (M, 16).
+        """Return the first layer (M, W) of landmarks without their position in the image, and their terms of sums (M, 16).
 
-        They are at offsets (M, 3) m from the location, and at rows (M,) of the points.
+        The landmarks are at offsets (M, 3) m from the location, and at rows (M,) of the points.
         """
         mapped = self._mapped[rows]
         distance = offsets.norm(dim=1)
@@ -241,12 +241,12 @@ class ScoresAround:
         pixels = torch.stack([torch.full_like(size_ratio, self._pixel_angle), size_ratio], 1)
         weight = bearing_precision(pixels, ("pixel_angle", "pixel_size_ratio"))
         x, y, z = bearing.unbind(1)
-        told = torch.empty((len(x), 16), device=self.device)
-        told[:, 0] = 1
-        plane = told[:, 10:]
+        terms = torch.empty((len(x), 16), device=self.device)
+        terms[:, 0] = 1
+        plane = terms[:, 10:]
         for column, number in enumerate((1 - x * x, -x * y, -x * z, 1 - y * y, -y * z, 1 - z * z)):
             torch.mul(number, weight, out=plane[:, column])
         inverse = distance.reciprocal()
-        torch.mul(plane, inverse.square()[:, None], out=told[:, 1:7])
-        torch.mul(bearing, (inverse * weight)[:, None], out=told[:, 7:10])
-        return base, told
+        torch.mul(plane, inverse.square()[:, None], out=terms[:, 1:7])
+        torch.mul(bearing, (inverse * weight)[:, None], out=terms[:, 7:10])
+        return base, terms

@@ -15,11 +15,10 @@ class SetConfig(LandmarksConfig):
     With few training views, batches get smaller and epochs more (`wheretolook.scorers.set.learn.of_size`).
 
     Args:
-        landmark_loss: how much the loss of the chances of being found counts beside that of the views, where it is
-            stored which landmarks were matched.
-        pooled: numbers that attention pools beside what the landmarks are expected to tell of the pose.
-        head: units of the layers that decide.
-        dropout: share of the deciding layers' units dropped.
+        landmark_loss: weight of the loss of landmark detection, where matches are stored.
+        pooled: features that attention pools in addition to the expected information on the pose.
+        head: units of the head's layers.
+        dropout: share of the head's units dropped.
         from_matchability: start from `weights/matchability.safetensors` where the dataset has it.
     """
 
@@ -41,5 +40,5 @@ class SetConfig(LandmarksConfig):
 
     @property
     def starts_from(self) -> str:
-        """The matchability model, unless told otherwise."""
+        """Name of the matchability model, or none."""
         return "matchability" if self.from_matchability else ""

@@ -1,4 +1,4 @@
-"""The network over the set of landmarks that a view sees: whether the view localizes."""
+"""Network over the set of landmarks visible from a view: whether the view localizes."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def _layout(device: torch.device) -> tuple[Tensor, Tensor]:
 
 
 EXPECTED = (
-    "log_expected_inliers",  # log(1 + landmarks expected to be found)
-    "log_visible",  # log(1 + landmarks in view)
-    "expected_share",  # how many of these are expected to be found
+    "log_expected_inliers",  # log(1 + landmarks expected to be detected)
+    "log_visible",  # log(1 + visible landmarks)
+    "expected_share",  # share of these
     "log_position_variance",  # of the expected covariance: the trace of its block of the position
     "log_orientation_variance",
     "log_det_information",
     *(f"log_variance_{axis}" for axis in "xyz"),  # of the position, along the camera's axes
-    "log_spread",  # area of the image the landmarks expected to be found spread over: det of their second moment
+    "log_spread",  # spread of detected landmarks over the image: det of their second moment
 )
 """Outputs of `expected_statistics`."""
 
@@ -64,19 +64,16 @@ CELLS = 30
 
 
 class SetNetwork(LandmarkNetwork):
-    """Scores a view by the set of landmarks it sees, without bins.
+    """Scores a view from the set of its visible landmarks, without bins.
 
-    Each landmark has a probability of being found. Weighted by it, the landmarks' Fisher information sums up to the
-    information that the view can be expected to have on its pose, and its inverse to the expected covariance: how far
-    off position and orientation will be, which is what a label asks. So the probability is the attention by which
-    landmarks are pooled; on request further attention pools what else there may be to know of them, in `pooled`
-    numbers. It also tells over how many cells of the view the landmarks spread that will be found. All of these are
-    made of sums over landmarks, so in training a random sample of them, scaled up, will do.
+    Each landmark's probability of detection weights its Fisher information. The sum is the expected information on the
+    pose, and its inverse the expected covariance of position and orientation, which decides the label. On request,
+    attention pools `pooled` further features. Another statistic is the number of cells of the view that hold a detected
+    landmark. All statistics follow from sums over landmarks, so training uses a random sample, scaled up.
 
-    `width` and `head` are units of the layers that look at single landmarks and of those that decide; `hidden` names
-    attributes not to look at. Of "across", "down" and "distance" the information remains. `told` names the
-    statistics of a view, of `ALL_STATISTICS`, that the deciding layers are given. Given more, they learn
-    their training scenes by heart and choose worse elsewhere than the expected inliers alone.
+    `width` and `head` are units of the layers for single landmarks and of the head; `hidden` names attributes that are
+    no inputs of these layers. `told` names the statistics of a view, of `ALL_STATISTICS`, that are inputs of the head:
+    with more than the default ones it overfits its training scenes.
     """
 
     def __init__(
@@ -92,7 +89,7 @@ class SetNetwork(LandmarkNetwork):
         options = {"width": width, "pooled": pooled, "head": head, "dropout": dropout}
         super().__init__(statistics, **options, hidden=hidden, told=told)
         self.pose_variances = pose_variances  # replaced where there is no Cholesky decomposition
-        self._told = [ALL_STATISTICS.index(name) for name in told]
+        self._inputs = [ALL_STATISTICS.index(name) for name in told]
         self._cells = "log_expected_cells" in told
         self.matchability = MatchabilityNetwork(statistics, width, hidden)
         self.attention = None
@@ -110,26 +107,28 @@ class SetNetwork(LandmarkNetwork):
     def forward(
         self, values: Tensor, taken: Tensor, n_visible: Tensor, axis_height: Tensor, found: Tensor | None = None
     ) -> Tensor:
-        """Logits (B,) from samples (B, K, A) of each view's landmarks, of which the first `taken` (B,) are its own.
+        """Return logits (B,) from samples (B, K, A) of each view's landmarks, of which the first `taken` (B,) count.
 
-        A view sees `n_visible` (B,) landmarks in all; `axis_height` (B,) is the z of its optical axis in the world.
+        `n_visible` (B,) landmarks are visible in all; `axis_height` (B,) is the z of the optical axis in the world.
         """
-        return self._seen(values, self.matchability(values), taken, n_visible, axis_height)
+        return self._logits_of_samples(values, self.matchability(values), taken, n_visible, axis_height)
 
     def learn_more(self, options: SetConfig, count: float, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Logits (B,) of the inputs of `forward`, and a loss beside theirs, with which the chances stay true.
+        """Return logits (B,) of the inputs of `forward`, and a further loss of the detection probabilities.
 
-        The fifth input tells which landmarks were found, (B, K), NaN where that is not known. The `count` of views
-        divides the loss, and the landmarks that a step looks at of a view.
+        The fifth input (B, K) is 1 for detected landmarks, 0 for others, NaN if unknown. The loss is divided by the
+        `count` of views and the landmarks of a training step's window.
         """
         values, taken, n_visible, axis_height, found = inputs
         log_odds = self.matchability(values)
-        logits = self._seen(values, log_odds, taken, n_visible, axis_height)
+        logits = self._logits_of_samples(values, log_odds, taken, n_visible, axis_height)
         known = ~found.isnan()
         missed = binary_cross_entropy_with_logits(log_odds[known], found[known], reduction="sum")
         return logits, options.landmark_loss * missed / (count * options.landmarks)
 
-    def _seen(self, values: Tensor, log_odds: Tensor, taken: Tensor, n_visible: Tensor, axis_height: Tensor) -> Tensor:
+    def _logits_of_samples(
+        self, values: Tensor, log_odds: Tensor, taken: Tensor, n_visible: Tensor, axis_height: Tensor
+    ) -> Tensor:
         there = torch.arange(values.shape[1], device=values.device) < taken[:, None]
         sums = (self.parts(values, log_odds) * there[..., None]).sum(1)
         each = n_visible / taken.clamp(min=1)
@@ -140,7 +139,7 @@ class SetNetwork(LandmarkNetwork):
         return self.logits(sums * each[:, None], n_visible, axis_height, cells)
 
     def score(self, landmarks: ViewLandmarks, n_visible: Tensor, axis_height: Tensor) -> Tensor:
-        """Logits (B,) from described landmarks, which may be a part of those that each view sees; see `forward`."""
+        """Return logits (B,) from described landmarks, possibly a sample of those visible; see `forward`."""
         values = landmarks.values
         log_odds = self.matchability(landmarks.values)
         # summed in double precision: in single, the sums of two machines may differ by more than scores should
@@ -151,7 +150,7 @@ class SetNetwork(LandmarkNetwork):
         return self.logits(sums * each[:, None], n_visible, axis_height, cells)
 
     def parts(self, values: Tensor, log_odds: Tensor) -> Tensor:
-        """What each landmark (..., A) adds to its view's sums, (..., D), by its log-odds of being found (...,)."""
+        """Return what landmarks (..., A) with log-odds of detection (...) add to their view's sums, (..., D)."""
         expected = expected_parts(values, log_odds, self.attributes)
         if self.attention is None:
             return expected
@@ -160,12 +159,12 @@ class SetNetwork(LandmarkNetwork):
         return torch.cat([expected, weight, weight * attended[..., 1:]], -1)
 
     def logits(self, sums: Tensor, n_visible: Tensor, axis_height: Tensor, cells: Tensor | None = None) -> Tensor:
-        """Logits (B,) from the sums over each view's landmarks (B, D), and `expected_cells` (B,) if told of them."""
+        """Return logits (B,) from sums (B, D) over each view's landmarks, and `expected_cells` (B,) if they are an input."""
         statistics = expected_statistics(sums[:, :N_EXPECTED], n_visible, self.pose_variances)
         known = [statistics, axis_height[:, None]]
         if cells is not None:
             known.append(cells.log1p()[:, None])
-        features = [torch.cat(known, 1)[:, self._told]]
+        features = [torch.cat(known, 1)[:, self._inputs]]
         if self.attention is not None:
             features.append(sums[:, N_EXPECTED + 1 :] / (sums[:, N_EXPECTED : N_EXPECTED + 1] + 1e-6))
         joined = torch.cat(features, 1).float()
@@ -180,17 +179,16 @@ class SetNetwork(LandmarkNetwork):
 def expected_cells(
     values: Tensor, log_odds: Tensor, views: Tensor, each: Tensor, attributes: tuple[str, ...] = ATTRIBUTES
 ) -> Tensor:
-    """Cells of 6 degrees in which a landmark can be expected to be found, (B,), of B views.
+    """Return the expected number of cells of 6 degrees with a detected landmark, (B,), of B views.
 
-    A view that finds a hundred landmarks in one corner knows its pose worse than one that finds them all over the
-    image. Landmarks have `values` (E, A) and `log_odds` of being found (E,), and are of the `views` (E,); each of them
-    stands for `each` (B,) landmarks in its view.
+    Landmarks have `values` (E, A), `log_odds` of detection (E,) and `views` (E,); each stands for `each` (B,) landmarks
+    of its view. Landmarks spread over the image determine the pose better than as many in one corner.
     """
-    # in double precision, so that a landmark near the border of a cell lies in the same one on every machine
+    # in double precision, so that a landmark near a cell's border is in the same cell on every machine
     across, down = (values[:, attributes.index(name)].double().atan() for name in ("across", "down"))
     column, row = (((angle / torch.pi + 0.5) * CELLS).long().clamp(0, CELLS - 1) for angle in (across, down))
     place = (views * CELLS + row) * CELLS + column
-    # a sum of the logarithms of the chances that none is found
+    # sum of log probabilities that none is detected
     none = torch.zeros(len(each) * CELLS**2, dtype=log_odds.dtype, device=log_odds.device)
     none = none.index_add(0, place, logsigmoid(-log_odds)).view(len(each), CELLS**2)
     return -torch.expm1(none * each[:, None]).sum(1)
@@ -201,7 +199,7 @@ def pose_variances(information: Tensor) -> tuple[Tensor, Tensor]:
     try:
         factor = torch.linalg.cholesky(information)
     except torch.linalg.LinAlgError as error:  # NaN, by weights that are too large
-        problem = "these weights give no numbers: they are damaged, or the map is"
+        problem = "these weights give scores that are not finite: they or the map are damaged"
         raise WeightsError(problem, fix="Give other weights, or train again.") from error
     unit = torch.eye(6, dtype=factor.dtype, device=factor.device).expand_as(factor)
     # not by `cholesky_inverse`, which takes the matrices of a batch one by one on a GPU

@@ -1,4 +1,4 @@
-"""The score of a network over the set of landmarks in view."""
+"""Scorer of a network over the set of visible landmarks."""
 
 from __future__ import annotations
 
@@ -17,14 +17,12 @@ from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.training_range import view_quantities
 
 MOST = 1024
-"""Landmarks of a view that are looked at; of more, so many evenly spread ones stand for all. The network has learnt
-from samples of a fifth of that; against looking at all, log-odds differ by 0.05 where a view sees thousands."""
+"""Landmarks of a view that are described; of more, an even sample stands for all. Against all, log-odds differ by 0.05
+where a view sees thousands."""
 
 
 class SetScorer(LandmarkScorer):
-    """Network over the set of landmarks in view: each by its chance of being found, all by what they tell
-    of the pose.
-    """
+    """Network over the set of visible landmarks: their probabilities of detection and their information on the pose."""
 
     local = True
     most = MOST
@@ -41,42 +39,44 @@ class SetScorer(LandmarkScorer):
         """(B,) probabilities in [0, 1]."""
         cam_from_world = check_poses(cam_from_world)
         scores = np.empty(len(cam_from_world))
-        looked_at: list[Float] = []
+        quantities: list[Float] = []
         for rows, described, n_visible in self.describer.in_blocks(cam_from_world, MOST):
-            looked_at += self._quantities(described, n_visible)
-            scores[rows] = self._chances(cam_from_world[rows], described, n_visible)
-        self._watch.check(self.name, looked_at)
+            quantities += self._quantities(described, n_visible)
+            scores[rows] = self._probabilities(cam_from_world[rows], described, n_visible)
+        self._watch.check(self.name, quantities)
         return scores
 
     def report(self, cam_from_world: Float) -> ViewReport:
-        """As of every method; without warning of views out of range, which it tells one by one."""
+        """See `Scorer.report`; does not warn of views out of range, which the report names."""
         cam_from_world = check_poses(cam_from_world)
         n = len(cam_from_world)
-        told = ViewReport(np.empty(n), np.zeros(n), np.zeros(n, dtype=np.int64), np.full(n, self._serves_camera))
+        report = ViewReport(np.empty(n), np.zeros(n), np.zeros(n, dtype=np.int64), np.full(n, self._serves_camera))
         for rows, described, n_visible in self.describer.in_blocks(cam_from_world, MOST):
-            told.score[rows] = self._chances(cam_from_world[rows], described, n_visible)
-            told.n_visible[rows] = n_visible.cpu().numpy()
-            told.in_range[rows] &= self.training_range.contains(view_quantities(described, n_visible, self._of_camera))
+            report.score[rows] = self._probabilities(cam_from_world[rows], described, n_visible)
+            report.n_visible[rows] = n_visible.cpu().numpy()
+            report.in_range[rows] &= self.training_range.contains(
+                view_quantities(described, n_visible, self._of_camera)
+            )
             with torch.inference_mode():
-                chances = self.network.matchability(described.values).sigmoid().double()
-                sums = torch.segment_reduce(chances, "sum", lengths=described.counts, initial=0.0)
-                found = sums * n_visible / described.counts.clamp(min=1)
-            told.expected_inliers[rows] = found.cpu().numpy()
-        return told
+                p_detect = self.network.matchability(described.values).sigmoid().double()
+                sums = torch.segment_reduce(p_detect, "sum", lengths=described.counts, initial=0.0)
+                detected = sums * n_visible / described.counts.clamp(min=1)
+            report.expected_inliers[rows] = detected.cpu().numpy()
+        return report
 
     def log_odds_of_detection(self, values: Tensor) -> Tensor:
         """Return the log-odds (E,) that landmarks (E, A) are detected, by the network's part for single landmarks."""
         log_odds: Tensor = self.network.matchability(values)
         return log_odds
 
-    def _chances(self, cam_from_world: Float, described: ViewLandmarks, n_visible: Tensor) -> Float:
+    def _probabilities(self, cam_from_world: Float, described: ViewLandmarks, n_visible: Tensor) -> Float:
         height = torch.from_numpy(cam_from_world[:, 2, 2]).to(described.values)
         with torch.inference_mode():
             logits = self.network.score(described, n_visible, height).double()
             return np.asarray(self.trained.calibrated(logits).sigmoid().cpu().numpy())
 
     def score_around(self, locations: Float, directions: Float) -> Float:
-        """(L, D) probabilities; where many landmarks are in view, by fewer of them than `score`."""
+        """Return probabilities (L, D); where many landmarks are visible, from a smaller sample than `score`."""
         if not ScoresAround.serves(self.network):
             return super().score_around(locations, directions)
         if self._around is None or not np.array_equal(self._around_axes, directions):

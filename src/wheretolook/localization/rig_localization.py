@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import poselib
@@ -264,9 +265,9 @@ class _Rig:
             return None
         return self._refine(pose.Rt)
 
-    def _masked(self, masks: Sequence[NDArray[np.bool_]]) -> tuple[list[Float], list[Float]]:
-        pixels = [pixels[mask] for pixels, mask in zip(self.pixels, masks, strict=True)]
-        points = [points[mask] for points, mask in zip(self.points, masks, strict=True)]
+    def _masked(self, masks: Sequence[NDArray[np.bool_]]) -> tuple[list[NDArray[Any]], list[NDArray[Any]]]:
+        pixels: list[NDArray[Any]] = [pixels[mask] for pixels, mask in zip(self.pixels, masks, strict=True)]
+        points: list[NDArray[Any]] = [points[mask] for points, mask in zip(self.points, masks, strict=True)]
         return pixels, points
 
     def _refine(self, rig_from_world: Float) -> _Hypothesis:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -180,13 +180,12 @@ def _with_errors(table: pd.DataFrame, true_poses: Float, results: Sequence[Local
 def _with_matches(table: pd.DataFrame, results: Sequence[Localization], store_pixels: bool) -> pd.DataFrame:
     """Add matched landmarks and inliers, in ascending order of the landmarks, and optionally pixels."""
     orders = [np.argsort(result.matched_rows, kind="stable") for result in results]
-    table = table.assign(
-        matched_rows=[
+    columns: dict[str, Any] = {
+        "matched_rows": [
             result.matched_rows[order].astype(np.int32) for result, order in zip(results, orders, strict=True)
         ],
-        inlier_rows=[np.sort(result.inlier_rows).astype(np.int32) for result in results],
-    )
-    if not store_pixels:
-        return table
-    pixels = [result.matched_pixels[order].ravel() for result, order in zip(results, orders, strict=True)]
-    return table.assign(**{PIXELS: pixels})
+        "inlier_rows": [np.sort(result.inlier_rows).astype(np.int32) for result in results],
+    }
+    if store_pixels:
+        columns[PIXELS] = [result.matched_pixels[order].ravel() for result, order in zip(results, orders, strict=True)]
+    return table.assign(**columns)

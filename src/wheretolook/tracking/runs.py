@@ -174,14 +174,15 @@ def log(mlflow_client: MlflowClient, run_id: str, params: Values = None, metrics
 def log_history(mlflow_client: MlflowClient, run_id: str, history: pd.DataFrame) -> None:
     """Log a training history, one row per `epoch`, as training itself logs it."""
     start_ms = int(mlflow_client.get_run(run_id).info.start_time)
-    rows = history.set_index("epoch").to_dict("index")
-    log_metrics(mlflow_client, run_id, [(int(epoch), metrics) for epoch, metrics in rows.items()], start_ms)
+    rows = history.drop(columns="epoch").to_dict("records")
+    steps = [(int(epoch), row) for epoch, row in zip(history["epoch"], rows, strict=True)]
+    log_metrics(mlflow_client, run_id, steps, start_ms)
 
 
 def log_metrics(
     mlflow_client: MlflowClient,
     run_id: str,
-    steps: Iterable[tuple[int, Mapping[str, Any]]],
+    steps: Iterable[tuple[int, Mapping[Any, Any]]],
     start_ms: int | None = None,
 ) -> None:
     """Log metrics of steps in batches. Metrics that are not finite are skipped.

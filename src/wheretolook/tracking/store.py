@@ -82,9 +82,9 @@ def _client(root: Path, uri: str) -> MlflowClient:
     with store_errors(root):
         if not database.exists():
             _create(database)
-        opened = mlflow_package().MlflowClient(tracking_uri=uri)
-        opened.search_experiments(max_results=1)
-    return cast("MlflowClient", _Client(root, opened))
+        wrapped = mlflow_package().MlflowClient(tracking_uri=uri)
+        wrapped.search_experiments(max_results=1)
+    return cast("MlflowClient", _Client(root, wrapped))
 
 
 def _create(database: Path) -> None:

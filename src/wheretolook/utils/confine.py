@@ -8,10 +8,10 @@ from pathlib import Path, PurePosixPath
 from wheretolook.utils.errors import ConfigError
 
 
-def check_folder_name(whose: str, name: str, taken: tuple[str, ...] = ()) -> None:
-    """Raise ConfigError unless a name can be a new folder's and is not one of those taken."""
-    if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name) or name in taken:
-        others = f", but not {', '.join(taken)}" if taken else ""
+def check_folder_name(whose: str, name: str, reserved: tuple[str, ...] = ()) -> None:
+    """Raise ConfigError unless a name can be a new folder's and is not reserved."""
+    if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name) or name in reserved:
+        others = f", but not {', '.join(reserved)}" if reserved else ""
         fix = f"Use letters, digits, '.', '_' and '-'{others}."
         raise ConfigError(f"{whose} becomes a folder's name", value=name, fix=fix)
 

@@ -31,8 +31,8 @@ def open_parquet(path: Path, **options: Any) -> Iterator[pq.ParquetFile]:
     """
     _read_sizes(path)
     try:
-        with pq.ParquetFile(path, thrift_container_size_limit=MAX_LIST_LENGTH, **options) as opened:
-            yield opened
+        with pq.ParquetFile(path, thrift_container_size_limit=MAX_LIST_LENGTH, **options) as file:
+            yield file
     except (pa.ArrowException, OSError, KeyError, UnicodeDecodeError) as error:
         raise ValueError(str(error)) from error
 

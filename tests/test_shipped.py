@@ -12,7 +12,7 @@ import pytest
 import wheretolook
 from synthetic_dataset import CAMERA, make_landmarks
 from wheretolook import LocalizationMap, load_scorer, poses_looking_along
-from wheretolook.cli import main, parse_command
+from wheretolook.cli import parse_command
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import fingerprint
 from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped, shipped_configs
@@ -65,14 +65,6 @@ def test_the_commands_of_the_help_run_in_any_folder(given: list[str]) -> None:
     assert experiment is not None and experiment.name == "small"
     assert experiment.evaluate.weights == (shipped(WEIGHTS) / "mlp-2d+z.safetensors",)
     assert experiment.root == Path("data/small")  # in this folder
-
-
-@pytest.mark.usefixtures("elsewhere")
-def test_a_missing_configuration_names_those_that_ship(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["map", "--config", "configs/smal.yaml"]) == 2
-    assert "Did you mean configs/small.yaml?" in capsys.readouterr().err
-    assert main(["map", "--config", "x"]) == 2
-    assert "configs/aliked.yaml, configs/apartments.yaml, " in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("elsewhere")

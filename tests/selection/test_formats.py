@@ -10,7 +10,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from selection.room import POINTS
-from wheretolook.select.formats import check_format
 from wheretolook.select.views import SelectedViews
 from wheretolook.select.waypoints import read_waypoints
 from wheretolook.select.where_to_look import WhereToLook
@@ -109,14 +108,6 @@ def test_colmap_reads_the_folder(look: WhereToLook, n: int, tmp_path: Path) -> N
     )
 
 
-def test_an_images_file_alone_leaves_what_lies_beside_it(views: SelectedViews, tmp_path: Path) -> None:
-    (tmp_path / "cameras.txt").write_text("mine")
-    views.save(tmp_path / "images.txt")
-    assert (tmp_path / "cameras.txt").read_text() == "mine" and len([*tmp_path.iterdir()]) == 2
-    lines = [line for line in (tmp_path / "images.txt").read_text().splitlines() if not line.startswith("#")]
-    assert [line.split()[-1] for line in lines[::2]] == ["3", "1", "20", "7"] and not any(lines[1::2])
-
-
 def test_files_that_cannot_be(views: SelectedViews, look: WhereToLook, sparse: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="does not tell"):
         views.save(tmp_path / "views.txt")
@@ -133,9 +124,3 @@ def test_files_that_cannot_be(views: SelectedViews, look: WhereToLook, sparse: P
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError, match="cannot write"):
         views.save(tmp_path / "file" / "views.csv")
-
-
-def test_a_place_that_cannot_be_written_to_is_known_before_scoring(tmp_path: Path) -> None:
-    (tmp_path / "taken").write_text("a file")
-    with pytest.raises(StorageError, match="cannot write views there"):
-        check_format(tmp_path / "taken" / "views.csv", None, 1)

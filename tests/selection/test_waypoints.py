@@ -58,14 +58,6 @@ def test_files_that_are_none(text: str, says: str, tmp_path: Path) -> None:
     assert caught.value.path == path and caught.value.fix
 
 
-def test_a_missing_file_and_one_that_is_no_text(tmp_path: Path) -> None:
-    with pytest.raises(TableError, match="no such file"):
-        read_waypoints(tmp_path / "nothing.csv")
-    (tmp_path / "image").write_bytes(bytes(range(256)))
-    with pytest.raises(TableError, match="text file"):
-        read_waypoints(tmp_path / "image")
-
-
 def test_numbers() -> None:
     np.testing.assert_array_equal(parse_points(["1.5,-2,.25", " 0,3,1"]).points, AT)
     for text in ("1,2", "a,b,c", "1,2,3,4"):

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from box_scenes import furnished_room
 from selection.room import POINTS, WEIGHTS, write_room
@@ -19,20 +17,9 @@ from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import rotation_angle_deg, rotation_looking_along
 from wheretolook.scenes.loading import save_glb
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.set.batched_directions import ScoresAround
-from wheretolook.scorers.set.network import DEFAULT_STATISTICS, SetNetwork
-from wheretolook.scorers.set.score import SetScorer
+from wheretolook.select.request import SelectionRequest
 from wheretolook.select.where_to_look import WhereToLook
-from wheretolook.training.trained_network import TrainedNetwork
-from wheretolook.utils.errors import (
-    ConfigError,
-    MapError,
-    MapWarning,
-    SceneError,
-    TableError,
-    WeightsError,
-    WhereToLookError,
-)
+from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError, WhereToLookError
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 
 AXES = direction_lattice(60)
@@ -90,21 +77,6 @@ def test_a_sample_of_the_landmarks_ranks_as_all(tmp_path: Path) -> None:
     assert (slow.max(axis=1) - slow[rows, fast.argmax(axis=1)] < 0.01).all()
 
 
-def test_all_that_a_network_is_told_is_told_at_once(sparse: Path) -> None:
-    around = LocalizationMap.from_colmap(sparse)
-    old = load_scorer(WEIGHTS, around)
-    assert isinstance(old, SetScorer)
-    torch.manual_seed(0)
-    network = SetNetwork(old.network.statistics, hidden=old.network.options["hidden"], told=DEFAULT_STATISTICS)
-    network.matchability.load_state_dict(old.network.matchability.state_dict())
-    scorer = SetScorer(around, TrainedNetwork("set", network, None))
-    assert ScoresAround.serves(scorer.network)
-    slow = all_scores(scorer, POINTS)
-    fast = scorer.score_around(POINTS, AXES)
-    assert np.ptp(slow) > 0.1
-    np.testing.assert_allclose(fast, slow, atol=1e-4)
-
-
 def test_the_sequence_is_the_best_of_all(sparse: Path) -> None:
     look = WhereToLook.from_colmap(sparse, weights=WEIGHTS, directions=12, device="cpu")
     axes = look.directions
@@ -128,23 +100,6 @@ def test_limits_on_pitch(look: WhereToLook) -> None:
     views = look.best(POINTS, 5, pitch_deg=(-20, 10))
     assert (views.pitch_deg >= -20).all() and (views.pitch_deg <= 10).all()
     assert len(views) == 20 and len({tuple(axis) for axis in views.axes[:5].round(6)}) == 5
-
-
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        ({"n": 0}, "at least 1"),
-        ({"n": 10_000}, "directions to choose from"),
-        ({"n": 2, "max_turn_deg": 30}, "one view of each waypoint"),
-        ({"max_turn_deg": -1}, "at least 0 degrees"),
-        ({"max_turn_deg": np.nan}, "at least 0 degrees"),
-        ({"pitch_deg": (10, -10)}, "within -90 and 90"),
-        ({"pitch_deg": (0.001, 0.002)}, "no direction lies within"),
-    ],
-)
-def test_limits_that_are_none(look: WhereToLook, options: dict, says: str) -> None:
-    with pytest.raises(ConfigError, match=says):
-        look.best(POINTS, **options)
 
 
 def test_waypoints_outside_the_map(look: WhereToLook) -> None:
@@ -178,16 +133,6 @@ def test_a_mesh_hides_landmarks_and_holds_waypoints_inside_geometry(sparse: Path
         room.grid(0.001)
     with pytest.raises(ConfigError, match="length"):
         room.grid(0)
-
-
-def test_a_mesh_of_another_frame_is_doubted(sparse: Path, tmp_path: Path) -> None:
-    room = furnished_room()
-    save_glb(replace(room, vertices=room.vertices + np.float32([0, 0, 40])), tmp_path / "room.glb")
-    told = r"room\.glb: half of the landmarks are 38\.\d\d m or more from the mesh"  # 40 m, less half of the wall
-    with pytest.warns(MapWarning, match=told):
-        WhereToLook.from_colmap(sparse, method="visible", mesh=tmp_path / "room.glb", device="cpu")
-    with pytest.warns(MapWarning, match=told):
-        LocalizationMap.from_colmap(sparse, mesh=tmp_path / "room.glb")
 
 
 def test_a_grid_without_a_mesh_lies_near_the_images(look: WhereToLook) -> None:
@@ -267,26 +212,6 @@ def test_bad_options_are_typed(sparse: Path, options: dict, error: type[WhereToL
         WhereToLook.from_colmap(sparse, **{"weights": WEIGHTS, "device": "cpu", **options})
 
 
-def test_methods_without_weights(sparse: Path) -> None:
-    look = WhereToLook.from_colmap(sparse, method="visible", directions=60, occlusion="none", device="cpu")
-    views = look.best(POINTS)
-    assert views.method == "visible" and np.isnan(views.expected_inliers).all() and views.in_range.all()
-    poses = poses_looking_along(np.repeat(POINTS, len(AXES), axis=0), np.tile(AXES, (len(POINTS), 1)))
-    seen = np.diff(look.localization_map.in_view_on_device(poses)[0]).reshape(len(POINTS), -1)
-    np.testing.assert_array_equal(views.n_visible, seen.max(axis=1))
-
-
-def test_ten_lines(sparse: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    look = Exported.from_colmap(sparse)
-    with pytest.raises(ConfigError, match="no views"):
-        look.save("views.csv")
-    views = look.best([(2.0, 2.0, 1.5)])
-    assert look.score(views.cam_from_world)[0] == pytest.approx(views.score[0], rel=1e-6)
-    look.save("views.csv")
-    assert len(Path("views.csv").read_text().splitlines()) == 2
-
-
 def test_looks_chosen_together_are_worth_more_than_one(look: WhereToLook, tmp_path: Path) -> None:
     one = look.best(POINTS, looks=1)
     three = look.best(POINTS, looks=3)
@@ -304,20 +229,6 @@ def test_looks_chosen_together_are_worth_more_than_one(look: WhereToLook, tmp_pa
     assert "set_score" in (tmp_path / "looks.csv").read_text().splitlines()[0]
     look.best(POINTS).save(tmp_path / "views.csv")
     assert "set_score" not in (tmp_path / "views.csv").read_text()
-
-
-def test_looks_are_refused_where_they_make_no_sense(look: WhereToLook) -> None:
-    refused = (
-        ({"looks": 0}, "whole number of 1 to 6"),
-        ({"looks": 2.0}, "whole number of 1 to 6"),
-        ({"looks": 2, "n": 3}, "chosen together"),
-        ({"looks": 2, "max_turn_deg": 30}, "chosen together"),
-        ({"max_total_turn_deg": 30}, "for looks chosen together"),
-        ({"looks": 2, "max_total_turn_deg": -1}, "at least 0"),
-    )
-    for options, problem in refused:
-        with pytest.raises(ConfigError, match=problem):
-            look.best(POINTS, **options)
 
 
 def test_a_sequence_stops_where_one_look_will_not_do(look: WhereToLook, tmp_path: Path) -> None:
@@ -340,11 +251,24 @@ def test_a_sequence_stops_where_one_look_will_not_do(look: WhereToLook, tmp_path
     views.save(tmp_path / "views.csv")
     with pytest.raises(ConfigError, match="one view of each waypoint"):
         views.save(tmp_path / "views.tum")
-    for options, message in (
-        ({"looks": 3, "least_score": 0.5}, "along a path"),
-        ({"max_turn_deg": 10, "least_score": 0.5}, "along a path"),
-        ({"looks": 3, "max_turn_deg": 10, "least_score": 0.0}, "probability above 0"),
-        ({"looks": 3, "max_turn_deg": 10, "least_score": 0.5, "max_total_turn_deg": 90}, "not for looks along"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            look.best(POINTS, **options)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"n": 0},
+        {"looks": 0},
+        {"n": 2, "looks": 2},
+        {"n": 2, "max_turn_deg": 30},
+        {"max_turn_deg": -1},
+        {"looks": 2, "max_turn_deg": 30},
+        {"max_total_turn_deg": 30},
+        {"pitch_deg": (30, -30)},
+        {"looks": 3, "least_score": 0.5},
+        {"looks": 3, "max_turn_deg": 10, "least_score": 0.0},
+        {"looks": 3, "max_turn_deg": 10, "least_score": 0.5, "max_total_turn_deg": 90},
+    ],
+)
+def test_requests_that_cannot_be(options: dict) -> None:
+    with pytest.raises(ConfigError):
+        SelectionRequest(**options)

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from mapping.conftest import box_room
 from synthetic_dataset import make_dataset
 from wheretolook.cli import main
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import is_good, poses, write_table
 from wheretolook.evaluation.adaptation import compare_log_odds
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.scenes.loading import save_glb
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import finished_runs
 from wheretolook.training.weights import read_training
@@ -109,13 +106,6 @@ def test_bad_input_is_named(
     assert says in capsys.readouterr().err
 
 
-def test_too_few_views_are_counted(dataset: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = dataset.scenes[1]
-    write_table(scene.read_table().iloc[:60], scene.table)
-    assert run(dataset, "--scene", "scene-1") == 2
-    assert "60 views at 3 locations" in capsys.readouterr().err
-
-
 def test_gains_are_those_of_known_cases() -> None:
     """Two locations of two views: the first chooses wrongly before and rightly after."""
     good = np.array([True, False, True, False])
@@ -128,52 +118,6 @@ def test_gains_are_those_of_known_cases() -> None:
     expected = (np.log1p(np.exp(1)) + np.log1p(np.exp(-1))) / 2 - np.log1p(np.exp(-2))
     assert gain.log_loss_less[0] == pytest.approx(expected) and gain.regret_less[0] == 50
     assert pd.notna(gain.log_loss_less[1])
-
-
-def test_a_name_that_is_no_dataset_leaves_nothing(dataset: Dataset) -> None:
-    data = dataset.root.parent
-    assert main(["adapt", "--name", "nothere", "--data", str(data), "--tracking.folder", str(data / "mlruns")]) == 2
-    assert not (data / "nothere").exists() and not (data / "mlruns").exists()
-
-
-@pytest.mark.slow
-def test_views_that_were_labelled_wait_for_the_next_run_and_go_when_they_are_of_no_use(tmp_path: Path) -> None:
-    mesh = box_room()
-    plain = tuple(np.full_like(t, 200) if number == 1 else t for number, t in enumerate(mesh.textures))
-    save_glb(replace(mesh, textures=plain, corner_uvs=mesh.corner_uvs * np.float32(0.5)), tmp_path / "room.glb")
-    camera = ["--camera.width", "240", "--camera.height", "180", "--camera.focal_px", "120"]
-    where = ["--name", "rooms", "--data", str(tmp_path / "data"), "--tracking.folder", str(tmp_path / "mlruns")]
-    meshes = ["--scenes.train", "0", "--scenes.test", "0", "--scenes.meshes", f"[{{path: {tmp_path / 'room.glb'}}}]"]
-    sample = ["--sample.grid", "[5,5,3]", "--sample.directions", "40", "--sample.keep", "20"]
-
-    def stage(name: str, *options: str, locations: int = 15) -> int:
-        table = [*sample, "--sample.max_locations", str(locations), "--sample.max_directions", "12"]
-        given = [
-            *where,
-            "--device",
-            "cpu",
-            *camera,
-            "--camera.fov_deg",
-            "null",
-            *meshes,
-            "--map.n_images",
-            "12",
-            *table,
-        ]
-        return main([name, *given, "--label.workers", "1", *options])
-
-    assert [stage(name) for name in ("scenes", "map", "sample")] == [0, 0, 0]
-    shards = tmp_path / "data" / "rooms" / "room" / "adapt-shards"
-    assert stage("adapt", "--minutes", "0.0001") == 0
-    first = {path: path.stat().st_mtime_ns for path in shards.rglob("*.parquet")}
-    assert len(first) == 1
-    assert stage("adapt") == 0
-    every = {path: path.stat().st_mtime_ns for path in shards.rglob("*.parquet")}
-    assert len(every) == 2 and first.items() <= every.items()  # the first was not labelled again
-    assert stage("sample", locations=12) == 0 and stage("adapt", locations=12) == 0
-    assert not {*every} & {*shards.rglob("*.parquet")}  # of other viewpoints
-    assert stage("label", locations=12) == 0
-    assert not shards.exists()
 
 
 @pytest.mark.slow

@@ -20,11 +20,10 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses, write_table
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.results import latest_scores
-from wheretolook.scorers.visible import VisibleScorer
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import artifact, experiment_ids, finished_runs, newest_run, start_run, ui_command
 from wheretolook.tracking.store import client
-from wheretolook.utils.errors import ConfigError, SceneError, TableError, WeightsError
+from wheretolook.utils.errors import ConfigError, TableError, WeightsError
 from wheretolook.weights.resolve import load_scorer
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
@@ -188,62 +187,6 @@ def test_learned_methods_are_calibrated_on_the_val_scenes(dataset: Dataset, tmp_
         write_table(scene.read_table().assign(status=UNLABELLED), scene.table)
     table = evaluate(unlabelled, config, tracking, models=[model], progress=False)
     assert table["temperature"].isna().all() and table.loc[table["method"] == "mlp-2d+z", "ece"].notna().all()
-
-
-def test_what_a_location_sees_by_the_mesh_needs_no_mesh_where_it_is_stored(dataset: Dataset, tmp_path: Path) -> None:
-    tracking = TrackingConfig(str(tmp_path / "mlruns"))
-    stored = evaluate(dataset, RULES, tracking, progress=False)
-    both = evaluate(dataset, replace(RULES, occlusions=("mesh", "none")), tracking, progress=False)
-    first = both[both["occlusion"] == "mesh"].reset_index(drop=True)
-    pd.testing.assert_frame_equal(first, stored)
-    assert {*both["occlusion"]} == {"mesh", "none"} and len(both) == 2 * len(first)
-    with pytest.raises(SceneError, match="occlusion by tsdf needs the scene's mesh"):
-        evaluate(dataset, replace(RULES, occlusions=("tsdf",)), tracking, progress=False)
-
-
-def test_neighbours_are_resampled_together(dataset: Dataset, tmp_path: Path) -> None:
-    tracking = TrackingConfig(str(tmp_path / "mlruns"))
-    key = "0.05m_0.4deg"
-    tables = [
-        evaluate(dataset, replace(RULES, block_m=block_m, methods=("random",)), tracking, progress=False).iloc[0]
-        for block_m in (0.0, 1e-6, 1.0, 1e3)
-    ]
-    assert len({table[f"raw_{key}"] for table in tables}) == 1
-    ends = [(table[f"raw_low_{key}"], table[f"raw_high_{key}"]) for table in tables]
-    assert ends[0][0] < ends[0][1] and ends[2] != ends[0]
-    assert np.isnan(ends[3]).all()  # all of a scene are neighbours
-
-
-def test_scores_that_are_not_finite_are_named(
-    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(VisibleScorer, "score_binned", lambda self, views, binned: np.full(len(views), np.nan))
-    with pytest.raises(TableError, match=r"scene-2.*not finite.*visible"):
-        evaluate(dataset, RULES, TrackingConfig(str(tmp_path / "mlruns")), progress=False)
-
-
-@pytest.mark.slow
-def test_the_papers_tables_have_networks_that_do_not_ship(dataset: Dataset, tmp_path: Path) -> None:
-    tracking = TrackingConfig(str(tmp_path / "mlruns"))
-    results = dataset.root / "results"
-    both = train(
-        dataset, train_config("mlp-2d", "mlp-2d+z", epochs=2, hidden=(16,), accelerator="cpu"), tracking, False
-    )
-    config = replace(CONFIG, occlusions=("mesh", "none"))
-    evaluate(dataset, config, tracking, models=both, progress=False)
-    tables = {path.name: path.read_bytes() for path in results.glob("table_*")}
-    shutil.copyfile(results / "scores.csv", results / "variants.csv")
-    try:
-        for models in (both, both[:1]):
-            evaluate(dataset, config, tracking, models=models, progress=False)
-            if models is both:
-                assert {path.name: path.read_bytes() for path in results.glob("table_*")} == tables
-            else:
-                for kind in ("csv", "md", "tex"):
-                    name = f"table_input_variants.{kind}"
-                    assert (results / name).read_bytes() == tables[name]
-    finally:
-        (results / "variants.csv").unlink()
 
 
 def test_candidates_are_chosen_by_visibility(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import artifact, finished_runs
 from wheretolook.tracking.store import client
 from wheretolook.training.fit import EpochRecord
-from wheretolook.utils.errors import StorageError, TrackingError, TrackingWarning
+from wheretolook.utils.errors import TrackingError, TrackingWarning
 from wheretolook.utils.files import sha256
 from wheretolook_paper.release.training_histories import keep_histories, train_runs
 
@@ -104,13 +104,6 @@ def test_a_training_that_cannot_be_logged_is_kept_and_logged_later(
     assert first.params == second.params and first.metrics == pytest.approx(second.metrics)
     (last,) = train_methods(dataset, SMALL, tracking, progress=False)
     assert last.run_id == straight.run_id and len(list(finished_runs(tracking, "train"))) == 2
-
-
-def test_weights_that_cannot_be_written_are_no_matter_of_the_store(dataset: Dataset, tracking: TrackingConfig) -> None:
-    (dataset.root / "weights").write_text("no folder")
-    with pytest.raises(StorageError, match="weights") as raised:
-        train_methods(dataset, SMALL, tracking, progress=False)
-    assert not isinstance(raised.value, TrackingError)
 
 
 def test_an_evaluation_that_cannot_be_logged_is_kept_and_logged_later(

@@ -102,12 +102,6 @@ def test_training_holds_the_labels_that_it_learns_from(dataset: Dataset) -> None
     assert not list(dataset.root.glob(".*"))
 
 
-def test_a_name_that_is_no_dataset_leaves_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["sample", "--name", "typo", "--data", str(tmp_path / "data"), "--device", "cpu"]) == 2
-    assert "this folder is no dataset" in capsys.readouterr().err
-    assert not (tmp_path / "data" / "typo").exists()
-
-
 def test_what_killed_runs_left_is_removed_by_the_next_that_changes_the_dataset(dataset: Dataset) -> None:
     scene = dataset.scenes[0]
     left = [scene.folder / ".map.partial" / "points3D.bin", scene.table.with_name("viewpoints.parquet.partial"),

@@ -137,35 +137,6 @@ def test_from_a_model_to_a_planned_path(tmp_path, with_mesh):
     assert sum("reusing" in line for line in said) == 2
 
 
-def test_without_its_mesh_the_scene_is_made_anew(tmp_path):
-    folder = save(room_model(), tmp_path / "flat")
-    save_glb(empty_room(), tmp_path / "scan.glb")
-    with_mesh = experiment_of(folder, tmp_path / "data", mesh=tmp_path / "scan.glb")
-    (scene,) = run(Map, with_mesh).scenes
-    assert scene.mesh.is_file() and not scene.is_photographed
-    (scene,) = run(Map, experiment_of(folder, tmp_path / "data")).scenes
-    assert not scene.mesh.exists() and scene.is_photographed
-
-
-def test_the_filter_that_is_asked_for_is_counted(tmp_path):
-    model = room_model()
-    rng = np.random.default_rng(1)
-    for point in model.points3D.values():
-        point.error = rng.uniform(0, 2)
-    n_bad = sum(point.error > 0.5 for point in model.points3D.values())
-    folder = save(model, tmp_path / "flat")
-    said: list[str] = []
-    run(Map, experiment_of(folder, tmp_path / "data"), said.append)
-    assert "left out" not in " ".join(said)
-    (scene,) = run(Map, experiment_of(folder, tmp_path / "data", max_reprojection_error_px=0.5), said.append).scenes
-    assert 100 < n_bad < 700 and f"from 36 images, {n_bad} points left out" in " ".join(said)
-    assert len(scene.read_landmarks()) == read_model(scene.map).num_points3D() == model.num_points3D() - n_bad
-    config = MapConfig(existing=ExistingModelConfig(folder, max_reprojection_error_px=1e-6))
-    with pytest.raises(MapError, match=r"no landmark.*map\.existing\.max_reprojection_error_px"):
-        map_existing(config, tmp_path / "map", tmp_path / "work")
-    assert not (tmp_path / "map").exists()
-
-
 def test_several_cameras_are_asked_for(tmp_path, capsys):
     folder = save(room_model(cameras=(LOOKS, OTHER)), tmp_path / "flat")
     arguments = ["map", "--name", "mine", "--data", str(tmp_path / "data"), "--model", str(folder)]
@@ -189,15 +160,6 @@ def test_scenes_of_models_stand_beside_one_another_with_their_own_cameras(tmp_pa
     said: list[str] = []
     run(Sample, second, said.append)
     assert len(said) == 4 and all("occlusion" in line or "viewpoints" in line for line in said)
-
-
-def test_models_do_not_join_generated_scenes(tmp_path):
-    scene = SceneFolder(tmp_path / "data" / "mine" / "apartment-000", "train")
-    scene.folder.mkdir(parents=True)
-    scene.mesh.write_bytes(b"")
-    Dataset(scene.folder.parent, (scene,)).save()
-    with pytest.raises(ConfigError, match="of their own: --name"):
-        run(Map, experiment_of(save(room_model(), tmp_path / "flat"), tmp_path / "data"))
 
 
 def test_a_turned_and_scaled_model_is_doubted_and_mended(tmp_path):
@@ -227,31 +189,6 @@ def test_a_turned_and_scaled_model_is_doubted_and_mended(tmp_path):
     np.testing.assert_allclose(by_positions, centers, atol=1e-6)
     with pytest.raises(ConfigError, match=r"markers are detected in photographs.*--images"):
         mended(ScaleConfig(marker_size_m=0.4))
-
-
-def test_a_mesh_of_another_frame_is_doubted(tmp_path):
-    folder = save(room_model(), tmp_path / "flat")
-    mesh = empty_room()
-    save_glb(replace(mesh, vertices=mesh.vertices + np.float32([0, 0, 40])), tmp_path / "scan.glb")
-    experiment = experiment_of(folder, tmp_path / "data", mesh=tmp_path / "scan.glb")
-    with pytest.warns(MapWarning, match=r"scan\.glb: half of the landmarks are .* m or more from the mesh"):
-        run(Map, experiment)
-    with pytest.raises(ConfigError, match="leaves its mesh"):
-        run(Map, experiment_of(folder, tmp_path / "data", mesh=tmp_path / "scan.glb", level=True))
-
-
-@pytest.mark.parametrize("arguments, said", [
-    (["--model", "nowhere"], "no such folder"),
-    (["--model", "flat", "--mesh", "nowhere.glb"], "nowhere.glb"),
-    (["--model", "flat", "--database", "nowhere.db"], "no such database"),
-    (["--model", "flat", "--images", "nowhere"], "cannot read an image of the model"),
-    (["--model", "flat", "--images", ".", "--database", "x.db"], "Leave --database out"),
-])  # fmt: skip
-def test_the_command_line_names_what_is_missing(tmp_path, monkeypatch, capsys, arguments, said):
-    save(room_model(), tmp_path / "flat")
-    monkeypatch.chdir(tmp_path)
-    assert main(["map", "--name", "mine", *arguments]) == 2
-    assert said in capsys.readouterr().err and not (tmp_path / "data" / "mine" / "dataset.json").exists()
 
 
 @pytest.mark.slow

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Iterator
-from contextlib import closing
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -27,7 +23,6 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.inputs.channels import CHANNELS
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.localization import labeller
 from wheretolook.scorers.mlp.network import ViewpointNetwork
 from wheretolook.scorers.registry import scorers
 from wheretolook.scorers.train_config import TrainConfig
@@ -142,26 +137,6 @@ def test_the_demo_ends_in_a_sentence_a_picture_and_what_to_do_next(
     assert shown["next"].startswith("wheretolook select --map ") and "mlflow ui" in shown["runs"]
 
 
-def test_what_has_changed_is_compared_anew(copy: Path) -> None:
-    root = copy / "data" / "tiny"
-    overview = root / "results" / "overview.png"
-    report = root / "results" / "scores.md"
-
-    def drawn(*options: str) -> int:
-        assert run("demo", copy, *options) == 0
-        assert report.read_text().startswith("# Localization score")
-        return overview.stat().st_mtime_ns
-
-    times = [drawn()]  # the store has moved with the copy
-    assert drawn() == times[0]
-    report.write_text("mine")
-    times.append(drawn())
-    for suffix in ("safetensors", "json"):
-        shutil.copy(root / "weights" / f"set.{suffix}", root / "weights" / f"kept.{suffix}")
-    times += [drawn(), drawn("--evaluate.resamples", "30")]
-    assert times == sorted({*times})
-
-
 def test_all_methods_are_trained_and_compared(copy: Path) -> None:
     methods = EvaluateConfig().methods
     learned = TrainConfig().methods
@@ -242,14 +217,6 @@ def test_three_lines_score_viewpoints_of_a_colmap_model(demo: Path) -> None:
     np.testing.assert_array_equal(localization_map.bin_views(poses(table)).counts, binned.counts)
 
 
-def test_what_a_table_says_is_what_its_features_hold(demo: Path) -> None:
-    dataset = Dataset.load(demo / "data" / "tiny")
-    for scene in dataset.scenes:
-        table = scene.read_table()
-        binned = scene.localization_map(dataset.camera).bin_views(poses(table))
-        assert np.abs(binned.n_visible - table["n_visible"]).max() <= 1  # single precision at the border
-
-
 def test_every_occlusion_model_scores_the_same_viewpoints(copy: Path) -> None:
     root = copy / "data" / "tiny"
     stored = pd.read_csv(root / "results" / "scores.csv")
@@ -290,83 +257,11 @@ def test_viewpoints_can_be_sampled_with_every_occlusion_model(copy: Path, model:
     assert agreement.recall > {"tsdf": 0.9, "hidden-points": 0.6, "none": 0.999}[model]
 
 
-@pytest.mark.parametrize(
-    ("damage", "stage", "said"),
-    [
-        (lambda scene: scene.mesh.unlink(), "map", "mesh.glb"),
-        (lambda scene: scene.mesh.write_bytes(b""), "map", "mesh.glb"),
-        (lambda scene: scene.landmarks.unlink(), "sample", "landmarks.npz"),
-        (lambda scene: scene.landmarks.write_bytes(b"zip?"), "evaluate", "landmarks.npz"),
-        (lambda scene: scene.table.write_bytes(scene.table.read_bytes()[:500]), "evaluate", "viewpoints.parquet"),
-        (lambda scene: scene.occlusion.unlink(), "evaluate", "occlusion.npz"),
-        (lambda scene: (scene.folder.parent / "dataset.json").write_text("{"), "map", "dataset.json"),
-    ],
-)
-def test_damage_is_named_and_the_rest_left_alone(
-    damage: object, stage: str, said: str, copy: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scene = Dataset.load(copy / "data" / "tiny").scenes[1]
-    damage(scene)  # type: ignore[operator]
-    before = {path: fingerprint(path) for path in results(copy)}
-    capsys.readouterr()
-    assert run(stage, copy) == 2
-    errors = capsys.readouterr().err
-    assert said in errors and "Traceback" not in errors
-    assert {path: fingerprint(path) for path in results(copy)} == before
-
-
-@pytest.mark.parametrize(("stage", "index"), [("train", 0), ("evaluate", 1)])
-def test_labels_of_one_class_are_named(stage: str, index: int, copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = Dataset.load(copy / "data" / "tiny").scenes[index]
-    write_table(read_table(scene.table).assign(status="no_pose", error_m=np.nan, error_deg=np.nan), scene.table)
-    assert run(stage, copy) == 2
-    assert "one class" in capsys.readouterr().err
-
-
 def test_a_stage_refuses_what_an_earlier_one_has_remade(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("scenes", copy, "--scenes.apartment.texture_richness", "0.3") == 0
     for stage, needed in (("label", "sample"), ("sample", "map"), ("evaluate", "label")):
         assert run(stage, copy) == 2
         assert f"Run `wheretolook {needed}`" in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("in_this_process", "no_pictures_here")
-def test_labels_of_different_settings_are_not_used_together(
-    copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    original = labeller.label_scenes
-
-    def interrupted(*args: Any, **options: Any) -> Iterator[Any]:
-        with closing(original(*args, **options)) as scenes:
-            yield next(scenes)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(labeller, "label_scenes", interrupted)
-    assert run("label", copy, "--label.localizer.min_inliers", "11") == 130
-    capsys.readouterr()
-    for stage in ("train", "evaluate"):
-        assert run(stage, copy) == 2
-        assert "Run `wheretolook label`" in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("in_this_process", "no_pictures_here")
-def test_a_report_that_could_not_be_logged_is_logged_the_next_time(
-    copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    tracking = TrackingConfig(str(copy / "mlruns"))
-    first = newest_run(tracking, "label")
-    with monkeypatch.context() as patch:
-        patch.setattr(
-            import_module("wheretolook.commands.label"),
-            "log_to_run",
-            lambda *args, **options: (_ for _ in ()).throw(OSError("the disk is full")),
-        )
-        assert run("label", copy, "--label.localizer.min_inliers", "11") == 2
-    assert "the disk is full" in capsys.readouterr().err
-    assert run("label", copy, "--label.localizer.min_inliers", "11") == 0
-    assert (copy / "data" / "tiny" / "results" / "labels.md").is_file()
-    last = newest_run(tracking, "label")
-    assert first is not None and last is not None and last.info.run_id != first.info.run_id
 
 
 def test_another_camera_makes_all_but_the_meshes_anew(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -387,33 +282,6 @@ def test_weights_are_not_tested_on_what_they_learnt_from(copy: Path, capsys: pyt
     assert "learnt from a scene of the test split (got 'apartment-000')" in capsys.readouterr().err
     assert run("evaluate", copy) == 2
     assert "trained on other data" in capsys.readouterr().err
-
-
-def test_nothing_to_see_is_named(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("sample", copy, "--sample.min_visible", "1000000") == 2
-    errors = capsys.readouterr().err
-    assert "sample.min_visible" in errors and "mesh.glb" in errors
-
-
-def test_a_scene_without_free_space_is_named(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("sample", copy, "--scenes.free_space.clearance_m", "5") == 2
-    assert "free space" in capsys.readouterr().err
-
-
-def test_another_camera_is_refused(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("map", copy, "--camera.focal_px", "200") == 2
-    assert "another camera" in capsys.readouterr().err
-
-
-def test_stages_are_plain_functions(demo: Path) -> None:
-    from wheretolook.cli import parse_command
-
-    experiment = parse_command("sample", ["--config", str(demo / "tiny.yaml"), "--data", str(demo / "data")])
-    assert experiment is not None
-    said: list[str] = []
-    dataset = experiment.run(log=said.append)
-    assert len(said) == 2 and all("reusing" in line for line in said)
-    assert dataset.name == "tiny"
 
 
 PATHS = ["--paths.grid", "[4, 4, 2]", "--paths.directions", "40", "--paths.min_distance_m", "1", "--paths.max_turn_deg",

@@ -62,13 +62,6 @@ def test_a_scenes_map_is_that_of_its_scorer(dataset: Path, capsys: pytest.Captur
     assert not (dataset / "data" / "rooms" / "b" / "viewpoint-map").exists()
 
 
-def test_without_a_scene_all_are_made_with_the_method_named(dataset: Path) -> None:
-    assert run(dataset, "--method", "visible", "--viewpoint_map.lattice", "yaw-pitch") == 0
-    for name in "ab":
-        found = ViewpointMap.load(dataset / "data" / "rooms" / name / "viewpoint-map")
-        assert (found.origin.scorer, found.origin.lattice, len(found.directions)) == ("visible", "yaw-pitch", 108)
-
-
 def test_the_papers_network_scores_for_its_field_of_view_alone(dataset: Path) -> None:
     weights = dataset / "data" / "release" / "weights"
     weights.mkdir(parents=True)
@@ -134,20 +127,3 @@ def test_bad_input_is_named(
     assert run(dataset, *options) == 2
     errors = capsys.readouterr().err
     assert message in errors and "Traceback" not in errors
-
-
-def test_a_scene_without_mesh_or_map_says_what_to_run(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (dataset / "data" / "rooms" / "a" / "mesh.glb").unlink()
-    (dataset / "data" / "rooms" / "b" / "map" / "landmarks.npz").unlink()
-    assert run(dataset, "--scene", "a") == 2
-    assert "mesh.glb" in capsys.readouterr().err
-    assert run(dataset, "--scene", "b") == 2
-    assert "Run the map stage" in capsys.readouterr().err
-
-
-def test_help_teaches_and_short_flags_are_its_own(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["viewpoint-map", "--help"]) == 0
-    text = capsys.readouterr().out
-    assert "  --weights " in text and "ViewpointMap.load" in text and "--label.shard_size" not in text
-    assert main(["evaluate", "--scene", "a"]) == 2
-    assert "--scene" in capsys.readouterr().err

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from all_options import AllOptions, run
 from scans.recordings import COLOR, room, walk, write_seven_scenes
-from wheretolook.cli import main
 from wheretolook.commands.map import Map
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.scenes import Scenes
@@ -20,9 +18,8 @@ from wheretolook.geometry.camera import CameraConfig
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping.config import MapConfig
 from wheretolook.scans.config import RgbdConfig
-from wheretolook.scenes.loading import load_mesh, save_glb
+from wheretolook.scenes.loading import save_glb
 from wheretolook.scenes.scenes_config import MeshSource, ScenesConfig
-from wheretolook.utils.errors import ConfigError, SceneError
 
 
 @pytest.fixture(scope="module")
@@ -77,24 +74,3 @@ def test_it_joins_scenes_with_meshes_and_a_named_camera_looks(experiment, tmp_pa
     changed = replace(wide, scenes=ScenesConfig(rgbd=replace(coarse, up="-z")))
     with pytest.warns(UserWarning, match="up is said to be -z"):
         run(Scenes, changed, lambda _: None)  # other settings, so the scan is made anew
-
-
-def test_up_is_an_option_that_may_have_a_minus_sign(tmp_path, capsys):
-    y_down = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    write_seven_scenes(tmp_path / "room", room(), walk(), y_down)
-    where = ["--data", str(tmp_path / "data"), "--name", "scan", "--device", "cpu"]
-    how = ["--scenes.rgbd.voxel_m", "0.06", "--scenes.rgbd.appearance", "colors"]
-    assert main(["scenes", "--rgbd", str(tmp_path / "room"), "--up", "-y", *where, *how]) == 0
-    assert "up is (0.00 -1.00 0.00)" in capsys.readouterr().out
-    (scene,) = Dataset.load(tmp_path / "data" / "scan").scenes
-    low, high = load_mesh(scene.mesh).bounds
-    assert high[2] - low[2] == pytest.approx(2.4, abs=0.15)  # the room is 2.4 m high, more in the other directions
-    assert main(["scenes", "--rgbd", str(tmp_path / "room"), "--up", "-w", *where, *how]) == 2
-    assert "is no direction" in capsys.readouterr().err
-
-
-def test_bad_names_and_folders_are_refused(experiment, tmp_path):
-    for wrong, error in (({"name": "a/b"}, ConfigError), ({"folder": tmp_path / "none"}, SceneError)):
-        rgbd = replace(experiment.scenes.rgbd, **wrong)
-        with pytest.raises(error):
-            run(Scenes, replace(experiment, data=tmp_path, scenes=ScenesConfig(rgbd=rgbd)), lambda _: None)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-import signal
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -18,15 +16,13 @@ from learning_options import changed, train_config
 from synthetic_dataset import make_dataset
 from wheretolook.commands.train import train_methods as train
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.names import RELEASE_FILE
-from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, UNLABELLED, is_good, write_table
+from wheretolook.dataset.viewpoint_table import NO_POSE, UNLABELLED, is_good, write_table
 from wheretolook.inputs.bins import InputStatistics
 from wheretolook.scorers.mlp.network import ViewpointNetwork
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.store import client
-from wheretolook.training.data import BinnedBatches, ViewpointDataModule, balance_classes, hold_out_locations
-from wheretolook.training.fit import EpochRecord
+from wheretolook.training.data import BinnedBatches, ViewpointDataModule, hold_out_locations
 from wheretolook.training.provenance import training_fingerprint, was_trained_on
 from wheretolook.training.scenes import with_also
 from wheretolook.training.trained_network import TrainedNetwork
@@ -167,44 +163,6 @@ def test_balanced_training_views_are_equally_many_and_all_of_the_rarer_class(dat
     assert balanced.statistics == InputStatistics.of(views.means, views.filled, balanced.train_rows)
 
 
-def test_the_choice_of_a_balance_follows_its_seed() -> None:
-    labels = torch.tensor([1.0] * 90 + [0.0] * 10)[torch.randperm(100, generator=torch.Generator().manual_seed(0))]
-    rows = balance_classes(labels, seed=3)
-    assert torch.equal(rows, rows.sort().values)
-    assert labels[rows].sum() == 10
-    assert torch.equal(rows, balance_classes(labels, seed=3))
-    assert not torch.equal(rows, balance_classes(labels, seed=4))
-    assert torch.equal(balance_classes(1 - labels, seed=3), balance_classes(1 - labels, seed=3))
-    assert (1 - labels)[balance_classes(1 - labels, seed=3)].sum() == 10
-
-
-@pytest.mark.parametrize("status", [NO_POSE, LOCALIZED])
-def test_labels_of_one_class_are_refused(dataset: Dataset, status: str) -> None:
-    for scene in dataset.split("train"):
-        table = scene.read_table()
-        table["status"] = status
-        table["error_m"] = 0.001
-        table["error_deg"] = 0.001
-        write_table(table, scene.table)
-    config = changed(SMALL, val_fraction=1e-9)
-    with pytest.raises(TableError, match="training labels are of one class") as caught:
-        train(dataset, config, TrackingConfig(str(dataset.root / "mlruns")), progress=False)
-    total = 2 * (24 - 1) * 20  # one location of each scene is held out
-    assert f"{total if status == LOCALIZED else 0} of {total} viewpoints" in str(caught.value)
-    assert caught.value.fix
-    assert not (dataset.root / "weights").exists()
-
-
-def test_no_label_and_no_train_scene_are_refused(tmp_path: Path, dataset: Dataset) -> None:
-    only_test = make_dataset(tmp_path / "only-test", ("test",), n_locations=2, n_directions=4)
-    with pytest.raises(TableError, match="no train scene"):
-        data_of(only_test, SMALL).setup()
-    scene = dataset.scenes[0]
-    write_table(scene.read_table().assign(status=UNLABELLED), scene.table)
-    with pytest.raises(TableError, match=r"scene-0.*no viewpoint has a label"):
-        data_of(dataset, SMALL).setup()
-
-
 @pytest.mark.parametrize(
     "options",
     [
@@ -303,15 +261,6 @@ def test_other_datasets_are_learnt_from_too(dataset: Dataset, store: str) -> Non
         train(dataset, config, tracking, progress=False)
 
 
-def test_a_release_may_ship_weights_of_another_dataset(dataset: Dataset) -> None:
-    about = {"dataset": "cameras", "dataset_fingerprint": "0" * 16}
-    assert not was_trained_on(dataset, about)
-    released = Dataset(dataset.root.parent / "released", dataset.scenes)
-    released.root.mkdir()
-    (released.root / RELEASE_FILE).write_text("{}")
-    assert was_trained_on(released, about) and not was_trained_on(released, {**about, "dataset": "released"})
-
-
 def test_the_same_seed_gives_the_same_weights(dataset: Dataset, store: str) -> None:
     config = changed(SMALL, noise_px=1.0)
     tracking = TrackingConfig(store, "same seed")
@@ -348,45 +297,6 @@ def test_two_processes_train_as_one_does(dataset: Dataset, store: str, capfd: py
     np.testing.assert_allclose(histories[1], histories[0], rtol=1e-4)
     # which devices trained does not decide what was learnt
     assert train(dataset, one, tracking, progress=False)[0].reused
-
-
-@pytest.mark.parametrize(("accelerator", "gpus"), [("auto", 1), ("gpu", 1), ("gpu", 0)])
-def test_more_gpus_than_there_are_are_refused(
-    dataset: Dataset, accelerator: Any, gpus: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
-    config = changed(SMALL, accelerator=accelerator, devices=2)
-    with pytest.raises(ConfigError, match=rf"more GPUs than there are: {gpus} \(got 2\)"):
-        train(dataset, config, TrackingConfig(str(dataset.root / "mlruns")), progress=False)
-
-
-def test_views_that_do_not_fit_into_shared_memory_are_refused(
-    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: object) -> None:
-        raise RuntimeError("unable to allocate shared memory: No space left on device")
-
-    monkeypatch.setattr(torch.Tensor, "share_memory_", full)
-    with pytest.raises(ConfigError, match=r"do not fit into shared memory.*No space left.*devices to 1"):
-        data_of(dataset, changed(SMALL, devices=2)).setup()
-
-
-def test_an_interrupted_training_is_reported_as_such(
-    dataset: Dataset, store: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def stop(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(EpochRecord, "on_train_epoch_end", stop)
-    tracking = TrackingConfig(store, "interrupted")
-    handler = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt):
-        train(dataset, SMALL, tracking, progress=False)
-    assert signal.getsignal(signal.SIGINT) is handler
-    experiment = client(tracking).get_experiment_by_name("interrupted")
-    (run,) = client(tracking).search_runs([experiment.experiment_id])
-    assert run.info.status == "KILLED"
-    assert not (dataset.root / "weights").exists()
 
 
 def test_the_released_variant_trains_as_the_released_code(dataset: Dataset, store: str) -> None:

@@ -83,7 +83,6 @@ def test_python_and_the_command_line_mean_the_same() -> None:
         ["map", "--map.n_images", "many"],
         ["map", "--map.n_images", "3", "4"],
         ["map", "--map.n_image", "3"],  # no abbreviations
-        ["train", "--map.n_images", "3"],  # of another command
         ["map", "--map.partners", "1"],  # a constant
         ["map", "--list-methods"],
         ["scenes", "--device", "gpu"],

@@ -208,6 +208,8 @@ def named_values(command: Any, types: Mapping[str, Any], arguments: Sequence[str
         name = option.removeprefix("--").replace("-", "_")
         name = command.SHORT.get(name.replace("_", "-"), name)
         if not is_option(name, known):
+            if hasattr(command, "root") and is_option(name, configurable_options()):
+                continue  # of another command: the same options may be given to all
             near = nearest(name, [*known, *command.SHORT])
             raise ConfigError("unknown option", value=option, fix=f"Did you mean --{near}?" if near else None)
         if is_sequence(types.get(name)) and values[:1] != ["null"] and not "".join(values[:1]).startswith("["):

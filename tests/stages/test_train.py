@@ -245,7 +245,7 @@ def test_other_datasets_are_learnt_from_too(dataset: Dataset, store: str) -> Non
     assert was_trained_on(elsewhere, about)
     assert not was_trained_on(Dataset(elsewhere.root, dataset.scenes[1:]), about)
     for names in (("tiny",), ("other", "other")):
-        with pytest.raises(ConfigError, match="learnt from twice"):
+        with pytest.raises(ConfigError, match="named twice"):
             with_also(dataset, names)
     leak = Dataset(other.root, (replace(other.scenes[2], split="train"),))
     shutil.copy(dataset.split("test")[0].landmarks, leak.scenes[0].landmarks)

@@ -49,7 +49,7 @@ def test_most_of_what_was_learnt_from_is_in_range() -> None:
     assert known.contains(far).tolist() == [False] * 3 + [True] and known.contains(near).all()
     assert not TrainingRange.of(views, enlarged=2).outside(views_at([[6.0] * 9])).any()
     text = known.complaint(far)
-    assert text.startswith("3 of 3 views are unlike those learnt from: mean distance of the landmarks in view 12 m (")
+    assert text.startswith("3 of 3 views are unlike the training views: mean distance of the landmarks in view 12 m (")
     assert known.outside(views_at([[2.0] * 500])).sum(0)[[*QUANTITIES].index("in_view")] == 1
     assert not known.complaint(np.concatenate([near] * 99 + [far]), 0.05)  # three odd ones in a hundred
 

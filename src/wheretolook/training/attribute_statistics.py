@@ -1,4 +1,4 @@
-"""Statistics of landmarks' attributes over training views. Apart from learning, so that scoring needs no Lightning."""
+"""Statistics of landmark attributes over training views, without Lightning."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from wheretolook.utils.errors import WeightsError
 
 @dataclass(frozen=True)
 class AttributeStatistics:
-    """Mean and standard deviation of what is known of each landmark, over those in view while training."""
+    """Mean and standard deviation of the known attributes of landmarks visible in training."""
 
-    mean: tuple[float, ...]  # (A,), 0 for what is not known of any
+    mean: tuple[float, ...]  # (A,), 0 where no value is known
     std: tuple[float, ...]  # (A,), 1 where it would be 0
     attributes: tuple[str, ...] = ATTRIBUTES  # names of the A attributes
 
     @classmethod
     def of(cls, values: Tensor) -> AttributeStatistics:
-        """Statistics over landmarks (E, len(ATTRIBUTES)), some numbers NaN."""
+        """Compute statistics over landmarks (E, len(ATTRIBUTES)); unknown values are NaN."""
         means = []
         stds = []
         for column in values.unbind(1):
@@ -36,12 +36,12 @@ class AttributeStatistics:
 
 
 def mean_and_std(stored: Mapping[str, Any], names: Sequence[str]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Means and deviations of so many kinds of values, from the header of weights.
+    """Return means and deviations of named values from the header of weights.
 
-    Raises WeightsError unless there is one of each kind, a mean is finite and a deviation above zero; it may be
-    infinite. KeyError, TypeError or ValueError if they are no numbers.
+    Raises a WeightsError unless there is a finite mean and a positive, possibly infinite deviation for each name;
+    KeyError, TypeError or ValueError if they are no numbers.
     """
     mean, std = (tuple(float(value) for value in stored[key]) for key in ("mean", "std"))
     if not len(mean) == len(std) == len(names) or not all(map(isfinite, mean)) or not all(value > 0 for value in std):
-        raise WeightsError(f"these are no means and deviations of {len(names)} values", value=(mean, std))
+        raise WeightsError(f"invalid means and deviations of {len(names)} values", value=(mean, std))
     return mean, std

@@ -20,7 +20,7 @@ CALIBRATION_BINS = 15  # equal-width bins of the expected calibration error (Guo
 def weighted_bce(
     logits: Tensor, labels: Tensor, class_weights: tuple[float, float], count: float | None = None
 ) -> Tensor:
-    """Mean weighted binary cross-entropy of logits and labels (B,), 0 or 1 (paper, Sec. 3.3), a scalar.
+    """Return the mean weighted binary cross-entropy of logits and labels (B,), 0 or 1 (paper, Sec. 3.3), a scalar.
 
     The weights are those of the negative and the positive class; a `count` divides the sum in place of B.
     """
@@ -30,7 +30,7 @@ def weighted_bce(
 
 
 def weight_penalty(module: nn.Module) -> Tensor:
-    """Sum of the squares of all weights, a scalar. Biases are left out (the paper's sum is over W_l)."""
+    """Return the sum of the squares of all weights without biases (the paper's sum is over W_l), a scalar."""
     layers = [layer for layer in module.modules() if isinstance(layer, (nn.Linear, nn.Conv2d))]
     weights = torch.cat([layer.weight.flatten() for layer in layers])
     return weights.dot(weights)
@@ -38,26 +38,25 @@ def weight_penalty(module: nn.Module) -> Tensor:
 
 @runtime_checkable
 class Augmented(Protocol):
-    """A network that changes its inputs while it learns."""
+    """A network that augments its inputs in training."""
 
     def augment(self, options: FittingConfig, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """The inputs to learn from in place of a batch's."""
+        """Return augmented inputs of a batch."""
 
 
 @runtime_checkable
-class LearnsMore(Protocol):
-    """A network that learns something beside the labels of views."""
+class HasFurtherLoss(Protocol):
+    """A network with a further loss."""
 
     def learn_more(self, options: Any, count: float, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Logits (B,) of a batch's inputs, and a further loss, a sum that the `count` of views divides."""
+        """Return logits (B,) of a batch's inputs, and a further loss divided by the `count` of views."""
 
 
 class ViewpointClassifier(LightningModule):
-    """Learns whether a viewpoint localizes, from batches of inputs of a network that gives logits (B,).
+    """Trains a network, with logits (B,) as output, to predict whether a viewpoint localizes.
 
-    A network with a method `augment(options, *inputs)` gets its inputs through that while it learns; one with a method
-    `learn_more` adds a loss of its own, which the logged ones leave out. The seed is of dropout and noise, where
-    several processes train.
+    A network may augment its inputs (`Augmented`) or add a loss (`HasFurtherLoss`), which the logged ones exclude. The
+    seed is that of dropout and noise where several processes train.
 
     Logged every epoch: `{train,val}_loss`, `{train,val}_bce`, `l2` (the weighted penalty), `train_average_precision`
     (with dropout on), `val_average_precision`, `val_roc_auc` and `val_calibration_error`. Balancing the classes shifts
@@ -78,7 +77,7 @@ class ViewpointClassifier(LightningModule):
         self._penalties: list[Tensor] = []
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """Logits (B,) of views."""
+        """Return logits (B,) of views."""
         logits: Tensor = self.network(*inputs)
         return logits
 
@@ -88,13 +87,13 @@ class ViewpointClassifier(LightningModule):
             torch.manual_seed(self.seed + self.trainer.global_rank)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Loss of one process's share of a batch. The mean over processes is the loss of the batch."""
+        """Return the loss of one process's share of a batch; the mean over processes is that of the batch."""
         inputs, labels, total = batch
         if isinstance(self.network, Augmented):
             inputs = self.network.augment(self.options, *inputs)
         count = total / self.trainer.world_size
         more: Tensor | float = 0.0
-        if isinstance(self.network, LearnsMore):
+        if isinstance(self.network, HasFurtherLoss):
             logits, more = self.network.learn_more(self.options, count, *inputs)
         else:
             logits = self(*inputs)
@@ -104,7 +103,7 @@ class ViewpointClassifier(LightningModule):
         return weighted_bce(logits, labels, self.class_weights, count) + more + penalty
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Logits of one process's share of a batch."""
+        """Store the logits of one process's share of a batch."""
         self._val_seen.append(torch.stack([self(*batch.inputs), batch.labels]))
 
     def on_validation_epoch_end(self) -> None:
@@ -118,7 +117,7 @@ class ViewpointClassifier(LightningModule):
         self._log({"val_loss": bce + penalty, "val_bce": bce, "l2": penalty, **ranking, **calibration})
 
     def on_train_epoch_end(self) -> None:
-        """Log the metrics of all training views, each as it was when the network learnt from it."""
+        """Log the metrics of all training views, each at the time of its training step."""
         logits, labels = self._gather(self._train_seen)
         bce = weighted_bce(logits, labels, self.class_weights)
         penalty = torch.stack(self._penalties).sum() / len(labels)
@@ -134,7 +133,7 @@ class ViewpointClassifier(LightningModule):
         return [optimizer], [torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, T_max=self.options.epochs)]
 
     def _gather(self, seen: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Logits and labels of an epoch, (B,) each, over all processes."""
+        """Return logits and labels of an epoch, (B,) each, over all processes."""
         values = torch.cat(seen, 1)
         seen.clear()
         if self.trainer.world_size > 1:

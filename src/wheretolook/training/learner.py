@@ -1,4 +1,4 @@
-"""What all ways of learning have in common: data in, a model and its metrics out."""
+"""The interface of learners: from a dataset to a model and its metrics."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from wheretolook.training.fit import EpochRecord, RunLog, fit
 
 
 class Model(Protocol):
-    """Something learnt that lies in a weights file."""
+    """A trained model that is stored in a weights file."""
 
     def save(self, path: Path, training: dict[str, Any] | None = None) -> None:
         """Write one safetensors file, atomically, with JSON values about the training in its header."""
@@ -29,32 +29,32 @@ class Model(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
-    """What a learner has learnt."""
+    """The result of training."""
 
     model: Model  # to be saved
-    metrics: dict[str, float]  # of what is kept, on the validation views; "val_average_precision" among them
-    # of what it has learnt from, such as n_train; logged as parameters
+    metrics: dict[str, float]  # of the stored weights on the validation views, with "val_average_precision"
+    # of the training data, such as n_train; logged as parameters
     counts: dict[str, Any] = field(default_factory=dict)
     history: pd.DataFrame | None = None  # metrics of each epoch, None where there are no epochs
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What a learner is asked to do."""
+    """What to train, on which data, with which options."""
 
     dataset: Dataset  # labelled train scenes, and val scenes if it has any
-    method: str  # name of the method to learn
+    method: str  # name of the method to train
     config: SharedConfig  # options that all learners share
     options: Any  # the method's own, such as a `FittingConfig`
     title: str = ""  # of its progress bar
     progress: bool = False  # whether to show it
     run_log: RunLog | None = None  # takes the metrics of epochs; None logs none
-    # what learners that follow one another leave for the next, such as views that are binned already
+    # what one learner leaves for the next, such as binned views
     kept: dict[str, Any] = field(default_factory=dict)
 
     @property
     def camera(self) -> Camera | None:
-        """The camera of all views to learn from; None if there are several."""
+        """The camera of all training views; None if there are several."""
         cameras = self.dataset.cameras
         return cameras[0] if len(cameras) == 1 else None
 
@@ -62,7 +62,7 @@ class Task:
 def fit_network(
     network: nn.Module, data: LightningDataModule, task: Task, class_weights: tuple[float, float] = (1.0, 1.0)
 ) -> tuple[dict[str, float], pd.DataFrame]:
-    """Train a network by the options of a task; it then holds the weights to keep. Their metrics, and all epochs'."""
+    """Train a network, which then holds the kept weights. Return their metrics and those of all epochs."""
     classifier = ViewpointClassifier(network, task.options, class_weights, task.config.seed)
     record = EpochRecord(task.title, task.options, task.progress, task.run_log)
     fit(classifier, data, record, task.config)
@@ -72,7 +72,7 @@ def fit_network(
 
 
 def predict(network: nn.Module, data: LightningDataModule) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Logits and labels (B,) of the validation views, by a network that is brought to where they are."""
+    """Return logits and labels (B,) of the validation views."""
     network.eval()
     logits = []
     labels = []
@@ -84,7 +84,7 @@ def predict(network: nn.Module, data: LightningDataModule) -> tuple[NDArray[Any]
 
 
 def class_counts(**sides: NDArray[Any]) -> dict[str, Any]:
-    """Number of views of each side, and share of positives, by the names in which runs have them."""
+    """Return the number of views of each split and their share of positives, named as parameters of runs."""
     counts: dict[str, Any] = {f"n_{name}": len(labels) for name, labels in sides.items()}
     return counts | {f"positives_{name}": round(float(labels.mean()), 4) for name, labels in sides.items()}
 

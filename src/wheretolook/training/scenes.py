@@ -1,4 +1,4 @@
-"""The scenes that a dataset is learnt from; read without PyTorch, which takes seconds to load."""
+"""Training scenes of a dataset and of further ones, without PyTorch."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from wheretolook.utils.files import fingerprint
 
 
 def with_also(dataset: Dataset, names: Sequence[str]) -> Dataset:
-    """A dataset together with the train scenes of others beside it.
+    """Return a dataset together with the train scenes of others in the same folder.
 
     Raises a TableError if there is no such dataset or it has no train scene; a ConfigError if it is named
     twice or is the dataset itself, or one of its scenes is one of the dataset's under another name.
     """
     if len({dataset.name, *names}) <= len(names):
         fix = "Name other datasets in the same folder, each once."
-        raise ConfigError("a dataset would be learnt from twice", value=list(names), fix=fix)
+        raise ConfigError("a dataset is named twice", value=list(names), fix=fix)
     scenes = list(dataset.scenes)
     for name in names:
         other = Dataset.load(safe_child(dataset.root.parent, name, "a dataset's name"))
@@ -35,7 +35,7 @@ def with_also(dataset: Dataset, names: Sequence[str]) -> Dataset:
 
 
 def training_scenes(dataset: Dataset) -> list[SceneFolder]:
-    """The scenes that are read for training: train scenes, then val scenes; a TableError without train scenes."""
+    """Return train scenes, then val scenes; a TableError without train scenes."""
     if not dataset.split("train"):
         fix = "Make one, or train on another dataset."
         raise TableError("the dataset has no train scene", path=dataset.root, fix=fix)

@@ -1,4 +1,4 @@
-"""What the views were like that a model has learnt from, so that it can say where a view is unlike all of them."""
+"""The range of a model's training views, to detect views outside of it."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ QUANTITIES = {
     "down_deg": "field of view down {:.1f} degrees",
     "focal_px": "focal length {:.4g} px",
 }
-"""What may be known of a view here, and how a message tells it; NaN where it is not. The mean distance is geometric."""
+"""Quantities of a view, NaN where unknown, and their text in messages. The mean distance is geometric."""
 
 OF_CAMERA = ("across_deg", "down_deg", "focal_px")
 _ANGLES = ("across_deg", "down_deg")
 
-QUANTILES = (0.005, 0.995)  # of the views learnt from, the few beyond these do not count as known
+QUANTILES = (0.005, 0.995)  # of the training views that bound the range
 MARGIN = 1.25  # a range is wider than these quantiles: by this factor, or angle
 MARGIN_DEG = 2.0
 
 
 @dataclass(frozen=True)
 class TrainingRange:
-    """Lowest and highest value of some of `QUANTITIES` over the views learnt from; of the others nothing is known."""
+    """Lowest and highest value of some of `QUANTITIES` over the training views; the others are unbounded."""
 
     bounds: Mapping[str, tuple[float, float]]
 
@@ -46,7 +46,7 @@ class TrainingRange:
 
         If scenes come larger and smaller by up to a factor while learning, so do the distances.
         """
-        seeing = quantities[_see_something(quantities)]
+        seeing = quantities[_have_landmarks(quantities)]
         bounds = {}
         for name, values in zip(QUANTITIES, seeing.T, strict=True):
             known = values[np.isfinite(values)]
@@ -76,7 +76,7 @@ class TrainingRange:
 
     @property
     def asks_for_landmarks(self) -> bool:
-        """Whether the camera alone does not tell if a view is within the range."""
+        """Whether the range bounds more than the camera."""
         return not {*self.bounds} <= {*OF_CAMERA}
 
     @cached_property
@@ -98,7 +98,7 @@ class TrainingRange:
 
         Each quantity is told by its median over the views where it is outside.
         """
-        seeing = quantities[_see_something(quantities)]
+        seeing = quantities[_have_landmarks(quantities)]
         outside = self.outside(seeing)
         n_outside = int(np.count_nonzero(outside.any(axis=1)))
         if n_outside <= tolerated * len(seeing):
@@ -108,11 +108,11 @@ class TrainingRange:
             if outside[:, column].any():
                 low, high = self.bounds[name]
                 value = np.median(seeing[outside[:, column], column])
-                parts.append(f"{text.format(value)} (learnt: {low:.3g} to {high:.3g})")
-        return f"{n_outside} of {len(seeing)} views are unlike those learnt from: {', '.join(parts)}"
+                parts.append(f"{text.format(value)} (trained on: {low:.3g} to {high:.3g})")
+        return f"{n_outside} of {len(seeing)} views are unlike the training views: {', '.join(parts)}"
 
 
-def _see_something(quantities: Float) -> NDArray[np.bool_]:
+def _have_landmarks(quantities: Float) -> NDArray[np.bool_]:
     """Which views, described by `QUANTITIES` (B, 6), see any landmark, (B,): it then has a distance or a depth."""
     return np.asarray(np.isfinite(quantities[:, :2]).any(axis=1))
 

@@ -32,7 +32,7 @@ def test_poses_come_back_from_disk_and_give_the_same_bytes(tmp_path: Path) -> No
     assert path.read_bytes() == content and [file.name for file in tmp_path.iterdir()] == ["cameras.npz"]
 
 
-def test_a_model_tells_the_poses_where_there_is_no_file(scene: SceneFolder) -> None:
+def test_poses_come_from_the_model_without_a_file(scene: SceneFolder) -> None:
     stored = scene.localization_map(CAMERA).mapping_poses
     np.testing.assert_array_equal(stored, load_mapping_poses(scene.mapping_cameras))
     scene.mapping_cameras.unlink()

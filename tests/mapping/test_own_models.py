@@ -115,7 +115,7 @@ def test_arrays_are_what_pycolmap_says_of_each_point(tmp_path):
 
 
 @pytest.mark.parametrize("old", [False, True])
-def test_what_the_mapper_kept_is_kept_and_what_is_left_out_is_counted(tmp_path, old):
+def test_all_points_are_landmarks_and_omitted_ones_are_counted(tmp_path, old):
     offsets_px = np.linspace(0, 3, 60)
     points = np.column_stack([np.linspace(-1, 1, 60), np.full(60, 3.0), np.ones(60)])
     model = hand_written_model(offsets_px=offsets_px, tracks=([0, 1, 2],) * 60, points=points)[0]
@@ -144,7 +144,7 @@ def test_missing_and_incomplete_models_are_rejected(tmp_path):
             read_model(path)
 
 
-def test_a_database_tells_ambiguity_and_is_not_written_to(tmp_path):
+def test_a_database_gives_ambiguity_and_is_not_written_to(tmp_path):
     model, keypoints = hand_written_model()
     folder = written(model, tmp_path / "model")
     database = write_database(tmp_path / "db.db", model, keypoints, random_descriptors([len(k) for k in keypoints]))
@@ -162,12 +162,12 @@ def test_a_database_tells_ambiguity_and_is_not_written_to(tmp_path):
     assert database.read_bytes() == before and sorted(path.name for path in tmp_path.iterdir()) == ["db.db", "model"]
 
 
-@pytest.mark.parametrize("kind", ["none", "learnt"])
-def test_without_sift_descriptors_ambiguity_is_unknown_and_that_is_said_once(tmp_path, kind):
+@pytest.mark.parametrize("kind", ["none", "learned"])
+def test_without_sift_descriptors_ambiguity_is_unknown_with_one_warning(tmp_path, kind):
     model, keypoints = hand_written_model()
     folder = written(model, tmp_path / "model")
     database = write_database(tmp_path / "db.db", model, keypoints, random_descriptors([len(k) for k in keypoints]))
-    change = {"none": "DELETE FROM descriptors", "learnt": "UPDATE descriptors SET type = 2"}[kind]
+    change = {"none": "DELETE FROM descriptors", "learned": "UPDATE descriptors SET type = 2"}[kind]
     with sqlite3.connect(database) as db:
         db.execute(change)
     db.close()
@@ -192,15 +192,6 @@ def test_features_in_hdf5_of_hloc(tmp_path):
             group["descriptors"] = (descriptors[i] / lengths[:, None]).T
     found, expected = (load_colmap_landmarks(folder, path) for path in (tmp_path / "feats.h5", database))
     np.testing.assert_allclose(found.ambiguity, expected.ambiguity, atol=0.01)
-    with h5py.File(tmp_path / "feats.h5", "a") as file:
-        for i in range(3):
-            del file[f"{i}.png/descriptors"]
-            file[f"{i}.png"]["descriptors"] = np.zeros((512, len(keypoints[i])))  # D2-Net's
-    with pytest.warns(MapWarning, match="ambiguity"):
-        assert np.isnan(load_colmap_landmarks(folder, tmp_path / "feats.h5").ambiguity).all()
-    (tmp_path / "feats.h5").write_bytes(b"not HDF5")
-    with pytest.raises(MapError):
-        load_colmap_landmarks(folder, tmp_path / "feats.h5")
 
 
 def test_scale_and_axes_are_doubted_where_they_are_implausible():

@@ -60,7 +60,7 @@ def test_photographs_are_turned_upright_and_reduced(tmp_path: Path) -> None:
     assert reduce_photograph(upright, 0) is upright and reduce_photograph(upright, 60) is upright
 
 
-def test_exif_tells_the_focal_length_and_who_shares_a_camera(tmp_path: Path) -> None:
+def test_focal_lengths_and_shared_cameras_from_exif(tmp_path: Path) -> None:
     for name in ("a.jpg", "b.jpg"):
         save(tmp_path / name, sized(240, 360), focal_mm=28)
     save(tmp_path / "c.jpg", sized(240, 360), focal_mm=50)

@@ -88,7 +88,7 @@ def test_kinds_take_turns() -> None:
         ScenesConfig(kinds=("castle",))  # type: ignore[arg-type]
 
 
-def test_mapped_floor_is_kept_beside_the_mesh(tmp_path: Path) -> None:
+def test_mapped_floor_is_stored_with_the_mesh(tmp_path: Path) -> None:
     scene = SceneFolder(tmp_path / "building-001", "train")
     floor = ((0.0, 0.0, 2.5, 1.0), (3.0, 0.0, 4.0, 1.0))
     assert scene.mapped_floor() == ()

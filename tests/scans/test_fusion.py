@@ -254,7 +254,7 @@ def model_of(names, poses, points=None, scale=1.0):
     return model
 
 
-def test_poses_of_a_model_serve_instead_and_tell_the_unit(seven_scenes, mesh, tmp_path):
+def test_poses_of_a_model_replace_those_of_the_recording(seven_scenes, mesh, tmp_path):
     folder = copied(seven_scenes, tmp_path / "some")
     for path in folder.glob("*.pose.txt"):
         path.unlink()

@@ -154,7 +154,7 @@ class Check(OcclusionOptions, ScorerOptions):
         """Open the map with its photographs' features, and the occlusion model; results go to `out`."""
         from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
         from wheretolook.holdout import photo_map as source
-        from wheretolook.mapping.sources import features_beside, photographs_of
+        from wheretolook.mapping.sources import find_features, find_photographs
 
         mesh = self.mesh
         metric = self.metres
@@ -174,7 +174,7 @@ class Check(OcclusionOptions, ScorerOptions):
             raise ConfigError("a mesh is of use only for a map in metres", value=str(mesh), fix=fix)
         files = ColmapFiles(model, mesh=mesh)
         occlusion = ColmapEnvironment(files, occlusion=self.occlusion or "", device=device).occlusion
-        given = self.images or self.database or features_beside(model) or photographs_of(model)
+        given = self.images or self.database or find_features(model) or find_photographs(model)
         if given is None and scene is not None and scene.mesh.is_file():  # its images were rendered, and are gone
             problem = "neither the features nor the photographs of this map are known"
             fix = "Map the scene again with `wheretolook map --map.keep_database true`, which keeps the features."

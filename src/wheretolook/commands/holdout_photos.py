@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 def knows_photographs(files: SceneFolder, images: Path | None = None, database: Path | None = None) -> bool:
     """Return whether the photographs that a scene's map was made from, or their features, are known."""
     from wheretolook.mapping.colmap_model import holds_model
-    from wheretolook.mapping.sources import features_beside, photographs_of
+    from wheretolook.mapping.sources import find_features, find_photographs
 
     if not holds_model(files.map):
         return False
-    given = images or database or features_beside(files.map) or photographs_of(files.map)
+    given = images or database or find_features(files.map) or find_photographs(files.map)
     return given is not None
 
 

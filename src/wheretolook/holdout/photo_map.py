@@ -25,7 +25,7 @@ from wheretolook.mapping.georeference import Similarity, read_scale
 from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.mapping.rendered_map import DATABASE_FILE
 from wheretolook.mapping.sanity import axes_doubt
-from wheretolook.mapping.sources import features_beside, photographs_of
+from wheretolook.mapping.sources import find_features, find_photographs
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.confine import safe_child
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning
@@ -227,8 +227,8 @@ def features_of(
     features nor photographs are known.
     """
     if images is None and database is None:
-        database = features_beside(model_dir)
-        images = photographs_of(model_dir) if database is None else None
+        database = find_features(model_dir)
+        images = find_photographs(model_dir) if database is None else None
     if database is not None:
         return model_dir, database
     if images is None:

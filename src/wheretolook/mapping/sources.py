@@ -10,7 +10,7 @@ from wheretolook.mapping.map_folder import DATABASE_FILE
 from wheretolook.utils.reading import read_json_object
 
 
-def features_beside(model_dir: Path) -> Path | None:
+def find_features(model_dir: Path) -> Path | None:
     """Find the file of features of a map, in its folder, COLMAP's usual folders or its report; None if there is none."""
     places = (model_dir, model_dir.parent / "photographs", model_dir.parent, model_dir.parent.parent)
     for place in places:
@@ -23,7 +23,7 @@ def features_beside(model_dir: Path) -> Path | None:
     return Path(named) if named is not None and Path(named).is_file() else None
 
 
-def photographs_of(model_dir: Path) -> Path | None:
+def find_photographs(model_dir: Path) -> Path | None:
     """Find the folder of images that a map was built from, in its folder or its report; None if there is none."""
     named = _reported(model_dir, "photographs", "images")
     for folder in (model_dir / "images", *([Path(named)] if named is not None else [])):

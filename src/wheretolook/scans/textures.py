@@ -96,10 +96,10 @@ def _cover(areas: NDArray[np.float16]) -> NDArray[np.int64]:
     open_ones = good.sum(1)
     while open_ones.max() > 0:
         row = int(open_ones.argmax())
-        taken = np.flatnonzero(good[row])
-        chosen[taken] = row
-        open_ones -= good[:, taken].sum(1)
-        good[:, taken] = False
+        covered = np.flatnonzero(good[row])
+        chosen[covered] = row
+        open_ones -= good[:, covered].sum(1)
+        good[:, covered] = False
     return chosen
 
 

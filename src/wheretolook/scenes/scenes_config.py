@@ -54,15 +54,15 @@ class ScenesConfig:
         val: generated scenes for validation; with none, some locations of the training scenes are held out.
         test: generated scenes to evaluate on.
         seed: seed of the first generated scene; each further one counts up.
-        kinds: kinds of generated scenes, one after the other in turn: a seed's is `kinds[seed % len(kinds)]`. Beside
-            `apartment` there are `hall`, `court`, `office` and `building`, in which rooms repeat that are mapped in
-            part. These draw their sizes and difficulty from the seed, as apartments do that `vary`.
-        apartment: what an apartment is like, and the texture and light of all generated scenes.
-        meshes: scenes from meshes of one's own, beside the generated ones, such as [{path: scans/office.glb}].
-        rgbd: an RGB-D recording to make one scene of. With its folder no other scene is made; those that the dataset
-            has are kept.
-        free_space: where a camera may be.
-        mapped_space: where it may be in a scene of photographs, which has no mesh, or in a scan, which is in parts.
+        kinds: kinds of generated scenes in turn: a seed's kind is `kinds[seed % len(kinds)]`. `apartment`, `hall`,
+            `court`, `office` or `building`, in which rooms repeat and are mapped in part. All but apartments without
+            `vary` draw their sizes and difficulty from the seed.
+        apartment: options of apartments, and the texture and light of all generated scenes.
+        meshes: scenes from existing meshes, in addition to generated ones, such as [{path: scans/office.glb}].
+        rgbd: an RGB-D recording to make one scene of. With its folder no other scene is made; existing scenes of the
+            dataset remain.
+        free_space: positions that a camera may take.
+        mapped_space: the same in a scene of photographs, which has no mesh, or in a scan, which is incomplete.
     """
 
     train: int = 3

@@ -178,7 +178,7 @@ def open_map(
         WeightsError: the weights cannot be used.
     """
     from wheretolook.mapping.sanity import warn_of_mesh
-    from wheretolook.mapping.sources import photographs_of
+    from wheretolook.mapping.sources import find_photographs
     from wheretolook.view.photographs import Photographs
 
     environment = ColmapEnvironment(ColmapFiles(path, mesh), camera, device=device)
@@ -191,7 +191,7 @@ def open_map(
         available = given_weights(weights, landmarks.features)
     if mesh is not None:
         warn_of_mesh(mesh, landmarks.points, environment.raycaster)
-    folder = images or photographs_of(path)
+    folder = images or find_photographs(path)
     photographs = None if folder is None else Photographs.of_model(path, folder)
     model = path.resolve()
     name = model.parent.name if model.name in ("0", "sparse", "map") else model.name
@@ -207,7 +207,7 @@ def open_scene(
     TableError if the scene has not been mapped, WeightsError if the weights cannot be used.
     """
     from wheretolook.mapping.colmap_model import holds_model
-    from wheretolook.mapping.sources import photographs_of
+    from wheretolook.mapping.sources import find_photographs
     from wheretolook.view.photographs import Photographs
 
     if not files.landmarks.is_file():
@@ -221,7 +221,7 @@ def open_scene(
         available = scene_weights(files, landmarks.points, landmarks.features)
     else:
         available = given_weights(weights, landmarks.features)
-    folder = photographs_of(files.map)
+    folder = find_photographs(files.map)
     photographs = None
     if folder is not None and holds_model(files.map):
         photographs = Photographs.of_model(files.map, folder)

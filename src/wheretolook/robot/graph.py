@@ -73,7 +73,7 @@ class RobotNetwork(nn.Module):
         network = self.network
         log_odds = network.matchability(values)
         own = torch.arange(values.shape[1]) < n_sampled[:, None]
-        each = (n_visible.double() / n_sampled.clamp(min=1))[:, None]  # visible landmarks that each of them stands for
+        each = (n_visible.double() / n_sampled.clamp(min=1))[:, None]  # visible landmarks per sampled one
         sums = (network.parts(values, log_odds).double() * own[..., None]).sum(1) * each
         cells = (
             self._expected_cells(values, log_odds, own, each)

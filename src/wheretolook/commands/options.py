@@ -193,7 +193,7 @@ class CameraOptions(Command):
 
     def named_camera(self) -> Camera | int | None:
         """Return the camera asked for: one, a camera_id of the map, or None for the map's own."""
-        from wheretolook.geometry.camera_text import parse_camera
+        from wheretolook.geometry.camera import parse_camera
 
         if self.camera is not None and self.camera_id is not None:
             raise ConfigError("the camera is described in several ways", value=self.camera, fix="Give one of them.")

@@ -90,7 +90,7 @@ class Select(SelectionRequest, CameraOptions, OcclusionOptions, ScorerOptions):
 
     def named_camera(self) -> Camera | int | None:
         """Return the camera asked for: one, a camera_id of the map, or None for the map's own."""
-        from wheretolook.geometry.camera_text import camera_of_view, parse_size
+        from wheretolook.geometry.camera import PinholeCamera, parse_size
 
         if self.fov is None:
             if self.size is not None:
@@ -98,7 +98,7 @@ class Select(SelectionRequest, CameraOptions, OcclusionOptions, ScorerOptions):
             return super().named_camera()
         if self.camera is not None or self.camera_id is not None:
             raise ConfigError("the camera is described in several ways", value=self.fov, fix="Give one of them.")
-        return camera_of_view(self.fov, parse_size(self.size or "640x480"))
+        return PinholeCamera.of_field_of_view(self.fov, *parse_size(self.size or "640x480"))
 
     def request(self) -> dict[str, Any]:
         """Return the fields of `SelectionRequest`."""

@@ -48,13 +48,12 @@ def sample_viewpoints(
     progress: str | None = None,
     split: Split = "train",
 ) -> tuple[pd.DataFrame, StoredOcclusion]:
-    """Choose viewpoints by how many landmarks they see, at locations (L,) of the grid, the centres of its voxels.
+    """Choose the viewpoints that see most landmarks at locations (L,) of the grid, and return them with the occlusion.
 
     At every location all directions of the lattice are ranked by the number of landmarks in view (descending, then by
-    direction id), and the best K are kept. Some options differ by the scene's split. Of several cameras, by number,
-    each location looks with one, in turn, and the table says with which. The progress bar has a text; None shows none.
-    Returns the table of viewpoints, unlabelled, in the order of their ids (location id times the number of directions,
-    plus direction id), and the occlusion of the table's locations, for later stages.
+    direction id), and the best K are kept. Several cameras, by number, are assigned to the locations in turn.
+    `progress` is the text of a progress bar. The table is unlabelled and sorted by viewpoint id: location id times the
+    number of directions, plus direction id.
 
     Raises:
         SceneError: no viewpoint sees enough landmarks, or a location lies inside geometry.
@@ -75,38 +74,41 @@ def sample_viewpoints(
         rng.shuffle(numbers)
     inputs = (rotation_looking_along(directions), locations, landmarks.points, occlusion)
     seen = _survey_by_camera(several, numbers, *inputs, options)
-    counts = seen.counts
+    kept = []
+    for row, best in enumerate(seen.best):
+        visible = best[seen.counts[row, best] >= config.min_visible]
+        kept.append(np.sort(_subset(visible, config.directions_of(split), rng)))
+    location = np.repeat(np.arange(len(ids)), [len(chosen) for chosen in kept])
+    direction = np.concatenate(kept)
+    _check_number(len(direction), len(ids), int(seen.counts.max(initial=0)), len(landmarks.points), config)
     rank = np.full(seen.counts.shape, -1, dtype=np.int32)
     np.put_along_axis(rank, seen.best, np.arange(seen.best.shape[1])[None], axis=1)
-
-    kept_directions = []
-    for row, best in enumerate(seen.best):
-        kept = best[counts[row, best] >= config.min_visible]
-        kept_directions.append(np.sort(_subset(kept, config.directions_of(split), rng)))
-    row_index = np.repeat(np.arange(len(ids)), [len(kept) for kept in kept_directions])
-    direction = np.concatenate(kept_directions)
-    if len(direction) == 0:
-        n_landmarks = len(landmarks.points)
-        fix = "Lower sample.min_visible, or map the scene with more images."
-        problem = f"from no location does a viewpoint see {config.min_visible} of the {n_landmarks} landmarks"
-        raise SceneError(problem, value=int(counts.max(initial=0)), fix=fix)
-    if len(direction) > (most := fitting(BYTES_PER_VIEWPOINT)):
-        fix = f"Set sample.max_directions to {max(1, most // len(ids)):,} or less, or sample.max_locations."
-        raise ConfigError("the table has more viewpoints than there is memory for", value=len(direction), fix=fix)
     columns = {
-        "viewpoint_id": ids[row_index] * len(directions) + direction,
-        "location_id": ids[row_index],
+        "viewpoint_id": ids[location] * len(directions) + direction,
+        "location_id": ids[location],
         "direction_id": direction,
-        **pose_columns(poses_looking_along(locations[row_index], directions[direction])),
-        "n_visible": counts[row_index, direction],
-        "visibility_rank": rank[row_index, direction],
+        **pose_columns(poses_looking_along(locations[location], directions[direction])),
+        "n_visible": seen.counts[location, direction],
+        "visibility_rank": rank[location, direction],
     }
     if isinstance(cameras, Mapping):
-        columns[CAMERA_ID] = numbers[row_index].astype(np.int32)
+        columns[CAMERA_ID] = numbers[location].astype(np.int32)
     nan = np.float32(np.nan)
     assert seen.occlusion is not None
     table = pd.DataFrame(columns).assign(status=UNLABELLED, error_m=nan, error_deg=nan, n_inliers=0)
     return table, seen.occlusion
+
+
+def _check_number(n_viewpoints: int, n_locations: int, max_count: int, n_landmarks: int, config: SampleConfig) -> None:
+    """Raise SceneError without viewpoints, ConfigError if there are more than memory holds."""
+    if n_viewpoints == 0:
+        fix = "Lower sample.min_visible, or map the scene with more images."
+        problem = f"from no location does a viewpoint see {config.min_visible} of the {n_landmarks} landmarks"
+        raise SceneError(problem, value=max_count, fix=fix)
+    most = fitting(BYTES_PER_VIEWPOINT)
+    if n_viewpoints > most:
+        fix = f"Set sample.max_directions to {max(1, most // n_locations):,} or less, or sample.max_locations."
+        raise ConfigError("the table has more viewpoints than there is memory for", value=n_viewpoints, fix=fix)
 
 
 def _survey_by_camera(

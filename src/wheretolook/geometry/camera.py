@@ -299,6 +299,33 @@ def camera_of_record(record: Mapping[str, Any]) -> Camera:
     return PinholeCamera(**record)
 
 
+def parse_camera(text: str) -> Camera:
+    """Parse "MODEL,width,height,parameters", with COLMAP's models and order of parameters, separated by commas or blanks.
+
+    Raises ConfigError if the text describes no camera.
+    """
+    model, *numbers = text.replace(",", " ").split() or [""]
+    fix = "Write MODEL,width,height,parameters as COLMAP orders them, such as PINHOLE,640,480,320,320,320,240; sizes in pixels."
+    try:
+        width, height, *params = (float(number) for number in numbers)
+    except ValueError as error:
+        raise ConfigError("this is no camera", value=text, fix=fix) from error
+    if not width.is_integer() or not height.is_integer():
+        raise ConfigError("an image's size is whole pixels", value=text, fix=fix)
+    try:
+        return camera_of(model.upper(), int(width), int(height), params)
+    except ConfigError as error:
+        raise ConfigError(error.problem, value=text, fix=error.fix or fix) from error
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Parse width and height in pixels, such as "640x480". Raises ConfigError if the text is no size."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise ConfigError("this is no image size", value=text, fix="Write it in pixels, such as 640x480.")
+    return int(width), int(height)
+
+
 def read_cameras(path: Path) -> dict[int, Camera]:
     """Cameras by their camera_id from a file in COLMAP's text format, a line each: id, model, size, parameters.
 

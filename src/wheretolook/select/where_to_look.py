@@ -113,7 +113,7 @@ class WhereToLook:
             WeightsError: the weights cannot be used, or there are none.
             ConfigError: no such method, camera, occlusion, lattice or device.
         """
-        from wheretolook.geometry.camera_text import camera_of_view, parse_camera
+        from wheretolook.geometry.camera import PinholeCamera, parse_camera
         from wheretolook.scorers.registry import make_scorer
         from wheretolook.weights.resolve import load_scorer, resolve_weights
 
@@ -125,7 +125,7 @@ class WhereToLook:
         if isinstance(camera, str):
             camera = parse_camera(camera)
         elif fov_deg is not None:
-            camera = camera_of_view(fov_deg)
+            camera = PinholeCamera.of_field_of_view(fov_deg, 640, 480)
         resolve_weights(method, weights)  # so that one that cannot be had is known before anything is read
         environment = ColmapEnvironment(
             ColmapFiles(

@@ -1,7 +1,7 @@
 """Catalog of figures and tables: the logged run that each is drawn from, and the command that makes this run.
 
-To add one, add an entry to `ITEMS`: its name, its number in the paper, the run and file that it needs, the command that
-makes that run, and a function from `Source` to a figure, or to texts by file suffix.
+To add one, decorate a function from `Source` to a figure, or to texts by file suffix, with `@item`: its name, its number
+in the paper, its content and notebook, the run and file that it needs, and the command that makes that run.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -144,49 +144,29 @@ def _source_of(dataset: Dataset) -> str:
     return str(read_about(dataset)["source"]) if is_release(dataset) else dataset.name
 
 
-def _of(
-    draw: Callable[[pd.DataFrame], Figure], file: str, read: Callable[[Path], pd.DataFrame] = pd.read_csv
+ITEMS: list[Item] = []
+"""All items: the paper's in its order, then further ones."""
+
+
+def item(name: str, paper: str, what: str, notebook: str, **needs: Any) -> Callable[[Drawer], Drawer]:
+    """Register a function as an item; `needs` are the fields of `Item` that describe its run."""
+
+    def register(draw: Drawer) -> Drawer:
+        ITEMS.append(Item(name, paper, what, notebook, draw, **needs))
+        return draw
+
+    return register
+
+
+def _table_figure(
+    draw: Callable[[pd.DataFrame], Figure], file: str = SCORES_CSV, read: Callable[[Path], pd.DataFrame] = read_scores
 ) -> Drawer:
     """Return a function that draws the table in an artifact."""
-
-    def drawer(source: Source) -> Figure:
-        return draw(read(source.file(file)))
-
-    return drawer
-
-
-def _of_scores(draw: Callable[[pd.DataFrame], Figure]) -> Drawer:
-    return _of(draw, SCORES_CSV, read_scores)
-
-
-def _score_table(source: Source) -> Texts:
-    scores = read_scores(source.file(SCORES_CSV))
-    return {"md": f"{score_markdown(scores)}\n{comparisons_markdown(scores)}", "csv": scores.to_csv(index=False)}
-
-
-def _training(source: Source) -> Figure:
-    return training_figure(histories(source.tracking, source.dataset.name))
-
-
-def _architecture(source: Source) -> Texts:
-    params = {method_of_run(run): run.data.params for run in source.runs}
-    networks = [params[name] for name, method in learned().items() if method.ships == "network" and name in params]
-    if not networks:
-        raise MissingRunError("none of the paper's networks was trained")
-    table = paper_architecture_table(networks[-1])  # that of most inputs, the paper's proposal
-    return {
-        "md": markdown_table(list(table.columns), table.to_numpy().tolist()) + "\n",
-        "csv": table.to_csv(index=False),
-        "tex": table.to_latex(index=False),
-    }
+    return lambda source: draw(read(source.file(file)))
 
 
 def _paper_table(name: str) -> Drawer:
     return lambda source: {ending: source.file(f"table_{name}.{ending}").read_text() for ending in ("md", "csv", "tex")}
-
-
-def _lattices(source: Source) -> Figure:
-    return fibonacci_figure()
 
 
 _open = lru_cache(maxsize=1)(open_showcase)
@@ -204,81 +184,147 @@ def _walkthrough(source: Source) -> Learning:
     return learning_of(showcase, cast("BinnedNetworkScorer", scorer), location)
 
 
+def _trained(method: str, command: str, **more: Any) -> dict[str, Any]:
+    """Return the needs of an item drawn from the train run of a method."""
+    params = (("dataset", "{dataset}"), ("method", method))
+    return {"stage": "train", "file": "", "command": command, "params": params, **more}
+
+
+_TRAIN = "wheretolook train --config {config}"
+_SET = _trained("set", "wheretolook demo --config configs/cameras.yaml", of_release=True)
+_NETWORK = _trained("mlp-2d+z", _TRAIN, of_release=True)
+_WIDEST = _trained("mlp-2d+3d", f"{_TRAIN} --train.methods '[mlp-2d+3d]'")
+_NO_RUN = {"stage": "", "file": ""}
+_LOG_RELEASE = "wheretolook log-release --config {config}"
+_BENCH = "python tests/benchmarks/bench_visibility.py"
+
+
+def _measured(file: str, options: str = "") -> dict[str, Any]:
+    command = f"{_BENCH}{options} --out cpu.json && {_BENCH} --draw cpu.json --log"
+    return {"stage": "benchmark", "file": file, "command": command, "params": ()}
+
+
+@item("pipeline", "Fig. 1", "from a map to the camera that is turned", "01_pipeline", **_SET)
 def _pipeline(source: Source) -> Figure:
     return pipeline_figure(pipeline_of(*_shown(source)))
 
 
+@item("learning", "Fig. 2", "a view on its way through the network", "03_inputs", **_NETWORK)
 def _learning(source: Source) -> Figure:
     return learning_figure(*_walkthrough(source))
 
 
+@item(
+    "viewpoint_generation",
+    "Fig. 3",
+    "voxels, directions, occlusion",
+    "02_sampling",
+    **_NO_RUN,
+    command=_LOG_RELEASE,
+    of_release=True,
+)
 def _sampling(source: Source) -> Figure:
     showcase = _open(source.dataset)
     return sampling_figure(sampling_of(showcase, showcase.instructive_location()))
 
 
-def _inputs(source: Source) -> Figure:
-    return inputs_figure(_walkthrough(source).image)
+@item("spherical_sampling", "Fig. 4", "lattices of directions", "02_sampling", **_NO_RUN)
+def _lattices(source: Source) -> Figure:
+    return fibonacci_figure()
 
 
-def _peaks(source: Source) -> Figure:
-    return peaks_figure(*peaks_of(*_shown(source)))
+@item("architecture", "Table 1", "layers of the network", "04_training", **_WIDEST)
+def _architecture(source: Source) -> Texts:
+    params = {method_of_run(run): run.data.params for run in source.runs}
+    networks = [params[name] for name, method in learned().items() if method.ships == "network" and name in params]
+    if not networks:
+        raise MissingRunError("none of the paper's networks was trained")
+    table = paper_architecture_table(networks[-1])  # that of most inputs, the paper's proposal
+    return {
+        "md": markdown_table(list(table.columns), table.to_numpy().tolist()) + "\n",
+        "csv": table.to_csv(index=False),
+        "tex": table.to_latex(index=False),
+    }
 
 
+item("table_vs_others", "Table 2", "all methods", "05_tables", file="table_vs_others.md")(_paper_table("vs_others"))
+
+
+@item("planning", "Fig. 5", "the same way by three methods", "07_planning", **_SET)
 def _planning(source: Source) -> Figure:
     showcase = _open(source.dataset)
     return methods_figure(planned_views(showcase, source.dataset), showcase.localization_map.landmarks.points)
 
 
-_TRAIN = "wheretolook train --config {config}"
-_BENCH = "python tests/benchmarks/bench_visibility.py{} --out cpu.json && python tests/benchmarks/bench_visibility.py" \
-    " --draw cpu.json --log"  # fmt: skip
-_LOG_RELEASE = "wheretolook log-release --config {config}"
+item(
+    "paths",
+    "Fig. 5",
+    "planned paths that localize",
+    "07_planning",
+    stage="paths",
+    file=PATHS_CSV,
+    command="wheretolook compare-paths --config {source}",
+    of_source=True,
+)(_table_figure(paths_figure, PATHS_CSV, pd.read_csv))
+item("runtimes", "Fig. 6", "times of the visibility check", "08_runtimes", **_measured(RUNTIMES_CSV))(
+    _table_figure(runtime_figure, RUNTIMES_CSV, pd.read_csv)
+)
+item("table_input_variants", "Table 3", "inputs of the network", "05_tables", file="table_input_variants.md")(
+    _paper_table("input_variants")
+)
+item("top_n", "Fig. 7", "several viewpoints of a location", "06_top_n")(_table_figure(top_n_figure))
 
-_SET, _PAPERS, _WIDEST = ((("dataset", "{dataset}"), ("method", method)) for method in ("set", "mlp-2d+z", "mlp-2d+3d"))
-_TRAIN_SET = "wheretolook demo --config configs/cameras.yaml"
-_TRAIN_WIDEST = f"{_TRAIN} --train.methods '[mlp-2d+3d]'"
 
-ITEMS: tuple[Item, ...] = (
-    Item("pipeline", "Fig. 1", "from a map to the camera that is turned", "01_pipeline", _pipeline, "train", "",
-         _TRAIN_SET, _SET, of_release=True),
-    Item("learning", "Fig. 2", "a view on its way through the network", "03_inputs", _learning, "train", "", _TRAIN,
-         _PAPERS, of_release=True),
-    Item("viewpoint_generation", "Fig. 3", "voxels, directions, occlusion", "02_sampling", _sampling, "", "",
-         _LOG_RELEASE, of_release=True),
-    Item("spherical_sampling", "Fig. 4", "lattices of directions", "02_sampling", _lattices, "", ""),
-    Item("architecture", "Table 1", "layers of the network", "04_training", _architecture, "train", "", _TRAIN_WIDEST,
-         _WIDEST),
-    Item("table_vs_others", "Table 2", "all methods", "05_tables", _paper_table("vs_others"),
-         file="table_vs_others.md"),
-    Item("planning", "Fig. 5", "the same way by three methods", "07_planning", _planning, "train", "", _TRAIN_SET,
-         _SET, of_release=True),
-    Item("paths", "Fig. 5", "planned paths that localize", "07_planning", _of(paths_figure, PATHS_CSV),
-         "paths", PATHS_CSV, "wheretolook compare-paths --config {source}", of_source=True),
-    Item("runtimes", "Fig. 6", "times of the visibility check", "08_runtimes", _of(runtime_figure, RUNTIMES_CSV),
-         "benchmark", RUNTIMES_CSV, _BENCH.format(""), ()),
-    Item("table_input_variants", "Table 3", "inputs of the network", "05_tables", _paper_table("input_variants"),
-         file="table_input_variants.md"),
-    Item("top_n", "Fig. 7", "several viewpoints of a location", "06_top_n", _of_scores(top_n_figure)),
-    Item("inputs", "", "from an image to an input", "03_inputs", _inputs, "train", "", _TRAIN, _PAPERS,
-         of_release=True),
-    Item("peaks", "", "what the network looks at", "04_training", _peaks, "train", "", _TRAIN_SET, _SET,
-         of_release=True),
-    Item("training", "", "learning curves", "04_training", _training, "train", HISTORY_CSV, _TRAIN),
-    Item("calibration", "", "whether probabilities mean what they say", "04_training",
-         _of(calibration_figure, CALIBRATION_CSV, read_calibration), file=CALIBRATION_CSV),
-    Item("scores", "", "all methods at all thresholds", "05_tables", _of_scores(score_figure)),
-    Item("score_table", "", "all that an evaluation tells", "05_tables", _score_table),
-    Item("regret", "", "what each method loses", "05_tables", _of_scores(regret_figure)),
-    Item("occlusion", "", "what seeing through walls changes", "05_tables", _of_scores(occlusion_figure)),
-    Item("regret_interiors", "", "what each loses on scenes by others", "05_tables", _of_scores(regret_figure),
-         command=_LOG_RELEASE, params=(("dataset", "interiors"),), of_release=True),
-    Item("looks", "", "several looks localized together", "10_looks", _of(looks_figure, LOOKS_CSV), "looks", LOOKS_CSV,
-         "wheretolook evaluate --config {config} # of labels made with --label.store_pixels true"),
-    Item("visibility_scaling", "", "how time and memory grow", "08_runtimes", _of(scaling_figure, SCALING_CSV),
-         "benchmark", SCALING_CSV, _BENCH.format(" --scaling"), ()),
-)  # fmt: skip
-"""The paper's in its order, then further ones."""
+@item("inputs", "", "from an image to an input", "03_inputs", **_NETWORK)
+def _inputs(source: Source) -> Figure:
+    return inputs_figure(_walkthrough(source).image)
+
+
+@item("peaks", "", "what the network looks at", "04_training", **_SET)
+def _peaks(source: Source) -> Figure:
+    return peaks_figure(*peaks_of(*_shown(source)))
+
+
+@item("training", "", "learning curves", "04_training", stage="train", file=HISTORY_CSV, command=_TRAIN)
+def _training(source: Source) -> Figure:
+    return training_figure(histories(source.tracking, source.dataset.name))
+
+
+item("calibration", "", "whether probabilities mean what they say", "04_training", file=CALIBRATION_CSV)(
+    _table_figure(calibration_figure, CALIBRATION_CSV, read_calibration)
+)
+item("scores", "", "all methods at all thresholds", "05_tables")(_table_figure(score_figure))
+
+
+@item("score_table", "", "all that an evaluation tells", "05_tables")
+def _score_table(source: Source) -> Texts:
+    scores = read_scores(source.file(SCORES_CSV))
+    return {"md": f"{score_markdown(scores)}\n{comparisons_markdown(scores)}", "csv": scores.to_csv(index=False)}
+
+
+item("regret", "", "what each method loses", "05_tables")(_table_figure(regret_figure))
+item("occlusion", "", "what seeing through walls changes", "05_tables")(_table_figure(occlusion_figure))
+item(
+    "regret_interiors",
+    "",
+    "what each loses on scenes by others",
+    "05_tables",
+    command=_LOG_RELEASE,
+    params=(("dataset", "interiors"),),
+    of_release=True,
+)(_table_figure(regret_figure))
+item(
+    "looks",
+    "",
+    "several looks localized together",
+    "10_looks",
+    stage="looks",
+    file=LOOKS_CSV,
+    command="wheretolook evaluate --config {config} # of labels made with --label.store_pixels true",
+)(_table_figure(looks_figure, LOOKS_CSV, pd.read_csv))
+item("visibility_scaling", "", "how time and memory grow", "08_runtimes", **_measured(SCALING_CSV, " --scaling"))(
+    _table_figure(scaling_figure, SCALING_CSV, pd.read_csv)
+)
 
 
 def catalog_text() -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -82,50 +82,33 @@ def summary_table(results: Sequence[Result]) -> pd.DataFrame:
     A script that stops in one scene has no result over all scenes.
     """
     groups: dict[tuple[str, str], list[Scores]] = {}
-    for result in results:
-        groups.setdefault((result.scene, result.method), []).append(result.scores)
-    if len({result.scene for result in results}) > 1:
+    several = len({result.scene for result in results}) > 1
+    for scene_of in (lambda result: result.scene, *([lambda result: ALL] if several else [])):
         for result in results:
-            groups.setdefault((ALL, result.method), []).append(result.scores)
+            groups.setdefault((scene_of(result), result.method), []).append(result.scores)
     rows = []
     for (scene, method), scores in groups.items():
         for measure in MEASURES:
             row: dict[str, Any] = {"scene": scene, "method": method, "measure": measure}
-            row |= _cells("as_shipped", _sum([one.as_shipped for one in scores], measure))
-            row |= _cells("mended", _sum([one.mended for one in scores], measure))
+            for version in ("as_shipped", "mended"):
+                shares = [getattr(one, version)[measure] for one in scores]
+                share = None if None in shares else sum(shares, Share(0, 0))
+                values = ("", "", "") if share is None else (share.hits, share.total, share.percent)
+                row |= dict(zip((f"{version}_{name}" for name in ("hits", "total", "percent")), values, strict=True))
             rows.append(row)
     return pd.DataFrame(rows)
-
-
-def _sum(shares: Sequence[Mapping[str, Share | None]], measure: str) -> Share | None:
-    total = Share(0, 0)
-    for of_scene in shares:
-        share = of_scene[measure]
-        if share is None:
-            return None
-        total += share
-    return total
-
-
-def _cells(prefix: str, share: Share | None) -> dict[str, Any]:
-    names = [f"{prefix}_{name}" for name in ("hits", "total", "percent")]
-    values = ("", "", "") if share is None else (share.hits, share.total, share.percent)
-    return dict(zip(names, values, strict=True))
 
 
 def summary_text(summary: pd.DataFrame) -> str:
     """Format the summary as Markdown."""
     rows = []
-    for _, row in summary.iterrows():
-        shares = [_text(row, "as_shipped"), _text(row, "mended")]
-        rows.append([str(row["scene"]), str(row["method"]), measure_label(str(row["measure"])), *shares])
+    for row in summary.to_dict("records"):
+        cells = [row["scene"], row["method"], measure_label(row["measure"])]
+        for version in ("as_shipped", "mended"):
+            hits = row[f"{version}_hits"]
+            cells.append("stops" if hits == "" else str(Share(int(hits), int(row[f"{version}_total"]))))
+        rows.append(cells)
     return markdown_table(["scene", "method", "error at most", "as shipped", "mended"], rows)
-
-
-def _text(row: pd.Series[Any], prefix: str) -> str:
-    hits = row[f"{prefix}_hits"]
-    total = row[f"{prefix}_total"]
-    return "stops" if hits == "" else str(Share(int(hits), int(total)))
 
 
 def measure_label(measure: str) -> str:

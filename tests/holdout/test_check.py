@@ -98,27 +98,27 @@ def test_blocks_share_out_all_photographs_and_grow(corridor: tuple[Path, Path]) 
     blocks = choose_blocks(source)
     parts = [block for block in blocks if block.is_part]
     assert 8 <= len(blocks) <= 12 and [block.number for block in blocks] == [*range(1, len(blocks) + 1)]
-    assert sorted(np.concatenate([block.left_out for block in parts]).tolist()) == [*range(N)]
-    sizes = [len(block.left_out) for block in parts]
+    assert sorted(np.concatenate([block.held_out for block in parts]).tolist()) == [*range(N)]
+    sizes = [len(block.held_out) for block in parts]
     assert len(parts) == 8 and max(sizes) >= 3 * min(sizes)
     sees = observation_matrix(source)
     grown = [block for block in blocks if not block.is_part]
-    assert grown and max(len(block.left_out) for block in grown) <= (1 - MIN_REST) * N
+    assert grown and max(len(block.held_out) for block in grown) <= (1 - MIN_REST) * N
     for block in grown:
-        worse = np.quantile(landmarks_kept(sees, source.moment[block.left_out]), 0.25)
-        assert worse <= KEPT[0] or len(block.left_out) == int((1 - MIN_REST) * N)
+        worse = np.quantile(landmarks_kept(sees, source.moment[block.held_out]), 0.25)
+        assert worse <= KEPT[0] or len(block.held_out) == int((1 - MIN_REST) * N)
     again = choose_blocks(open_map(*corridor, metric=True))
-    assert all(np.array_equal(one.left_out, other.left_out) for one, other in zip(blocks, again, strict=True))
+    assert all(np.array_equal(one.held_out, other.held_out) for one, other in zip(blocks, again, strict=True))
     few = choose_blocks(source, views=3)
-    assert max(len(block.looked_at) for block in few) == 3
-    assert all(np.isin(block.looked_at, block.left_out).all() for block in few)
+    assert max(len(block.tested) for block in few) == 3
+    assert all(np.isin(block.tested, block.held_out).all() for block in few)
 
 
 def test_neighbours_are_those_that_share_landmarks_whatever_their_names(tmp_path: Path) -> None:
     sparse, database = write_corridor(tmp_path)
     source = open_map(sparse, database, metric=True)
-    alone = [block for block in choose_blocks(source) if block.is_part and np.isin(ALONE, block.left_out).any()]
-    assert len(alone) == 1 and np.isin(ALONE, alone[0].left_out).all()
+    alone = [block for block in choose_blocks(source) if block.is_part and np.isin(ALONE, block.held_out).any()]
+    assert len(alone) == 1 and np.isin(ALONE, alone[0].held_out).all()
 
 
 # --- the command

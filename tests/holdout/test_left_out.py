@@ -18,7 +18,7 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.report import score_markdown
 from wheretolook.evaluation.results import latest_scores, runs_of_rows
-from wheretolook.holdout.holdout import left_out_blocks
+from wheretolook.holdout.holdout import hold_out_blocks
 from wheretolook.holdout.holdout_views import evaluated_photographs
 from wheretolook.holdout.photo_map import WORK, open_map
 from wheretolook.scorers.set.network import SetNetwork
@@ -86,7 +86,7 @@ def test_photographs_have_rows_beside_rendered_views(checked: tuple[Path, Path, 
     sparse, database, data = checked
     rendered = make_dataset(tmp_path / "data" / "both", ("test",), n_locations=14, n_directions=16)
     source = open_map(sparse, database, metric=True)
-    left_out = left_out_blocks(source, data / "checks" / "corridor" / "work")
+    left_out = hold_out_blocks(source, data / "checks" / "corridor" / "work")
     photographs = evaluated_photographs(rendered.scenes[0], source, left_out, NoOcclusion())
     config = EvaluateConfig(("random", "visible", "set"), weights=(SET,), resamples=50, top_n=(1,), photographs=True)
     tracking = TrackingConfig(str(tmp_path / "mlruns"))

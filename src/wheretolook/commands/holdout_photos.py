@@ -52,7 +52,7 @@ def leave_photographs_out(
     See `wheretolook.holdout.photo_map.open_map` for arguments and errors; `upright` raises MapError if the model's
     cameras seem to be on their side.
     """
-    from wheretolook.holdout.holdout import left_out_blocks
+    from wheretolook.holdout.holdout import hold_out_blocks
     from wheretolook.holdout.photo_map import WORK, features_of, folder_of_check, open_map
 
     out = folder_of_check(options.data, name)
@@ -66,7 +66,7 @@ def leave_photographs_out(
                 fix = "Make a scene of it: `wheretolook map --name NAME --model SPARSE --map.existing.level true`."
                 raise MapError("the map lies on its side, and this needs z up", path=model, fix=fix)
             log(f"{name}: leaving out blocks of {len(source.poses)} photographs")
-            return source, left_out_blocks(source, out / WORK, workers=workers, device=device)
+            return source, hold_out_blocks(source, out / WORK, workers=workers, device=device)
     finally:
         with suppress(OSError):  # created for the lock only
             out.rmdir()

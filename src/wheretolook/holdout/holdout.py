@@ -95,21 +95,21 @@ class _Job:
     device: str
 
 
-def left_out_blocks(
+def hold_out_blocks(
     source: PhotographedMap, work: Path, views: int = VIEWS, workers: int = 1, device: str = "cpu"
 ) -> list[HoldoutResult]:
     """Hold out all blocks of a map, with a progress bar; finished ones are cached in `work`."""
     blocks = choose_blocks(source, views)
     results = []
-    total = sum(len(block.looked_at) for block in blocks)
+    total = sum(len(block.tested) for block in blocks)
     with tqdm(total=total, desc="check: leave out, localize", unit="view") as bar:
-        for result in leave_out(source, blocks, work, workers, device):
+        for result in hold_out(source, blocks, work, workers, device):
             results.append(result)
             bar.update(len(result.views))
     return results
 
 
-def leave_out(
+def hold_out(
     source: PhotographedMap, blocks: Sequence[Block], work: Path, workers: int = 1, device: str = "cpu"
 ) -> Iterator[HoldoutResult]:
     """Hold out each block and localize its photographs against the rest; yields results in the order of the blocks.
@@ -129,9 +129,9 @@ def leave_out(
     caches = {}
     jobs = list[_Job]()
     for block in blocks:
-        rows = block.looked_at
+        rows = block.tested
         place = folder / f"{block.number:02}"
-        cache = ArtifactCache(place, cache_key(key, block.left_out.tolist(), rows.tolist()))
+        cache = ArtifactCache(place, cache_key(key, block.held_out.tolist(), rows.tolist()))
         caches[block.number] = cache
         if _load(cache, block) is None:
             names = [source.names[row] for row in rows]
@@ -141,7 +141,7 @@ def leave_out(
     if jobs:
         write_model(source.model, model)
     pending = {job.block.number for job in jobs}
-    jobs.sort(key=lambda job: -len(job.block.looked_at))  # no process is left with the largest block at the end
+    jobs.sort(key=lambda job: -len(job.block.tested))  # no process is left with the largest block at the end
     with WorkerPool(max(1, min(workers, len(jobs)))) as pool:
         finished = pool.map(_run, jobs)
         for block in blocks:
@@ -199,11 +199,11 @@ def _run(job: _Job) -> int:
     torch.set_num_threads(1)
     whole = _model(job.model)
     image_ids = np.array(sorted(number for number, image in whole.images.items() if image.has_pose))
-    rest = without(whole, image_ids[job.block.left_out].tolist())
+    rest = without(whole, image_ids[job.block.held_out].tolist())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MapWarning)
         landmarks = load_colmap_landmarks(job.model, job.features, None, job.device, rest, progress=False)
-    observed = [_observed(whole.images[int(number)]) for number in image_ids[job.block.looked_at]]
+    observed = [_observed(whole.images[int(number)]) for number in image_ids[job.block.tested]]
     views = _localize(job, landmarks, observed)
     job.cache.folder.mkdir(parents=True, exist_ok=True)
     job.cache.clear()
@@ -230,7 +230,7 @@ def _localize(job: _Job, landmarks: Landmarks, observed: Sequence[NDArray[np.int
         limit_m = float(job.limits[number])
         views.append(
             HoldoutView(
-                row=int(job.block.looked_at[number]),
+                row=int(job.block.tested[number]),
                 image=job.names[number],
                 status=estimate.status,
                 good=estimate.status == LOCALIZED and error_m < limit_m and error_deg < MAX_ERROR_DEG,

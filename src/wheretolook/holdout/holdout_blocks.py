@@ -32,14 +32,14 @@ class Block:
 
     Attributes:
         number: from 1.
-        left_out: (B,) held-out photographs, ascending.
-        looked_at: (V,) those of them that are localized, ascending.
+        held_out: (B,) held-out photographs, ascending.
+        tested: (V,) those of them that are localized, ascending.
         is_part: whether the block belongs to the partition of all photographs.
     """
 
     number: int
-    left_out: NDArray[np.int64]
-    looked_at: NDArray[np.int64]
+    held_out: NDArray[np.int64]
+    tested: NDArray[np.int64]
     is_part: bool
 
 
@@ -51,7 +51,7 @@ def choose_blocks(source: PhotographedMap, views: int = VIEWS) -> list[Block]:
     with the block. The sizes of the first 8 (fewer for few photographs) are a geometric progression. The others grow
     from four places until a quarter of their photographs observe at most `KEPT` landmarks that the rest still has, so
     that they hold well covered views at their edges and badly covered ones within. No block takes more than nine tenths
-    of the photographs, and blocks that are mostly the same are taken once. Photographs of a rig frame stay together.
+    of the photographs, and blocks that are mostly the same are chosen once. Photographs of a rig frame stay together.
 
     Raises MapError if fewer than two blocks leave a map.
     """
@@ -70,18 +70,18 @@ def choose_blocks(source: PhotographedMap, views: int = VIEWS) -> list[Block]:
         first = int(walk[int(number * _GOLDEN % 1 * len(walk))])
         order = _grow(share, places, first, np.ones(len(share), dtype=bool))
         groups.append((order[: _block_size(observes, order, kept)], False))
-    taken = list[tuple[NDArray[np.int64], bool]]()
-    for group, is_part in reversed(groups):  # of two that are the same, the one that is grown further is taken
+    chosen = list[tuple[NDArray[np.int64], bool]]()
+    for group, is_part in reversed(groups):  # of two that are the same, the one that is grown further is chosen
         held_out = np.flatnonzero(np.isin(source.moment, group))
         leaves_map = _landmarks_without(observes, group) >= MIN_LANDMARKS
-        if leaves_map and not any(_same(held_out, other) for other, _ in taken):
-            taken.append((held_out, is_part))
-    if len(taken) < 2:
+        if leaves_map and not any(_same(held_out, other) for other, _ in chosen):
+            chosen.append((held_out, is_part))
+    if len(chosen) < 2:
         problem = f"without a block of neighbouring photographs fewer than {MIN_LANDMARKS} landmarks are left"
         fix = "Take more photographs, each part of the scene from several sides, and map them all."
         raise MapError(problem, path=source.path, value=f"{len(source.poses)} photographs", fix=fix)
     blocks = list[Block]()
-    for number, (held_out, is_part) in enumerate(reversed(taken), 1):
+    for number, (held_out, is_part) in enumerate(reversed(chosen), 1):
         tested = np.unique(np.linspace(0, len(held_out) - 1, min(views, len(held_out))).round().astype(int))
         blocks.append(Block(number, held_out, held_out[tested], is_part))
     return blocks

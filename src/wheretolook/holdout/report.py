@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from wheretolook.evaluation.scores import is_probability
-from wheretolook.holdout.holdout import HoldoutResult, left_out_blocks
+from wheretolook.holdout.holdout import HoldoutResult, hold_out_blocks
 from wheretolook.holdout.holdout_blocks import VIEWS
 from wheretolook.holdout.metrics import measure
 from wheretolook.holdout.photo_map import MAX_ERROR_DEG, MAX_ERROR_M, MAX_ERROR_OF_DEPTH, PhotographedMap
@@ -157,7 +157,7 @@ def check_map(
     block are localized. Raises MapError if blocks leave no map; WeightsError if weights cannot be used.
     """
     check_place(source, scoring, device)
-    results = left_out_blocks(source, work, views, workers, device)
+    results = hold_out_blocks(source, work, views, workers, device)
     method, scored = score_views(source, results, scoring, occlusion or HiddenPointRemoval(), device)
     methods = list(dict.fromkeys([method, *(name for name in scoring.also if name != VISIBLE), VISIBLE]))
     columns = ["score" if name == method else name for name in methods]
@@ -203,12 +203,12 @@ def _blocks(source: PhotographedMap, results: Sequence[HoldoutResult], views: pd
     rows = []
     for one in results:
         of_block = views[views["block"] == one.block.number]
-        x, y, z = np.median(source.own_centers[one.block.left_out], axis=0).tolist()
+        x, y, z = np.median(source.own_centers[one.block.held_out], axis=0).tolist()
         rows.append(
             {
                 "block": one.block.number,
                 "kind": "part" if one.block.is_part else "grown",
-                "left_out": len(one.block.left_out),
+                "left_out": len(one.block.held_out),
                 "looked_at": len(of_block),
                 "localized": int(of_block["good"].sum()),
                 "share_localized": float(of_block["good"].mean()),
@@ -220,8 +220,8 @@ def _blocks(source: PhotographedMap, results: Sequence[HoldoutResult], views: pd
                 "x": x,
                 "y": y,
                 "z": z,
-                "first": source.names[one.block.left_out[0]],
-                "last": source.names[one.block.left_out[-1]],
+                "first": source.names[one.block.held_out[0]],
+                "last": source.names[one.block.held_out[-1]],
             }
         )
     return pd.DataFrame(rows)

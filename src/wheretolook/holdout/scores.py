@@ -107,7 +107,7 @@ def maps_without(
     source: PhotographedMap, result: HoldoutResult, occlusion: OcclusionModel, device: str
 ) -> Iterator[tuple[NDArray[np.int64], LocalizationMap]]:
     """Yield, for each camera, the rows of a block's views, and the map without the block for that camera."""
-    remaining = np.setdiff1d(np.arange(len(source.poses)), result.block.left_out)
+    remaining = np.setdiff1d(np.arange(len(source.poses)), result.block.held_out)
     cached = occlusion if occlusion.name == "none" else CachedOcclusion(occlusion)
     cameras = [source.cameras[row] for row in result.views["row"]]
     poses = compact_poses(source.poses[remaining])

@@ -63,7 +63,7 @@ def weak_parts(source: PhotographedMap, results: list[HoldoutResult], views: pd.
     alike = shared >= MIN_SHARED * np.minimum(counts[:, None], counts)
     bad = np.flatnonzero(~good)
     _, label = connected_components(alike[np.ix_(bad, bad)], directed=False)
-    sizes = {one.block.number: len(one.block.left_out) for one in results}
+    sizes = {one.block.number: len(one.block.held_out) for one in results}
     to_frame = source.from_model
     parts = []
     for group in np.unique(label):

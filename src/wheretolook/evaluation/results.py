@@ -122,7 +122,7 @@ def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[Nes
 
 
 def _metrics_by_n(rows: pd.DataFrame, columns: Iterable[str]) -> dict[str, float]:
-    metrics = {}
+    metrics: dict[str, float] = {}
     for row in rows.to_dict("records"):
         prefix = f"top-{row['top_n']}" + ("" if row["scene"] == ALL else f"/{row['scene']}")
         metrics |= {f"{prefix}/{name}": float(row[name]) for name in columns if name in row}

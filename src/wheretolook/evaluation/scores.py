@@ -102,7 +102,7 @@ def reference_method(methods: Iterable[str], name: str) -> str:
     if name and name not in methods:
         known = f"Use one of {', '.join(methods)}."
         raise ConfigError("the reference is none of the methods evaluated", value=name, fix=known)
-    learned = {method: known for method in methods if (known := find(method)) is not None and known.probability}
+    learned = {method: record for method in methods if (record := find(method)) is not None and record.probability}
     return name or max(learned, key=lambda method: learned[method].reference, default="")
 
 

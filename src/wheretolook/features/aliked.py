@@ -30,8 +30,8 @@ def _build(config: ExtractorSettings, device: str) -> Extraction:
 
         def detect(self, images: Tensor) -> list[Detection]:
             # ALIKED counts pixels from the middle of the first
-            found = detect_and_describe(self._network, images)
-            return [(pixels + 0.5, descriptors, scores) for pixels, descriptors, scores in found]
+            result = detect_and_describe(self._network, images)
+            return [(pixels + 0.5, descriptors, scores) for pixels, descriptors, scores in result]
 
     return Aliked(config, device)
 

@@ -26,9 +26,9 @@ def _build(config: ExtractorSettings, device: str) -> Extraction:
             return load_state(kornia_feature().DISK(), config.weights, _FILE, _URLS, lambda state: state["extractor"])
 
         def detect(self, images: Tensor) -> list[Detection]:
-            found = self._network(images, n=config.max_keypoints, pad_if_not_divisible=True)
+            result = self._network(images, n=config.max_keypoints, pad_if_not_divisible=True)
             # whole pixels, counted from the first
-            return [(each.keypoints + 0.5, each.descriptors, each.detection_scores) for each in found]
+            return [(each.keypoints + 0.5, each.descriptors, each.detection_scores) for each in result]
 
     return Disk(config, device)
 

@@ -35,11 +35,11 @@ class OpenCvSift:
         return [self._extract(grey_bitmap(rgb).to_array()) for rgb in images]
 
     def _extract(self, grey: NDArray[np.uint8]) -> Keypoints:
-        found, descriptors = self._sift.detectAndCompute(np.ascontiguousarray(grey), None)
-        if len(found) == 0:
+        keypoints, descriptors = self._sift.detectAndCompute(np.ascontiguousarray(grey), None)
+        if len(keypoints) == 0:
             return Keypoints.none()
-        octave = np.array([k.octave & 255 for k in found], dtype=np.uint8).view(np.int8)
-        table = np.array([(*k.pt, k.size / 2, k.response, k.angle) for k in found], dtype=np.float32)
+        octave = np.array([k.octave & 255 for k in keypoints], dtype=np.uint8).view(np.int8)
+        table = np.array([(*k.pt, k.size / 2, k.response, k.angle) for k in keypoints], dtype=np.float32)
         usable = np.flatnonzero(octave >= self.config.first_octave)
         x, y, scale, response, angle = table[usable].T
         keep = usable[np.lexsort((angle, scale, y, x, -response))[: self.config.max_keypoints]]

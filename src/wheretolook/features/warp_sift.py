@@ -23,11 +23,10 @@ _ASSUMED_SIGMA = 0.5  # blur of an input image, in its pixels
 class WarpSift:
     """Extracts SIFT keypoints of many images at once (Lowe, IJCV 2004).
 
-    The plain twin is `cv2.SIFT` as `KeypointExtractor` uses it, with the same constants and conventions but another
-    order of summation. The keypoints of an image do not depend on the others in its batch. An extractor must be used by
+    The plain twin is `cv2.SIFT` with the same constants and conventions, but another order of summation. The keypoints of an image do not depend on the others in its batch. An extractor must be used by
     one thread only, since it keeps its memory on the device from call to call. It ignores the method of its config, and
     fills `block_bytes` of scale spaces at a time (40 MB for an image of 640 x 480). The device is a CUDA device, or
-    "cpu" (one core and slow: for tests); ConfigError if there is none such.
+    "cpu" (one core and slow: for tests). Raises ConfigError if it is missing.
     """
 
     def __init__(self, config: ExtractorSettings, device: str = "cuda", block_bytes: int = 1 << 30) -> None:
@@ -62,11 +61,11 @@ class WarpSift:
         if space is None or (space.rows, space.columns) != (rows, columns) or space.n_images < block:
             self._space = None  # frees its memory first
             self._space = space = ScaleSpace(rows, columns, block, self.config.first_octave, self._limits, self.device)
-        found: list[Keypoints] = []
+        keypoints: list[Keypoints] = []
         for start in range(0, n_images, space.n_images):
             stop = min(start + space.n_images, n_images)  # a Warp slice may not exceed the array
-            found += self._extract_block(space, grey[start:stop])
-        return found
+            keypoints += self._extract_block(space, grey[start:stop])
+        return keypoints
 
     def _extract_block(self, space: ScaleSpace, grey: Any) -> list[Keypoints]:
         n_images = grey.shape[0]
@@ -125,8 +124,8 @@ class WarpSift:
         descriptors = self._buffer("descriptors", n, wp.float32, size)
         self._launch(kernels.describe_kernel, (n, cells), [space.pyramid, places, chosen, turned], [histograms])
         self._launch(kernels.finish_kernel, n, [histograms], [descriptors])
-        found: NDArray[np.float32] = descriptors[:n].numpy()
-        return found.copy() if self.device == "cpu" else found  # on the CPU, `found` is the buffer's own memory
+        result: NDArray[np.float32] = descriptors[:n].numpy()
+        return result.copy() if self.device == "cpu" else result  # on the CPU it shares the buffer's memory
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
         # small thread blocks, so that a few thousand keypoints occupy all of a GPU
@@ -162,7 +161,7 @@ class ScaleSpace:
     """The Gaussian scale spaces of up to `n_images` images of one size, and the list of their extrema.
 
     The smaller of rows and columns must exceed `BORDER`, so that there is an octave. With `first_octave` -1, keypoints
-    are looked for in the doubled image too, with 0 only from the image's own size on. `limits` is the kernels'.
+    are detected in the doubled image too, with 0 only from the image's own size on. `limits` is passed to kernels.
     """
 
     def __init__(self, rows: int, columns: int, n_images: int, first_octave: int, limits: Any, device: str) -> None:
@@ -232,17 +231,17 @@ class ScaleSpace:
 
         def level_of(octave: int, level: int, half_smooth: bool = False) -> Any:
             """A level of the pyramid, or the memory for one smoothed along its rows only."""
-            found: Any = scale_kernels.Level()
-            found.rows, found.columns = self.sizes[octave]
+            result: Any = scale_kernels.Level()
+            result.rows, result.columns = self.sizes[octave]
             if half_smooth:
-                found.values = self.half_smooth
-                found.image_size = 4 * self.rows * self.columns
-                found.start = 0
+                result.values = self.half_smooth
+                result.image_size = 4 * self.rows * self.columns
+                result.start = 0
             else:
-                found.values = self.pyramid.values
-                found.image_size = self.image_size
-                found.start = self.starts[octave] + level * found.rows * found.columns
-            return found
+                result.values = self.pyramid.values
+                result.image_size = self.image_size
+                result.start = self.starts[octave] + level * result.rows * result.columns
+            return result
 
         def smooth(octave: int, source: int, target: int) -> None:
             """From level to level of an octave, with the filter of the latter."""

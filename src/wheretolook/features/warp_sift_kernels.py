@@ -1,6 +1,6 @@
 """Warp kernels of `WarpSift` up to its keypoints: the Gaussian scale space and its extrema (Lowe, IJCV 2004, 3 and 4).
 
-Grey values are in 0..255. All levels of all octaves of a block of images lie in one array, see `Pyramid`.
+Grey values are in 0..255. All levels of all octaves of a block of images are stored in one array, see `Pyramid`.
 """
 
 # mypy: ignore-errors
@@ -12,9 +12,9 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-LAYERS = wp.constant(3)  # of each octave, in which extrema are looked for
+LAYERS = wp.constant(3)  # of each octave, searched for extrema
 LEVELS = wp.constant(6)  # of the Gaussian in each octave
-BORDER = wp.constant(5)  # distance in pixels from an octave's border within which no extremum is looked for
+BORDER = wp.constant(5)  # distance in pixels from an octave's border that is not searched for extrema
 STEPS = wp.constant(5)  # of refinement, after which a candidate that still moves is dropped
 SIGMA = wp.constant(1.6)  # of an octave's first level, in its pixels
 
@@ -69,7 +69,7 @@ class Peak:
 
 @wp.func
 def place_in(level: Level, image: wp.int32, row: wp.int32, column: wp.int32):
-    """Where the value of a pixel stands."""
+    """Index of the value of a pixel."""
     return image * level.image_size + level.start + row * level.columns + column
 
 

@@ -31,8 +31,8 @@ def _build(config: ExtractorSettings, device: str) -> Extraction:
             # whole pixels of the image reduced to multiples of 32, counted from the first
             ratio = images.new_tensor([width / max(32, width // 32 * 32), height / max(32, height // 32 * 32)])
             detect: Any = self._network.detectAndCompute
-            found = detect(images)
-            return [(each["keypoints"] + ratio / 2, each["descriptors"], each["scores"]) for each in found]
+            result = detect(images)
+            return [(each["keypoints"] + ratio / 2, each["descriptors"], each["scores"]) for each in result]
 
     return XFeat(config, device)
 

@@ -1,4 +1,4 @@
-"""Quieter logs of COLMAP, and errors of its databases that name them."""
+"""Silences COLMAP's log, and names databases in its errors."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from wheretolook.utils.files import STORAGE_FIX
 
 @contextmanager
 def quiet_colmap(least: Literal["WARNING", "ERROR"] = "WARNING") -> Iterator[None]:
-    """Silence COLMAP's log below a level: it would break up the progress bars."""
+    """Silence COLMAP's log below a level: it would interrupt progress bars."""
     import pycolmap
 
     level = pycolmap.logging.minloglevel
@@ -27,12 +27,12 @@ def quiet_colmap(least: Literal["WARNING", "ERROR"] = "WARNING") -> Iterator[Non
 
 @contextmanager
 def storing_in_database(database: Path) -> Iterator[None]:
-    """Turn what COLMAP says of a database that it cannot make or write to into a StorageError that names it."""
+    """Re-raise COLMAP's errors about a database that cannot be written as StorageError."""
     try:
         yield
     except RuntimeError as error:
-        found = re.search(r"SQLite error: (.*)|No registered database factory succeeded", str(error))
-        if not found:
+        match = re.search(r"SQLite error: (.*)|No registered database factory succeeded", str(error))
+        if not match:
             raise
-        reason = found[1] or "SQLite cannot make it"
+        reason = match[1] or "SQLite cannot make it"
         raise StorageError(f"cannot be written: {reason}", path=database, fix=STORAGE_FIX) from error

@@ -1,4 +1,4 @@
-"""Errors a user can act on: each one names the offending file and value, and what to do."""
+"""Errors a user can act on: each names the file, the value, and the fix."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from os import PathLike
 
 
 class WhereToLookError(Exception):
-    """Base of every error this package raises on bad input. The command line exits with code 2 on it.
+    """Base of all errors on bad input. The command line exits with code 2 on it.
 
     `problem` is one sentence. `path` is the file or folder, and `value` the value, that it is about, if there is one;
     `fix` tells the user what to do.
@@ -48,11 +48,11 @@ class WorkerError(WhereToLookError):
 
 
 class StorageError(WhereToLookError):
-    """A result cannot be written, or vanished after it was."""
+    """A result cannot be written, or was removed after it was written."""
 
 
 class InUseError(WhereToLookError):
-    """Another run holds the lock on a dataset or a store."""
+    """Another process holds the lock on a dataset or a store."""
 
 
 class TrackingError(StorageError):
@@ -64,7 +64,7 @@ class WeightsError(WhereToLookError):
 
 
 class CameraError(WeightsError):
-    """Weights have learnt from the views of another camera than the one that looks, and serve no other."""
+    """Weights were trained on views of another camera, and do not apply to this one."""
 
 
 class MapFormatError(WhereToLookError):
@@ -76,24 +76,24 @@ class MissingRunError(WhereToLookError):
 
 
 class OutOfRangeWarning(UserWarning):
-    """Views are unlike those that a scorer has learnt from, so that its scores are less sure than usual."""
+    """Views are outside the training distribution of a scorer, so that its scores are less reliable."""
 
 
 class MapWarning(UserWarning):
-    """A map is used, but in part, or may not be what it is taken for: not in metres, or not with z up."""
+    """A map is used only in part, or may not be in metres with z up."""
 
 
 class LockWarning(UserWarning):
-    """A file system has no locks, so that nothing keeps two runs apart."""
+    """A file system has no locks, so that two processes may write at once."""
 
 
 class TrackingWarning(UserWarning):
-    """Results lie on disk, but are not logged."""
+    """Results are on disk, but are not logged."""
 
 
 class PoseError(WhereToLookError, ValueError):
-    """Poses, locations or directions have the wrong shape, are not finite, or say nothing, as a direction of zero."""
+    """Poses, locations or directions have the wrong shape, are not finite, or are zero directions."""
 
 
 class PlanningError(WhereToLookError):
-    """There is no path, or no sequence of views along one that keeps the camera's limits."""
+    """There is no path, or no sequence of views along it within the camera's limits."""

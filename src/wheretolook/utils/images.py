@@ -1,4 +1,4 @@
-"""Reading of image files with limits: a few bytes of a file can unfold to gigabytes of pixels."""
+"""Reads image files with limits: a few bytes can expand to gigabytes of pixels."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAX_PIXELS = 150_000_000
-"""Of a photograph; three bytes of each, and a copy, take 900 MB."""
+"""Limit for photographs; three bytes per pixel and a copy take 900 MB."""
 
 MAX_DEPTH_PIXELS = 25_000_000
-"""Of a depth image; those registered to photographs of telephones have half of it."""
+"""Limit for depth images; those of phones have half of it."""
 
 
 def image_size(path: Path, at_most: int = MAX_PIXELS) -> tuple[int, int]:
-    """Width and height of an image as it is stored.
+    """Width and height of an image file.
 
-    ValueError if it is no regular file, no image, or has more pixels than `at_most`; OSError if it is missing.
+    Raises ValueError if it is no image or has more pixels than `at_most`, OSError if it is missing.
     """
     from PIL import Image
 
@@ -39,7 +39,7 @@ def image_size(path: Path, at_most: int = MAX_PIXELS) -> tuple[int, int]:
 
 
 def read_image(path: Path, flags: int, at_most: int = MAX_PIXELS) -> NDArray[Any]:
-    """An image as `cv2.imread` reads it. ValueError if it cannot, or as `image_size`; OSError if it is missing."""
+    """Read an image with `cv2.imread`. Raises ValueError if that fails, and as `image_size`."""
     import cv2
 
     image_size(path, at_most)

@@ -1,4 +1,4 @@
-"""Files that ship with the package, configurations and weights, found wherever it is installed.
+"""Finds the configurations and weights that are bundled with the package.
 
 They lie in `wheretolook/shipped/` under the names that they have in the project's folder, such as `configs/demo.yaml`:
 links to that folder in a checkout, copies in a wheel.
@@ -14,7 +14,7 @@ WEIGHTS = "data/release/weights"  # folder of the weights that ship
 
 
 def shipped(name: str | Path = "") -> Path:
-    """The file or folder that ships under a name, or the folder of all; raises ConfigError if there is none."""
+    """Path of a bundled file or folder, or of the folder of all. Raises ConfigError if there is none."""
     from importlib.resources import files
 
     root = Path(str(files("wheretolook"))) / "shipped"
@@ -25,7 +25,7 @@ def shipped(name: str | Path = "") -> Path:
 
 
 def or_shipped(path: str | Path) -> Path:
-    """The path, or if nothing lies there the file that ships under this name, if there is one.
+    """The path, or if nothing exists there, the bundled file of this name, if there is one.
 
     So `configs/demo.yaml` and `data/release/weights/set.safetensors` can be given in any folder.
     """
@@ -39,5 +39,5 @@ def or_shipped(path: str | Path) -> Path:
 
 
 def shipped_configs() -> list[str]:
-    """Names of the configurations that ship, such as `configs/demo.yaml`."""
+    """Names of the bundled configurations, such as `configs/demo.yaml`."""
     return [f"configs/{path.name}" for path in sorted(shipped("configs").glob("*.yaml"))]

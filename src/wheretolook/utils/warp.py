@@ -1,4 +1,4 @@
-"""Starting Warp and putting a mesh on a device."""
+"""Starts Warp, and copies points to a device."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def start_warp(device: str = "cpu") -> str:
 
 @contextmanager
 def _without_driver_warning() -> Iterator[None]:
-    """Hide that Warp's native library warns about a missing GPU, which would break up progress bars."""
+    """Hide the warning of Warp's native library about a missing GPU, which would interrupt progress bars."""
     if find_library("cuda") is not None:
         yield
         return

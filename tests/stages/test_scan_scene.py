@@ -72,5 +72,5 @@ def test_it_joins_scenes_with_meshes_and_a_named_camera_looks(experiment, tmp_pa
     assert run(Scenes, replace(wide, scenes=loaded), lambda _: None) == dataset  # which does not name the scan
     assert dataset.scenes[1].mesh.stat().st_mtime_ns == before
     changed = replace(wide, scenes=ScenesConfig(rgbd=replace(coarse, up="-z")))
-    with pytest.warns(UserWarning, match="up is said to be -z"):
+    with pytest.warns(UserWarning, match="up is given as -z"):
         run(Scenes, changed, lambda _: None)  # other settings, so the scan is made anew

@@ -109,6 +109,7 @@ def _of_files(options: Benchmark) -> list[Result]:
     from wheretolook_paper.benchmark.report import Result
     from wheretolook_paper.benchmark.scores import Scores
 
+    assert options.poses is not None and options.errors is not None
     scores = Scores.of(read_poses(options.poses), read_errors(options.errors))
     return [Result(options.errors.resolve().parent.name, options.errors.name, scores)]
 

@@ -154,7 +154,8 @@ class SceneComparison:
         return {name: planner_scorer(self.scene, self.dataset, name, self.weights[name]) for name in names}
 
     def _localizer(self, what: str) -> Any:
-        given = {"points": self.scene.landmarks.points, "cameras": self.scene.camera, "config": self.job.localizer}
+        points = self.scene.landmarks.points
+        given: dict[str, Any] = {"points": points, "cameras": self.scene.camera, "config": self.job.localizer}
         return partial(label_sets, **given, progress=f"{what} {self.scene.name}")
 
     def _joint(self, name: str, key: list[Any], localize: Callable[[], pd.DataFrame]) -> pd.DataFrame:

@@ -233,12 +233,12 @@ def _log_learners(dataset: Dataset, tracking: TrackingConfig) -> str:
         params = {"dataset": dataset.name, "learner": learner, "learnt_from": source, "seed": seed}
         nested.append(NestedRun(joined(learner, source, f"seed {seed}" if seed else ""), params, numbers))
     by_learner = [{"what": joined(one.params["learner"], one.params["learnt_from"]), **one.metrics} for one in nested]
-    means = pd.DataFrame(by_learner).groupby("what").mean().filter((REGRET, AUC))
+    of_learner = pd.DataFrame(by_learner).groupby("what").mean().filter((REGRET, AUC))
     tags = dict(TAGS)
     metrics = {}
-    if REGRET in means:
-        tags[BEST_TAG] = str(means[REGRET].idxmin())
-        metrics = {str(name): float(value) for name, value in means.loc[tags[BEST_TAG]].items()}
+    if REGRET in of_learner:
+        tags[BEST_TAG] = str(of_learner[REGRET].idxmin())
+        metrics = {str(name): float(value) for name, value in of_learner.loc[tags[BEST_TAG]].items()}
     with start_run(tracking, "all learners", "learners", {"dataset": dataset.name}, tags=tags) as (mlflow, run):
         log(mlflow, run, metrics=metrics)
         mlflow.log_artifact(run, str(path))

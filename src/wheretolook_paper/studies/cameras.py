@@ -98,7 +98,7 @@ def summary(views: pd.DataFrame, methods: list[str]) -> pd.DataFrame:
         for method in methods:
             regret = regrets(part, method)
             known = regret.reindex(locations.index)
-            draws.append(100 * bootstrap.ratios(known.fillna(0).to_numpy(), known.notna().to_numpy(float)))
+            draws.append(100 * bootstrap.ratios(known.fillna(0).to_numpy(), known.notna().astype(float).to_numpy()))
             row = {"kind": kind, "group": name, "method": method, "n_locations": len(regret), "n_views": len(part)}
             row |= {"good": part["good"].mean(), "regret": draws[-1][0]}
             row["auc"] = roc_auc_score(part["good"], part[method])
@@ -108,7 +108,7 @@ def summary(views: pd.DataFrame, methods: list[str]) -> pd.DataFrame:
                 right = part[part["right"]]
                 row["real_over_expected"] = right["inliers"].sum() / right[method].sum()
             rows.append(row)
-    table = pd.DataFrame(rows).assign(draws=draws)
+    table = pd.DataFrame(rows).assign(draws=pd.Series(list(draws)))
     numbers = {name: "mean" for name in ("regret", "auc", "ece", "draws") if name in table}
     of_kinds = table.groupby(["kind", "method"], sort=False).agg(numbers | {"draws": _mean}).reset_index()
     means = of_kinds.groupby("method", sort=False).agg(numbers | {"draws": _mean}).reset_index()

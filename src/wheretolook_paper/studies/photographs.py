@@ -25,6 +25,7 @@ import cv2
 import numpy as np
 import pandas as pd
 import pycolmap
+from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.features.config import ExtractorConfig
@@ -80,6 +81,12 @@ def triangulate(model: Any, database: Path) -> Any:
     return model
 
 
+def _depth_m(path: Path) -> NDArray[np.float32]:
+    """Read a depth image in millimetres, shrunk; unknown depths become 0 m."""
+    depth = shrink_depth(np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), dtype=np.float32))
+    return np.where(depth < 65535, depth * np.float32(1e-3), np.float32(0))
+
+
 def map_known_poses(
     folder: Path, work: Path, focal_px: float, extractor: ExtractorConfig, workers: int, device: str
 ) -> None:
@@ -92,17 +99,14 @@ def map_known_poses(
             (work / "images" / path.name).symlink_to(path.resolve())
     stems = [path.name.partition(".color.")[0] for path in colors]
     poses = invert_poses(np.stack([np.loadtxt(folder / f"{stem}.pose.txt")[:3] for stem in stems]))
-    depth = [cv2.imread(str(folder / f"{stem}.depth.png"), cv2.IMREAD_UNCHANGED) for stem in stems]
-    depth_m = np.stack(
-        [np.where(one < 65535, one * np.float32(1e-3), np.float32(0)) for one in map(shrink_depth, depth)]
-    )
+    depth_m = np.stack([_depth_m(folder / f"{stem}.depth.png") for stem in stems])
     with WorkerPool(workers) as processes:
         config = MapConfig(extractor=extractor, photographs=PhotographsConfig(max_side_px=0))
         run = MapRun(config, processes, device=device)
         features = photograph_features(work / "images", work / "photographs", run)
         names = features.names
         stored = features.stored
-        pinhole = PinholeCamera(*features.sizes[0].tolist(), focal_px)
+        pinhole = PinholeCamera(int(features.sizes[0][0]), int(features.sizes[0][1]), focal_px)
         pairs = choose_pairs(surface_overlap(pinhole, poses, depth_m), PARTNERS)
         camera = pycolmap.Camera(camera_id=1, **pinhole.colmap.record())
         model = posed_model(camera, names, dict(enumerate(poses)), stored)

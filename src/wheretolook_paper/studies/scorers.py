@@ -113,13 +113,15 @@ def of_set_network(dataset: Dataset, args: argparse.Namespace, tracking: Trackin
     if args.part == "options":
         conditions = [(" ".join(f"{k}={v}" for k, v in one.items()) or "default", one, whole) for one in args.choices]
     if args.part == "curves":
-        rows = whole.numpy()
+        train_rows = whole.numpy()
         rng = np.random.default_rng(0)
-        scene = data.views.scene[rows]
+        scene = data.views.scene[train_rows]
         order = rng.permutation(np.unique(scene))
-        some = {f"{n} scenes": rows[np.isin(scene, order[:n])] for n in (1, 2, 3, 5, 7, 9) if n <= len(order)}
+        some = {f"{n} scenes": train_rows[np.isin(scene, order[:n])] for n in (1, 2, 3, 5, 7, 9) if n <= len(order)}
         for share in (0.01, 0.03, 0.1, 0.3):
-            some[f"{share:g} of the views"] = np.sort(rng.choice(rows, int(share * len(rows)), replace=False))
+            some[f"{share:g} of the views"] = np.sort(
+                rng.choice(train_rows, int(share * len(train_rows)), replace=False)
+            )
         conditions = [(name, {}, torch.from_numpy(chosen)) for name, chosen in some.items()]
     for seed in args.seeds:
         for name, options, rows in conditions:

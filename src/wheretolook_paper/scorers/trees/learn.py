@@ -180,10 +180,10 @@ def fit_trees(
         precision[min(first + every, booster.num_trees())] = float(average_precision_score(val.labels, raw))
     n_trees = max(precision, key=lambda number: precision[number])
     trees = BoostedTrees(booster.model_to_string(num_iteration=n_trees), camera)
-    raw = trees.raw_logits(val.values)
-    scale, offset = fit_platt(raw, val.labels)
+    logits = trees.raw_logits(val.values)
+    scale, offset = fit_platt(logits, val.labels)
     trees = replace(trees, scale=scale, offset=offset)
     bce = float(log_loss(val.labels, expit(trees.logits(val.values))))
-    auc = float(roc_auc_score(val.labels, raw))
+    auc = float(roc_auc_score(val.labels, logits))
     metrics = {"n_trees": float(n_trees), "val_average_precision": precision[n_trees], "val_roc_auc": auc}
     return trees, {**metrics, "val_bce": bce}

@@ -56,7 +56,7 @@ def sample_viewpoints(
     number of directions, plus direction id.
 
     Raises:
-        SceneError: no viewpoint sees enough landmarks, or a location lies inside geometry.
+        SceneError: no viewpoint sees enough landmarks, or a location is inside geometry.
         MapError: there are no landmarks.
         ConfigError: so many viewpoints do not fit into memory.
     """

@@ -87,7 +87,7 @@ def check_voxels(shape: tuple[int, int, int]) -> None:
 
 @dataclass(frozen=True)
 class ViewLattice:
-    """The views that are looked at in a scene: a grid of locations, and the same directions at each of them.
+    """Candidate views of a scene: a grid of locations with the same directions at each of them.
 
     Args:
         grid: voxels along x, y and z over the scene's bounds.

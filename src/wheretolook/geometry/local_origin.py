@@ -24,7 +24,7 @@ def local_origin(points: ArrayLike) -> Float:
 
 
 def poses_from(cam_from_world: ArrayLike, origin: ArrayLike) -> Float:
-    """Poses (..., 3, 4) in a world whose origin lies at `origin` (3,) m of the world they are given in.
+    """Transform poses (..., 3, 4) to a world whose origin is at `origin` (3,) m of the world they are given in.
 
     With minus the origin, back again.
     """

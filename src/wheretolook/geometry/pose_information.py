@@ -1,4 +1,4 @@
-"""The Fisher information on a camera's pose that lies in the bearings of landmarks.
+"""Computes the Fisher information on a camera's pose from bearings of landmarks.
 
 A landmark at the offset r = n f from the camera (unit bearing f, distance n) is measured as the bearing f with
 isotropic noise of one radian. Let the pose be perturbed by (rho, theta), a translation and a rotation about the camera

@@ -43,7 +43,7 @@ def split_poses(cam_from_world: ArrayLike) -> tuple[Float, Float]:
 def rotation_looking_along(directions: ArrayLike) -> Float:
     """cam_from_world rotations (..., 3, 3) of cameras that look along world directions (..., 3) and do not roll.
 
-    The image's x axis is horizontal and its y axis points down as far as it can (world z is up). Of a camera that looks
+    The image's x axis is horizontal and its y axis points down as far as it can (world z is up). If a camera looks
     straight up or down, the image's x axis is the world's. Directions need not be of unit length. Raises PoseError if
     one has no length, or entries that are not finite.
     """

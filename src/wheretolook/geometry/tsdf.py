@@ -30,7 +30,7 @@ _TOUCH_STRIDE = 4  # Open3D looks for blocks at every fourth pixel
 _SURVEY_IMAGES = 100  # images, and pixels of each, from which the memory is estimated
 _SURVEY_PIXELS = 5000
 _SURVEY_CELL_M = 0.16  # those pixels are too far apart to count smaller blocks
-_BLOCKS_PER_CELL = 1.7  # a block is also touched by a surface that passes beside it: measured, 1.3 to 1.7
+_BLOCKS_PER_CELL = 1.7  # surfaces also touch neighbouring blocks: measured, 1.3 to 1.7
 _OUTWARD_VOXELS = 0.1  # averaging views at a slant rounds edges off by about this much
 
 
@@ -200,7 +200,7 @@ class TsdfVolume:
     def surface(self, least_weight: float = 0.5) -> TexturedMesh:
         """The zero crossing as triangles, whose fronts face the cameras that saw them; with colours if it has them.
 
-        Of voxels with at least so many readings.
+        Only voxels with at least `least_weight` readings count.
 
         Several threads find the triangles, so their order may differ from run to run; the triangles do not. Raises
         SceneError if there is none.

@@ -62,7 +62,7 @@ def _face_camera(camera: ColmapCamera) -> PinholeCamera:
 def _lookup(
     camera: ColmapCamera,
 ) -> tuple[NDArray[np.int8], tuple[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]]:
-    """Of each pixel (H, W): its face of the cube, -1 for none; column and row there; z of its ray over the face's."""
+    """For each pixel (H, W): face of the cube, -1 for none; column and row there; z of its ray over the face's."""
     pixels = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), axis=-1)
     rays = camera.unproject(pixels)
     # beyond what a model was made for, such as 90 degrees for COLMAP's fisheyes, rays come back of other pixels

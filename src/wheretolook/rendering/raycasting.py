@@ -40,7 +40,7 @@ class MeshRaycaster:
         self.origin = mesh.origin
 
     def occluded(self, origins: ArrayLike, points: ArrayLike, margin_m: float = 0.02) -> NDArray[np.bool_]:
-        """Whether something lies between each of origins (L, 3) and each of points (N, 3), in metres; (L, N).
+        """Whether a surface is between each of origins (L, 3) and each of points (N, 3), in metres; (L, N).
 
         Geometry closer to the point than `margin_m` does not count, so that a landmark on (or, by its triangulation
         error, a little behind) a surface is not hidden by that surface. Shorter segments are never occluded.

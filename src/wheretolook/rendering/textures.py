@@ -69,7 +69,7 @@ def texel_gradients(mesh: TexturedMesh) -> NDArray[np.float32]:
     sizes = np.array([(texture.shape[1], texture.shape[0]) for texture in mesh.textures], dtype=np.float64)
     texels = mesh.corner_uvs.astype(np.float64) * sizes[mesh.triangle_texture][:, None]
     changes = texels[:, 1:] - texels[:, :1]  # (T, 2 edges, 2)
-    # The gradient g lies in the plane and satisfies edges @ g = changes: g = edges^T (edges edges^T)^-1 changes.
+    # The gradient g is in the plane and satisfies edges @ g = changes: g = edges^T (edges edges^T)^-1 changes.
     gram = edges @ np.swapaxes(edges, 1, 2)
     determinant = gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] ** 2
     flat = determinant <= 1e-12 * (gram[:, 0, 0] + gram[:, 1, 1]) ** 2

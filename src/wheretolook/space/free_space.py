@@ -9,7 +9,7 @@ from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.rendering.raycasting import MeshRaycaster, RayHits
 from wheretolook.space.config import FreeSpaceConfig
 
-AT_ONCE = 1 << 18  # points around which it is looked at a time: 34 rays each, about 2 KB
+AT_ONCE = 1 << 18  # points tested at a time: 34 rays each, about 2 KB
 _N_SIDEDNESS_POINTS = 1024  # random points that decide whether triangles are one-sided
 
 
@@ -34,7 +34,7 @@ class FreeSpace:
     def is_free(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Whether a camera can be at points (N, 3) metres; (N,).
 
-        A point is free if it lies within the bounds, no geometry is closer than `clearance_m`, the first surface
+        A point is free if it is within the bounds, no geometry is closer than `clearance_m`, the first surface
         straight below is level (within 60 degrees) and at most `max_floor_drop_m` away, and the point is enclosed, as
         `FreeSpaceConfig` says.
         """

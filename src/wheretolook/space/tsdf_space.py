@@ -23,13 +23,13 @@ CELL_M = 0.05
 class TsdfSpace(FreeSpace):
     """Free space of a truncated signed distance field.
 
-    The field covers only a few voxels on either side of a surface, so the depth images themselves tell empty space from
-    space that was never seen. Space that none of them saw through may contain anything: like a surface, it must be
+    The field covers only a few voxels on either side of a surface, so the depth images themselves separate empty from
+    unobserved space. Space that none of them saw through may contain anything: like a surface, it must be
     farther away than the clearance. Elsewhere the surface counts as a mesh does in `FreeSpace`; its fronts face the
     cameras that saw it, so the inside of closed objects is not free.
 
     The volume is of the same images and not needed any more afterwards; `two_sided` is ignored, since the surface is
-    one-sided. Over the bounds lies a grid of `cells`; `to_unseen_m` (nx, ny, nz) is the distance from each one's centre
+    one-sided. `cells` is a grid over the bounds; `to_unseen_m` (nx, ny, nz) is the distance from each one's centre
     to the nearest centre of a cell that no image saw through. Raises SceneError if the depth images show no surface,
     ConfigError if there is no such device.
     """

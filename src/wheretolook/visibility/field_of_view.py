@@ -20,7 +20,7 @@ from wheretolook.geometry.poses import Float
 COARSEST_SIZE = 256  # cells along the first table's side, and of a cell's side in the next
 REFINEMENT = 4
 TABLE_SIZE = 1024  # cells along a side of the table: 0.06 to 0.19 degrees from a cell's centre to its farthest corner
-MAX_DEPTH_RAD = 0.25  # deeper than this is not told apart: cells of the sphere that need more are small in number
+MAX_DEPTH_RAD = 0.25  # larger depths are clipped to this; few cells of the sphere need more
 
 EDGE_SAMPLES = 2048  # pixels sampled along each edge of the image, and each side of a grid over it
 GRID_SAMPLES = 512
@@ -29,7 +29,7 @@ BISECTIONS = 20  # of the gap between neighbouring centres on either side of the
 
 @dataclass(frozen=True, eq=False)
 class FieldOfView:
-    """How far inside the field of view every direction of the camera frame lies at least.
+    """Lower bound on how far each direction of the camera frame is inside the field of view.
 
     Where the table says zero the camera itself must be asked. So one table serves every camera model, and the answer
     stays that of the model. (The table would miss a hole in the field of view smaller than a cell of the first table,
@@ -47,7 +47,7 @@ def tabulate(camera: ColmapCamera, size: int = TABLE_SIZE) -> FieldOfView:
     """The table of a camera, which takes half a second. The latest are kept.
 
     A large table is made from one with fewer cells: what is certain of a cell there is certain of its parts, and only
-    the parts of the others are looked at.
+    the parts of the others are examined.
     """
     centers, radii = cell_centers(size)
     depth = np.zeros(size * size, dtype=np.float32)
@@ -75,7 +75,7 @@ def tabulate(camera: ColmapCamera, size: int = TABLE_SIZE) -> FieldOfView:
     reach = 2 * np.sin(MAX_DEPTH_RAD / 2)
     chord, _ = cKDTree(border).query(centers[cells], distance_upper_bound=reach, workers=-1)
     angle = 2 * np.arcsin(np.minimum(chord, reach) / 2)
-    # A cell lies within its radius of its centre. Points found on the border are at most a cell apart, so the border
+    # Every point of a cell is within the cell's radius of its centre. Points found on the border are at most a cell apart, so the border
     # passes within a radius of one of them. The remaining half radius is a margin.
     depth[cells] = sign * np.maximum(angle - 2.5 * radii[cells], 0)
     return FieldOfView(size, depth)
@@ -87,7 +87,7 @@ def _neighbours(cells: NDArray[np.int64], size: int) -> tuple[NDArray[np.int64],
     step = np.repeat(((0, 1), (1, 0), (0, -1), (-1, 0)), len(cells), axis=0)
     row = row + step[:, 0]
     column = column + step[:, 1]
-    # the map's edge folds onto itself, mirrored: beyond (row, size - 1) lies (size - 1 - row, size - 1)
+    # the map's edge folds onto itself, mirrored: beyond (row, size - 1) is (size - 1 - row, size - 1)
     across = (column < 0) | (column >= size)
     along = (row < 0) | (row >= size)
     row = np.where(across, size - 1 - row, row)

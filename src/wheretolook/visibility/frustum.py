@@ -88,7 +88,7 @@ def sides_rounding(sides: NDArray[np.float32]) -> float:
 
 
 def near_radius_m(camera: PinholeCamera) -> float:
-    """Distance from the camera centre beyond which whatever lies within the four sides exceeds `MIN_DEPTH_M` too."""
+    """Distance from the camera centre beyond which every point within the four sides is deeper than `MIN_DEPTH_M`."""
     x = max(abs(camera.cx), abs(camera.width - camera.cx)) / camera.fx
     y = max(abs(camera.cy), abs(camera.height - camera.cy)) / camera.fy
     return float(1.001 * MIN_DEPTH_M * np.sqrt(1 + x**2 + y**2))

@@ -26,7 +26,7 @@ _LOCK = Lock()
 
 @dataclass(frozen=True, eq=False)
 class _Places:
-    """Where the landmarks of a map are. Of two millions it takes seconds to find out, and a map is asked often."""
+    """Distinct positions of a map's landmarks; computing them takes seconds for two million, so they are reused."""
 
     points: Float  # (N, 3)
     distinct: Float  # (P, 3) the places that differ
@@ -101,8 +101,8 @@ class HiddenPointRemoval(OcclusionModel):
         """Refuse what cannot be answered, before any long work.
 
         Raises a MapError if there are no landmarks, or one is not finite; a SceneError if a location is not finite, or
-        a landmark lies at it, so that a camera there would be inside geometry. Other locations inside geometry cannot
-        be told from free ones without a mesh.
+        a landmark is at it, so that a camera there would be inside geometry. Without a mesh, other locations inside
+        geometry are not detected.
         """
         super().check(locations, points)
         bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
@@ -113,7 +113,7 @@ class HiddenPointRemoval(OcclusionModel):
         distance, _ = tree.query(locations, distance_upper_bound=2 * TOUCHING_M)
         touching = distance <= TOUCHING_M
         if touching.any():
-            problem = "a landmark lies at the location: it is on a surface, or inside geometry"
+            problem = "a landmark is at the location, which is on a surface or inside geometry"
             at = tuple(np.asarray(locations)[touching][0].tolist())
             raise SceneError(problem, value=at, fix="Choose locations in free space.")
 
@@ -135,8 +135,8 @@ class HiddenPointRemoval(OcclusionModel):
 def on_hull(directions: Float, lengths: Float, margin: float = 0.0) -> NDArray[np.bool_]:
     """Which points (N,) lie on the convex hull of all and the origin, or less than a margin below it.
 
-    They are given by unit vectors (N, 3) from the origin and positive lengths (N,). What `on_hull_plain` tells, of the
-    points that may be there.
+    They are given by unit vectors (N, 3) from the origin and positive lengths (N,). Same result as
+    `on_hull_plain`, computed only for points that may be on the hull.
     """
     on = may_be_near_hull(directions, lengths, margin)
     on[on] = on_hull_plain(directions[on], lengths[on], margin)

@@ -1,8 +1,8 @@
-"""Convex hulls that hold the origin: where directions leave them, and which points are far below them.
+"""Convex hulls that contain the origin: their length along directions, and a filter of points far below them.
 
-Of millions of landmarks seen from one place nearly all lie deep below the hull, and need neither be given to Qhull nor
-compared with its facets. Directions are sorted into cells of an octahedral map. The farthest points of each cell have a
-hull of their own, which lies within that of all; what lies below that one in all of its cell is left out.
+Most of the millions of landmarks around a location are deep below the hull, and need neither be passed to Qhull nor
+compared with its facets. Directions are sorted into cells of an octahedral map. The farthest points of each cell span
+an inner hull; points below it in all of their cell are skipped.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def may_be_near_hull(directions: Float, lengths: Float, margin: float) -> NDArra
 
 
 def _least_lengths(hull: ConvexHull, size: int) -> Float:
-    """Of each cell (size^2,) a length that the hull reaches in all of its directions; 0 where it may not.
+    """Length (size^2,) that the hull reaches in all directions of each cell; 0 where it may not.
 
     The hull holds the points where the cell's corners leave it, and so all their mixes, in which every direction of the
     cell meets it. If these points are h or more from the origin, and their directions at most an angle a apart, mixes

@@ -1,4 +1,4 @@
-"""Which landmarks are in view at every location in every direction, one by one: what counts alone do not tell."""
+"""Lists the landmarks in view at every location in every direction."""
 
 from __future__ import annotations
 

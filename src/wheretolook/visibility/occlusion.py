@@ -92,7 +92,7 @@ class OcclusionInputs(Protocol):
 
 
 class OcclusionModel(ABC):
-    """Tells which landmarks nothing stands in front of.
+    """Decides which landmarks are unoccluded from a location.
 
     Callers ask for as many locations at once as their memory allows, so a model need not divide its work.
     """
@@ -114,13 +114,13 @@ class OcclusionModel(ABC):
         return wp.array(np.ascontiguousarray(mask[:, points.order]), dtype=wp.bool, device=points.device)
 
     def inside_geometry(self, locations: Float) -> NDArray[np.bool_]:
-        """Whether locations (L, 3) m lie inside geometry, where no camera can be; (L,). False where nothing tells."""
+        """Whether locations (L, 3) m are inside geometry, where no camera can be; (L,). False if the model cannot decide."""
         return np.zeros(len(locations), dtype=bool)
 
     def check(self, locations: Float, points: Float) -> None:
-        """Refuse what cannot be answered for locations (L, 3) m and points (N, 3) m, before any long work.
+        """Validate locations (L, 3) m and points (N, 3) m, before any long work.
 
-        Raises a SceneError, which names the first, if a location is not finite or lies inside geometry; a MapError if
+        Raises a SceneError, which names the first, if a location is not finite or is inside geometry; a MapError if
         there are no landmarks.
         """
         if len(points) == 0:
@@ -134,7 +134,7 @@ class OcclusionModel(ABC):
         if inside.any():
             first = tuple(np.round(at[inside][0], 3).tolist())
             fix = "Give locations in free space, as `FreeSpace.is_free` finds them."
-            raise SceneError("this location lies inside geometry", value=first, fix=fix)
+            raise SceneError("this location is inside geometry", value=first, fix=fix)
 
 
 class NoOcclusion(OcclusionModel):
@@ -160,7 +160,7 @@ class MeshOcclusion(OcclusionModel):
 
     A surface `margin_m` in front of a landmark is the landmark's own; ConfigError if that is negative or not finite.
     `two_sided` says whether the backs of triangles are surfaces too, which `FreeSpace.two_sided` finds out. If not, a
-    location from which mostly backs are seen lies inside geometry.
+    location from which mostly backs are visible is inside geometry.
     """
 
     name = "mesh"

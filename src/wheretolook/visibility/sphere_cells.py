@@ -5,7 +5,7 @@ orientation the cells are sorted into those wholly in view, whose landmarks coun
 view, and those on the border, whose landmarks are tested one by one: a few per cent of all.
 
 The cells are the squares of an octahedral map. Within a face of the octahedron a cell is the cone over a planar
-quadrilateral. So it lies on one side of a plane through the centre if its corners do.
+quadrilateral. So it is on one side of a plane through the centre if its corners do.
 """
 
 from __future__ import annotations

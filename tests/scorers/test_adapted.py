@@ -118,21 +118,6 @@ def test_photographs_calibrate_what_they_say_nothing_else_of() -> None:
     assert learnt.adaptation.offset == pytest.approx(2, abs=0.8)
 
 
-def test_rendered_views_and_photographs_are_learnt_from_together() -> None:
-    rendered = random_views(20)
-    photographs = photographed(1.0)
-    both = rendered.joined(photographs)
-    assert len(both) == len(rendered) + len(photographs)
-    assert not np.isin(both.group[both.photograph < 0], both.group[both.photograph >= 0]).any()
-    assert not np.isin(both.place[both.photograph < 0], both.place[both.photograph >= 0]).any()
-    assert (both.blocks[: len(rendered)] == -1).all() and len(np.unique(both.blocks[len(rendered) :])) == 8
-    parts = list(splits(both))
-    assert len(parts) == 5 and sum(out.sum() for out, _ in parts) == len(both)
-    for out, learnt in parts:
-        again = np.intersect1d(learnt.photograph, both.photograph[out])
-        assert again.tolist() in ([], [-1])
-
-
 def test_corrections_one_by_one_and_on_a_grid_are_the_plain_sum() -> None:
     views = random_views(20)
     weights = np.random.default_rng(0).normal(size=len(views))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import shutil
 from pathlib import Path
 
@@ -16,14 +15,10 @@ from wheretolook.commands.train import train_methods as train
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good, read_table, write_table
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber
-from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
-from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.matchability.config import MatchabilityConfig
 from wheretolook.scorers.set.config import SetConfig
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.training.weights import read_weights
-from wheretolook_paper.scorers.pooled_features import POOLED
 from wheretolook_paper.scorers.trees.config import TreesConfig
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
@@ -77,17 +72,3 @@ def test_only_labels_of_the_outcome_are_learnt_from(tmp_path: Path, tracking: Tr
     columns = ["method", "raw_0.05m_0.4deg", "roc_auc", "average_precision"]
     tables = [evaluate(data, config, tracking, progress=False)[columns] for data in (one, other)]
     assert tables[0].equals(tables[1])
-
-
-def test_what_is_known_of_a_landmark_comes_from_map_and_pose() -> None:
-    of_map = {
-        "track_length", "reprojection_error", "triangulation_angle", "direction_spread", "ambiguity",
-        "mapped_distance", "distance_spread", "mapped_pixel_size",
-    }  # fmt: skip
-    of_pose = {"across", "down", "distance", "mapped_angle", "distance_ratio", "pixel_angle", "pixel_size_ratio"}
-    assert set(MAP_ATTRIBUTES) == of_map and set(ATTRIBUTES) == of_map | of_pose
-    assert {name.rsplit("_", 1)[0] for name in POOLED[5:]} == set(ATTRIBUTES)
-    # a describer is built of a map, and asked about poses and what is visible: there is no way in for anything else
-    assert list(inspect.signature(LandmarkDescriber).parameters) == ["localization_map", "attributes"]
-    assert list(inspect.signature(LandmarkDescriber.describe).parameters) == ["self", "cam_from_world", "in_view"]
-    assert list(inspect.signature(Landmarks.attributes).parameters) == ["self"]

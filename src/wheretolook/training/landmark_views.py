@@ -178,8 +178,8 @@ class LandmarkBatches(IndexBatches):
         share = self.share_of(rows)
         starts = views.starts[share]
         lengths = views.starts[share + 1] - starts
-        taken = lengths.clamp(max=self.width)
-        steps = torch.arange(int(taken.max()) if len(taken) else 0, device=rows.device)
+        n_sampled = lengths.clamp(max=self.width)
+        steps = torch.arange(int(n_sampled.max()) if len(n_sampled) else 0, device=rows.device)
         place = ((self.share_of(first) * lengths).long()[:, None] + steps) % lengths.clamp(min=1)[:, None]
         entries = (starts[:, None] + place).clamp(max=len(views.values) - 1)
         values = views.values[entries].float()
@@ -190,8 +190,8 @@ class LandmarkBatches(IndexBatches):
             labels = (views.error_m[share] * log_scale.exp() < self.max_error_m).float()
         detected = torch.full(entries.shape, torch.nan, device=rows.device)
         if views.detected is not None:
-            detected = torch.where(steps < taken[:, None], views.detected[entries].float(), detected)
-        known = (taken, views.n_visible[share], views.axis_height[share])
+            detected = torch.where(steps < n_sampled[:, None], views.detected[entries].float(), detected)
+        known = (n_sampled, views.n_visible[share], views.axis_height[share])
         return Batch((values, *known, detected), labels, len(rows))
 
 

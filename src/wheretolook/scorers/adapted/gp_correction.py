@@ -1,9 +1,9 @@
-"""Adapting a scorer to a place: how its log-odds are calibrated and corrected there, by views that were localized.
+"""Adapt a scorer to a scene: calibrate and correct its log-odds by localized views.
 
 The log-odds of a view become scale * log-odds + offset + g(pose), where g is a Gaussian process over poses with the
 kernel of `wheretolook.scorers.adapted.kernel` (Rasmussen and Williams, "Gaussian Processes for Machine Learning",
-2006, Sec. 3.4: binary classification by the Laplace approximation, found by Newton's method). So a place is told where
-the scorer was wrong nearby, as where it resembles another; far from localized views g is 0.
+2006, Sec. 3.4: binary classification by the Laplace approximation and Newton's method). It corrects the scorer where it
+was wrong at nearby views; far from localized views g is 0.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ TOLERANCE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class LocalizedViews:
-    """B views of a place: what a scorer thought of each, and whether it localized."""
+    """B views of a scene: the log-odds of a scorer, and whether each localized."""
 
     log_odds: Float  # (B,) of the scorer to be adapted
     good: NDArray[np.bool_]  # (B,)
     centers: Float  # (B, 3) m, cameras in the map's frame
     axes: Float  # (B, 3) unit optical axes
-    group: NDArray[np.int64]  # (B,) views of a group are never learnt from and judged by at once: of a location, say
-    # (B,) number of the photograph that a view is, as one may be left out with several blocks; -1 for rendered views
+    group: NDArray[np.int64]  # (B,) views of a group, such as a location, are held out together
+    # (B,) index of the view's photograph, which may be held out with several blocks; -1 for rendered views
     photograph: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    # (B,) number of the place that a view is at: of its views one is chosen; the group where it is not given
+    # (B,) index of the view's location, of whose views one is chosen; the group by default
     place: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
@@ -58,15 +58,15 @@ class LocalizedViews:
 
     @property
     def blocks(self) -> NDArray[np.int64]:
-        """Number of the block that each photograph was left out with (B,), -1 for rendered views."""
+        """Index of the block that each photograph was held out with (B,), -1 for rendered views."""
         return np.where(self.photograph >= 0, self.group, -1)
 
     def rows(self, rows: NDArray[np.integer] | NDArray[np.bool_]) -> LocalizedViews:
-        """Some of the views."""
+        """Return some of the views."""
         return LocalizedViews(*(getattr(self, part.name)[rows] for part in fields(self)))
 
     def joined(self, other: LocalizedViews) -> LocalizedViews:
-        """These views and others of the same place, whose groups and places are others than these."""
+        """Return these views and others of the same scene, with separate groups and locations."""
         shifts = {"group": 0, "place": 0}
         for name in shifts if len(self) else ():
             shifts[name] = int(getattr(self, name).max()) + 1
@@ -79,7 +79,7 @@ class LocalizedViews:
 
 @dataclass(frozen=True, eq=False)
 class Adaptation:
-    """How log-odds change at a place; without support they are calibrated only."""
+    """Calibration and correction of log-odds; without support views, calibration only."""
 
     scale: float
     offset: float
@@ -90,7 +90,7 @@ class Adaptation:
     weights: Float  # (N,)
 
     def log_odds(self, views: LocalizedViews) -> Float:
-        """Adapted log-odds (B,)."""
+        """Return adapted log-odds (B,)."""
         found = self.scale * views.log_odds + self.offset
         if len(self.weights):
             correction = Correction(self.centers, self.axes, self.weights, self.length_m, self.sharpness)
@@ -101,14 +101,14 @@ class Adaptation:
 def fit(
     views: LocalizedViews, length_m: float, amplitude: float, sharpness: float = SHARPNESS, most: int = MAX_SUPPORT
 ) -> Adaptation:
-    """The adaptation that views make most likely, with a kernel of this length and variance; 0 calibrates only."""
-    learnt = evenly(views, most) if amplitude else views
-    y = learnt.good.astype(np.float64)
-    fixed = np.column_stack([learnt.log_odds, np.ones(len(learnt))])
-    if not amplitude or not len(learnt):
+    """Return the most likely adaptation of views for a kernel of this length and variance; 0 calibrates only."""
+    training = evenly(views, most) if amplitude else views
+    y = training.good.astype(np.float64)
+    fixed = np.column_stack([training.log_odds, np.ones(len(training))])
+    if not amplitude or not len(training):
         scale, offset = _calibration(fixed, y)
         return Adaptation(scale, offset, length_m, sharpness, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-    poses = learnt.centers, learnt.axes
+    poses = training.centers, training.axes
     kernel = amplitude * nearness(*poses, *poses, length_m, sharpness)
     residual = _most_likely(fixed @ (1.0, 0.0), kernel + (fixed / PRIOR) @ fixed.T, y)
     scale, offset = (1.0, 0.0) + fixed.T @ residual / PRIOR
@@ -116,17 +116,17 @@ def fit(
 
 
 def _most_likely(mean: Float, covariance: Float, y: Float) -> Float:
-    """The residual a (N,) for which log-odds mean + covariance a are the most likely, of labels (N,).
+    """Return the residual a (N,) that maximizes the posterior of log-odds mean + covariance a, given labels (N,).
 
     Newton's method (Rasmussen and Williams, Algorithm 3.1), whose steps are halved until they gain.
     """
 
-    def worth(a: Float, shift: Float) -> float:
+    def objective(a: Float, shift: Float) -> float:
         return float(-a @ shift / 2 - np.logaddexp(0.0, np.where(y > 0, -1.0, 1.0) * (mean + shift)).sum())
 
     a = np.zeros(len(y))
     shift = np.zeros(len(y))
-    known = worth(a, shift)
+    known = objective(a, shift)
     for _ in range(STEPS):
         p = expit(mean + shift)
         root = np.sqrt(p * (1 - p))
@@ -135,7 +135,9 @@ def _most_likely(mean: Float, covariance: Float, y: Float) -> Float:
         full = target - root * cho_solve(factor, root * (covariance @ target), check_finite=False)
         step = 1.0
         full_shift = covariance @ full
-        while (gained := worth(a + step * (full - a), shift + step * (full_shift - shift)) - known) < 0 and step > 1e-4:
+        while (
+            gained := objective(a + step * (full - a), shift + step * (full_shift - shift)) - known
+        ) < 0 and step > 1e-4:
             step /= 2
         a = a + step * (full - a)
         shift = shift + step * (full_shift - shift)
@@ -146,7 +148,7 @@ def _most_likely(mean: Float, covariance: Float, y: Float) -> Float:
 
 
 def _calibration(fixed: Float, y: Float) -> tuple[float, float]:
-    """Scale and offset of log-odds (Platt scaling), with their prior."""
+    """Return scale and offset of log-odds (Platt scaling) with a prior."""
     at = np.array([1.0, 0.0])
     prior = np.array([1.0, 0.0])
     for _ in range(STEPS):
@@ -160,14 +162,14 @@ def _calibration(fixed: Float, y: Float) -> tuple[float, float]:
 
 
 def evenly(views: LocalizedViews, most: int) -> LocalizedViews:
-    """At most so many of the views, evenly spread over their order."""
+    """Return at most so many of the views, evenly spread over their order."""
     if len(views) <= most:
         return views
     return views.rows(np.arange(most, dtype=np.int64) * len(views) // max(most, 1))
 
 
 def folds_of(group: NDArray[np.int64], count: int = FOLDS, seed: int = 0) -> NDArray[np.int64]:
-    """A fold (B,) of each view; groups stay together."""
+    """Return the fold (B,) of each view; groups stay together."""
     names, row = np.unique(group, return_inverse=True)
     order = np.random.default_rng(seed).permutation(len(names))
     return np.asarray(order[row.reshape(-1)] % min(count, max(2, len(names))))
@@ -175,33 +177,33 @@ def folds_of(group: NDArray[np.int64], count: int = FOLDS, seed: int = 0) -> NDA
 
 @dataclass(frozen=True, eq=False)
 class Adapted:
-    """The adaptation to a place, and what it gave for views that it had not learnt from."""
+    """An adaptation, and its held-out predictions."""
 
     adaptation: Adaptation
     length_m: float  # of the kernel that was chosen
     amplitude: float  # its variance; 0 where calibration alone was as good
-    held_out: Float  # (B,) log-odds of each view, by what was learnt without its fold
+    held_out: Float  # (B,) log-odds of each view, adapted without its fold
 
 
 def adapt(views: LocalizedViews, seed: int = 0) -> Adapted:
-    """Adapt by cross-validation: the kernel with the least log loss over views that were not learnt from.
+    """Adapt with the kernel of least held-out log loss in cross-validation.
 
-    Photographs alone calibrate only: they are few, and a correction by pose was no better for blocks that were not
-    learnt from (docs/adapt.md), while calibration leaves the order of a map's views as it is.
+    Photographs alone calibrate only: they are few, and a correction by pose did not improve held-out blocks
+    (docs/adapt.md).
     """
     rendered = (views.photograph < 0).any()
     best = _choose_kernel(views, seed) if rendered else (1.0, 0.0)
     found = np.zeros(len(views))
-    for out, learnt in splits(views, seed):
-        found[out] = fit(learnt, *best).log_odds(views.rows(out))
+    for out, training in splits(views, seed):
+        found[out] = fit(training, *best).log_odds(views.rows(out))
     return Adapted(fit(views, *best), *best, found)
 
 
 def splits(views: LocalizedViews, seed: int = 0) -> Iterator[tuple[NDArray[np.bool_], LocalizedViews]]:
-    """Views to judge by (B,), each once, and those to learn from then.
+    """Yield held-out views (B,), each view once, and the training views.
 
-    Locations are judged by in `FOLDS` parts; where there are photographs alone, one block after the other. Photographs
-    that are judged by are not learnt from, in whatever block they are.
+    Locations are held out in `FOLDS` parts; photographs alone, one block after the other. A held-out photograph is not
+    in the training views, whatever its block.
     """
     rendered = (views.photograph < 0).any()
     fold = folds_of(views.group, FOLDS if rendered else len(views), seed)
@@ -212,18 +214,18 @@ def splits(views: LocalizedViews, seed: int = 0) -> Iterator[tuple[NDArray[np.bo
 
 
 def _choose_kernel(views: LocalizedViews, seed: int) -> tuple[float, float]:
-    """Length and variance of the kernel that is the best for views that were not learnt from."""
+    """Return length and variance of the kernel with the least held-out loss."""
     parts = list(splits(views, seed))
 
     def loss(kernel: tuple[float, float]) -> float:
         found = np.zeros(len(views))
-        for out, learnt in parts:
-            found[out] = fit(learnt, *kernel, most=TRIED_SUPPORT).log_odds(views.rows(out))
+        for out, training in parts:
+            found[out] = fit(training, *kernel, most=TRIED_SUPPORT).log_odds(views.rows(out))
         return float(log_losses(found, views.good).mean())
 
     return min([(1.0, 0.0), *product(LENGTHS_M, AMPLITUDES)], key=loss)
 
 
 def log_losses(log_odds: Float, good: NDArray[np.bool_]) -> Float:
-    """Negative log-likelihood (B,) of whether each view localizes."""
+    """Return the negative log-likelihood (B,) of whether each view localizes."""
     return np.asarray(np.logaddexp(0.0, np.where(good, -log_odds, log_odds)))

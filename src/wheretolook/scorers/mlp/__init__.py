@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 def _network(inputs: str, style: MethodStyle, channels: tuple[str, ...], **fields: Any) -> Method:
     def learn(task: Task) -> Learnt:
-        learnt: Learnt = imported("wheretolook.scorers.mlp.learn:learn_mlp")(task, channels)
-        return learnt
+        result: Learnt = imported("wheretolook.scorers.mlp.learn:learn_mlp")(task, channels)
+        return result
 
     name = f"mlp-{inputs}"
     variant = style.label.partition(", ")[2]

@@ -48,12 +48,12 @@ IMAGE = ("across", "down")
 """Attributes of a landmark that depend on the camera's orientation."""
 
 ROOM = {"cpu": 1 << 13, "cuda": 1 << 22}  # landmarks in view that pass the network at once: fits the cache, or 2 GB
-AROUND = {"cpu": 1, "cuda": 1 << 23}  # landmarks around the locations of a block; of a location at least
+NEARBY = {"cpu": 1, "cuda": 1 << 23}  # landmarks around the locations of a block; of a location at least
 SCRATCH_BYTES = 1 << 24
 LEAST_CELLS = 64  # along a side of the sphere's map: of larger cells too many lie on the border of a view
 
 
-class ScoresAround:
+class BatchedDirections:
     """Scores the same directions (D, 3), unit vectors in the world, at any location.
 
     A view of more than `most` landmarks is scored from every second of the map's, every fourth, and so on, along a
@@ -67,10 +67,10 @@ class ScoresAround:
         self.trained = trained
         self.directions = directions
         self.most = most
-        around = localization_map
+        nearby = localization_map
         matchability = trained.network.matchability
         self.rotations = rotation_looking_along(directions)
-        self.points = DevicePoints(around.landmarks.points, around.device)
+        self.points = DevicePoints(nearby.landmarks.points, nearby.device)
         names = matchability.attributes
         first, self._second, self._last = (layer for layer in matchability.layers if isinstance(layer, torch.nn.Linear))
         self.device = matchability.input.mean.device
@@ -78,9 +78,9 @@ class ScoresAround:
             weight = first.weight * matchability.input.scale
             self._of_image = self._weight(weight, names, IMAGE)
             self._of_location = self._weight(weight, names, OF_LOCATION)
-            of_map = torch.from_numpy(around.landmarks.attributes()[self.points.order]).to(self.device)
+            of_map = torch.from_numpy(nearby.landmarks.attributes()[self.points.order]).to(self.device)
             self._mean = self._weight(matchability.input.mean[None], names, OF_LOCATION)[:, 0]
-            self._pixel_angle = -log(around.camera.mean_focal_px)
+            self._pixel_angle = -log(nearby.camera.mean_focal_px)
             # the first layer of what neither location nor image tells: the other columns are at their means, so 0
             values = matchability.input.mean.repeat(len(of_map), 1)
             for column, name in enumerate(names):
@@ -94,7 +94,7 @@ class ScoresAround:
                 - self._weight(matchability.input.mean[None], names, IMAGE)[:, 0] @ self._of_image
             )
             mapped = [MAP_ATTRIBUTES.index(name) for name in ("mapped_distance", "mapped_pixel_size")]
-            mapped_from = torch.from_numpy(around.landmarks.mapping_direction[self.points.order]).to(self.device)
+            mapped_from = torch.from_numpy(nearby.landmarks.mapping_direction[self.points.order]).to(self.device)
             self._mapped = torch.cat([mapped_from, of_map[:, mapped]], 1)
         self._asks_for_cells = "log_expected_cells" in trained.network.options["told"]
         with warnings.catch_warnings():  # PyTorch says once that sparse matrices are young
@@ -120,7 +120,7 @@ class ScoresAround:
         """Scores (L, D) at locations (L, 3) m. Raises PoseError if one is not finite."""
         locations = check_locations(locations)
         scores = np.empty((len(locations), len(self.rotations)))
-        step = max(1, AROUND[self.device.type] // max(1, len(self.points)))
+        step = max(1, NEARBY[self.device.type] // max(1, len(self.points)))
         blocks = [slice(begin, begin + step) for begin in range(0, len(locations), step)]
 
         def work(rows: slice) -> None:
@@ -146,8 +146,8 @@ class ScoresAround:
         mask = self.localization_map.occlusion.unoccluded_on_device(locations, self.points)
         pairs = np.stack(np.divmod(np.arange(len(locations) * n_directions), n_directions), axis=1)
         lister = self._lister(0)
-        around = lister.surroundings(locations, double, mask)
-        in_view = lister.lengths(around, pairs)
+        nearby = lister.surroundings(locations, double, mask)
+        in_view = lister.lengths(nearby, pairs)
         halvings = np.ceil(np.log2(np.maximum(in_view, 1) / self.most)).clip(0).astype(int)
         scores = np.empty(len(pairs))
         for level in np.unique(halvings):
@@ -157,14 +157,14 @@ class ScoresAround:
             if level:
                 lister = self._lister(int(level))
                 part = None if mask is None else mask[:, ::stride].contiguous()
-                around = lister.surroundings(locations, double[::stride].contiguous(), part)
-                lengths = lister.lengths(around, pairs[views])
-            listed = lister.list(around, pairs[views], lengths)
+                nearby = lister.surroundings(locations, double[::stride].contiguous(), part)
+                lengths = lister.lengths(nearby, pairs[views])
+            listed = lister.list(nearby, pairs[views], lengths)
             # the share of a sample that the camera does see, where that is for the camera to say, is that of all
             n_visible = np.diff(listed.starts) / np.maximum(lengths, 1) * in_view[views]
             if self.device.type != "cpu":
                 wp.synchronize_device(self.points.device)  # Torch works on a stream of its own
-            scores[views] = self._of_listed(listed, around, stride, n_visible, self.directions[pairs[views, 1], 2])
+            scores[views] = self._of_listed(listed, nearby, stride, n_visible, self.directions[pairs[views, 1], 2])
         return scores.reshape(-1, n_directions)
 
     def _lister(self, level: int) -> FrustumLister:
@@ -180,15 +180,15 @@ class ScoresAround:
             return self._listers[level]
 
     def _of_listed(
-        self, listed: ListedViews, around: Surroundings, stride: int, n_visible: Float, heights: Float
+        self, listed: ListedViews, nearby: Surroundings, stride: int, n_visible: Float, heights: Float
     ) -> Float:
         """Return scores (V,) of listed views of `n_visible` (V,) landmarks in all, whose axes have z `heights` (V,)."""
         network = self.trained.network
         starts = listed.starts
         entries = wp.to_torch(listed.entries)
         image = wp.to_torch(listed.image)
-        offsets = wp.to_torch(around.offsets)
-        rows = wp.to_torch(around.rows)
+        offsets = wp.to_torch(nearby.offsets)
+        rows = wp.to_torch(nearby.rows)
         used = torch.zeros(len(rows), dtype=torch.bool, device=self.device)
         used[entries] = True
         place = used.cumsum(0, dtype=torch.int32) - 1

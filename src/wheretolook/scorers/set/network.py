@@ -105,13 +105,13 @@ class SetNetwork(LandmarkNetwork):
         self.decide = nn.Sequential(*first, nn.Linear(head, head), nn.ReLU(), nn.Linear(head, 1))
 
     def forward(
-        self, values: Tensor, taken: Tensor, n_visible: Tensor, axis_height: Tensor, found: Tensor | None = None
+        self, values: Tensor, n_sampled: Tensor, n_visible: Tensor, axis_height: Tensor, found: Tensor | None = None
     ) -> Tensor:
-        """Return logits (B,) from samples (B, K, A) of each view's landmarks, of which the first `taken` (B,) count.
+        """Return logits (B,) from samples (B, K, A) of each view's landmarks, of which the first `n_sampled` (B,) count.
 
         `n_visible` (B,) landmarks are visible in all; `axis_height` (B,) is the z of the optical axis in the world.
         """
-        return self._logits_of_samples(values, self.matchability(values), taken, n_visible, axis_height)
+        return self._logits_of_samples(values, self.matchability(values), n_sampled, n_visible, axis_height)
 
     def learn_more(self, options: SetConfig, count: float, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return logits (B,) of the inputs of `forward`, and a further loss of the detection probabilities.
@@ -119,19 +119,19 @@ class SetNetwork(LandmarkNetwork):
         The fifth input (B, K) is 1 for detected landmarks, 0 for others, NaN if unknown. The loss is divided by the
         `count` of views and the landmarks of a training step's window.
         """
-        values, taken, n_visible, axis_height, found = inputs
+        values, n_sampled, n_visible, axis_height, found = inputs
         log_odds = self.matchability(values)
-        logits = self._logits_of_samples(values, log_odds, taken, n_visible, axis_height)
+        logits = self._logits_of_samples(values, log_odds, n_sampled, n_visible, axis_height)
         known = ~found.isnan()
         missed = binary_cross_entropy_with_logits(log_odds[known], found[known], reduction="sum")
         return logits, options.landmark_loss * missed / (count * options.landmarks)
 
     def _logits_of_samples(
-        self, values: Tensor, log_odds: Tensor, taken: Tensor, n_visible: Tensor, axis_height: Tensor
+        self, values: Tensor, log_odds: Tensor, n_sampled: Tensor, n_visible: Tensor, axis_height: Tensor
     ) -> Tensor:
-        there = torch.arange(values.shape[1], device=values.device) < taken[:, None]
+        there = torch.arange(values.shape[1], device=values.device) < n_sampled[:, None]
         sums = (self.parts(values, log_odds) * there[..., None]).sum(1)
-        each = n_visible / taken.clamp(min=1)
+        each = n_visible / n_sampled.clamp(min=1)
         cells = None
         if self._cells:
             views = torch.arange(len(values), device=values.device)[:, None].expand_as(log_odds)[there]

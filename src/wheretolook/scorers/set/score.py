@@ -11,7 +11,7 @@ from wheretolook.inputs.landmark_features import ViewLandmarks
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scorers.base import ViewReport
 from wheretolook.scorers.landmark_scorer import LandmarkScorer
-from wheretolook.scorers.set.batched_directions import ScoresAround
+from wheretolook.scorers.set.batched_directions import BatchedDirections
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.training_range import view_quantities
@@ -32,8 +32,8 @@ class SetScorer(LandmarkScorer):
         self.name = trained.method
         self.trained = trained
         self.network = trained.network.to(localization_map.device)
-        self._around: ScoresAround | None = None
-        self._around_axes: Float = np.empty((0, 3))
+        self._batched: BatchedDirections | None = None
+        self._batched_axes: Float = np.empty((0, 3))
 
     def score(self, cam_from_world: Float) -> Float:
         """(B,) probabilities in [0, 1]."""
@@ -77,9 +77,9 @@ class SetScorer(LandmarkScorer):
 
     def score_around(self, locations: Float, directions: Float) -> Float:
         """Return probabilities (L, D); where many landmarks are visible, from a smaller sample than `score`."""
-        if not ScoresAround.serves(self.network):
+        if not BatchedDirections.serves(self.network):
             return super().score_around(locations, directions)
-        if self._around is None or not np.array_equal(self._around_axes, directions):
-            self._around = ScoresAround(self.localization_map, self.trained, directions, MOST // 2)
-            self._around_axes = directions
-        return self._around.score(locations)
+        if self._batched is None or not np.array_equal(self._batched_axes, directions):
+            self._batched = BatchedDirections(self.localization_map, self.trained, directions, MOST // 2)
+            self._batched_axes = directions
+        return self._batched.score(locations)

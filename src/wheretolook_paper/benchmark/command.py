@@ -138,12 +138,12 @@ def _of_scenes(options: Benchmark) -> tuple[list[Result], list[str]]:
     )
     rounds = [SceneRound(scene, options.out / scene.name, config) for scene in scenes]
     results: list[Result] = []
-    told: list[str] = []
+    messages: list[str] = []
     while rounds:
         one = rounds.pop(0)  # so that its mesh goes when it is done
         for method in methods:
             scores = one.run(method)
             if scores is not None:
                 results.append(Result(one.scene.name, one.folder_name(method), scores))
-        told += [f"{one.scene.name}: {line}" for line in one.messages]
-    return results, told
+        messages += [f"{one.scene.name}: {line}" for line in one.messages]
+    return results, messages

@@ -140,10 +140,11 @@ def fit_similarity(source: ArrayLike, target: ArrayLike) -> Similarity:
 
     a = np.asarray(source, dtype=np.float64)
     b = np.asarray(target, dtype=np.float64)
-    if len(a) < 3 or _are_on_a_line(a) or _are_on_a_line(b):
+    determined = len(a) >= 3 and not _are_on_a_line(a) and not _are_on_a_line(b)
+    sim3d = pycolmap.estimate_sim3d(a, b) if determined else None
+    if sim3d is None:
         fix = "Give the positions of three photographs or more, not on a line."
         raise MapError("these positions do not determine a frame", value=len(a), fix=fix)
-    sim3d = pycolmap.estimate_sim3d(a, b)
     return Similarity(float(sim3d.scale), np.asarray(sim3d.rotation.matrix()), np.asarray(sim3d.translation))
 
 

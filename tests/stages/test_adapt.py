@@ -145,12 +145,12 @@ label: {workers: 1, shard_size: 32}
     assert main(["adapt", *where, "--minutes", "0.0001"]) == 0
     said = capsys.readouterr()
     assert f"labelling up to {n_views} views, for 0.0001 minutes at most" in said.out
-    assert f"128 of {n_views} views labelled; run it again to go on" in said.out and "learning from 128" in said.out
+    assert f"128 of {n_views} views labelled; run it again to go on" in said.out and "fitting to 128" in said.out
     assert "label:" in said.err  # the progress bar
     made = {path: path.stat().st_mtime_ns for path in scene.folder.glob("adapt-shards/*/*.parquet")}
     assert sum(len(pd.read_parquet(path)) for path in made) >= 128
     assert main(["adapt", *where]) == 0
     said = capsys.readouterr()
-    assert f"learning from {n_views} rendered views" in said.out and "run it again" not in said.out
+    assert f"fitting to {n_views} rendered views" in said.out and "run it again" not in said.out
     assert made == {path: path.stat().st_mtime_ns for path in made}  # nothing was labelled twice
     assert len(list(finished_runs(TrackingConfig(tmp_path / "mlruns"), "adapt"))) == 2

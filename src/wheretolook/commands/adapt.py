@@ -45,11 +45,11 @@ LEAST_VIEWS = 100
 LEAST_LOCATIONS = 10
 LEAST_OF_A_KIND = 10
 _AT_ONCE = 128  # views between two looks at the clock
-_PLACE = 256  # landmarks by which the place is known again
+_MAX_SIGNATURE = 256  # landmarks by which the scene is recognized
 
 
 @dataclass(frozen=True)
-class _Place:
+class _Target:
     """What weights are adapted to, and where they go."""
 
     name: str
@@ -129,15 +129,15 @@ class Adapt(SceneOptions, LabelOptions):
                 except MapError as error:
                     if views is None:
                         raise
-                    log(f"{files.name}: its photographs are not learnt from: {error}")
+                    log(f"{files.name}: its photographs are not used: {error}")
             assert views is not None
             _check_enough(views, files.table if table is not None else files.map)
-            place = _Place(files.name, dataset.name, files.table, weights, path)
-            return _learn(self, place, views, files.read_landmarks().points, log, progress)
+            target = _Target(files.name, dataset.name, files.table, weights, path)
+            return _fit(self, target, views, files.read_landmarks().points, log, progress)
 
 
 def _adapt_map(options: Adapt, model: Path, weights: Path, log: Log, progress: Progress) -> Path | None:
-    """Adapt to a COLMAP map by its photographs alone."""
+    """Adapt to a COLMAP map by its photographs only."""
     from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
     from wheretolook.holdout.photo_map import folder_of_check
     from wheretolook.mapping.colmap_model import model_arrays, read_model
@@ -157,7 +157,7 @@ def _adapt_map(options: Adapt, model: Path, weights: Path, log: Log, progress: P
     views = _left_out(options, model, environment.occlusion, weights, name, log)
     _check_enough(views, model)
     with hold(path.with_name(f".{path.name}.lock"), "adapt"):
-        return _learn(options, _Place(name, "", model, weights, path), views, points, log, progress)
+        return _fit(options, _Target(name, "", model, weights, path), views, points, log, progress)
 
 
 def _left_out(
@@ -174,26 +174,26 @@ def _left_out(
     return photographed_views(source, left_out, weights, occlusion, options.warp_device)
 
 
-def _learn(
-    options: Adapt, place: _Place, views: LocalizedViews, points: Float, log: Log, progress: Progress
+def _fit(
+    options: Adapt, target: _Target, views: LocalizedViews, points: Float, log: Log, progress: Progress
 ) -> Path | None:
-    """Learn from a place's views; keep, tell and log what came of it."""
+    """Adapt to localized views; keep the weights if they are better, report and log the gain."""
     from wheretolook.evaluation.adaptation import compare_log_odds, gain_markdown
-    from wheretolook.scorers.adapted.gp_correction import adapt as learn
+    from wheretolook.scorers.adapted.gp_correction import adapt as fit
 
-    name = place.name
-    path = place.path
+    name = target.name
+    path = target.path
     seed = options.adapt.seed
     photographs = views.photograph >= 0
     kinds = {"rendered views": ~photographs, "left-out photographs": photographs}
-    told = " and ".join(f"{rows.sum():,} {kind}" for kind, rows in kinds.items() if rows.any())
-    log(f"{name}: learning from {told}, {views.good.mean():.0%} of which localize")
-    learnt = learn(views, seed)
+    counts = " and ".join(f"{rows.sum():,} {kind}" for kind, rows in kinds.items() if rows.any())
+    log(f"{name}: fitting to {counts}, {views.good.mean():.0%} of which localize")
+    adapted = fit(views, seed)
 
     def gain_of(rows: NDArray[np.bool_]) -> Gain:
         some = views.rows(rows)
         judged = some.good, some.place, some.centers, seed, some.blocks
-        return compare_log_odds(some.log_odds, learnt.held_out[rows], *judged)
+        return compare_log_odds(some.log_odds, adapted.held_out[rows], *judged)
 
     gain = gain_of(np.ones(len(views), dtype=bool))
     text = gain_markdown(gain)
@@ -201,18 +201,18 @@ def _learn(
     if photographs.any() and not photographs.all():
         of_photographs = gain_of(photographs)
         is_better = is_better and not of_photographs.is_worse
-        text += f"\nOf the photographs alone:\n\n{gain_markdown(of_photographs)}"
-    write_text(path.with_suffix(".md"), f"# {name}: adapted by {told}\n\n{text}")
+        text += f"\nPhotographs only:\n\n{gain_markdown(of_photographs)}"
+    write_text(path.with_suffix(".md"), f"# {name}: adapted by {counts}\n\n{text}")
     if is_better:
-        _save(place, points, learnt, views, gain)
+        _save(target, points, adapted, views, gain)
         log(f"{text}\n{name}: the adapted weights are better -> {path}")
     else:
-        log(f"{text}\n{name}: adapting does not make the weights better here: use {place.weights}")
+        log(f"{text}\n{name}: adapting does not make the weights better here: use {target.weights}")
         if options.adapt.out is None and path.is_file():  # of an earlier run, by other labels
             path.unlink()
             log(f"{name}: removed {path}, which an earlier run had made")
     with kept_if_not_logged(f"what was gained, {path.with_suffix('.md')},"):
-        _log(options, place, learnt, views, gain, is_better)
+        _log(options, target, adapted, views, gain, is_better)
     progress(1)
     return path if is_better else None
 
@@ -241,7 +241,7 @@ def _labelled(
 ) -> pd.DataFrame | None:
     """The scene's labelled viewpoints: all if the label stage has been here, else those that the time allows.
 
-    None where there are photographs alone.
+    None where there are only photographs.
     """
     if files.stage_cache("label").stored_key is not None:
         shutil.rmtree(files.adapt_shards, ignore_errors=True)  # of views that have labels now
@@ -254,7 +254,7 @@ def _labelled(
         raise SceneError(problem, path=files.folder, fix=fix)
     if files.stage_cache("sample").stored_key is None:
         if has_photographs:
-            log(f"{files.name}: no viewpoints are sampled, so photographs alone are learnt from")
+            log(f"{files.name}: no viewpoints are sampled, so only photographs are used")
             return None
         problem = "the sample stage has not been run for this scene since its input was made"
         raise TableError(problem, path=files.folder, fix="Run `wheretolook sample`.")
@@ -296,10 +296,10 @@ def _label_for(options: Adapt, files: SceneFolder, scene: SceneEnvironment, log:
             if end is not None and time.monotonic() >= end:
                 break
     _remove_stale(files.adapt_shards, tasks)
-    found = pd.concat([done[task.name] for task in tasks if task.name in done], ignore_index=True)
-    if len(found) < len(table):
-        log(f"{files.name}: {len(found):,} of {len(table):,} views labelled; run it again to go on with more")
-    return found
+    labelled_table = pd.concat([done[task.name] for task in tasks if task.name in done], ignore_index=True)
+    if len(labelled_table) < len(table):
+        log(f"{files.name}: {len(labelled_table):,} of {len(table):,} views labelled; run it again to go on with more")
+    return labelled_table
 
 
 def _remove_stale(folder: Path, tasks: list[LabelTask]) -> None:
@@ -372,38 +372,38 @@ def _check_enough(views: LocalizedViews, source: Path) -> None:
         raise TableError(problem, path=source, value=value, fix="Sample more viewpoints, or give more minutes.")
 
 
-def _save(place: _Place, points: Float, learnt: Adapted, views: LocalizedViews, gain: Gain) -> None:
+def _save(target: _Target, points: Float, adapted: Adapted, views: LocalizedViews, gain: Gain) -> None:
     import torch
 
     from wheretolook.scorers.adapted.network import AdaptedNetwork
     from wheretolook.scorers.set.network import SetNetwork
     from wheretolook.training.trained_network import TrainedNetwork
 
-    base = TrainedNetwork.load(place.weights, SetNetwork, "set")
-    found = learnt.adaptation
-    some = points[np.arange(min(_PLACE, len(points))) * len(points) // max(1, min(_PLACE, len(points)))]
-    sizes = len(found.weights), len(some)
-    kernel = base.scale, base.offset, found.length_m, found.sharpness
+    base = TrainedNetwork.load(target.weights, SetNetwork, "set")
+    correction = adapted.adaptation
+    some = points[np.arange(min(_MAX_SIGNATURE, len(points))) * len(points) // max(1, min(_MAX_SIGNATURE, len(points)))]
+    sizes = len(correction.weights), len(some)
+    kernel = base.scale, base.offset, correction.length_m, correction.sharpness
     network = AdaptedNetwork(base.network, *kernel, *sizes)
-    for name, values in (("centers", found.centers), ("axes", found.axes), ("weights", found.weights)):
+    for name, values in (("centers", correction.centers), ("axes", correction.axes), ("weights", correction.weights)):
         setattr(network, f"support_{name}", torch.from_numpy(np.array(values, dtype=np.float64)))
     network.place = torch.from_numpy(np.array(some, dtype=np.float64))
-    trained = TrainedNetwork("adapted", network, base.camera, found.scale, found.offset, base.training_range)
-    about = {"scene": place.name, "views": len(views), "photographs": int((views.photograph >= 0).sum())}
-    about |= {"weights_sha256": fingerprint(place.weights)}
-    trained.save(place.path, {**about, "before": gain.before, "after": gain.after})
+    trained = TrainedNetwork("adapted", network, base.camera, correction.scale, correction.offset, base.training_range)
+    about = {"scene": target.name, "views": len(views), "photographs": int((views.photograph >= 0).sum())}
+    about |= {"weights_sha256": fingerprint(target.weights)}
+    trained.save(target.path, {**about, "before": gain.before, "after": gain.after})
 
 
-def _log(options: Adapt, place: _Place, learnt: Adapted, views: LocalizedViews, gain: Gain, is_better: bool) -> None:
+def _log(options: Adapt, target: _Target, adapted: Adapted, views: LocalizedViews, gain: Gain, is_better: bool) -> None:
     from wheretolook.tracking.runs import log, start_run
 
-    params = {"dataset": place.dataset, "scene": place.name, "weights": place.weights, "views": len(views)}
+    params = {"dataset": target.dataset, "scene": target.name, "weights": target.weights, "views": len(views)}
     params |= {"photographs": int((views.photograph >= 0).sum())}
-    params |= {"length_m": learnt.length_m, "amplitude": learnt.amplitude, "scale": learnt.adaptation.scale}
+    params |= {"length_m": adapted.length_m, "amplitude": adapted.amplitude, "scale": adapted.adaptation.scale}
     metrics = {**gain.after, **{f"{name}_before": value for name, value in gain.before.items()}}
     metrics |= {"better": float(is_better), "log_loss_less": gain.log_loss_less[0]}
-    with start_run(options.tracking, place.name, "adapt", params) as (client, run):
+    with start_run(options.tracking, target.name, "adapt", params) as (client, run):
         log(client, run, metrics=metrics)
-        client.log_artifact(run, str(place.path.with_suffix(".md")))
+        client.log_artifact(run, str(target.path.with_suffix(".md")))
         if is_better:
-            client.log_artifact(run, str(place.path))
+            client.log_artifact(run, str(target.path))

@@ -1,4 +1,4 @@
-"""Files of selected views. Each says in which frame its poses are.
+"""Write selected views to files, each of which names the frame of its poses.
 
 The world is that of the map, in metres, z up; cameras look along their z, x right, y down.
 """
@@ -7,16 +7,17 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from wheretolook.geometry.camera import Camera
-from wheretolook.geometry.poses import Float, quaternion_from_rotation
+from wheretolook.geometry.poses import quaternion_from_rotation
 from wheretolook.mapping.colmap_model import holds_model
 from wheretolook.utils.errors import ConfigError, StorageError
 from wheretolook.utils.files import write_json, write_text
+
+if TYPE_CHECKING:
+    from wheretolook.select.views import SelectedViews
 
 FORMATS = {
     "csv": "a table; position of the camera in the world, quaternion camera-to-world (wxyz, and xyzw in one cell)",
@@ -28,88 +29,55 @@ FORMATS = {
 """Formats, and the frames in which they have poses."""
 
 
-class Views(Protocol):
-    """What is written of V views; see `wheretolook.select.views.SelectedViews`."""
-
-    def __len__(self) -> int: ...
-    @property
-    def waypoint_id(self) -> tuple[str, ...]: ...
-    @property
-    def rank(self) -> NDArray[np.int64]: ...
-    @property
-    def cam_from_world(self) -> Float: ...
-    @property
-    def score(self) -> Float: ...
-    @property
-    def set_score(self) -> Float | None: ...
-    @property
-    def expected_inliers(self) -> Float: ...
-    @property
-    def n_visible(self) -> NDArray[np.int64]: ...
-    @property
-    def in_range(self) -> NDArray[np.bool_]: ...
-    @property
-    def camera(self) -> Camera: ...
-    @property
-    def method(self) -> str: ...
-    @property
-    def positions(self) -> Float: ...
-    @property
-    def yaw_deg(self) -> Float: ...
-    @property
-    def pitch_deg(self) -> Float: ...
-    @property
-    def quaternions_wxyz(self) -> Float: ...
-    @property
-    def quaternions_xyzw(self) -> Float: ...
-
-
 def format_of(path: Path, format: str | None = None) -> str:
-    """The format named, or else that of the file's name: .csv, .json, .tum, images.txt; a folder is for COLMAP.
+    """Return the given format, or else that of the file's name: .csv, .json, .tum, images.txt; a folder is for COLMAP.
 
-    Raises a ConfigError if there is no such format, or the name does not tell.
+    Raises ConfigError if there is no such format, or the name has no known ending.
     """
     if format is None:
         by_suffix = {".csv": "csv", ".json": "json", ".tum": "tum", "": "colmap"}
         format = "colmap" if path.name == "images.txt" else by_suffix.get(path.suffix.lower())
         if format is None:
             fix = f"Name a format ({', '.join(FORMATS)}), or a file that ends on .csv, .json or .tum."
-            raise ConfigError("the name does not tell the format of the file", path=path, fix=fix)
+            raise ConfigError("the file's name has no known format", path=path, fix=fix)
     if format not in FORMATS:
         raise ConfigError("unknown format of views", value=format, fix=f"There are {', '.join(FORMATS)}.")
     return format
 
 
 def check_format(path: Path, format: str | None, n: int) -> str:
-    """As `format_of`, and whether it can hold n views of a waypoint; a ConfigError if not, or the path is taken; a
-    StorageError if nothing can be written there."""
-    found = format_of(path, format)
-    if found in ("tum", "benchmark") and n > 1:
+    """Return the format of a file for n views of each waypoint.
+
+    Raises ConfigError if the format holds one view only, or the path holds something else; StorageError if nothing can
+    be written there.
+    """
+    chosen = format_of(path, format)
+    if chosen in ("tum", "benchmark") and n > 1:
         fix = "Ask for one view, or write csv, json or colmap."
-        raise ConfigError(f"a file of the format {found} has one view of each waypoint", value=n, fix=fix)
-    if path.is_dir() and found != "colmap":
+        raise ConfigError(f"a file of the format {chosen} has one view of each waypoint", value=n, fix=fix)
+    if path.is_dir() and chosen != "colmap":
         raise ConfigError("this is a folder", path=path, fix="Name a file.")
-    if found == "colmap" and not path.suffix and holds_model(path) and not _is_ours(path):
-        raise ConfigError("a COLMAP model lies here already", path=path, fix="Name another folder.")
+    if chosen == "colmap" and not path.suffix and holds_model(path) and not _is_ours(path):
+        raise ConfigError("this folder holds a COLMAP model", path=path, fix="Name another folder.")
     folder = next(parent for parent in path.absolute().parents if parent.exists())
     if not folder.is_dir() or not os.access(folder, os.W_OK):
         raise StorageError("cannot write views there", path=folder, fix="Name a file in another folder.")
-    return found
+    return chosen
 
 
-def save_views(views: Views, path: Path, format: str | None = None) -> None:
+def save_views(views: SelectedViews, path: Path, format: str | None = None) -> None:
     """Write views to a file, atomically; its folder is made if missing.
 
     Raises a ConfigError as `check_format`, a StorageError if the file cannot be written.
     """
-    found = check_format(path, format, int(views.rank.max(initial=1)))
-    if found == "csv":
+    chosen = check_format(path, format, int(views.rank.max(initial=1)))
+    if chosen == "csv":
         write_text(path, _csv(views))
-    elif found == "json":
+    elif chosen == "json":
         write_json(path, _json(views))
-    elif found == "tum":
+    elif chosen == "tum":
         write_text(path, _tum(views))
-    elif found == "benchmark":
+    elif chosen == "benchmark":
         write_text(path, _benchmark(views))
     elif path.suffix:
         write_text(path, _images(views))
@@ -127,42 +95,33 @@ def _is_ours(folder: Path) -> bool:
     return images.is_file() and images.read_text(errors="replace").startswith(_MARK)
 
 
-def _rows(views: Views) -> list[dict[str, Any]]:
-    """One record a view; None for expected inliers where the method does not tell them."""
-    wxyz = views.quaternions_wxyz
-    positions = views.positions
-    yaw = views.yaw_deg
-    pitch = views.pitch_deg
-    rows = []
-    for row in range(len(views)):
-        w, x, y, z = (float(value) for value in wxyz[row])
-        inliers = float(views.expected_inliers[row])
-        rows.append(
-            {
-                "waypoint": views.waypoint_id[row],
-                "rank": int(views.rank[row]),
-                **dict(zip("xyz", (float(value) for value in positions[row]), strict=True)),
-                "yaw_deg": float(yaw[row]),
-                "pitch_deg": float(pitch[row]),
-                "score": float(views.score[row]),
-                **({} if views.set_score is None else {"set_score": float(views.set_score[row])}),
-                "expected_inliers": inliers if np.isfinite(inliers) else None,
-                "n_visible": int(views.n_visible[row]),
-                "in_range": bool(views.in_range[row]),
-                "qw": w,
-                "qx": x,
-                "qy": y,
-                "qz": z,
-            }
-        )
-    return rows
+def _rows(views: SelectedViews) -> list[dict[str, Any]]:
+    """Return a record for each view; expected inliers are None where the method does not report them."""
+    columns = {
+        "rank": views.rank,
+        **dict(zip("xyz", views.positions.T, strict=True)),
+        "yaw_deg": views.yaw_deg,
+        "pitch_deg": views.pitch_deg,
+        "score": views.score,
+        **({} if views.set_score is None else {"set_score": views.set_score}),
+        "expected_inliers": [value if np.isfinite(value) else None for value in views.expected_inliers.tolist()],
+        "n_visible": views.n_visible,
+        "in_range": views.in_range,
+        **dict(zip(("qw", "qx", "qy", "qz"), views.quaternions_wxyz.T, strict=True)),
+    }
+    values = [
+        np.asarray(column, dtype=object if name == "expected_inliers" else None).tolist()
+        for name, column in columns.items()
+    ]
+    rows = zip(views.waypoint_id, *values, strict=True)
+    return [dict(zip(("waypoint", *columns), row, strict=True)) for row in rows]
 
 
 FAR_M = 1000.0  # of a camera from the origin
 _DIGITS = {"yaw_deg": ".3f", "pitch_deg": ".3f", "score": ".9g", "set_score": ".9g", "expected_inliers": ".2f"}
 
 
-def _csv(views: Views) -> str:
+def _csv(views: SelectedViews) -> str:
     lines: list[str] = []
     for row in _rows(views):
         cells = {name: _cell(name, value) for name, value in row.items()}
@@ -182,7 +141,7 @@ def _cell(name: str, value: Any) -> str:
     return format(value, _DIGITS.get(name, ".9f"))
 
 
-def _json(views: Views) -> dict[str, Any]:
+def _json(views: SelectedViews) -> dict[str, Any]:
     frames = "x, y, z: camera centre in the world, m; qw, qx, qy, qz: camera-to-world; world z up, camera z forward"
     about = {"frames": frames, "method": views.method, "camera": views.camera.colmap.record()}
     poses = zip(_rows(views), views.quaternions_xyzw.tolist(), views.cam_from_world.tolist(), strict=True)
@@ -190,7 +149,7 @@ def _json(views: Views) -> dict[str, Any]:
     return about | {"views": rows}
 
 
-def _tum(views: Views) -> str:
+def _tum(views: SelectedViews) -> str:
     lines = [
         "# t x y z qx qy qz qw, camera-to-world, metres; t is the waypoint's name if that is a number, else a count"
     ]
@@ -204,14 +163,14 @@ def _tum(views: Views) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _benchmark(views: Views) -> str:
+def _benchmark(views: SelectedViews) -> str:
     lines = ["# id qw qx qy qz tx ty tz"]
     for name, pose in zip(views.waypoint_id, _cam_from_world(views), strict=True):
         lines.append(" ".join([name.replace(" ", "_"), *pose]))
     return "\n".join(lines) + "\n"
 
 
-def _images(views: Views) -> str:
+def _images(views: SelectedViews) -> str:
     lines = [_MARK + ": world-to-camera; a name is that of the waypoint, and of several views the rank"]
     lines += ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# an empty line follows: no points"]
     several = views.rank.max(initial=1) > 1
@@ -222,13 +181,13 @@ def _images(views: Views) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _cameras(views: Views) -> str:
+def _cameras(views: SelectedViews) -> str:
     record = views.camera.colmap.record()
     values = [1, record["model"], record["width"], record["height"], *record["params"]]
     return "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n" + " ".join(map(str, values)) + "\n"
 
 
-def _cam_from_world(views: Views) -> list[list[str]]:
+def _cam_from_world(views: SelectedViews) -> list[list[str]]:
     """qw qx qy qz tx ty tz of each view, world-to-camera.
 
     Far from the origin quaternions get more decimals, which decide where the camera is: its centre follows from both.

@@ -1,4 +1,4 @@
-"""Views that were selected: where they are, how they look, what they are worth."""
+"""Selected views: poses, scores and visible landmarks."""
 
 from __future__ import annotations
 
@@ -29,15 +29,20 @@ class SelectedViews:
     rank: NDArray[np.int64]  # (V,) 1 for the best view of the waypoint
     cam_from_world: Float  # (V, 3, 4) float64
     score: Float  # (V,)
-    expected_inliers: Float  # (V,) landmarks expected to be found; NaN where the method does not tell
-    n_visible: NDArray[np.int64]  # (V,) landmarks in view
-    in_range: NDArray[np.bool_]  # (V,) whether the view is like those that the scorer has learnt from
-    camera: Camera  # the one that looks
+    expected_inliers: Float  # (V,) expected number of inliers; NaN where the method does not predict it
+    n_visible: NDArray[np.int64]  # (V,) visible landmarks
+    in_range: NDArray[np.bool_]  # (V,) whether the view is within the training distribution of the scorer
+    camera: Camera  # of the views
     method: str  # name of the scorer
-    set_score: Float | None = None  # (V,) that the waypoint's looks localize together, if they were chosen together
+    set_score: Float | None = None  # (V,) probability that the waypoint's views localize jointly, if chosen so
 
     def __len__(self) -> int:
         return len(self.score)
+
+    def __getitem__(self, rows: NDArray[np.int64]) -> SelectedViews:
+        """Return some of the views."""
+        values = {name: getattr(self, name)[rows] for name in _arrays(self)}
+        return replace(self, waypoint_id=tuple(self.waypoint_id[row] for row in rows), **values)
 
     @property
     def positions(self) -> Float:
@@ -70,7 +75,7 @@ class SelectedViews:
         return np.roll(self.quaternions_wxyz, -1, axis=1)
 
     def save(self, path: str | Path, format: str | None = None) -> None:
-        """Write a file, see `wheretolook.select.formats`, whose name tells the format unless it is given.
+        """Write a file in the given format, or that of its name, see `wheretolook.select.formats`.
 
         Raises a ConfigError if there is no such format, or it holds one view of a waypoint and there are several.
         """
@@ -78,8 +83,13 @@ class SelectedViews:
 
 
 def joined(parts: Sequence[SelectedViews]) -> SelectedViews:
-    """Views of one camera and method, one after another."""
-    arrays = [field.name for field in fields(SelectedViews) if field.name not in ("waypoint_id", "camera", "method")]
-    arrays = [name for name in arrays if getattr(parts[0], name) is not None]
-    values: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays}
+    """Concatenate views of one camera and method."""
+    values: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in _arrays(parts[0])
+    }
     return replace(parts[0], waypoint_id=tuple(name for part in parts for name in part.waypoint_id), **values)
+
+
+def _arrays(views: SelectedViews) -> list[str]:
+    """Return the names of the fields that are arrays."""
+    return [field.name for field in fields(views) if isinstance(getattr(views, field.name), np.ndarray)]

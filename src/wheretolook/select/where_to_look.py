@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,7 +44,7 @@ scores of all directions stand on other samples of them."""
 
 OCCLUSION_CACHE_BYTES = 1 << 30
 
-SIGHT_LINES = 1 << 24  # lines of sight looked at at once when views are told of
+SIGHT_LINES = 1 << 24  # lines of sight tested at once
 
 
 class WhereToLook:
@@ -55,7 +56,7 @@ class WhereToLook:
 
     World in metres, z up. `scorer` is any method on a localization map; `directions` (D, 3) are the optical axes that
     are looked along at each place, in the world; cameras do not roll. `space` tells where a camera can be, for grids;
-    None for what the map itself tells.
+    None for the space near the mapping cameras.
     """
 
     def __init__(self, scorer: Scorer, directions: ArrayLike | None = None, space: Any = None) -> None:
@@ -63,7 +64,7 @@ class WhereToLook:
         self._space = space
         axes = direction_lattice(500) if directions is None else np.asarray(directions, dtype=np.float64)
         self.directions = axes / np.linalg.norm(axes, axis=1, keepdims=True)
-        self.views: SelectedViews | None = None  # those found last
+        self.views: SelectedViews | None = None  # of the last selection
 
     @classmethod
     def from_colmap(
@@ -156,7 +157,7 @@ class WhereToLook:
 
     @property
     def space(self) -> Any:
-        """Where a camera can be: by mesh, depth images, or the map alone."""
+        """Where a camera can be, by mesh, depth images, or the map only."""
         if self._space is None:
             here = self.localization_map
             assert here.mapping_poses is not None
@@ -221,31 +222,18 @@ class WhereToLook:
             chosen = np.argsort(-scores, axis=1, kind="stable")[:, : n + SPARE]
         step = max(1, SIGHT_LINES // max(1, len(self.localization_map.landmarks)))
         blocks = [slice(begin, begin + step) for begin in range(0, len(rows), step)]
-        found = [self._described(waypoints, rows[block], axes[chosen[block]], n) for block in blocks]
-        self.views = joined(found)
+        self.views = joined([self._described(waypoints, rows[block], axes[chosen[block]], n) for block in blocks])
         return self.views
 
     def _described(self, waypoints: Waypoints, rows: NDArray[np.int64], axes: Float, n: int) -> SelectedViews:
-        """The n best of views along axes (W, K, 3) at some of the waypoints, with all that is told of them."""
-        scorer = self.scorer
+        """Return the n best of views along axes (W, K, 3) at some of the waypoints."""
         k = axes.shape[1]
-        poses = poses_looking_along(np.repeat(waypoints.points[rows], k, axis=0), axes.reshape(-1, 3))
-        told = scorer.report(poses)
-        order = np.argsort(-told.score.reshape(-1, k), axis=1, kind="stable")[:, :n]
-        taken = (np.arange(len(rows))[:, None] * k + order).ravel()
-        of_waypoint = np.repeat(rows, order.shape[1])
-        return SelectedViews(
-            waypoint=of_waypoint,
-            waypoint_id=tuple(waypoints.ids[row] for row in of_waypoint),
-            rank=np.tile(np.arange(1, order.shape[1] + 1), len(rows)),
-            cam_from_world=poses[taken],
-            score=told.score[taken],
-            expected_inliers=told.expected_inliers[taken],
-            n_visible=told.n_visible[taken],
-            in_range=told.in_range[taken],
-            camera=scorer.localization_map.camera,
-            method=scorer.name,
+        views = self._reported(
+            waypoints, np.repeat(rows, k), np.tile(np.arange(1, k + 1), len(rows)), axes.reshape(-1, 3)
         )
+        order = np.argsort(-views.score.reshape(-1, k), axis=1, kind="stable")[:, :n]
+        best = views[(np.arange(len(rows))[:, None] * k + order).ravel()]
+        return replace(best, rank=np.tile(np.arange(1, order.shape[1] + 1), len(rows)))
 
     def _looks(
         self,
@@ -261,10 +249,10 @@ class WhereToLook:
         at = waypoints.points[rows]
         pairs = tqdm(zip(at, scores, strict=True), total=len(at), desc="looks", unit="waypoint", disable=not progress)
         sets = [best_views(self.scorer, place, axes, values, n, max_turn_deg) for place, values in pairs]
-        looked = axes[[look for found in sets for look in found.rows]]
+        chosen = axes[[row for view_set in sets for row in view_set.rows]]
         rank = np.tile(np.arange(1, n + 1), len(rows))
-        set_scores = np.repeat([found.score for found in sets], n)
-        return self._reported(waypoints, np.repeat(rows, n), rank, looked, set_scores)
+        set_scores = np.repeat([view_set.score for view_set in sets], n)
+        return self._reported(waypoints, np.repeat(rows, n), rank, chosen, set_scores)
 
     def _sequence_with_stops(
         self,
@@ -279,28 +267,33 @@ class WhereToLook:
         """The best sequence at some of the waypoints, (R,) rows, with further looks where it scores too little."""
         at = waypoints.points[rows]
         chosen = axes[best_sequence(scores, TurnLimit.of(axes, max_turn_deg)).direction_ids]
-        alone = self.scorer.score(poses_looking_along(at, chosen))
+        scores_of_path = self.scorer.score(poses_looking_along(at, chosen))
         text = "stops" if progress else None
-        found = stops_along(self.scorer, at, chosen, axes, stops, progress=text)
-        path = PlannedPath(at, chosen, alone, np.nan, stops=found)
+        path_stops = stops_along(self.scorer, at, chosen, axes, stops, progress=text)
+        path = PlannedPath(at, chosen, scores_of_path, np.nan, stops=path_stops)
         places, rank = path.looks
         return self._reported(waypoints, rows[places], rank, path.all_axes, path.scores_with_stops[places])
 
     def _reported(
-        self, waypoints: Waypoints, rows: NDArray[np.int64], rank: NDArray[np.int64], axes: Float, set_score: Float
+        self,
+        waypoints: Waypoints,
+        rows: NDArray[np.int64],
+        rank: NDArray[np.int64],
+        axes: Float,
+        set_score: Float | None = None,
     ) -> SelectedViews:
-        """Looks along axes (V, 3) from the waypoints of rows (V,), with all that is told of them."""
+        """Return the views along axes (V, 3) from the waypoints of rows (V,), with their scores."""
         poses = poses_looking_along(waypoints.points[rows], axes)
-        told = self.scorer.report(poses)
+        report = self.scorer.report(poses)
         return SelectedViews(
             waypoint=rows,
             waypoint_id=tuple(waypoints.ids[row] for row in rows),
             rank=rank,
             cam_from_world=poses,
-            score=told.score,
-            expected_inliers=told.expected_inliers,
-            n_visible=told.n_visible,
-            in_range=told.in_range,
+            score=report.score,
+            expected_inliers=report.expected_inliers,
+            n_visible=report.n_visible,
+            in_range=report.in_range,
             camera=self.localization_map.camera,
             method=self.scorer.name,
             set_score=set_score,
@@ -327,7 +320,7 @@ class WhereToLook:
         axes = self.directions[(pitch >= low - 1e-9) & (pitch <= high + 1e-9)]
         if len(axes) == 0:
             fix = "Widen it, or look along more directions."
-            raise ConfigError("no direction lies within the limit on pitch", value=(low, high), fix=fix)
+            raise ConfigError("no direction is within the limit on pitch", value=(low, high), fix=fix)
         return self._enough(axes, n)
 
     @staticmethod
@@ -338,7 +331,7 @@ class WhereToLook:
         return axes
 
     def save(self, path: str | Path, format: str | None = None) -> None:
-        """Write the views found last, as `SelectedViews.save`; a ConfigError if none were."""
+        """Write the views of the last selection, see `SelectedViews.save`. Raises ConfigError if there are none."""
         if self.views is None:
             raise ConfigError("there are no views to save", path=path, fix="Ask for them first: best(points).")
         self.views.save(path, format)

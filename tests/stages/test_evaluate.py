@@ -73,7 +73,7 @@ def test_evaluation_writes_prints_and_logs(
     figures = {"scores.png", "regret.png", "calibration.png"}
     tables = {f"table_{name}.{kind}" for name in ("vs_others", "input_variants") for kind in ("csv", "md", "tex")}
     expected = {"scores.csv", "scores.md", "calibration.csv"} | figures | tables
-    assert {path.name for path in results.iterdir()} == expected
+    assert {path.name for path in results.iterdir()} == {*expected, "comparisons.md"}
     report = (results / "scores.md").read_text()
     assert report in capsys.readouterr().out
     assert "| reprojections with bins | 100.0" in report

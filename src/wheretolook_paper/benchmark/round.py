@@ -30,7 +30,7 @@ from wheretolook_paper.benchmark.scores import Scores
 if TYPE_CHECKING:
     from wheretolook.geometry.mesh import TexturedMesh
     from wheretolook.localization.localizer import Localizer
-    from wheretolook.rendering.warp_renderer import WarpRenderer
+    from wheretolook.rendering.types import Renderer
 
 POSES = "selected_gt_poses.txt"
 IMAGES = "images"
@@ -264,10 +264,10 @@ class SceneRound:
         return load_mesh(self.scene.mesh)
 
     @cached_property
-    def _renderer(self) -> WarpRenderer:
-        from wheretolook.rendering.warp_renderer import WarpRenderer
+    def _renderer(self) -> Renderer:
+        from wheretolook.rendering.registry import make_renderer
 
-        return WarpRenderer(self._mesh, self.config.device)
+        return make_renderer(self._mesh, self.config.device)
 
     @cached_property
     def _model_key(self) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -109,15 +108,6 @@ def test_evaluation_writes_prints_and_logs(
                 (table["method"] == params["method"]) & (table["top_n"] == n) & (table["scene"] == scene)
             ].to_dict("records")  # fmt: skip
             assert metrics[f"top-{n}/{scene}/regret_0.05m_0.4deg"] == pytest.approx(part["regret_0.05m_0.4deg"])
-    # the search of the page on evaluation finds the best of them, which is no oracle
-    page = (Path(__file__).parents[2] / "docs" / "evaluation.md").read_text()
-    (query,) = re.findall(r"`(tags\.stage = \"evaluate\"[^`]*)`", page)
-    query = query.replace('params.dataset = "release"', 'params.dataset = "tiny"')
-    (best,) = client(tracking).search_runs(
-        [parent.info.experiment_id], query, order_by=["metrics.`1_regret`"], max_results=1
-    )
-    assert best.data.params["method"] != "oracle"
-    assert best.data.metrics["top-1/regret_0.05m_0.4deg"] == pooled.loc[("bins", 1)]["regret_0.05m_0.4deg"] == 0
     artifacts = Path(parent.info.artifact_uri)
     assert {path.name for path in artifacts.iterdir()} == {path.name for path in results.iterdir()}
     assert not list(cwd.iterdir())

@@ -91,7 +91,7 @@ def test_a_view_exactly_on_a_landmark() -> None:
         weights = WEIGHTS / f"{LEARNT[method]}.safetensors" if method in LEARNT else None
         score = make_scorer(method, around, weights=weights).score(poses)
         assert not np.isnan(score).any(), method
-    with pytest.raises(SceneError, match="landmark lies at the location"):
+    with pytest.raises(SceneError):
         HiddenPointRemoval().unoccluded(here[None], landmarks.points)
 
 

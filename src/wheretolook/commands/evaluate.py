@@ -60,7 +60,8 @@ class Evaluate(SceneOptions, LabelOptions):
         Installed packages add results of their own. Raises what `evaluate_methods` does.
         """
         if self.list_methods:
-            return list_methods()
+            list_methods()
+            return None
         return self._evaluate(log, progress)
 
     @reads_dataset("evaluate")

@@ -72,7 +72,7 @@ class Scenes(DatasetOptions):
     def _generated(self) -> list[tuple[SceneFolder, MakeMesh, list[Any]]]:
         config = self.scenes
         splits = [*["train"] * config.train, *["val"] * config.val, *["test"] * config.test]
-        generated = []
+        generated: list[tuple[SceneFolder, MakeMesh, list[Any]]] = []
         for seed, split in enumerate(splits, config.seed):
             kind = config.kind_of(seed)
             scene = self._scene(f"{kind}-{seed:03d}", split)

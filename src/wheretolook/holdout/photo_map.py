@@ -112,7 +112,12 @@ class PhotographedMap:
 
 
 def open_map(
-    model_dir: Path, features: Path, metric: bool, name: str = "", keep_frame: bool = False, reconstruction: Any = None
+    model_dir: Path,
+    features: Path,
+    metric: bool,
+    name: str | None = "",
+    keep_frame: bool = False,
+    reconstruction: Any = None,
 ) -> PhotographedMap:
     """Open a COLMAP model and the features that it was built from as a map to check.
 

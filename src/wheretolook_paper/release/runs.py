@@ -238,7 +238,7 @@ def _log_learners(dataset: Dataset, tracking: TrackingConfig) -> str:
     metrics = {}
     if REGRET in of_learner:
         tags[BEST_TAG] = str(of_learner[REGRET].idxmin())
-        best: pd.Series[float] = of_learner.loc[tags[BEST_TAG]]
+        best: Any = of_learner.loc[tags[BEST_TAG]]
         metrics = {str(name): float(value) for name, value in best.items()}
     with start_run(tracking, "all learners", "learners", {"dataset": dataset.name}, tags=tags) as (mlflow, run):
         log(mlflow, run, metrics=metrics)

@@ -15,8 +15,8 @@ import pytest
 from wheretolook import cli
 from wheretolook.cli import main, parse_command
 from wheretolook.commands.options import Experiment
+from wheretolook.commands.scenes_config import MeshSource
 from wheretolook.mapping.config import MapConfig
-from wheretolook.scenes.scenes_config import MeshSource
 from wheretolook.scorers.registry import describe_methods
 from wheretolook.utils import devices
 from wheretolook.utils.errors import ConfigError

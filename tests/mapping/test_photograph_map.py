@@ -17,6 +17,7 @@ from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room, 
 from wheretolook.commands.label import Label
 from wheretolook.commands.map import Map
 from wheretolook.commands.sample import Sample
+from wheretolook.commands.scenes_config import ScenesConfig
 from wheretolook.commands.viewpoint_map import BuildViewpointMap
 from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.viewpoint_table import UNLABELLED, poses
@@ -28,7 +29,6 @@ from wheretolook.mapping.georeference import fit_similarity
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.photograph_map import map_photographs
 from wheretolook.planning.config import ViewpointMapConfig
-from wheretolook.scenes.scenes_config import ScenesConfig
 from wheretolook.scorers.visible import VisibleScorer
 from wheretolook.space.config import MappedSpaceConfig
 from wheretolook.utils.errors import MapError, SceneError

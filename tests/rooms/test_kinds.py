@@ -9,9 +9,9 @@ from typing import get_args
 import numpy as np
 import pytest
 
+from wheretolook.commands.scenes_config import ScenesConfig
 from wheretolook.dataset.layout import SceneFolder
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
-from wheretolook.scenes.scenes_config import ScenesConfig
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook_rooms.building import MAX_DIFFERENCE, Copy, Module, draw_building

@@ -20,6 +20,7 @@ from wheretolook.commands.map import Map
 from wheretolook.commands.plan import Plan
 from wheretolook.commands.preconditions import extractor_of
 from wheretolook.commands.sample import Sample
+from wheretolook.commands.scenes_config import ScenesConfig
 from wheretolook.commands.viewpoint_map import BuildViewpointMap
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.sampling_config import SampleConfig
@@ -32,7 +33,6 @@ from wheretolook.mapping.imported_map import map_existing
 from wheretolook.planning.config import PathConfig, PlanConfig, ViewpointMapConfig
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.loading import save_glb
-from wheretolook.scenes.scenes_config import ScenesConfig
 from wheretolook.space.config import MappedSpaceConfig
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError, WeightsError

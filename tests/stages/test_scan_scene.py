@@ -11,6 +11,7 @@ from scans.recordings import COLOR, room, walk, write_seven_scenes
 from wheretolook.commands.map import Map
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.scenes import Scenes
+from wheretolook.commands.scenes_config import MeshSource, ScenesConfig
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.viewpoint_table import poses
@@ -19,7 +20,6 @@ from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping.config import MapConfig
 from wheretolook.scans.config import RgbdConfig
 from wheretolook.scenes.loading import save_glb
-from wheretolook.scenes.scenes_config import MeshSource, ScenesConfig
 
 
 @pytest.fixture(scope="module")

@@ -98,6 +98,7 @@ class Check(OcclusionOptions, ScorerOptions):
     def run(self) -> None:
         """Check the map, write the report to `out`, and print a summary."""
         self._check_names()
+        from wheretolook.dataset.layout import find_scene
         from wheretolook.figures.style import save_figure
         from wheretolook.holdout import photo_map as sources
         from wheretolook.holdout.figure import check_figure
@@ -112,7 +113,7 @@ class Check(OcclusionOptions, ScorerOptions):
         scoring = Scoring(self.method, self.weights, self.also, self.anywhere)
         scoring.check()
         out = self.out or sources.folder_of_check(self.data, self._result_name())
-        scene = None if self.scene is None else sources.find_scene(self.data, self.scene, self.name)
+        scene = None if self.scene is None else find_scene(self.data, self.scene, self.name)
         try:
             with _reading(scene), hold(out / ".lock", "check"):
                 source, occlusion = self._open(scene, out, device, workers)

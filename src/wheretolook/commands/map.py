@@ -18,13 +18,13 @@ from wheretolook.commands.preconditions import (
     open_scene,
     refuse_release,
 )
+from wheretolook.commands.scenes_config import NOT_SCENES
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, describe_camera, draw_camera
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.config import MapConfig, ScaleConfig
 from wheretolook.mapping.georeference import read_scale
-from wheretolook.scenes.scenes_config import NOT_SCENES
 from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.confine import check_folder_name, path_within, safe_child
 from wheretolook.utils.errors import ConfigError, MapError, SceneError

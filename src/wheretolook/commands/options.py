@@ -6,12 +6,12 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
+from wheretolook.commands.scenes_config import ScenesConfig
 from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import Camera, CameraConfig
 from wheretolook.localization.config import LabelConfig
 from wheretolook.mapping.config import MapConfig
-from wheretolook.scenes.scenes_config import ScenesConfig
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.utils.confine import safe_child

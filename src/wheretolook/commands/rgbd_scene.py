@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from wheretolook.commands.options import DatasetOptions, Log, Progress
+from wheretolook.commands.scenes_config import NOT_SCENES
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import CameraConfig, camera_of_record, describe_camera
 from wheretolook.scans.config import RgbdConfig
-from wheretolook.scenes.scenes_config import NOT_SCENES
 from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.confine import check_folder_name, safe_child
 from wheretolook.utils.errors import ConfigError, SceneError

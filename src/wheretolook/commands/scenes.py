@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from wheretolook.commands.options import DatasetOptions, Log, Progress, ignore_progress
 from wheretolook.commands.preconditions import mesh_fingerprint, refuse_release
 from wheretolook.commands.rgbd_scene import fuse_recording
+from wheretolook.commands.scenes_config import MeshSource, ScenesConfig
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, MappedFloor, SceneFolder
-from wheretolook.scenes.scenes_config import MeshSource, ScenesConfig
 from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.confine import safe_child
 from wheretolook.utils.errors import ConfigError, SceneError

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.dataset.names import NO_DATASET
+from wheretolook.dataset.names import NO_DATASET, check_scene_name, no_such_scene
 from wheretolook.dataset.sampling_config import Split
 from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of_record, read_cameras
 from wheretolook.geometry.poses import Float
@@ -298,3 +298,26 @@ class Dataset:
             fix = "Run the scenes stage again."
             raise TableError(problem, path=path, fix=fix) from error
         return cls(root, tuple(scenes))
+
+
+def find_scene(data: Path, name: str, dataset: str = "") -> SceneFolder:
+    """Find the scene of a name in a dataset, or in the only dataset of a folder that has it.
+
+    Raises ConfigError if there is none, or several datasets have it; TableError if the dataset is damaged.
+    """
+    check_scene_name(data, name, dataset)
+    if dataset:
+        return Dataset.load(data / dataset).scene(name)
+    roots = [path.parent for path in sorted(data.glob("*/dataset.json"))]
+    # datasets without such a folder are not read, so that damaged ones are not in the way
+    having = [
+        one
+        for one in map(Dataset.load, (root for root in roots if (root / name).is_dir()))
+        if name in {scene.name for scene in one.scenes}
+    ]
+    if len(having) == 1:
+        return having[0].scene(name)
+    if having:
+        names = ", ".join(one.name for one in having)
+        raise ConfigError("several datasets have such a scene", value=name, fix=f"Give --name: {names}.")
+    no_such_scene(data, name, roots)

@@ -11,8 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.dataset.names import check_scene_name, no_such_scene
 from wheretolook.dataset.thresholds import THRESHOLDS
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import Camera, cameras_by_id
@@ -28,7 +26,7 @@ from wheretolook.mapping.sanity import axes_doubt
 from wheretolook.mapping.sources import find_features, find_photographs
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.confine import safe_child
-from wheretolook.utils.errors import ConfigError, MapError, MapWarning
+from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.files import fingerprint
 
 MAX_ERROR_M, MAX_ERROR_DEG = THRESHOLDS[0]  # below both, a photograph counts as localized
@@ -192,29 +190,6 @@ def _fingerprints(model_dir: Path) -> list[str]:
 def folder_of_check(data: Path, name: str) -> Path:
     """Return the folder of a check's results, by its name; ConfigError if it would be outside the folder of checks."""
     return safe_child(safe_child(data, CHECKS, "the folder of all checks"), name, "the name of a check")
-
-
-def find_scene(data: Path, name: str, dataset: str = "") -> SceneFolder:
-    """Find the scene of a name in a dataset, or in the only dataset of a folder that has it.
-
-    Raises ConfigError if there is none, or several datasets have it; TableError if the dataset is damaged.
-    """
-    check_scene_name(data, name, dataset)
-    if dataset:
-        return Dataset.load(data / dataset).scene(name)
-    roots = [path.parent for path in sorted(data.glob("*/dataset.json"))]
-    # datasets without such a folder are not read, so that damaged ones are not in the way
-    having = [
-        one
-        for one in map(Dataset.load, (root for root in roots if (root / name).is_dir()))
-        if name in {scene.name for scene in one.scenes}
-    ]
-    if len(having) == 1:
-        return having[0].scene(name)
-    if having:
-        names = ", ".join(one.name for one in having)
-        raise ConfigError("several datasets have such a scene", value=name, fix=f"Give --name: {names}.")
-    no_such_scene(data, name, roots)
 
 
 def features_of(

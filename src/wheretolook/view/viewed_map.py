@@ -245,8 +245,8 @@ def _labels(files: SceneFolder, camera: int) -> pd.DataFrame | None:
 def open_named_scene(
     data: Path, name: str, dataset: str, camera: Camera | None, weights: Path | None, device: str
 ) -> ViewedMap:
-    """Open the scene of a name in a folder of datasets; raises as `holdout.photo_map.find_scene` and `open_scene`."""
-    from wheretolook.holdout.photo_map import find_scene
+    """Open the scene of a name in a folder of datasets; raises as `dataset.layout.find_scene` and `open_scene`."""
+    from wheretolook.dataset.layout import find_scene
 
     if not data.is_dir():
         fix = "Make a scene first, such as by `wheretolook demo`, or name a model: --map SPARSE."

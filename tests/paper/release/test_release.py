@@ -22,6 +22,7 @@ from wheretolook.commands.label import Label
 from wheretolook.commands.map import Map
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.scenes import Scenes
+from wheretolook.commands.scenes_config import ScenesConfig
 from wheretolook.commands.train import Train
 from wheretolook.commands.train import train_methods as train
 from wheretolook.dataset.layout import Dataset
@@ -29,7 +30,6 @@ from wheretolook.dataset.names import RELEASE, RELEASE_FILE
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.report import score_markdown
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.scenes.scenes_config import ScenesConfig
 from wheretolook.scorers.mlp.network import ViewpointNetwork
 from wheretolook.scorers.set.config import SetConfig
 from wheretolook.tracking.config import TrackingConfig

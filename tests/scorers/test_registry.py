@@ -73,11 +73,11 @@ class Model:
 
 
 def learn(task):
-    from wheretolook.training.learner import Learnt
+    from wheretolook.training.learner import TrainingResult
 
     counts = np.concatenate([scene.read_table()["n_visible"] for scene in task.dataset.split("train")])
     metrics = {"val_average_precision": 0.5}
-    return Learnt(Model(task.dataset.camera, task.options.slope, float(np.median(counts))), metrics, {"n": len(counts)})
+    return TrainingResult(Model(task.dataset.camera, task.options.slope, float(np.median(counts))), metrics, {"n": len(counts)})
 
 
 def build(localization_map, options):

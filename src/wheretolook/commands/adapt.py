@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.commands.holdout_photos import check_name, knows_photographs, leave_photographs_out
+from wheretolook.commands.holdout_photos import check_name, hold_out_photographs, knows_photographs
 from wheretolook.commands.options import LabelOptions, Log, Progress, SceneOptions, ignore_progress
 from wheretolook.commands.preconditions import extractor_of, open_scene, refuse_release
 from wheretolook.dataset.dataset_lock import reading
@@ -124,8 +124,8 @@ class Adapt(SceneOptions, LabelOptions):
                     scene.require_metres()
                 name = check_name(self, files)
                 try:
-                    left_out = _left_out(self, files.map, scene.occlusion, weights, name, log)
-                    views = left_out if views is None else views.joined(left_out)
+                    held_out = _held_out_views(self, files.map, scene.occlusion, weights, name, log)
+                    views = held_out if views is None else views.joined(held_out)
                 except MapError as error:
                     if views is None:
                         raise
@@ -154,13 +154,13 @@ def _adapt_map(options: Adapt, model: Path, weights: Path, log: Log, progress: P
     points = model_arrays(read_model(model)).points
     occlusion = "none" if options.occlusion.model == "none" else "hidden-points"
     environment = ColmapEnvironment(ColmapFiles(model), occlusion=occlusion, device=options.warp_device)
-    views = _left_out(options, model, environment.occlusion, weights, name, log)
+    views = _held_out_views(options, model, environment.occlusion, weights, name, log)
     _check_enough(views, model)
     with hold(path.with_name(f".{path.name}.lock"), "adapt"):
         return _fit(options, _Target(name, "", model, weights, path), views, points, log, progress)
 
 
-def _left_out(
+def _held_out_views(
     options: Adapt, model: Path, occlusion: OcclusionModel, weights: Path, name: str, log: Log
 ) -> LocalizedViews:
     """A map's photographs, left out in blocks: in the folder of its check, so that neither does it again."""
@@ -170,8 +170,8 @@ def _left_out(
     settings = options.adapt
     mesh = occlusion.name == "mesh"
     given = (settings.images, settings.database)
-    source, left_out = leave_photographs_out(options, "adapt", model, name, True, mesh, *given, log, True)
-    return photographed_views(source, left_out, weights, occlusion, options.warp_device)
+    source, held_out = hold_out_photographs(options, "adapt", model, name, True, mesh, *given, log, True)
+    return photographed_views(source, held_out, weights, occlusion, options.warp_device)
 
 
 def _fit(

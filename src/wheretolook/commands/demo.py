@@ -180,7 +180,7 @@ def draw_overview(options: Demo, weights: Path) -> None:
     scores = scorer.score(poses(candidates))
     best, worst = rendered_views(scene, *_ends(candidates, scores), outcome_in_words)
     directions = options.sample.axes()
-    around = scorer.score(poses_looking_along(np.tile(place, (len(directions), 1)), directions))
+    scores = scorer.score(poses_looking_along(np.tile(place, (len(directions), 1)), directions))
     by_height = np.argsort(np.abs(locations[:, 2] - place[2]), kind="stable")
     shown = by_height[np.unique(locations[by_height, :2].round(2), axis=0, return_index=True)[1]]
     drawn = Overview(
@@ -191,7 +191,7 @@ def draw_overview(options: Demo, weights: Path) -> None:
         share_good=shares_good(table)[1][shown],
         place=place,
         directions=directions,
-        scores=around,
+        scores=scores,
         best=best,
         worst=worst,
     )

@@ -8,7 +8,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from wheretolook.commands.holdout_photos import check_name, knows_photographs, leave_photographs_out
+from wheretolook.commands.holdout_photos import check_name, hold_out_photographs, knows_photographs
 from wheretolook.commands.options import LabelOptions, Log, Progress, SceneOptions, ignore_progress
 from wheretolook.commands.preconditions import load_dataset, open_scene
 from wheretolook.dataset.dataset_lock import reading, reads_dataset
@@ -100,7 +100,7 @@ def held_out_photographs(options: Evaluate, dataset: Dataset, log: Log) -> list[
             name = check_name(options, files)
             keep_frame = files.mesh.is_file()
             how = (metric, keep_frame, None, None, log)
-            source, views = leave_photographs_out(options, "evaluate", files.map, name, *how)
+            source, views = hold_out_photographs(options, "evaluate", files.map, name, *how)
             occlusion = open_scene(options, files).occlusion
             held_out.append(evaluated_photographs(files, source, views, occlusion, options.warp_device))
     if not held_out:

@@ -35,7 +35,7 @@ def check_name(options: LabelOptions, files: SceneFolder) -> str:
     return next((name for name in names if (options.data / CHECKS / name).is_dir()), names[0])
 
 
-def leave_photographs_out(
+def hold_out_photographs(
     options: LabelOptions,
     stage: str,
     model: Path,

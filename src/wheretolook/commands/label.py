@@ -176,8 +176,8 @@ def log_labels(
     for row in summary.shares[summary.shares["scene"] == ALL].to_dict("records"):
         prefix = "" if row["split"] == ALL else f"{row['split']}_"
         metrics |= {f"{prefix}{name}": value for name, value in row.items() if name not in ("scene", "split")}
-    opened = start_run(tracking, "all scenes", "label", params, tags={"dataset": dataset.name})
-    with kept_if_not_logged(f"the summary of labels in {folder}", note, seconds or {}), opened as (client, run):
+    run_context = start_run(tracking, "all scenes", "label", params, tags={"dataset": dataset.name})
+    with kept_if_not_logged(f"the summary of labels in {folder}", note, seconds or {}), run_context as (client, run):
         log_to_run(client, run, metrics=metrics)
         for name in (report.LABELS_CSV, report.LABELS_MD, report.LABELS_PNG):
             client.log_artifact(run, str(folder / name))

@@ -230,9 +230,9 @@ def _import_model(options: Map, folder: Path, log: Log, progress: Progress) -> D
             warn_of_mesh(settings.mesh, scene.read_landmarks().points, caster)
             save_glb(loaded, scene.mesh)
         scene.stage_cache("map", key).store()
-        left_out = f", {report.n_landmarks_removed:,} points left out" if report.n_landmarks_removed else ""
+        removed = f", {report.n_landmarks_removed:,} points removed" if report.n_landmarks_removed else ""
         again = ", triangulated again," if report.triangulated_anew else ""
-        found = f"{report.n_landmarks:,} landmarks{again} from {report.n_images} images{left_out}"
+        found = f"{report.n_landmarks:,} landmarks{again} from {report.n_images} images{removed}"
         log(f"{scene.name}: {found} -> {scene.map}")
     scale = read_scale(scene.map)
     assert scale is not None

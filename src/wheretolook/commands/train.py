@@ -115,7 +115,7 @@ def _train(
     from lightning.pytorch.utilities.seed import isolate_rng
 
     from wheretolook.training.fit import RunLog
-    from wheretolook.training.learner import Task
+    from wheretolook.training.learner import TrainingJob
     from wheretolook.training.provenance import TrainedModel, weights_path
     from wheretolook.training.run_record import NOT_LOGGED, kept_metrics, params_of
 
@@ -129,14 +129,14 @@ def _train(
             seed_everything(config.seed, verbose=False)
             options = config.options_of(method)
             run_log = RunLog(tracking, run_id)
-            learnt = method.learn(Task(dataset, method.name, config, options, title, run_log=run_log, **shared))
-            learnt.model.save(path, about)
-            history = "" if learnt.history is None else learnt.history.to_csv(index=False)
-            kept = {NOT_LOGGED: {"params": devices | learnt.counts, "history": history}}
-            record = {"about": about, "weights_sha256": sha256(path), "run_id": "", "metrics": learnt.metrics}
+            result = method.learn(TrainingJob(dataset, method.name, config, options, title, run_log=run_log, **shared))
+            result.model.save(path, about)
+            history = "" if result.history is None else result.history.to_csv(index=False)
+            kept = {NOT_LOGGED: {"params": devices | result.counts, "history": history}}
+            record = {"about": about, "weights_sha256": sha256(path), "run_id": "", "metrics": result.metrics}
             write_json(path.with_suffix(".json"), record | kept)
-            log_to_run(client, run_id, params=learnt.counts, metrics=kept_metrics(learnt.metrics))
-            _log_artifacts(client, run_id, path, learnt.history)
+            log_to_run(client, run_id, params=result.counts, metrics=kept_metrics(result.metrics))
+            _log_artifacts(client, run_id, path, result.history)
             if run_log.failed is not None:
                 raise run_log.failed
         write_json(path.with_suffix(".json"), record | {"run_id": run_id})

@@ -27,8 +27,8 @@ if TYPE_CHECKING:  # pandas and Warp are imported when first needed
     from wheretolook.geometry.mesh import TexturedMesh
     from wheretolook.geometry.tsdf import DepthImage, TsdfVolume
     from wheretolook.inputs.localization_map import LocalizationMap
+    from wheretolook.mapping.colmap_source import ColmapSource
     from wheretolook.mapping.landmarks import Landmarks
-    from wheretolook.mapping.opened_map import OpenedMap
     from wheretolook.rendering.raycasting import MeshRaycaster
     from wheretolook.rendering.types import Renderer
     from wheretolook.space.free_space import FreeSpace
@@ -382,8 +382,8 @@ class ColmapEnvironment(Environment):
         self.config = replace(config, occlusion=replace(config.occlusion, model=name))
 
     @cached_property
-    def _map(self) -> OpenedMap:
-        from wheretolook.mapping.opened_map import open_colmap
+    def _map(self) -> ColmapSource:
+        from wheretolook.mapping.colmap_source import open_colmap
 
         files = self.files
         limit_px = files.max_reprojection_error_px

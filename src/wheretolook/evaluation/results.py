@@ -214,8 +214,8 @@ def log_evaluation(
     metrics |= {"n_locations": views.n_locations, "n_views": len(views.good)}
     metrics["positives"] = float(views.good[:, 0].mean())
     tags = {"dataset": dataset.name, FINGERPRINT_TAG: mark, **best}
-    opened = start_run(tracking, ALL_METHODS, "evaluate", params, tags=tags)
-    with temporary_folder() as folder, opened as (client, run):
+    run_context = start_run(tracking, ALL_METHODS, "evaluate", params, tags=tags)
+    with temporary_folder() as folder, run_context as (client, run):
         log(client, run, metrics=metrics)
         for file in results.iterdir():
             if file.is_file() and file.suffix != ".partial":  # left by a killed process

@@ -72,7 +72,7 @@ def reference_of(scores: pd.DataFrame) -> str:
 def is_random(method: str) -> bool:
     """Whether a method chooses at random, so that its rows hold exact expectations."""
     known = find(method)
-    return known is not None and known.by_chance
+    return known is not None and known.is_random_baseline
 
 
 def is_probability(method: str) -> bool:

@@ -20,7 +20,7 @@ ATTRIBUTES = POSE_ATTRIBUTES + MAP_ATTRIBUTES
 
 OF_SIZE = ("distance", "mapped_distance", "mapped_pixel_size")
 """Attributes that tell how large a scene is, logarithms of metres: they change when it is enlarged. Matching does not
-depend on that, so what learns chances of being found does not look at them unless told to."""
+depend on that, so models of detection probability ignore them by default."""
 
 LANDMARK_CHANNELS = ("mapped_angle", "distance_ratio", *MAP_ATTRIBUTES)
 """Channels of what landmarks are like, on request only: two of `POSE_ATTRIBUTES`, and what the map knows. A bin's mean

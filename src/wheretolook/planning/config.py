@@ -38,7 +38,7 @@ class ViewpointMapConfig(MappedLattice):
         scene: name of the scene; empty for all scenes of the dataset.
         method: method that scores the views. See `wheretolook evaluate --list-methods`; empty for the one that the
             weights are of, or bins if there are none.
-        weights: file of weights that the train stage wrote, for a method that has learnt. Unless a method is named,
+        weights: file of weights that the train stage wrote, for a learned method. Unless a method is named,
             the best of the dataset, or else of those that ship, for cameras with their field of view.
         out: folder to write; empty for `<data>/<name>/<scene>/viewpoint-map`. Only with a scene.
         anywhere: let weights that are adapted to another scene score here, too.
@@ -64,7 +64,7 @@ class PathConfig:
     every metre times one less the score of the views along it.
 
     Args:
-        score_weight: metres that a metre on which no view would localize costs beside its length. The paper's lambda.
+        score_weight: metres that a metre on which no view would localize costs in addition to its length. The paper's lambda.
         turn_weight_m: metres that turning by one radian costs.
         pitch_deg: least and greatest pitch of the optical axis, degrees above the horizon.
         max_turn_deg_per_m: degrees that the camera turns at most while it moves by a metre.
@@ -126,8 +126,8 @@ class PlanConfig(MappedLattice):
         out: folder to write; empty for `<data>/<name>/<scene>/path`.
         method: method that scores the views; forward for the shortest path, looking ahead. Empty as for the viewpoint
             map.
-        weights: file of weights, for a method that has learnt; by default the best there are.
-        against: further methods to plan by, drawn beside it. Such as forward and fisher-trace-gp; in `methods.png`.
+        weights: file of weights, for a learned method; by default the best there are.
+        against: further methods to plan by, drawn for comparison. Such as forward and fisher-trace-gp; in `methods.png`.
         film: kind of film to make: gif, mp4 or none.
         rerun: write a recording for the Rerun viewer too. Needs `pip install rerun-sdk`.
         anywhere: let weights that are adapted to another scene score here, too.

@@ -38,7 +38,7 @@ def plan_by_methods(
     method's must be.
 
     Methods are "forward", or names of scorers; empty for that of the weights, or bins without. `config` has weights for
-    methods that have learnt, if they are of their kind (`resolve_weights`). Returns paths by the names of their methods, in
+    learned methods, if they are of their kind (`resolve_weights`). Returns paths by the names of their methods, in
     the order given. Raises ConfigError if a method needs weights or there is none of that name, or the last cannot
     stop; PlanningError if no path can be found.
     """

@@ -58,7 +58,7 @@ def refine_directions(
     scores = start_scores.copy()
     n_scored = len(start)
     while len(active := np.flatnonzero(step_deg >= last_step_deg)):
-        candidates = _around(current[active], step_deg[active])
+        candidates = _neighbour_directions(current[active], step_deg[active])
         candidates = _within(candidates, start[active, None], max_angle_deg)
         values = scorer.score(poses_looking_along(np.repeat(at[active], 8, axis=0), candidates.reshape(-1, 3)))
         n_scored += len(values)
@@ -73,7 +73,7 @@ def refine_directions(
     return RefinedViews(current, scores, start_scores, n_scored)
 
 
-def _around(axes: Float, step_deg: Float) -> Float:
+def _neighbour_directions(axes: Float, step_deg: Float) -> Float:
     """Return eight unit vectors (B, 8, 3) at angles of `step_deg` (B,) around axes (B, 3)."""
     smallest = np.eye(3)[np.abs(axes).argmin(axis=1)]  # a coordinate axis that is not parallel to the axis
     u = np.cross(axes, smallest)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from wheretolook.geometry.camera import Camera
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.scorers.base import Scorer
-    from wheretolook.training.learner import Learnt, Task
+    from wheretolook.training.learner import TrainingJob, TrainingResult
 
 Group = Literal["learned", "rules", "Fisher", "probes"]
 """Groups of methods in figures. Probes test a Fisher field: they choose the views that it ranks last."""
@@ -63,12 +63,12 @@ class Method:
     position: int = 1000  # in tables and lists
     family: str = ""  # name that stands for all methods of the family in options
     probability: bool = False  # whether its score is the probability that a view localizes
-    by_chance: bool = False  # whether it is a random baseline, evaluated by its exact expectation
+    is_random_baseline: bool = False  # whether it is a random baseline, evaluated by its exact expectation
     only_if_named: bool = False  # whether an evaluation includes it only by name
     of_the_few: bool = False  # whether summary figures show it: of a family, the first that is evaluated
     fallback: bool = False  # whether it scores viewpoint maps where neither a method nor weights are given
     reference: int = 0  # of the learned methods evaluated, the highest is the one others are compared with
-    learn: Callable[[Task], Learnt] | None = None  # trains it
+    learn: Callable[[TrainingJob], TrainingResult] | None = None  # trains it
     config: type | None = None  # frozen dataclass of its training options, with defaults
     folder: str = ""  # group of these options in `train`; methods with the same folder share them
     settings: Mapping[str, Any] = field(default_factory=dict)  # options it overrides

@@ -59,7 +59,7 @@ METHODS = (
         MethodStyle("random", "#999999", "x", ":"),
         build=_build,
         position=0,
-        by_chance=True,
+        is_random_baseline=True,
         of_the_few=True,
     ),
 )

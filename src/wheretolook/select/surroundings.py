@@ -73,14 +73,14 @@ def usable_waypoints(localization_map: LocalizationMap, waypoints: Waypoints, sk
     bad = outside | inside
     if not bad.any() or (skip and not bad.all()):
         return np.asarray(~bad)
-    told = []
+    problems = []
     for row in np.flatnonzero(bad)[:LISTED]:
         why = f"{nearest[row]:.3g} m from all landmarks and cameras" if outside[row] else "inside geometry"
-        told.append(f"{waypoints.where(row)} {why}")
+        problems.append(f"{waypoints.where(row)} {why}")
     more = f", and {bad.sum() - LISTED} more" if bad.sum() > LISTED else ""
     problem = f"{bad.sum()} of {len(waypoints)} waypoints lie outside the map or inside geometry"
     low, high = np.quantile(landmarks.points, (0.01, 0.99), axis=0)
     box = " to ".join("(" + ", ".join(_short(x) for x in corner) + ")" for corner in (low, high))
     fix = f"The map's landmarks lie within {box}, in its unit: check unit and axes"
     fix += "." if bad.all() else ", or leave these out: --skip, in Python skip=True."
-    raise TableError(problem, path=waypoints.path, value="; ".join(told) + more, fix=fix)
+    raise TableError(problem, path=waypoints.path, value="; ".join(problems) + more, fix=fix)

@@ -142,12 +142,12 @@ class WhereToLook:
             EnvironmentConfig(occlusion_cache_bytes=OCCLUSION_CACHE_BYTES),
             device,
         )
-        around = environment.localization_map
-        weights = resolve_weights(method, weights, around.landmarks.features)
+        localization_map = environment.localization_map
+        weights = resolve_weights(method, weights, localization_map.landmarks.features)
         if method:
-            scorer = make_scorer(method, around, weights=weights, anywhere=anywhere)
+            scorer = make_scorer(method, localization_map, weights=weights, anywhere=anywhere)
         else:
-            scorer = load_scorer(str(weights), around, anywhere=anywhere)
+            scorer = load_scorer(str(weights), localization_map, anywhere=anywhere)
         return cls(scorer, axes, environment.space)
 
     @property
@@ -208,7 +208,7 @@ class WhereToLook:
         waypoints = Waypoints.of(points, ids)
         rows = np.flatnonzero(usable_waypoints(self.localization_map, waypoints, request.skip))
         at = waypoints.points[rows]
-        scores = self._scores_around(at, axes, progress)
+        scores = self._candidate_scores(at, axes, progress)
         if looks is not None and max_turn_deg is not None and request.least_score is not None:
             stops = StopConfig(int(looks), request.least_score)
             self.views = self._sequence_with_stops(waypoints, rows, axes, scores, max_turn_deg, stops, progress)
@@ -299,7 +299,7 @@ class WhereToLook:
             set_score=set_score,
         )
 
-    def _scores_around(self, locations: Float, axes: Float, progress: bool) -> Float:
+    def _candidate_scores(self, locations: Float, axes: Float, progress: bool) -> Float:
         """Scores (L, D) of all directions (D, 3) at locations (L, 3)."""
         kind = self.localization_map.device.partition(":")[0]
         scores = np.empty((len(locations), len(axes)))

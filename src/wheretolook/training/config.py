@@ -19,7 +19,7 @@ class SharedConfig:
     Args:
         methods: what to train, by name or family, such as set and mlp. See `wheretolook evaluate --list-methods`; and
             "matchability", which tells which landmarks will be found (needs labels with `--label.store_matches true`).
-        also: further datasets in the same folder whose train scenes are learnt from as well.
+        also: further datasets in the same folder whose train scenes are trained on as well.
         max_error_m: a viewpoint is positive if its position error is strictly smaller, in metres.
         max_error_deg: and if its orientation error is strictly smaller, in degrees.
         val_fraction: share of each training scene's locations held out for validation. Only when the dataset has no

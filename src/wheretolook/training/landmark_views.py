@@ -24,7 +24,7 @@ from wheretolook.training.batches import Batch, IndexBatches, TensorViews
 from wheretolook.training.config import SharedConfig
 from wheretolook.training.data import ViewsDataModule, labelled_rows, validation_views
 from wheretolook.training.fit import home_device
-from wheretolook.training.learner import Task
+from wheretolook.training.learner import TrainingJob
 from wheretolook.training.scenes import training_scenes
 from wheretolook.training.training_range import TrainingRange, camera_quantities, view_quantities
 
@@ -216,7 +216,7 @@ class LandmarkDataModule(ViewsDataModule):
     train_rows: Tensor
     val_rows: Tensor
 
-    def __init__(self, task: Task, max_landmarks: int, matches: bool = False) -> None:
+    def __init__(self, task: TrainingJob, max_landmarks: int, matches: bool = False) -> None:
         super().__init__()
         self.config = task.config
         self.options = task.options

@@ -28,7 +28,7 @@ class Model(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Learnt:
+class TrainingResult:
     """The result of training."""
 
     model: Model  # to be saved
@@ -39,7 +39,7 @@ class Learnt:
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
+class TrainingJob:
     """What to train, on which data, with which options."""
 
     dataset: Dataset  # labelled train scenes, and val scenes if it has any
@@ -60,7 +60,7 @@ class Task:
 
 
 def fit_network(
-    network: nn.Module, data: LightningDataModule, task: Task, class_weights: tuple[float, float] = (1.0, 1.0)
+    network: nn.Module, data: LightningDataModule, task: TrainingJob, class_weights: tuple[float, float] = (1.0, 1.0)
 ) -> tuple[dict[str, float], pd.DataFrame]:
     """Train a network, which then holds the kept weights. Return their metrics and those of all epochs."""
     classifier = ViewpointClassifier(network, task.options, class_weights, task.config.seed)

@@ -96,7 +96,7 @@ class TrainingRange:
     def complaint(self, quantities: Float, tolerated: float = 0.0) -> str:
         """What is unlike the views learnt from, in words; "" if no more than this share of the views that see anything.
 
-        Each quantity is told by its median over the views where it is outside.
+        Each quantity is reported by its median over the views where it is outside.
         """
         seeing = quantities[_have_landmarks(quantities)]
         outside = self.outside(seeing)

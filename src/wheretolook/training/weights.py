@@ -38,7 +38,7 @@ def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     Raises a WeightsError if the file is missing, damaged, of another program or of another version.
     """
     header = read_header(path)
-    with _opened(path, "pt") as file:
+    with _open_tensors(path, "pt") as file:
         names = file.keys()  # the file is no dict, whatever it looks like
         tensors = {name: file.get_tensor(name) for name in names}
     for name, tensor in tensors.items():
@@ -55,7 +55,7 @@ def read_header(path: Path) -> dict[str, Any]:
     """Return the header of a weights file, without loading its tensors or torch; raises as `read_weights`."""
     if not path.is_file():
         raise WeightsError("there are no weights", path=path, fix="Run the train command first, or correct the path.")
-    with _opened(path, "np") as file:
+    with _open_tensors(path, "np") as file:
         metadata = file.metadata() or {}
     if METADATA_KEY not in metadata:
         fix = "Give weights that the train command wrote."
@@ -73,7 +73,7 @@ def read_header(path: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def _opened(path: Path, framework: str) -> Iterator[Any]:
+def _open_tensors(path: Path, framework: str) -> Iterator[Any]:
     try:
         with safe_open(path, framework=framework) as file:
             yield file
@@ -108,14 +108,14 @@ def read_record(path: str | Path) -> dict[str, Any]:
 
     Raises a WeightsError if it is missing or damaged.
     """
-    beside = Path(path).with_suffix(".json")
+    record_path = Path(path).with_suffix(".json")
     try:
-        record = read_json_object(beside)
+        record = read_json_object(record_path)
         float(record["metrics"]["val_average_precision"])
         return record | {"about": dict(record["about"])}
     except (OSError, ValueError, TypeError, KeyError) as error:
         problem = f"the record of training is missing or damaged: {error}"
-        raise WeightsError(problem, path=beside, fix="Train again.") from error
+        raise WeightsError(problem, path=record_path, fix="Train again.") from error
 
 
 def preference(path: str | Path) -> tuple[bool, float]:

@@ -36,7 +36,7 @@ from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import start_run
 from wheretolook.training.fit import RunLog
-from wheretolook.training.learner import Task
+from wheretolook.training.learner import TrainingJob
 from wheretolook.training.provenance import weights_path
 from wheretolook.training.scenes import with_also
 
@@ -103,7 +103,7 @@ def of_set_network(dataset: Dataset, args: argparse.Namespace, tracking: Trackin
     """Train the set network under other conditions, on views that are described once."""
     table = Table(args.out / f"{args.part}.csv")
     log = RunLog(tracking, "")
-    task = Task(dataset, "set", TrainConfig(methods=("set",)), SetConfig(), "set", args.progress, log)
+    task = TrainingJob(dataset, "set", TrainConfig(methods=("set",)), SetConfig(), "set", args.progress, log)
     data = SetDataModule(task)
     whole = data.train_rows
     conditions: list[tuple[str, dict[str, Any], torch.Tensor]] = []

@@ -8,7 +8,7 @@ METHODS = (
     Method(
         position=120,
         name="adapted",
-        about="The set network adapted to one place: calibrated there and told where it was wrong.",
+        about="The set network adapted to one scene: calibrated, and corrected by pose.",
         style=MethodStyle("adapted to the place", "#882255", "P", "-"),
         group="learned",
         build=imported("wheretolook.scorers.adapted.score:adapted_scorer"),

@@ -16,7 +16,7 @@ class AdaptConfig:
         scene: name of the scene; may be left out where the dataset has one only.
         map: instead of a scene: folder of a COLMAP model, in metres with z up, whose photographs are left out.
         images: folder of the map's photographs, to extract their features anew.
-        database: features that the map was made from: COLMAP's `database.db`, or hloc's in HDF5. Empty for those beside
+        database: features that the map was made from: COLMAP's `database.db`, or hloc's in HDF5. Empty for those next to
             the map.
         weights: file of weights of `set` to start from; empty for those that ship.
         out: file of weights to write; empty for `<data>/<name>/adapted/<scene>.safetensors`, of a map

@@ -10,7 +10,7 @@ from torch import Tensor
 from wheretolook.scorers.matchability.network import MatchabilityNetwork
 from wheretolook.training.batches import Batch, IndexBatches
 from wheretolook.training.landmark_views import DISTANCES, LandmarkDataModule, random_log_scales
-from wheretolook.training.learner import Learnt, Task, class_counts, fit_network, fit_platt, predict
+from wheretolook.training.learner import TrainingJob, TrainingResult, class_counts, fit_network, fit_platt, predict
 from wheretolook.training.trained_network import TrainedNetwork
 
 
@@ -41,7 +41,7 @@ class SingleLandmarkBatches(IndexBatches):
 class MatchabilityDataModule(LandmarkDataModule):
     """Visible landmarks of a dataset's labelled viewpoints; a TableError if their matches are not stored."""
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: TrainingJob) -> None:
         super().__init__(task, task.options.landmarks, matches=True)
 
     @property
@@ -63,7 +63,7 @@ class MatchabilityDataModule(LandmarkDataModule):
         return SingleLandmarkBatches(*data, size, shuffle_seed, self.share, max_scale=self.options.enlarged)
 
 
-def learn_matchability(task: Task) -> Learnt:
+def learn_matchability(task: TrainingJob) -> TrainingResult:
     """Train a `MatchabilityNetwork` on the matches that are stored with a dataset's labels.
 
     Raises a TableError if there is no train scene, no labels, or no stored matches.
@@ -74,4 +74,4 @@ def learn_matchability(task: Task) -> Learnt:
     logits, detected = predict(network, data)
     counts = class_counts(train=data.detected.cpu()[data.entries(data.train_rows)].numpy(), val=detected)
     model = TrainedNetwork(task.method, network, task.camera, *fit_platt(logits, detected), data.training_range)
-    return Learnt(model, metrics, counts, history)
+    return TrainingResult(model, metrics, counts, history)

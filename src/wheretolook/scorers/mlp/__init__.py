@@ -9,12 +9,12 @@ from wheretolook.scorers.method import Method, MethodStyle, imported, network_sc
 from wheretolook.scorers.mlp.config import RELEASED_SETTINGS, MlpConfig
 
 if TYPE_CHECKING:
-    from wheretolook.training.learner import Learnt, Task
+    from wheretolook.training.learner import TrainingJob, TrainingResult
 
 
 def _network(inputs: str, style: MethodStyle, channels: tuple[str, ...], **fields: Any) -> Method:
-    def learn(task: Task) -> Learnt:
-        result: Learnt = imported("wheretolook.scorers.mlp.learn:learn_mlp")(task, channels)
+    def learn(task: TrainingJob) -> TrainingResult:
+        result: TrainingResult = imported("wheretolook.scorers.mlp.learn:learn_mlp")(task, channels)
         return result
 
     name = f"mlp-{inputs}"

@@ -7,14 +7,14 @@ from wheretolook.scorers.mlp.config import MlpConfig
 from wheretolook.scorers.mlp.network import NetworkSpec, ViewpointNetwork
 from wheretolook.training.data import ViewpointDataModule
 from wheretolook.training.fit import home_device
-from wheretolook.training.learner import Learnt, Task, class_counts, fit_network
+from wheretolook.training.learner import TrainingJob, TrainingResult, class_counts, fit_network
 from wheretolook.training.trained_network import TrainedNetwork
 
 KEPT = "binned views"
-"""What one network leaves for the next in `Task.kept`: the views, with the options that they were made by."""
+"""What one network leaves for the next in `TrainingJob.kept`: the views, with the options that they were made by."""
 
 
-def learn_mlp(task: Task, channels: tuple[str, ...]) -> Learnt:
+def learn_mlp(task: TrainingJob, channels: tuple[str, ...]) -> TrainingResult:
     """The paper's network over these channels from a dataset's train scenes; raises as `load_views`."""
     data = _views(task, channels)
     options = task.options
@@ -26,10 +26,10 @@ def learn_mlp(task: Task, channels: tuple[str, ...]) -> Learnt:
     labels = data.views.labels.cpu()
     counts = class_counts(train=labels[data.train_rows].numpy(), val=labels[data.val_rows].numpy())
     model = TrainedNetwork(task.method, network.cpu(), task.dataset.camera, training_range=data.training_range)
-    return Learnt(model, metrics, counts, history)
+    return TrainingResult(model, metrics, counts, history)
 
 
-def _views(task: Task, channels: tuple[str, ...]) -> ViewpointDataModule:
+def _views(task: TrainingJob, channels: tuple[str, ...]) -> ViewpointDataModule:
     """The dataset's views: those of the network before, if they were made by the same options and have the channels."""
     options: MlpConfig = task.options
     known: ViewpointDataModule | None = task.kept.get(KEPT)

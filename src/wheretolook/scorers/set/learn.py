@@ -13,7 +13,7 @@ from wheretolook.scorers.set.config import SetConfig
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.data import check_classes
 from wheretolook.training.landmark_views import LandmarkBatches, LandmarkDataModule
-from wheretolook.training.learner import Learnt, Task, class_counts, fit_network, fit_platt, predict
+from wheretolook.training.learner import TrainingJob, TrainingResult, class_counts, fit_network, fit_platt, predict
 from wheretolook.training.provenance import weights_path
 from wheretolook.training.scenes import training_scenes
 from wheretolook.training.trained_network import TrainedNetwork
@@ -27,7 +27,7 @@ MIN_STEPS = 600  # of all epochs
 class SetDataModule(LandmarkDataModule):
     """The labelled viewpoints of a dataset by their landmarks; a TableError if the labels of a split are of one class."""
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: TrainingJob) -> None:
         matches = task.options.landmark_loss > 0 and all(has_matches(s.table) for s in training_scenes(task.dataset))
         super().__init__(task, WINDOWS * task.options.landmarks, matches)
         positive = (self.views.labels > 0).numpy()
@@ -58,7 +58,7 @@ def of_size(options: SetConfig, n_train: int) -> SetConfig:
     return replace(options, batch_size=batch_size, epochs=max(options.epochs, enough))
 
 
-def learn_set(task: Task, data: SetDataModule | None = None) -> Learnt:
+def learn_set(task: TrainingJob, data: SetDataModule | None = None) -> TrainingResult:
     """Train a set network on a dataset's labels, or on views that are described already.
 
     Detection of landmarks is trained with it: on stored matches, if all tables have them, and through the labels. If the
@@ -83,4 +83,4 @@ def learn_set(task: Task, data: SetDataModule | None = None) -> Learnt:
     logits, labels = predict(network, data)
     counts = class_counts(train=data.views.labels[data.train_rows].cpu().numpy(), val=labels)
     model = TrainedNetwork(task.method, network, task.camera, *fit_platt(logits, labels), data.training_range)
-    return Learnt(model, metrics, counts, history)
+    return TrainingResult(model, metrics, counts, history)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from wheretolook.training.data import check_classes, validation_views
 from wheretolook.training.fit import home_device
-from wheretolook.training.learner import Learnt, Task, class_counts, fit_network, fit_platt, predict
+from wheretolook.training.learner import TrainingJob, TrainingResult, class_counts, fit_network, fit_platt, predict
 from wheretolook.training.scenes import training_scenes
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook_paper.scorers.sphere.network import SphereNetwork
 from wheretolook_paper.scorers.sphere.views import SphereDataModule, load_sphere_views
 
 
-def learn_sphere(task: Task) -> Learnt:
+def learn_sphere(task: TrainingJob) -> TrainingResult:
     """A `SphereNetwork` from a dataset's train scenes, calibrated on the validation views.
 
     Raises a TableError if there is no train scene, no labels, or labels of one class only; a MapError if a scene's
@@ -29,4 +29,4 @@ def learn_sphere(task: Task) -> Learnt:
     network = SphereNetwork(task.options)
     metrics, history = fit_network(network, data, task)
     model = TrainedNetwork(task.method, network, dataset.camera, *fit_platt(*predict(network, data)))
-    return Learnt(model, metrics, class_counts(train=labels[~held_out], val=labels[held_out]), history)
+    return TrainingResult(model, metrics, class_counts(train=labels[~held_out], val=labels[held_out]), history)

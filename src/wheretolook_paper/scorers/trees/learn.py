@@ -21,7 +21,7 @@ from wheretolook.geometry.poses import Float
 from wheretolook.inputs.landmark_features import LandmarkDescriber
 from wheretolook.training.data import check_classes, labelled_rows, validation_views
 from wheretolook.training.fit import home_device
-from wheretolook.training.learner import Learnt, Task, class_counts, fit_platt
+from wheretolook.training.learner import TrainingJob, TrainingResult, class_counts, fit_platt
 from wheretolook.training.scenes import training_scenes
 from wheretolook.training.training_range import QUANTITIES, TrainingRange, camera_quantities, view_quantities
 from wheretolook.training.weights import check_method_of_weights, read_weights, write_weights
@@ -138,7 +138,7 @@ def load_pooled(
     return PooledViews(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def learn_trees(task: Task) -> Learnt:
+def learn_trees(task: TrainingJob) -> TrainingResult:
     """Fit boosted trees to a dataset's train scenes; see `fit_trees`.
 
     Raises a TableError if there is no train scene, no labels, or labels of one class only.
@@ -153,7 +153,7 @@ def learn_trees(task: Task) -> Learnt:
     check_classes(dataset, config, train.labels, val.labels)
     trees, metrics = fit_trees(train, val, task.camera, task.options, config.seed)
     trees = replace(trees, training_range=TrainingRange.of(train.quantities))
-    return Learnt(trees, metrics, class_counts(train=train.labels, val=val.labels))
+    return TrainingResult(trees, metrics, class_counts(train=train.labels, val=val.labels))
 
 
 def fit_trees(

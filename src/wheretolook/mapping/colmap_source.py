@@ -12,7 +12,7 @@ from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.sanity import warn_of_frame
 
 
-class OpenedMap(NamedTuple):
+class ColmapSource(NamedTuple):
     """Parts of a COLMAP model in metres with z up."""
 
     landmarks: Landmarks
@@ -26,7 +26,7 @@ def open_colmap(
     database: str | Path | None = None,
     max_reprojection_error_px: float | None = None,
     device: str = "cpu",
-) -> OpenedMap:
+) -> ColmapSource:
     """Read a COLMAP model; arguments, errors and warnings are those of `LocalizationMap.from_colmap`.
 
     Without a database neither torch nor Warp is loaded, which takes longer than to read a map of 200,000 landmarks.
@@ -37,4 +37,4 @@ def open_colmap(
     warn_of_frame(model, landmarks.mapping_distance_m, poses)
     if camera is None or isinstance(camera, int):
         camera = camera_of_model(found, Path(model), camera)
-    return OpenedMap(landmarks, camera, compact_poses(poses))
+    return ColmapSource(landmarks, camera, compact_poses(poses))

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.ranking import CandidateViews, choose_at_random, choose_best, choose_by_truth, rank_views
+from wheretolook.evaluation.ranking import CandidateViews, choose_at_random, choose_best, choose_oracle, rank_views
 from wheretolook.evaluation.scores import reference_method, score_table
 from wheretolook.utils.errors import ConfigError
 
@@ -67,15 +67,15 @@ def test_ties_do_not_depend_on_the_order_of_rows() -> None:
 
 
 def test_oracle_by_hand() -> None:
-    np.testing.assert_array_equal(choose_by_truth(HAND, 1).good, [[1, 1], [0, 0], [1, 1]])
-    np.testing.assert_array_equal(choose_by_truth(HAND, 2).good, [[2, 2], [0, 0], [1, 2]])
+    np.testing.assert_array_equal(choose_oracle(HAND, 1).good, [[1, 1], [0, 0], [1, 1]])
+    np.testing.assert_array_equal(choose_oracle(HAND, 2).good, [[2, 2], [0, 0], [1, 2]])
 
 
 def test_nothing_beats_the_oracle() -> None:
     rng = np.random.default_rng(0)
     views = random_views(rng)
     for n in (1, 2, 5, 20):
-        oracle = choose_by_truth(views, n).good
+        oracle = choose_oracle(views, n).good
         truth = choose_best(views, rank_views(views, views.good.sum(1).astype(float)), n).good
         np.testing.assert_array_equal(truth, oracle)  # nested thresholds: one order is best by all of them
         assert np.all(choose_best(views, rank_views(views, rng.random(len(views.location))), n).good <= oracle)

@@ -45,7 +45,7 @@ def test_only_what_the_other_place_lacks_is_its_own():
     likeness = PoseAmbiguity(points)
     assert likeness.unique_support(room, here, there) == likeness.unique_support(copy, there, here) == 0
     # 2 m of the column, in cubes of 0.25 m whose corners lie at multiples of that: the last point is in a ninth
-    assert likeness.unique_support(column, here, there) == likeness.count_locations(column) == 9
+    assert likeness.unique_support(column, here, there) == likeness.count_voxels(column) == 9
     # a turn of half a circle: the room is alike, the column is where there is nothing
     turned = poses_looking_along([[-0.4, 0.7, 0.1]], [[-1.0, -0.4, 0.0]])[0]
     assert likeness.unique_support(column, here, turned) == 9

@@ -10,7 +10,7 @@ import pytest
 
 from wheretolook.features.descriptors import quantize_descriptors, unit_descriptors
 from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks, nearest_other_cosine
+from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks, max_cosine_to_other
 from wheretolook.utils.errors import MapError, MapWarning
 
 # Three cameras on a line, 2 m apart, that look along +y; two intrinsics. Points in front of them.
@@ -138,7 +138,7 @@ def test_ambiguity_against_brute_force(n):
     rows = np.unique(np.linspace(0, n - 1, 200).astype(int))
     cosine = unit[rows] @ unit.T
     cosine[np.arange(len(rows)), rows] = -1
-    ambiguity = nearest_other_cosine(descriptors)
+    ambiguity = max_cosine_to_other(descriptors)
     np.testing.assert_allclose(ambiguity[rows], cosine.max(1), atol=1e-6)
     assert ambiguity[0] == ambiguity[-1] == pytest.approx(1, abs=1e-6)
 

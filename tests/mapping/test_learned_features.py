@@ -14,7 +14,7 @@ from wheretolook.features.descriptors import unit_descriptors
 from wheretolook.features.registry import all_kinds
 from wheretolook.mapping.colmap_model import model_arrays
 from wheretolook.mapping.feature_files import read_features
-from wheretolook.mapping.landmarks import Landmarks, features_of, load_colmap_landmarks
+from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks, read_feature_name
 from wheretolook.mapping.triangulation import fill_database, match_pairs
 from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.processes import WorkerPool
@@ -80,7 +80,7 @@ def test_learned_descriptors_are_read_and_averaged(tmp_path, kind, source):
     for compact in (False, True):
         landmarks.save(tmp_path / "landmarks.npz", compact)
         again = Landmarks.load(tmp_path / "landmarks.npz")
-        assert again.features == features_of(tmp_path / "landmarks.npz") == kind.name
+        assert again.features == read_feature_name(tmp_path / "landmarks.npz") == kind.name
         assert (again.descriptors is None) == compact
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -16,7 +16,7 @@ from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import model_arrays, read_model
 from wheretolook.mapping.landmarks import load_colmap_landmarks
-from wheretolook.mapping.sanity import axes_doubt, scale_doubt
+from wheretolook.mapping.sanity import scale_warning, up_axis_warning
 from wheretolook.utils.errors import MapError, MapWarning
 
 pytestmark = pytest.mark.filterwarnings("error::wheretolook.utils.errors.MapWarning")
@@ -198,12 +198,12 @@ def test_scale_and_axes_are_doubted_where_they_are_implausible():
     poses = walk_in_a_room()
     centers = camera_centers(poses)
     for distance_m in (0.5, 2.5, 30.0):
-        assert scale_doubt(np.full(100, distance_m), centers) == ""
-    assert scale_doubt(np.full(100, 37 * 2.5), 37 * centers) and scale_doubt(np.full(100, 2.5 / 37), centers / 37)
-    assert scale_doubt(np.full(100, 20.0), 50 * centers)  # cameras 7.6 m apart
-    assert scale_doubt(np.full(100, 2.5), centers[:1]) == ""  # one camera has no distance from others
-    assert axes_doubt(poses) == ""
+        assert scale_warning(np.full(100, distance_m), centers) == ""
+    assert scale_warning(np.full(100, 37 * 2.5), 37 * centers) and scale_warning(np.full(100, 2.5 / 37), centers / 37)
+    assert scale_warning(np.full(100, 20.0), 50 * centers)  # cameras 7.6 m apart
+    assert scale_warning(np.full(100, 2.5), centers[:1]) == ""  # one camera has no distance from others
+    assert up_axis_warning(poses) == ""
     for turn in ([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.diag([1, -1, -1])):
-        assert axes_doubt(np.concatenate([poses[:, :, :3] @ np.array(turn, float).T, poses[:, :, 3:]], axis=2))
+        assert up_axis_warning(np.concatenate([poses[:, :, :3] @ np.array(turn, float).T, poses[:, :, 3:]], axis=2))
     above = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0), [30.0]), -1).reshape(-1, 3)
-    assert axes_doubt(poses_looking_along(above, np.tile([1e-3, 0, -1.0], (25, 1)))) == ""  # looking down
+    assert up_axis_warning(poses_looking_along(above, np.tile([1e-3, 0, -1.0], (25, 1)))) == ""  # looking down

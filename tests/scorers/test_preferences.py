@@ -12,7 +12,7 @@ from wheretolook.features.descriptors import quantize_descriptors
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks, nearest_other_cosine
+from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks, max_cosine_to_other
 from wheretolook.scorers.base import Scorer
 from wheretolook.weights.resolve import load_scorer
 
@@ -58,7 +58,7 @@ def two_walls(n: int, seed: int) -> Landmarks:
         mapping_distance_m=on_both(rng.uniform(1.5, 3.0, n)),
         mapping_distance_spread=on_both(rng.uniform(0, 0.2, n)),
         descriptors=None,
-        ambiguity=nearest_other_cosine(descriptors),
+        ambiguity=max_cosine_to_other(descriptors),
     )
 
 

@@ -239,7 +239,7 @@ def test_other_datasets_are_learnt_from_too(dataset: Dataset, store: str) -> Non
     (again,) = train(dataset, config, tracking, progress=False)
     (without,) = train(dataset, changed(config, also=()), tracking, progress=False)
     assert again.reused and not without.reused
-    with pytest.raises(TableError, match=r"nowhere.*no dataset"):
+    with pytest.raises(TableError, match="nowhere"):
         train(dataset, changed(config, also=("nowhere",)), tracking, progress=False)
     elsewhere = Dataset(dataset.root.parent / "moved" / "tiny", dataset.scenes)  # without the other one
     assert was_trained_on(elsewhere, about)

@@ -54,11 +54,11 @@ class Scenes(DatasetOptions):
             return fuse_recording(self, self.scenes.rgbd, log, progress)
         keys: dict[SceneFolder, str] = {}
         sources: dict[SceneFolder, MakeMesh] = {}
-        for scene, make, made_from in [*self._generated(), *self._loaded()]:
+        for scene, make, cache_inputs in [*self._generated(), *self._loaded()]:
             if scene.name in {other.name for other in sources}:
                 raise SceneError("two scenes have the same name", path=self.root, value=scene.name, fix="Give a name.")
             sources[scene] = make
-            keys[scene] = cache_key("scenes", made_from)
+            keys[scene] = cache_key("scenes", cache_inputs)
         for scene, make in sources.items():
             if scene.stage_cache("scenes", keys[scene]).is_current(scene.mesh):
                 log(f"{scene.name}: reusing {scene.mesh}")
@@ -90,7 +90,7 @@ class Scenes(DatasetOptions):
         return SceneFolder(safe_child(self.root, name, "a scene's name"), split, self.camera.camera)
 
     def _with_scans(self, made: tuple[SceneFolder, ...]) -> Dataset:
-        """Return the dataset of the scenes made and of the scans that it had; samples of other cameras are forgotten."""
+        """Return the dataset of the scenes made and of the scans that it had; clear the sample cache of scenes whose camera changed."""
         if not (self.root / "dataset.json").is_file():
             return Dataset(self.root, made)
         before = Dataset.load(self.root).scenes
@@ -106,7 +106,7 @@ class Scenes(DatasetOptions):
 
 
 def save_scene(scene: SceneFolder, make: MakeMesh, key: str, log: Log) -> None:
-    """Make a scene's mesh and write it; results of an earlier mesh or recording are forgotten first."""
+    """Make a scene's mesh and write it; results of an earlier mesh or recording are cleared first."""
     from wheretolook.scenes.loading import save_glb
 
     mesh, mapped = make()

@@ -33,7 +33,7 @@ STAGES = ("scenes", "map", "sample", "label")
 """Stages that work scene by scene, in order; the names in `stages.json`."""
 
 MappedFloor = tuple[tuple[float, float, float, float], ...]
-"""The floor that a map is made from: rectangles (x0, y0, x1, y1) in metres; empty for all of it."""
+"""Regions of the floor that the mapping images cover: rectangles (x0, y0, x1, y1) in metres; empty for the whole floor."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class SceneFolder:
     folder: Path  # `<data>/<dataset>/<scene>`
     split: Split  # the whole scene belongs to it
     camera: Camera = PinholeCamera()  # of all viewpoints, unless they name one of `cameras.txt`
-    own_camera: bool = False  # it is the map's camera, which default settings keep
+    own_camera: bool = False  # the camera is that of the COLMAP model, kept unless another one is configured
 
     @property
     def name(self) -> str:
@@ -100,7 +100,7 @@ class SceneFolder:
 
     @property
     def occlusion(self) -> Path:
-        """Which landmark each sampled location has a free line of sight to."""
+        """Unoccluded landmarks of each sampled location."""
         return self.folder / "occlusion.npz"
 
     @property
@@ -115,7 +115,7 @@ class SceneFolder:
 
     @property
     def is_photographed(self) -> bool:
-        """Whether the scene is known from photographs alone, or a model of such.
+        """Whether the scene is mapped from photographs, without a mesh.
 
         Raises MapError if it has no mesh, and its map's report is damaged.
         """
@@ -220,15 +220,15 @@ class Dataset:
         """The camera of all scenes. Raises ConfigError if there are several, or none."""
         if len(self.cameras) != 1:
             fix = "Use a method that serves every camera, such as set, or a dataset of one camera."
-            raise ConfigError("this dataset has not one camera", path=self.root, value=len(self.cameras), fix=fix)
+            raise ConfigError("the dataset has no camera, or several", path=self.root, value=len(self.cameras), fix=fix)
         return self.cameras[0]
 
     @property
     def features(self) -> str:
         """Name of the features of all its maps; "" if they differ, or there is no map. Raises MapError if damaged."""
-        from wheretolook.mapping.landmarks import features_of
+        from wheretolook.mapping.landmarks import read_feature_name
 
-        names = {features_of(scene.landmarks) for scene in self.scenes if scene.landmarks.is_file()}
+        names = {read_feature_name(scene.landmarks) for scene in self.scenes if scene.landmarks.is_file()}
         return names.pop() if len(names) == 1 else ""
 
     @property
@@ -292,7 +292,7 @@ class Dataset:
                     raise ValueError(f"a scene's split is {', '.join(get_args(Split))}, not {entry['split']!r}")
                 scenes.append(SceneFolder(folder, entry["split"], camera, own))
         except FileNotFoundError as error:
-            raise TableError("this folder is no dataset", path=path, fix=NO_DATASET) from error
+            raise TableError("not a folder of a dataset", path=path, fix=NO_DATASET) from error
         except (OSError, ConfigError, ValueError, KeyError, TypeError, AttributeError) as error:
             problem = f"damaged dataset description: {error}"
             fix = "Run the scenes stage again."

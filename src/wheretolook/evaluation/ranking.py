@@ -100,8 +100,8 @@ def choose_best(views: CandidateViews, ranks: Ids, n: int) -> TopN:
     return TopN(np.minimum(_n_views(views), n), good, (good > 0).astype(np.float64))
 
 
-def choose_by_truth(views: CandidateViews, n: int) -> TopN:
-    """Choose n good views of every location as far as there are some, for each threshold: the oracle."""
+def choose_oracle(views: CandidateViews, n: int) -> TopN:
+    """Choose up to n good views of every location for each threshold: the oracle."""
     good = np.minimum(_sum_by_location(views, views.good), n)
     return TopN(np.minimum(_n_views(views), n), good, (good > 0).astype(np.float64))
 

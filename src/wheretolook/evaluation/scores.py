@@ -18,7 +18,7 @@ from wheretolook.evaluation.ranking import (
     TopN,
     choose_at_random,
     choose_best,
-    choose_by_truth,
+    choose_oracle,
     rank_views,
 )
 from wheretolook.geometry.poses import Float
@@ -90,7 +90,7 @@ def choose(views: CandidateViews, scores: Mapping[str, Float], top_n: Sequence[i
         else:
             ranks = rank_views(views, values)
             choices |= {(method, n): choose_best(views, ranks, n) for n in top_n}
-    return choices | {(ORACLE, n): choose_by_truth(views, n) for n in top_n}
+    return choices | {(ORACLE, n): choose_oracle(views, n) for n in top_n}
 
 
 def reference_method(methods: Iterable[str], name: str) -> str:

@@ -22,7 +22,7 @@ from wheretolook.mapping.feature_files import read_descriptors
 from wheretolook.mapping.georeference import Similarity, read_scale
 from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.mapping.rendered_map import DATABASE_FILE
-from wheretolook.mapping.sanity import axes_doubt
+from wheretolook.mapping.sanity import up_axis_warning
 from wheretolook.mapping.sources import find_features, find_photographs
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.confine import safe_child
@@ -144,7 +144,7 @@ def open_map(
         problem = f"half of the photographs observe fewer than {MIN_OBSERVED} landmarks"
         fix = "Give a model with tracks, and the photographs it was made from."
         raise MapError(problem, path=model_dir, value=observed, fix=fix)
-    rotation = np.eye(3) if keep_frame or not axes_doubt(poses) else estimate_gravity(poses).rotation
+    rotation = np.eye(3) if keep_frame or not up_axis_warning(poses) else estimate_gravity(poses).rotation
     scale = 1.0 if metric else DEPTH_M / float(np.nanmedian(_median_depths(arrays, poses)))
     to_frame = Similarity(scale, rotation, np.zeros(3))
     if scale != 1 or not np.array_equal(rotation, np.eye(3)):

@@ -1,9 +1,8 @@
-"""Decides between pose hypotheses where a map resembles itself, by the inliers that only one of them explains.
+"""Select between pose hypotheses under perceptual aliasing, by the inliers that only one of them explains.
 
-Two rooms have the same chairs. Seen in one, these match landmarks of either, so a wrong pose may have more inliers than
-the right one. But inliers on a chair support both rooms: from the other room, too, a chair is seen at the same place in
-the image. So landmarks that agree with a pose are moved to where they would appear if the other pose were right. Where
-the map has a landmark there, they support both; where it has none, only the first.
+Identical objects in two rooms match landmarks of both rooms, so a wrong pose may have more inliers than the correct one.
+Such inliers do not discriminate: each hypothesis explains them. Therefore the inliers of one pose are transformed to where
+they would be under the other pose. If the map has a landmark there, both poses explain the match; otherwise only the first.
 """
 
 from __future__ import annotations
@@ -17,14 +16,14 @@ from scipy.spatial import cKDTree
 from wheretolook.geometry.poses import Float
 
 COUNTERPART_DISTANCE_M = 0.4
-"""A landmark this close to a moved one is its counterpart. On validation scenes 0.25 to 0.6 m do as well: of two copies
-of a thing, different points were mapped."""
+"""A landmark this close to a moved one is its counterpart. On validation scenes 0.25 to 0.6 m work equally: different
+points are triangulated on two copies of an object."""
 
-LOCATION_SIZE_M = 0.25
-"""Landmarks in one cube of this edge count once: those of one thing are matched together, and wrongly together."""
+VOXEL_SIZE_M = 0.25
+"""Landmarks in one cube of this edge count once: landmarks on one object are matched or mismatched jointly."""
 
 PSEUDOCOUNT = 10.0
-"""Locations added to both sides of a comparison, so that one against none is no proof."""
+"""Additive smoothing of both counts of a comparison: 1 against 0 is not decisive."""
 
 SUPPORT_POWER = 0.2
 """Power of the ratio of two poses' support that counts in addition to that of their unique support."""
@@ -41,18 +40,18 @@ class PoseAmbiguity:
         self._tree = cKDTree(points[np.isfinite(points).all(axis=1)])
 
     def unique_support(self, rows: NDArray[np.int64], pose: Float, other: Float) -> int:
-        """Count locations with landmarks, rows (M,), that agree with a pose and that the other pose cannot explain.
+        """Count voxels with landmarks, rows (M,), that agree with a pose and that the other pose cannot explain.
 
         Both poses (3, 4) are from the world into the same frame of camera or rig.
         """
         in_camera = self.points[rows] @ pose[:, :3].T + pose[:, 3]
         moved = (in_camera - other[:, 3]) @ other[:, :3]
         distance, _ = self._tree.query(moved, distance_upper_bound=COUNTERPART_DISTANCE_M)
-        return self.count_locations(rows[~np.isfinite(distance)])
+        return self.count_voxels(rows[~np.isfinite(distance)])
 
-    def count_locations(self, rows: NDArray[np.int64]) -> int:
-        """Count locations (cubes of `LOCATION_SIZE_M`) with landmarks, rows (M,)."""
-        return len(np.unique(np.floor(self.points[rows] / LOCATION_SIZE_M), axis=0))
+    def count_voxels(self, rows: NDArray[np.int64]) -> int:
+        """Count voxels (cubes of `VOXEL_SIZE_M`) with landmarks, rows (M,)."""
+        return len(np.unique(np.floor(self.points[rows] / VOXEL_SIZE_M), axis=0))
 
 
 def log_ratio(unique: ArrayLike, rival_unique: ArrayLike) -> Float:

@@ -150,7 +150,7 @@ class JointLocalizer:
         chosen = most_likely(unique, support) if len(looks) > 1 else 0
         best = hypotheses[chosen]
         rivals = [k for k in range(len(hypotheses)) if k != chosen]
-        unique_support = (self.ambiguity.count_locations(rig.inlier_rows(best)), 0)
+        unique_support = (self.ambiguity.count_voxels(rig.inlier_rows(best)), 0)
         if rivals:
             rival = strongest_rival(unique, support, chosen)
             unique_support = int(unique[chosen, rival]), int(unique[rival, chosen])

@@ -29,12 +29,12 @@ def open_colmap(
 ) -> ColmapSource:
     """Read a COLMAP model; arguments, errors and warnings are those of `LocalizationMap.from_colmap`.
 
-    Without a database neither torch nor Warp is loaded, which takes longer than to read a map of 200,000 landmarks.
+    Without a database torch and Warp are not imported: importing them takes longer than reading 200,000 landmarks.
     """
-    found = read_model(model)
-    landmarks = load_colmap_landmarks(Path(model), database, max_reprojection_error_px, device, found)
-    poses = colmap_poses(model, found)
+    reconstruction = read_model(model)
+    landmarks = load_colmap_landmarks(Path(model), database, max_reprojection_error_px, device, reconstruction)
+    poses = colmap_poses(model, reconstruction)
     warn_of_frame(model, landmarks.mapping_distance_m, poses)
     if camera is None or isinstance(camera, int):
-        camera = camera_of_model(found, Path(model), camera)
+        camera = camera_of_model(reconstruction, Path(model), camera)
     return ColmapSource(landmarks, camera, compact_poses(poses))

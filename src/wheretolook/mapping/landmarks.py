@@ -105,7 +105,7 @@ class Landmarks:
             raise MapError(f"not a file of landmarks: {error}", path=path, fix="Run the map stage again.") from error
 
 
-def features_of(path: Path) -> str:
+def read_feature_name(path: Path) -> str:
     """Read the name of the descriptors that a file of landmarks was made with; SIFT's if none is recorded.
 
     Raises MapError if the file is missing or damaged.
@@ -124,14 +124,16 @@ def _validated(values: dict[str, NDArray[Any]]) -> dict[str, Any]:
         raise ValueError(f"its features, {described_by}, are unknown; there are {', '.join(all_kinds())}")
     kind = all_kinds()[described_by]
     descriptors = values.pop("descriptors", None)
-    if descriptors is not None and not _has(descriptors, (len(values["ids"]), kind.dimension), kind.in_bytes):
+    if descriptors is not None and not _has_shape_and_kind(
+        descriptors, (len(values["ids"]), kind.dimension), kind.in_bytes
+    ):
         raise ValueError(f"the descriptors are not those of {kind.name}")
     names = {f.name for f in fields(Landmarks)} - {"described_by", "descriptors"}
     unexpected = (names - {"mapping_focal_px"} - {*values}) | ({*values} - names)
     if unexpected:
         raise ValueError(f"{', '.join(sorted(unexpected))} missing or unknown")
     for name, value in values.items():
-        if not _has(value, (len(values["ids"]), *_ROW_SHAPES.get(name, ())), name in _INTEGERS):
+        if not _has_shape_and_kind(value, (len(values["ids"]), *_ROW_SHAPES.get(name, ())), name in _INTEGERS):
             raise ValueError(f"{name} is an array of {value.dtype} and shape {value.shape}")
     if not np.isfinite(values["points"]).all():
         raise ValueError("some points are not finite")
@@ -139,7 +141,7 @@ def _validated(values: dict[str, NDArray[Any]]) -> dict[str, Any]:
     return {**arrays, "descriptors": descriptors, "described_by": None if kind is SIFT else kind.name}
 
 
-def _has(array: NDArray[Any], shape: tuple[int, ...], integer: bool) -> bool:
+def _has_shape_and_kind(array: NDArray[Any], shape: tuple[int, ...], integer: bool) -> bool:
     return array.shape == shape and array.dtype.kind in ("iu" if integer else "f")
 
 
@@ -185,7 +187,7 @@ def load_colmap_landmarks(
     if observations is not None:
         kind, of_observations = observations
         descriptors = _mean_descriptors(model, of_observations, kind)
-        ambiguity = nearest_other_cosine(descriptors, device, progress)
+        ambiguity = max_cosine_to_other(descriptors, device, progress)
     return Landmarks(
         ids=model.point_ids,
         points=model.points,
@@ -209,10 +211,10 @@ def _warn_of_omitted(observed: NDArray[np.bool_], n_kept: int, worst_px: float, 
         warnings.warn(text, MapWarning, stacklevel=3)
 
 
-def nearest_other_cosine(descriptors: NDArray[Any], device: str = "cpu", progress: bool = True) -> NDArray[np.float32]:
+def max_cosine_to_other(descriptors: NDArray[Any], device: str = "cpu", progress: bool = True) -> NDArray[np.float32]:
     """Compute the cosine (N,) between each stored descriptor (N, D) and the nearest other one; NaN if N is 1.
 
-    Sums of products of bytes are exact in float32, so that SIFT's result does not depend on the machine.
+    Dot products of uint8 descriptors are exact in float32, so the result for SIFT is the same on every machine.
     """
     import torch  # takes seconds to load, and most maps are read without it
 

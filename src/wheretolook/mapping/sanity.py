@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from wheretolook.rendering.raycasting import MeshRaycaster
 
 DISTANCE_M = (0.2, 50.0)
-"""Plausible range of the median distance from mapping cameras to landmarks, from desks to squares."""
+"""Plausible range of the median distance from mapping cameras to landmarks, from tabletops to plazas."""
 SPACING_M = 5.0
 """Largest plausible median distance from a mapping camera to the nearest other one."""
 TILT_DEG = {"level": 25.0, "mean": 50.0}
@@ -35,24 +35,24 @@ def warn_of_frame(model: str | Path, mapping_distance_m: ArrayLike, cam_from_wor
 
     Takes the mean distance of each landmark's mapping cameras (N,), and the poses (M, 3, 4) of all.
     """
-    for doubt in frame_doubts(mapping_distance_m, cam_from_world):
-        warnings.warn(f"{model}: {doubt}", MapWarning, stacklevel=3)
+    for message in frame_warnings(mapping_distance_m, cam_from_world):
+        warnings.warn(f"{model}: {message}", MapWarning, stacklevel=3)
 
 
-def frame_doubts(mapping_distance_m: ArrayLike, cam_from_world: ArrayLike) -> tuple[str, ...]:
-    """The non-empty ones of `scale_doubt` and `axes_doubt`; arguments of `warn_of_frame`."""
+def frame_warnings(mapping_distance_m: ArrayLike, cam_from_world: ArrayLike) -> tuple[str, ...]:
+    """Return the non-empty messages of `scale_warning` and `up_axis_warning`; arguments of `warn_of_frame`."""
     poses = np.asarray(cam_from_world, dtype=np.float64)
-    found = scale_doubt(mapping_distance_m, camera_centers(poses)), axes_doubt(poses)
-    return tuple(doubt for doubt in found if doubt)
+    messages = scale_warning(mapping_distance_m, camera_centers(poses)), up_axis_warning(poses)
+    return tuple(message for message in messages if message)
 
 
 def warn_of_mesh(mesh: str | Path, points: ArrayLike, raycaster: MeshRaycaster) -> None:
     """Issue a `MapWarning` if a map's landmarks (N, 3) m seem not to be in the frame or unit of a mesh."""
-    if doubt := mesh_doubt(points, raycaster):
-        warnings.warn(f"{mesh}: {doubt}", MapWarning, stacklevel=2)
+    if message := mesh_warning(points, raycaster):
+        warnings.warn(f"{mesh}: {message}", MapWarning, stacklevel=2)
 
 
-def mesh_doubt(points: ArrayLike, raycaster: MeshRaycaster) -> str:
+def mesh_warning(points: ArrayLike, raycaster: MeshRaycaster) -> str:
     """Message if a mesh seems not to be in a map's frame and unit, because landmarks (N, 3) m are far from it; else ""."""
     at = np.asarray(points, dtype=np.float64)
     at = at[:: max(1, -(-len(at) // _MAX_MEASURED))]
@@ -67,7 +67,7 @@ def mesh_doubt(points: ArrayLike, raycaster: MeshRaycaster) -> str:
     )
 
 
-def scale_doubt(mapping_distance_m: ArrayLike, centers: ArrayLike) -> str:
+def scale_warning(mapping_distance_m: ArrayLike, centers: ArrayLike) -> str:
     """Message if a map seems not to be in metres; else "".
 
     Takes the mean distance of each landmark's mapping cameras (N,), and the cameras' centres (M, 3).
@@ -79,12 +79,12 @@ def scale_doubt(mapping_distance_m: ArrayLike, centers: ArrayLike) -> str:
     if low <= distance <= high and spacing <= SPACING_M:
         return ""
     lengths = f"landmarks are {distance:.3g} m from the cameras that mapped them, and these {spacing:.3g} m from the "
-    lengths += f"nearest other (medians); where people walk it is {low:g} to {high:g} m, and at most {SPACING_M:g} m"
+    lengths += f"nearest other (medians); plausible are {low:g} to {high:g} m, and at most {SPACING_M:g} m"
     fix = "`wheretolook map --model` gives it a scale: --map.photographs.scale.positions, .distance or .marker_size_m"
     return f"the model seems not to be in metres: {lengths}. {fix}. Ignore this warning if it is metric"
 
 
-def axes_doubt(cam_from_world: ArrayLike) -> str:
+def up_axis_warning(cam_from_world: ArrayLike) -> str:
     """Message if z seems not to be up in a map, by the poses (M, 3, 4) of its cameras; else ""."""
     poses = np.asarray(cam_from_world, dtype=np.float64)
     gravity = estimate_gravity(poses)
@@ -94,7 +94,7 @@ def axes_doubt(cam_from_world: ArrayLike) -> str:
     how = "upside down" if off_deg > 135 else "on their side" if off_deg > 45 else "askew"
     up = " ".join(f"{value:.2f}" for value in _rounded(gravity.up))
     return (
-        f"the cameras are {how}: up, as they were held, is ({up}) in the model, {off_deg:.0f} degrees from z, which is "
+        f"the cameras are {how}: the up direction estimated from their orientations is ({up}), {off_deg:.0f} degrees from z, which is "
         "up here. `wheretolook map --model` turns it upright with --map.existing.level true, or give a model with z up "
         "(COLMAP's model_orientation_aligner). Ignore this warning if the cameras were held so"
     )

@@ -11,13 +11,13 @@ from wheretolook.training.config import SharedConfig
 from wheretolook.utils.errors import ConfigError
 
 
-def _trained_unasked() -> tuple[str, ...]:
+def _default_methods() -> tuple[str, ...]:
     return tuple(name for name, method in learned().items() if method.trained_unasked)
 
 
 @dataclass(frozen=True)
 class _NamedMethods(SharedConfig):
-    methods: tuple[str, ...] = field(default_factory=_trained_unasked)
+    methods: tuple[str, ...] = field(default_factory=_default_methods)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -39,12 +39,12 @@ def _train_config() -> type:
         assert method.config is not None
         if groups.setdefault(method.folder, method.config) is not method.config:
             fix = "Give all methods of a folder the same class of options."
-            raise ConfigError("two classes of options for one group of train", value=method.folder, fix=fix)
+            raise ConfigError("methods of one folder have different classes of options", value=method.folder, fix=fix)
     if taken := {*groups} & {own.name for own in fields(_NamedMethods)}:
         raise ConfigError("a learned method's folder has the name of an option", value=min(taken), fix="Rename it.")
     own = [(name, config, field(default_factory=config)) for name, config in groups.items()]
     made = make_dataclass("TrainConfig", own, bases=(_NamedMethods,), frozen=True)
-    made.__module__ = __name__  # where processes that train find it
+    made.__module__ = __name__  # so that training processes can unpickle it
     lines = [f"        {name}: {(config.__doc__ or name).partition(chr(10))[0]}" for name, config in groups.items()]
     shared = (SharedConfig.__doc__ or "").rstrip()
     made.__doc__ = "\n".join([shared, *lines, "    "])

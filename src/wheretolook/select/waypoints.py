@@ -70,9 +70,9 @@ class Waypoints:
 
 
 def read_waypoints(path: str | Path) -> Waypoints:
-    """Read a file in one of `FORMATS`, which is told from its columns.
+    """Read a file in one of `FORMATS`, detected from its columns.
 
-    Raises a TableError, with the line, if the file is missing, empty, has other columns, or a value is no number.
+    Raises a TableError, with the line, if the file is missing, empty, has other columns, or a value is not a number.
     """
     path = Path(path)
     if not path.is_file():
@@ -81,7 +81,7 @@ def read_waypoints(path: str | Path) -> Waypoints:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise TableError("waypoints are in a text file, this is none", path=path, fix=f"Give {FORMATS}.") from error
+        raise TableError("not a UTF-8 text file", path=path, fix=f"Give {FORMATS}.") from error
     stripped = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
     rows = [(number, line) for number, line in stripped if line and not line.startswith("#")]
     if not rows:
@@ -90,13 +90,13 @@ def read_waypoints(path: str | Path) -> Waypoints:
     cells = [(number, _cells(line, separator)) for number, line in rows]
     header = cells[0][1] if not any(map(_is_number, cells[0][1])) and len(cells[0][1]) > 1 else None
     if header is not None:
-        columns, name = _named(header, path)
+        columns, id_column = _columns_from_header(header, path)
         cells = cells[1:]
         if not cells:
             raise TableError("there are no waypoints below the header", path=path, fix=f"Give {FORMATS}.")
     else:
-        columns, name = _numbered(*cells[0], path)
-    n_named = 1 + max(*columns, name or 0)  # a header may be longer than what stands below it
+        columns, id_column = _columns_by_count(*cells[0], path)
+    n_named = 1 + max(*columns, id_column or 0)  # a header may be longer than what stands below it
     points: list[list[float]] = []
     ids: list[str] = []
     for number, row in cells:
@@ -107,13 +107,13 @@ def read_waypoints(path: str | Path) -> Waypoints:
             problem = f"a waypoint needs numbers in {n} columns, {like}"
             raise TableError(problem, path=path, value=value, fix=f"Give {FORMATS}.")
         points.append([float(row[column]) for column in columns])
-        ids.append(str(len(ids)) if name is None else row[name])
+        ids.append(str(len(ids)) if id_column is None else row[id_column])
     found = Waypoints(np.array(points), tuple(ids), tuple(number for number, _ in cells), path)
     return found._checked()
 
 
 def parse_points(texts: Sequence[str]) -> Waypoints:
-    """Waypoints from texts "x,y,z". Raises a TableError if one is none."""
+    """Parse texts "x,y,z". Raises TableError if one is not three numbers."""
     points = []
     for text in texts:
         cells = text.strip().split(",")
@@ -142,8 +142,8 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _named(header: list[str], path: Path) -> tuple[list[int], int | None]:
-    """Columns of x, y and z, and that of the names, by the names of columns."""
+def _columns_from_header(header: list[str], path: Path) -> tuple[list[int], int | None]:
+    """Return the columns of x, y, z and of the ids (or None) from the header."""
     names = [cell.strip("\"' ").lower() for cell in header]
     columns = [next((names.index(name) for name in known if name in names), None) for known in _NAMES.values()]
     if None in columns:
@@ -152,8 +152,8 @@ def _named(header: list[str], path: Path) -> tuple[list[int], int | None]:
     return [c for c in columns if c is not None], next((names.index(name) for name in _IDS if name in names), None)
 
 
-def _numbered(number: int, row: list[str], path: Path) -> tuple[list[int], int | None]:
-    """Columns of x, y and z, and that of the names, by how many there are."""
+def _columns_by_count(number: int, row: list[str], path: Path) -> tuple[list[int], int | None]:
+    """Return the columns of x, y, z and of the ids (or None) from the number of columns."""
     if len(row) not in (3, 4, 8):
         value = f"line {number}: {' '.join(row)[:80]}"
         problem = f"waypoints have 3, 4 or 8 columns, these have {len(row)}"

@@ -53,9 +53,9 @@ def about_training(dataset: Dataset, method: str, config: SharedConfig, options:
         "camera": cameras[0].record() if len(cameras) == 1 else f"{len(cameras)} cameras",
         "config": {**asdict(options), **shared},
     }
-    from wheretolook.mapping.landmarks import features_of
+    from wheretolook.mapping.landmarks import read_feature_name
 
-    features = sorted({features_of(scene.landmarks) for scene in scenes if scene.landmarks.is_file()})
+    features = sorted({read_feature_name(scene.landmarks) for scene in scenes if scene.landmarks.is_file()})
     if features not in ([], [SIFT.name]):  # SIFT is the default and not recorded
         about["features"] = features
     if config.also:

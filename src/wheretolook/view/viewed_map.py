@@ -94,12 +94,12 @@ class ViewedMap:
     @cached_property
     def warnings(self) -> tuple[str, ...]:
         """Signs that the map is not in metres with z up, or that the mesh is in another frame."""
-        from wheretolook.mapping.sanity import frame_doubts, mesh_doubt
+        from wheretolook.mapping.sanity import frame_warnings, mesh_warning
 
         warnings: tuple[str, ...] = ()
         if self.mapping_poses is not None and len(self.mapping_poses) > 0:
-            warnings = frame_doubts(self.landmarks.mapping_distance_m, self.mapping_poses)
-        if self.mesh is not None and (doubt := mesh_doubt(self.landmarks.points, self.environment.raycaster)):
+            warnings = frame_warnings(self.landmarks.mapping_distance_m, self.mapping_poses)
+        if self.mesh is not None and (doubt := mesh_warning(self.landmarks.points, self.environment.raycaster)):
             warnings = (*warnings, f"The mesh: {doubt}")
         return warnings
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from box_scenes import furnished_room
@@ -14,7 +13,6 @@ from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, Envi
 from wheretolook.dataset.layout import SceneFolder
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.rendering import raycasting
-from wheretolook.scenes import loading
 from wheretolook.scenes.loading import save_glb
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.utils.files import write_json
@@ -32,37 +30,29 @@ def files(tmp_path: Path) -> SceneFolder:
     return files
 
 
-def test_a_mesh_is_loaded_once_and_rays_are_cast_against_one_tree(
-    files: SceneFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    loaded = []
-    trees = []
-    load = loading.load_mesh
+def test_parts_of_a_scene_share_one_ray_caster(files: SceneFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    built = []
     build = raycasting.MeshRaycaster.__init__
-    monkeypatch.setattr(loading, "load_mesh", lambda *args, **options: loaded.append(args) or load(*args, **options))
-    monkeypatch.setattr(raycasting.MeshRaycaster, "__init__", lambda *args: trees.append(args) or build(*args))
+    monkeypatch.setattr(raycasting.MeshRaycaster, "__init__", lambda *args: built.append(args) or build(*args))
     scene = SceneEnvironment(files, CAMERA)
-    assert not loaded
-    views = ViewLattice((5, 4, 3), directions=10)
-    grid, free = scene.free_voxels(views, scene.space)
+    grid, free = scene.free_voxels(ViewLattice((5, 4, 3), directions=10), scene.space)
     assert 0 < len(free) < len(grid) and scene.space is scene.sampled_space
-    assert scene.renderer.render(scene.camera, np.eye(4)[None, :3]).rgb.shape[0] == 1
     assert scene.localization_map.occlusion is scene.occlusion and scene.localization_map.camera == CAMERA
-    assert (len(loaded), len(trees)) == (1, 1)
+    assert len(built) == 1
 
 
 def test_without_a_mesh_landmarks_hide_one_another_and_metres_are_needed(files: SceneFolder) -> None:
     files.mesh.unlink()
-    with pytest.raises(SceneError, match="needs the scene's mesh"):
+    with pytest.raises(SceneError):
         _ = SceneEnvironment(files, CAMERA).occlusion
     write_json(files.map / "report.json", {"scale": {"source": "unknown"}})
     scene = SceneEnvironment(files, CAMERA)
     assert scene.is_photographed and isinstance(scene.occlusion, HiddenPointRemoval)
     none = EnvironmentConfig(OcclusionConfig(model="none"))
     assert SceneEnvironment(files, CAMERA, none).occlusion_config.model == "none"
-    with pytest.raises(MapError, match="no scale, and this needs metres"):
+    with pytest.raises(MapError):
         _ = scene.space
-    with pytest.raises(MapError, match="poses of the map's photographs are missing"):
+    with pytest.raises(MapError):
         _ = SceneEnvironment(files, CAMERA, replace(none, assume_metric=True)).space
 
 
@@ -83,7 +73,7 @@ def test_the_most_accurate_occlusion_model_is_the_default(files: SceneFolder) ->
     assert isinstance(cached.occlusion, CachedOcclusion)
 
 
-@pytest.mark.parametrize("wrong", [{"grid": (8, 0, 8)}, {"directions": 0}, {"lattice": "spiral"}])
-def test_views_that_cannot_be_are_refused(wrong: dict[str, object]) -> None:
+@pytest.mark.parametrize("options", [{"grid": (8, 0, 8)}, {"directions": 0}, {"lattice": "spiral"}])
+def test_invalid_lattices(options: dict[str, object]) -> None:
     with pytest.raises(ConfigError):
-        ViewLattice(**wrong)  # type: ignore[arg-type]
+        ViewLattice(**options)  # type: ignore[arg-type]

@@ -150,7 +150,7 @@ def test_matches_that_are_not_stored(table: pd.DataFrame, matched: pd.DataFrame,
     path = tmp_path / "viewpoints.parquet"
     for content, compact in ((table, False), (matched.drop(columns="inlier_rows"), False), (matched, True)):
         write_table(content, path, compact)
-        with pytest.raises(TableError, match="store_matches"):
+        with pytest.raises(TableError):
             read_table(path, matches=True)
 
 

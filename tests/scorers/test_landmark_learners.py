@@ -1,4 +1,4 @@
-"""Learners that look at landmarks one by one: which are found, and what a view may expect of them."""
+"""Learners of single landmarks: which are detected, and the statistics expected of a view."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ NO_STATISTICS = AttributeStatistics((0.0,) * len(ATTRIBUTES), (1.0,) * len(ATTRI
 
 
 def attributes_of(offsets: np.ndarray) -> torch.Tensor:
-    """Attributes of landmarks at offsets (N, 3) in the camera's axes; what a map tells of them is 0."""
+    """Attributes of landmarks at offsets (N, 3) in the camera's axes; those of the map are 0."""
     values = np.zeros((len(offsets), len(ATTRIBUTES)))
     values[:, 0] = offsets[:, 0] / offsets[:, 2]
     values[:, 1] = offsets[:, 1] / offsets[:, 2]
@@ -76,7 +76,6 @@ def test_expectations_in_closed_form() -> None:
     expected = {
         "log_expected_inliers": np.log1p(p.sum()),
         "log_visible": np.log(51),
-        "log_expected_share": None,
         "log_position_variance": np.log(np.trace(covariance[:3, :3])),
         "log_orientation_variance": np.log(np.trace(covariance[3:, 3:])),
         "log_det_information": np.linalg.slogdet(matrix + 1e-3 * np.eye(6))[1],
@@ -84,8 +83,7 @@ def test_expectations_in_closed_form() -> None:
         "log_spread": np.log(spread + 1e-4),
     }
     for name, value in expected.items():
-        if value is not None:
-            assert found[name] == pytest.approx(value, rel=1e-5), name
+        assert found[name] == pytest.approx(value, rel=1e-5), name
     assert found["expected_share"] == pytest.approx(p.mean(), rel=1e-5)
 
 
@@ -94,8 +92,7 @@ def test_expected_cells_in_closed_form() -> None:
     degrees = np.array([[1.0, 1.0], [5.0, 3.0], [-40.0, 20.0], [89.99, 0.0], [0.5, 0.5]])
     values = torch.zeros(5, len(ATTRIBUTES), dtype=torch.float64)
     values[:, :2] = torch.from_numpy(np.tan(np.deg2rad(degrees)))
-    chance = np.array([0.3, 0.6, 0.25, 0.5, 0.9])
-    odds = torch.from_numpy(np.log(chance / (1 - chance)))
+    odds = torch.logit(torch.tensor([0.3, 0.6, 0.25, 0.5, 0.9], dtype=torch.float64))
     views = torch.tensor([0, 0, 0, 0, 1])
     each = torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64)
     found = expected_cells(values, odds, views, each)
@@ -103,20 +100,20 @@ def test_expected_cells_in_closed_form() -> None:
     np.testing.assert_allclose(found, [1 - 0.7 * 0.4 + 0.25 + 0.5, 1 - 0.1**2, 0], rtol=1e-12)
 
 
-def test_chances_are_learnt_beside_the_labels_from_known_matches_only() -> None:
+def test_detection_is_learned_from_known_matches_only() -> None:
     network = SetNetwork(NO_STATISTICS).eval()
     values = torch.randn(3, 5, len(ATTRIBUTES))
-    taken = torch.tensor([5, 2, 0])
-    found = torch.full((3, 5), torch.nan)
-    found[0] = torch.tensor([1.0, 0, 0, 1, 0])
-    found[1, :2] = 1.0
-    views = values, taken, taken, torch.zeros(3)
-    logits, loss = network.learn_more(SetConfig(landmark_loss=0.5, landmarks=10), 4.0, *views, found)
+    counts = torch.tensor([5, 2, 0])
+    detected = torch.full((3, 5), torch.nan)
+    detected[0] = torch.tensor([1.0, 0, 0, 1, 0])
+    detected[1, :2] = 1.0
+    views = values, counts, counts, torch.zeros(3)
+    logits, loss = network.learn_more(SetConfig(landmark_loss=0.5, landmarks=10), 4.0, *views, detected)
     torch.testing.assert_close(logits, network(*views))
-    chance = network.matchability(values).sigmoid()
-    missed = -(found * chance.log() + (1 - found) * (1 - chance).log())
+    p = network.matchability(values).sigmoid()
+    missed = -(detected * p.log() + (1 - detected) * (1 - p).log())
     assert float(loss) == pytest.approx(0.5 * float(missed.nansum()) / (4 * 10), rel=1e-5)
-    assert float(network.learn_more(SetConfig(), 4.0, *views, torch.full_like(found, torch.nan))[1]) == 0
+    assert float(network.learn_more(SetConfig(), 4.0, *views, torch.full_like(detected, torch.nan))[1]) == 0
 
 
 @pytest.mark.parametrize("pooled", [0, 4])
@@ -134,7 +131,7 @@ def test_a_sample_of_all_landmarks_scores_as_all_of_them(pooled: int) -> None:
     torch.testing.assert_close(network(padded, counts, counts, height), whole, rtol=1e-4, atol=1e-5)
 
 
-def test_what_is_not_known_is_the_mean_and_what_is_hidden_does_not_matter() -> None:
+def test_unknown_attributes_become_the_mean_and_hidden_ones_are_ignored() -> None:
     values = torch.randn(100, len(ATTRIBUTES))
     values[:, -1] = torch.nan
     statistics = AttributeStatistics.of(values)
@@ -185,20 +182,14 @@ def test_batches_hold_samples_of_each_view(dataset: Dataset) -> None:
     first, second = (torch.cat([batch.inputs[2] for batch in loader]) for _ in range(2))
     assert not torch.equal(first, second)  # another order
     assert torch.equal(first.sort().values, views.n_visible[rows].sort().values)
-    for batch in LandmarkBatches(views, rows, 8, 64):
-        values, taken, n_visible, _, found = batch.inputs
-        assert found.shape == values.shape[:2] and found.isnan().all()  # it was not asked for
-        assert torch.equal(taken, n_visible.clamp(max=8)) and values.shape[1] == taken.max()
-    in_order = LandmarkBatches(views, rows, 8, len(rows))
-    values, taken, *_ = next(iter(in_order)).inputs
-    assert torch.equal(values[0, : taken[0]].half(), views.values[views.starts[5] : views.starts[5] + taken[0]])
-    wide = next(iter(LandmarkBatches(views, rows, 40, len(rows), 1))).inputs[0]
-    assert torch.isfinite(wide[..., DISTANCE]).all()
+    values, counts, n_visible, *_ = next(iter(LandmarkBatches(views, rows, 8, len(rows)))).inputs
+    assert torch.equal(counts, n_visible.clamp(max=8)) and values.shape[1] == counts.max()
+    assert torch.equal(values[0, : counts[0]].half(), views.values[views.starts[5] : views.starts[5] + counts[0]])
 
 
 def test_enlarged_views_are_those_of_an_enlarged_scene(dataset: Dataset) -> None:
     views = load_landmark_views(dataset, training_scenes(dataset), train_config(), 40, progress=False)
-    views = replace(views, axis_height=torch.arange(len(views)).float())  # tells who is who
+    views = replace(views, axis_height=torch.arange(len(views)).float())  # identifies the view
     rows = torch.arange(len(views))
     plain, large = (next(iter(LandmarkBatches(views, rows, 8, len(rows), 3, max_scale=by))) for by in (1.0, 4.0))
     changed = [DISTANCE, *(ATTRIBUTES.index(name) for name in ("mapped_distance", "mapped_pixel_size"))]
@@ -215,15 +206,7 @@ def test_enlarged_views_are_those_of_an_enlarged_scene(dataset: Dataset) -> None
     assert np.array_equal(large.labels.numpy() > 0, good) and not torch.equal(large.labels, plain.labels)
 
 
-def test_a_batch_of_one_view_or_none_is_learnt_from() -> None:
-    network = SetNetwork(NO_STATISTICS, pooled=2).train()
-    for n in (0, 1):
-        taken = torch.full((n,), 3)
-        network(torch.randn(n, 3, len(ATTRIBUTES)), taken, taken, torch.zeros(n)).sum().backward()
-    assert all(torch.isfinite(parameter.grad).all() for parameter in network.parameters())
-
-
-def test_few_views_are_gone_through_more_often() -> None:
+def test_small_datasets_take_more_epochs() -> None:
     config = SetConfig()
     assert of_size(config, 200_000) is config and of_size(config, 16 * 1024) is config
     few = of_size(config, 1350)

@@ -55,6 +55,6 @@ def test_without_a_heading_one_is_drawn_for_each_location(localization_map: Loca
 @pytest.mark.parametrize(
     "heading", [(0.0, 0, 0), (np.nan, 0, 1), (np.inf, 0, 0), (1.0, 0), [[1.0, 0, 0]], [[1.0, 0, 0], [1, 0, 0]]]
 )
-def test_headings_that_are_none(heading: tuple[float, ...], localization_map: LocalizationMap) -> None:
-    with pytest.raises(ValueError, match="a heading is a direction"):
+def test_invalid_headings(heading: tuple[float, ...], localization_map: LocalizationMap) -> None:
+    with pytest.raises(ValueError):
         ForwardScorer(localization_map, heading)

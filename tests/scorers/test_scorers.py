@@ -47,15 +47,6 @@ def views() -> Float:
     return poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (40, 3)), rng.normal(size=(40, 3)))
 
 
-@pytest.fixture
-def weights(tmp_path: Path) -> Path:
-    """An untrained network whose scores differ from view to view."""
-    torch.manual_seed(0)
-    statistics = InputStatistics(CHANNELS, (80.0, 60.0, 0.0, 0.0, 2.0), (40.0, 30.0, 1.0, 1.0, 1.0))
-    path = tmp_path / "mlp.safetensors"
-    return save_network(path, "mlp-2d+3d", ViewpointNetwork(NetworkSpec(statistics, hidden=(16,))))
-
-
 NO_STATISTICS = AttributeStatistics((0.0,) * len(ATTRIBUTES), (1.0,) * len(ATTRIBUTES))
 
 
@@ -69,31 +60,32 @@ def some_trees(localization_map: LocalizationMap) -> BoostedTrees:
     return fit_trees(views, views, CAMERA, TreesConfig(max_trees=10, max_leaves=15, min_leaf=3))[0]
 
 
-def some_convolutions() -> ConvNetwork:
-    """An untrained network whose scores differ from view to view."""
-    torch.manual_seed(0)
-    mean = (80.0, 60.0, 0.0, 0.0, 2.0, *[0.5] * 10)
-    std = (40.0, 30.0, *[1.0] * 13)
-    return ConvNetwork(ConvSpec(InputStatistics(ALL_CHANNELS, mean, std), 30, (8, 8), 0.0))
-
-
 def weights_of(method: str, path: Path, localization_map: LocalizationMap) -> Path:
-    """Untrained weights of a method."""
+    """Write untrained weights of a method, whose scores differ from view to view."""
     if method == "trees":
         some_trees(localization_map).save(path)
         return path
     torch.manual_seed(0)
+    mean = (80.0, 60.0, 0.0, 0.0, 2.0, *[0.5] * 10)
+    std = (40.0, 30.0, *[1.0] * 13)
     if method.startswith("mlp"):
-        statistics = InputStatistics(CHANNELS, (80.0, 60.0, 0.0, 0.0, 2.0), (40.0, 30.0, 1.0, 1.0, 1.0))
-        return save_network(path, method, ViewpointNetwork(NetworkSpec(statistics, hidden=(16,))))
-    network = {
-        "conv": some_convolutions,
-        "sphere": lambda: SphereNetwork(SphereConfig()),
-        "set": lambda: SetNetwork(NO_STATISTICS, pooled=2),
-        "matchability": lambda: MatchabilityNetwork(NO_STATISTICS),
-        "adapted": lambda: AdaptedNetwork(SetNetwork(NO_STATISTICS, pooled=2), 1.0, 0.0, 1.0, 4.0, 0, 0),
-    }[method]()
+        network = ViewpointNetwork(NetworkSpec(InputStatistics(CHANNELS, mean[:5], std[:5]), hidden=(16,)))
+    elif method == "conv":
+        network = ConvNetwork(ConvSpec(InputStatistics(ALL_CHANNELS, mean, std), 30, (8, 8), 0.0))
+    elif method == "sphere":
+        network = SphereNetwork(SphereConfig())
+    elif method == "matchability":
+        network = MatchabilityNetwork(NO_STATISTICS)
+    else:
+        network = SetNetwork(NO_STATISTICS, pooled=2)
+        if method == "adapted":
+            network = AdaptedNetwork(network, 1.0, 0.0, 1.0, 4.0, 0, 0)
     return save_network(path, method, network)
+
+
+@pytest.fixture
+def weights(tmp_path: Path, localization_map: LocalizationMap) -> Path:
+    return weights_of("mlp-2d+3d", tmp_path / "mlp.safetensors", localization_map)
 
 
 @pytest.mark.parametrize("name", scorers())
@@ -121,14 +113,13 @@ def test_scorers_keep_their_contract(
     monkeypatch.setattr("wheretolook.scorers.base.BLOCK", 7)
     np.testing.assert_allclose(scorer.score(views), scores, rtol=rtol)
     assert scorer.score(views[:0]).shape == (0,)
-    spoilt = views.copy()
-    spoilt[3, 1, 2] = np.nan
-    for asked in (scorer.score, scorer.in_range, scorer.report):
+    invalid = views.copy()
+    invalid[3, 1, 2] = np.nan
+    for method in (scorer.score, scorer.in_range, scorer.report):
         with pytest.raises(PoseError):
-            asked(spoilt)
-    for location, direction in (([0.0, np.inf, 1], [1.0, 0, 0]), ([0.0, 0, 1], [0.0, np.nan, 1])):
-        with pytest.raises(PoseError):
-            scorer.score_around(np.array([location]), np.array([direction]))
+            method(invalid)
+    with pytest.raises(PoseError):
+        scorer.score_around(np.array([[0.0, np.inf, 1]]), np.array([[1.0, 0, 0]]))
 
 
 def _binned(counts: list[list[int]]) -> BinnedViews:

@@ -27,7 +27,7 @@ def test_bounds_reach_around_the_cameras_within_the_map() -> None:
 
 
 def test_bad_input_is_refused() -> None:
-    with pytest.raises(MapError, match="no landmarks or no cameras"):
+    with pytest.raises(MapError):
         MappedSpace(np.zeros((0, 3)), CAMERAS)
     for settings in ({"max_camera_distance_m": 0.0}, {"clearance_m": -0.1}):
         with pytest.raises(ConfigError):

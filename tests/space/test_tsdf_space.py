@@ -65,16 +65,6 @@ def test_what_no_image_saw_is_not_free(images: list[DepthImage]) -> None:
     assert space.is_free(start[:1]).all() and not space.segments_are_free(start, points[hidden]).any()
 
 
-def test_a_way_through_what_was_not_seen_is_not_free(images: list[DepthImage]) -> None:
-    space = space_of(images)
-    a = np.array([[0.6, 0.5, 1.2]])
-    b = np.array([[0.6, 1.9, 1.2]])
-    assert space.segments_are_free(a, b).all()
-    near = np.linalg.norm(space.cells.centers() - (a + b) / 2, axis=1) < 0.1
-    space.to_unseen_m[near.reshape(space.cells.shape)] = 0.0
-    assert space.is_free(np.concatenate([a, b])).all() and not space.segments_are_free(a, b).any()
-
-
 def test_an_image_sees_up_to_its_readings() -> None:
     depth = np.full((CAMERA.height, CAMERA.width), 2.0, dtype=np.float32)
     depth[:, : CAMERA.width // 2] = 0

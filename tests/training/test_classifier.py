@@ -7,11 +7,10 @@ import math
 import pytest
 import torch
 from torch import nn
-from torchmetrics.classification import BinaryCalibrationError
 
 from wheretolook.inputs.channels import CHANNELS
 from wheretolook.scorers.mlp.network import add_noise
-from wheretolook.training.classifier import CALIBRATION_BINS, weight_penalty, weighted_bce
+from wheretolook.training.classifier import weight_penalty, weighted_bce
 from wheretolook.training.data import class_weights
 
 
@@ -70,12 +69,3 @@ def test_noise_has_the_asked_scale_and_only_on_filled_bins() -> None:
     spread = noisy[:, :, :5].std((0, 2, 3))
     expected = torch.tensor([2.0 if name in "uv" else 0.1 for name in CHANNELS])
     torch.testing.assert_close(spread, expected, rtol=0.05, atol=0)
-
-
-def test_calibration_error_equals_a_hand_computation() -> None:
-    # bins of width 1/15: 0.03 and 0.05 share the first; 0.30 is alone in its bin; 0.95 and 0.99 share the last
-    probabilities = torch.tensor([0.03, 0.05, 0.30, 0.95, 0.99])
-    labels = torch.tensor([0, 1, 1, 1, 1])
-    by_hand = 2 / 5 * abs(0.5 - 0.04) + 1 / 5 * abs(1 - 0.30) + 2 / 5 * abs(1 - 0.97)
-    measured = BinaryCalibrationError(n_bins=CALIBRATION_BINS, norm="l1")(probabilities, labels)
-    assert measured.item() == pytest.approx(by_hand, rel=1e-5)

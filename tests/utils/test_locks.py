@@ -86,8 +86,3 @@ def test_without_locks_it_warns_and_goes_on(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(fcntl, "flock", none)
     with pytest.warns(LockWarning), hold(tmp_path / "lock", "label"):
         pass
-
-
-def test_a_reader_needs_no_folder_and_makes_none(tmp_path: Path) -> None:
-    with hold(tmp_path / "missing" / "lock", "plan", shared=True):
-        assert not (tmp_path / "missing").exists()

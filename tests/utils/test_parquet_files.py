@@ -29,23 +29,6 @@ def _long_text(path: Path) -> None:
     pq.write_table(pa.table({"status": texts}), path, **options)
 
 
-def _common_prefixes(path: Path) -> None:
-    """Texts that each begin as the one before."""
-    texts = pa.array(["x" * 20_000] * 20_000)
-    options = {"use_dictionary": False, "column_encoding": {"status": "DELTA_BYTE_ARRAY"}, "compression": "zstd"}
-    pq.write_table(pa.table({"status": texts}), path, data_page_size=2**30, **options)
-
-
-def _nulls(path: Path) -> None:
-    with pq.ParquetWriter(path, pa.schema([("a", pa.null())]), compression="zstd") as writer:
-        for _ in range(5):
-            writer.write_table(pa.table({"a": pa.nulls(50_000_000)}), row_group_size=50_000_000)
-
-
-def _wide(path: Path) -> None:
-    pq.write_table(pa.schema([(f"c{i}", pa.int32()) for i in range(5000)]).empty_table(), path, store_schema=False)
-
-
 def _nested(path: Path, depth: int) -> None:
     """No rows of a column nested in so many groups."""
 
@@ -63,7 +46,7 @@ def _nested(path: Path, depth: int) -> None:
     path.write_bytes(b"PAR1" + description + struct.pack("<I", len(description)) + b"PAR1")
 
 
-BOMBS = [_giant_list, _long_text, _common_prefixes, _nulls, _wide, lambda p: _nested(p, 100_000)]
+BOMBS = [_giant_list, _long_text, lambda p: _nested(p, 100_000)]
 
 
 @pytest.mark.parametrize("make", BOMBS)
@@ -88,21 +71,3 @@ def test_what_pandas_writes_is_read(tmp_path: Path) -> None:
     for options in ({}, {"compression": None, "row_group_size": 4000}, {"use_dictionary": False}):
         table.to_parquet(tmp_path / "a.parquet", **options)
         pd.testing.assert_frame_equal(read_parquet(tmp_path / "a.parquet"), pd.read_parquet(tmp_path / "a.parquet"))
-
-
-def test_damaged_files_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "a.parquet"
-    pq.write_table(pa.table({"a": np.arange(1000), "b": ["x"] * 1000}), path)
-    whole = path.read_bytes()
-    rng = np.random.default_rng(0)
-    refused = 0
-    for _ in range(200):
-        content = bytearray(whole)
-        for _ in range(3):
-            content[rng.integers(len(content))] = rng.integers(256)
-        path.write_bytes(content[: rng.integers(len(content))] if rng.random() < 0.2 else content)
-        try:
-            read_parquet(path)
-        except ValueError:
-            refused += 1
-    assert refused > 50

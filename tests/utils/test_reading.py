@@ -2,7 +2,6 @@
 
 import io
 import json
-import os
 import resource
 import time
 import zipfile
@@ -62,21 +61,14 @@ INVALID: list[tuple[Callable[[Path], object], Callable[[Path], object]]] = [
     (load_npz, lambda path: path.symlink_to("/dev/zero")),
     (load_npy, npy_of_wrong_size),
     (read_json, lambda path: path.symlink_to("/dev/zero")),
-    (read_json, os.mkfifo),
     (read_json, Path.mkdir),
     (read_json, text("[" * 100_000 + "]" * 100_000)),
-    (read_json, text("[" + "[]," * 5_000_000 + "1]")),
     (read_json, lambda path: path.write_bytes(bytes(MAX_TEXT_BYTES + 1))),
-    (read_json, lambda path: path.write_bytes(b"\xff\xfe{}")),
     (read_json_object, text("[]")),
     (read_yaml, alias_bomb),
     (read_yaml, text("a: &a " + "x" * 50_000 + "\nb: [" + "*a, " * 10_000 + "]")),
-    (read_yaml, text("a: &a [*a]")),
-    (read_yaml, text("[" * 100_000)),
     (read_yaml, text("a: 2001-99-99")),
-    (read_yaml, text("? {a: 1}\n: 2")),
     (read_yaml, text("!!python/object/apply:os.system ['true']")),
-    (read_yaml, lambda path: path.write_bytes(bytes(50_000))),
 ]
 
 
@@ -92,12 +84,6 @@ def test_invalid_files_are_refused_within_seconds_and_200_mb(
         read(path)
     assert time.process_time() - start < 5
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200 * 1024
-
-
-@pytest.mark.parametrize("read", [read_json, read_yaml])
-def test_a_missing_file_is_an_os_error(read: Callable[[Path], object], tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError):
-        read(tmp_path / "file")
 
 
 def test_good_files_are_read_as_they_were_written(tmp_path: Path) -> None:

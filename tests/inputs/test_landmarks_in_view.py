@@ -70,7 +70,7 @@ def test_each_landmark_by_hand(localization_map: LocalizationMap) -> None:
         np.testing.assert_allclose(found, np.stack([*expected.values()], axis=1), rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("most", [None, 1, 20, 10_000])
+@pytest.mark.parametrize("most", [None, 1, 20])
 def test_blocks_of_views_hold_all_or_evenly_spread_landmarks(
     localization_map: LocalizationMap, most: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -78,21 +78,19 @@ def test_blocks_of_views_hold_all_or_evenly_spread_landmarks(
     describer = LandmarkDescriber(localization_map)
     whole = describer.describe(views)
     monkeypatch.setattr("wheretolook.inputs.landmark_features.BLOCK_ENTRIES", {"cpu": 100, "cuda": 100})
-    at = 0
+    n_views = 0
     for rows, part, visible in describer.in_blocks(views, most):
-        assert rows.start == at and (len(part) == 1 or part.counts.sum() <= 100)
+        assert rows.start == n_views and (len(part) == 1 or part.counts.sum() <= 100)
         for view in range(len(part)):
-            all_rows = whole.rows[whole.starts[at] : whole.starts[at + 1]]
-            found = slice(int(part.starts[view]), int(part.starts[view + 1]))
-            assert visible[view] == len(all_rows)
-            if most is None or len(all_rows) <= most:
-                expected = torch.arange(len(all_rows))
-            else:
-                expected = torch.arange(most) * len(all_rows) // most
-            assert torch.equal(part.rows[found].cpu(), all_rows.cpu()[expected])
-            assert torch.equal(part.values[found], whole.values[whole.starts[at] : whole.starts[at + 1]][expected])
-            at += 1
-    assert at == len(views)
+            all_of_view = slice(int(whole.starts[n_views]), int(whole.starts[n_views + 1]))
+            kept = slice(int(part.starts[view]), int(part.starts[view + 1]))
+            n = all_of_view.stop - all_of_view.start
+            assert visible[view] == n
+            expected = torch.arange(n) if most is None or n <= most else torch.arange(most) * n // most
+            assert torch.equal(part.rows[kept].cpu(), whole.rows[all_of_view].cpu()[expected])
+            assert torch.equal(part.values[kept], whole.values[all_of_view][expected])
+            n_views += 1
+    assert n_views == len(views)
 
 
 def test_views_share_locations_in_whatever_order_they_come() -> None:

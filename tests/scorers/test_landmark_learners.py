@@ -151,28 +151,27 @@ def test_unknown_attributes_become_the_mean_and_hidden_ones_are_ignored() -> Non
 def test_views_by_their_landmarks(dataset: Dataset) -> None:
     scenes = training_scenes(dataset)
     views = load_landmark_views(dataset, scenes, train_config(), 20, progress=False, matches=True)
-    at = 0
     assert views.detected is not None
-    for number, scene in enumerate(scenes):
-        table = scene.read_table(matches=True)
-        described = LandmarkDescriber(scene.localization_map(CAMERA)).describe(poses(table))
-        for view in range(len(table)):
-            all_values = described.values[described.starts[view] : described.starts[view + 1]].half()
-            rows = described.rows[described.starts[view] : described.starts[view + 1]].numpy()
-            part = slice(int(views.starts[at]), int(views.starts[at + 1]))
-            kept = views.values[part]
-            assert len(kept) == min(20, len(all_values)) and views.n_visible[at] == len(all_values)
-            inliers = table["inlier_rows"].iloc[view] if table["status"].iloc[view] == LOCALIZED else None
-            if inliers is not None and not is_good(table.iloc[[view]], 0.5, 5.0)[0]:
-                inliers = []  # of a pose elsewhere: the map looks alike there, and these are wrong matches
-            for values, found in zip(kept, views.detected[part], strict=True):
-                row = rows[(all_values == values).all(1).numpy()]
-                assert len(row) == 1
-                if inliers is not None:
-                    assert bool(found) == (row[0] in inliers)
-            assert views.scene[at] == number
-            at += 1
-    assert at == len(views)
+    tables = pd.concat([scene.read_table(matches=True) for scene in scenes], ignore_index=True)
+    assert len(views) == len(tables) and views.scene.tolist() == np.repeat([0, 1], len(tables) // 2).tolist()
+    good = is_good(tables, 0.5, 5.0)
+    described = [
+        LandmarkDescriber(scene.localization_map(CAMERA)).describe(poses(scene.read_table())) for scene in scenes
+    ]
+    for at, (number, row) in enumerate(zip(views.scene.tolist(), tables.itertuples(), strict=True)):
+        whole = described[number]
+        view = at - number * len(tables) // 2
+        all_of_view = slice(int(whole.starts[view]), int(whole.starts[view + 1]))
+        values = whole.values[all_of_view].half()
+        part = slice(int(views.starts[at]), int(views.starts[at + 1]))
+        assert part.stop - part.start == min(20, len(values)) and views.n_visible[at] == len(values)
+        same = (views.values[part][:, None] == values).all(2)
+        assert (same.sum(1) == 1).all()
+        if row.status == LOCALIZED:
+            # inliers of a wrong pose are wrong matches
+            inliers = row.inlier_rows if good[at] else []
+            kept = whole.rows[all_of_view].numpy()[same.int().argmax(1).numpy()]
+            np.testing.assert_array_equal(views.detected[part].numpy() > 0, np.isin(kept, inliers))
 
 
 def test_batches_hold_samples_of_each_view(dataset: Dataset) -> None:

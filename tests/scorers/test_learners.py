@@ -79,22 +79,6 @@ def test_weights_and_run(name: str, trained: dict[str, TrainedModel], tracking: 
     assert run.metrics["kept_val_average_precision"] == pytest.approx(model.metrics["val_average_precision"])
 
 
-@pytest.mark.parametrize("name", SCORING)
-def test_a_stored_scorer_is_deterministic_and_finite(
-    name: str, trained: dict[str, TrainedModel], dataset: Dataset, tmp_path: Path
-) -> None:
-    scene = dataset.split("test")[0]
-    views = poses(scene.read_table())[:60]
-    localization_map = scene.localization_map(CAMERA)
-    scores = load_scorer(trained[name].path, localization_map).score(views)
-    assert np.isfinite(scores).all() and len(np.unique(scores)) > 2
-    copy = tmp_path / "copy.safetensors"
-    copy.write_bytes(trained[name].path.read_bytes())
-    np.testing.assert_array_equal(load_scorer(copy, localization_map).score(views), scores)
-    unknown = replace(localization_map.landmarks, ambiguity=np.full(len(localization_map.landmarks), np.nan, "f4"))
-    assert np.isfinite(load_scorer(copy, replace(localization_map, landmarks=unknown)).score(views)).all()
-
-
 def test_the_same_seed_gives_the_same_bytes_and_is_reused(
     dataset: Dataset, trained: dict[str, TrainedModel], tracking: TrackingConfig
 ) -> None:

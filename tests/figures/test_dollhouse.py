@@ -9,7 +9,6 @@ from box_scenes import CABINET, ROOM, furnished_room
 from wheretolook.figures.dollhouse import dollhouse, frustum_corners, frustum_segments
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along, transform
-from wheretolook.utils.errors import ConfigError, SceneError
 
 
 def test_a_plan_has_x_to_the_right_and_y_up_and_knows_what_is_visible() -> None:
@@ -28,12 +27,6 @@ def test_near_walls_are_removed_unless_two_sided() -> None:
     options = {"azimuth_deg": -90.0, "elevation_deg": 45.0, "width_px": 200}
     assert dollhouse(furnished_room(ceiling=False), **options).shows(floor).all()
     assert not dollhouse(furnished_room(ceiling=False), one_sided=False, **options).shows(floor).any()
-
-
-@pytest.mark.parametrize(("options", "error"), [({"elevation_deg": 0}, ConfigError), ({"cut_m": -1.0}, SceneError)])
-def test_invalid_views(options: dict[str, float], error: type[Exception]) -> None:
-    with pytest.raises(error):
-        dollhouse(furnished_room(), **options)
 
 
 def test_frustum_corners_project_to_image_corners() -> None:

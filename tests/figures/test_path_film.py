@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from wheretolook.figures.animation import save_moving
-from wheretolook.figures.path_film import FRAME_MS, film_frames, methods_figure, still_figure
+from wheretolook.figures.path_film import FRAME_MS, film_frames, still_figure
 from wheretolook.planning.routes import PathView
 from wheretolook.utils.errors import ConfigError
 
@@ -58,13 +58,6 @@ def test_still_figure_draws_scores_and_landmarks(scale: float) -> None:
     np.testing.assert_allclose(axes.lines[0].get_ydata(), scale * np.arange(9) / 9)
     low, high = axes.get_ylim()
     assert all(low <= view.score <= high for view in views)
-
-
-def test_methods_are_side_by_side() -> None:
-    views = some_views(6)
-    figure = methods_figure({"forward": views[:3], "set": views}, LANDMARKS)
-    for axes, shown in zip(figure.axes, (views[:3], views), strict=True):
-        np.testing.assert_allclose(axes.lines[0].get_xydata(), [view.position[:2] for view in shown])
 
 
 def test_stops_are_marked_with_their_joint_score() -> None:

@@ -8,9 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from wheretolook.figures import KINDS
-from wheretolook.figures.style import new_figure, note_of, save_figure, scene_label
-from wheretolook.scorers.styles import method_style
-from wheretolook.utils.errors import ConfigError
+from wheretolook.figures.style import new_figure, note_of, save_figure
 
 
 def drawn() -> Figure:
@@ -29,21 +27,3 @@ def test_files_keep_a_note_and_are_reproducible(kind: str, tmp_path: Path) -> No
     assert note_of(first) == note
     save_figure(drawn(), second)
     assert note_of(second) == ""
-
-
-@pytest.mark.parametrize("work", [lambda path: save_figure(drawn(), path), note_of])
-def test_other_formats_are_rejected(work, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    with pytest.raises(ConfigError):
-        work(tmp_path / "figure.bmp")
-
-
-def test_display_names_of_scenes() -> None:
-    names = {"apartment-210": "apartment 210", "aws_house": "furnished house", "my_house": "my house"}
-    names |= {"nexuiz_aggressor_b": "game level aggressor b", "nexuiz": "game level"}
-    assert {name: scene_label(name) for name in names} == names
-
-
-def test_methods_have_distinct_styles() -> None:
-    styles = [method_style(name) for name in ("oracle", "random", "forward", "visible", "bins", "set", "mlp-2d")]
-    for attribute in ("label", "color", "marker"):
-        assert len({getattr(style, attribute) for style in styles}) == len(styles)

@@ -120,18 +120,3 @@ class Deadly:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return signal.raise_signal, (signal.SIGKILL,)
-
-
-class BreaksRenderer(SceneJob):
-    """Makes the renderer fail in the process that receives it."""
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _arrive, (self.mesh, self.landmarks, self.camera)
-
-
-def _arrive(mesh: Path, landmarks: Path, camera: PinholeCamera) -> SceneJob:
-    def render(*_: Any) -> None:
-        raise RuntimeError("the device is gone")
-
-    WarpRenderer.render = render  # type: ignore[method-assign, assignment]
-    return SceneJob(mesh, landmarks, camera)

@@ -12,12 +12,12 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from localization.rooms import POSTER, MappedRoom, facing, file_bytes, label, times, wait_until
+from localization.rooms import MappedRoom, file_bytes, label, times, wait_until
 from wheretolook.localization import ray_engine
 from wheretolook.localization.config import LabelConfig
 from wheretolook.localization.labeller import MANIFEST, LabelTask, label_scenes
 from wheretolook.localization.shard import Shard
-from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.errors import SceneError
 
 SLOW = pytest.mark.slow
 
@@ -52,14 +52,6 @@ def test_a_run_that_was_left_goes_on_where_it_stopped(
     manifest = scenes["second"].manifest
     assert list(manifest["shards"]) == [path.name for path in times(second.shards)]
     assert (second.shards / MANIFEST).is_file()
-
-
-@SLOW
-def test_without_ray_the_extra_to_install_is_named(room: MappedRoom, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)
-    shard = Shard(room.job, Path("shard.parquet"), facing(POSTER, 1, 1.5))
-    with pytest.raises(ConfigError):
-        next(ray_engine.run_ray([shard]))
 
 
 @pytest.fixture(scope="module")

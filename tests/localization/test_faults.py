@@ -14,25 +14,13 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from localization.rooms import (
-    CAMERA,
-    BreaksRenderer,
-    Deadly,
-    MappedRoom,
-    is_running,
-    label,
-    times,
-    wait_until,
-    workers_of,
-)
+from localization.rooms import Deadly, MappedRoom, is_running, label, times, wait_until, workers_of
 from wheretolook.dataset.viewpoint_table import read_table, write_table
-from wheretolook.localization import labeller, local_engine
-from wheretolook.localization.config import LabelConfig
-from wheretolook.localization.labeller import LabelTask, label_scenes
+from wheretolook.localization import local_engine
 from wheretolook.localization.local_engine import run_local
 from wheretolook.localization.shard import Shard
 from wheretolook.scenes.loading import load_mesh, save_glb
-from wheretolook.utils.errors import StorageError, WorkerError
+from wheretolook.utils.errors import WorkerError
 
 
 @pytest.mark.slow
@@ -79,46 +67,6 @@ def test_a_shard_that_kills_its_worker_every_time_is_given_up(
     with pytest.raises(WorkerError):
         next(run)
     assert not multiprocessing.active_children()
-
-
-@pytest.mark.slow
-def test_a_failing_renderer_is_named_with_the_mesh(room: MappedRoom, views: pd.DataFrame, tmp_path: Path) -> None:
-    job = BreaksRenderer(room.mesh, room.landmarks, CAMERA)
-    run = label_scenes([LabelTask("room", job, views, tmp_path)], LabelConfig(workers=1, shard_size=5), progress=False)
-    with pytest.raises(WorkerError) as caught:
-        next(run)
-    assert caught.value.path == room.mesh
-    assert not multiprocessing.active_children() and not times(tmp_path)
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("in_this_process")
-def test_a_full_disk_keeps_what_is_finished(
-    room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path
-) -> None:
-    """/dev/full replaces the file that is being written: first the manifest, then the third shard."""
-    shards = tmp_path / "shards"
-    shards.mkdir()
-    (shards / f"{labeller.MANIFEST}.partial").symlink_to("/dev/full")
-    with pytest.raises(StorageError) as caught:
-        label(views, room, shards, shard_size=6)
-    assert caught.value.path == shards / labeller.MANIFEST and not times(shards)
-    assert not (shards / f"{labeller.MANIFEST}.partial").is_symlink()  # no part stays
-
-    run = local_engine.run_local
-
-    def fill_at_the_third(missing: list[Shard], workers: int):  # type: ignore[no-untyped-def]
-        missing[2].path.with_name(f"{missing[2].path.name}.partial").symlink_to("/dev/full")
-        return run(missing, workers)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(local_engine, "run_local", fill_at_the_third)
-        with pytest.raises(StorageError):
-            label(views, room, shards, shard_size=6)
-    finished = times(shards)
-    assert len(finished) == 2
-    assert label(views, room, shards, shard_size=6) == expected  # there is room again
-    assert finished.items() <= times(shards).items()
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from wheretolook.dataset.viewpoint_table import (
     write_table,
 )
 from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.localization.report import POSITIVE, label_markdown, label_summary
+from wheretolook.localization.report import POSITIVE, label_summary
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import artifact, newest_run
 from wheretolook.utils.errors import TableError
@@ -100,36 +100,6 @@ def test_bands_by_hand(summary) -> None:  # type: ignore[no-untyped-def]
     assert list(visible["low"]) == [0, 1, 10, 30, 100, 300, 1000, 3000]
     assert list(visible["n_views"]) == [1, 3, 0, 2, 1, 1, 1, 1]
     np.testing.assert_allclose(visible[POSITIVE[-1]], [0, 0, NAN, 1 / 2, 1, 1, 1, 1])
-
-
-def test_error_histograms_by_hand(summary) -> None:  # type: ignore[no-untyped-def]
-    metres = summary.errors_m
-    degrees = summary.errors_deg
-    for errors in (metres, degrees):
-        assert errors["localized"].sum() == 6
-        assert errors["disbelieved"].sum() == 2
-    (bin_of_4mm,) = np.flatnonzero((metres["low"] <= 0.004) & (metres["high"] > 0.004))
-    assert metres["localized"][bin_of_4mm] == 2
-    assert metres["disbelieved"][bin_of_4mm] == 1
-    assert metres["disbelieved"].iloc[-1] == 1  # 500 m counts in the last bin
-    assert degrees["high"].iloc[-1] > 180
-
-
-def one_kind(good: int, finer: int, bad: int) -> pd.DataFrame:
-    rows = [(0, 0.0, 1, LOCALIZED, 0.003, 0.05)] * good + [(0, 0.0, 1, LOCALIZED, 1.0, 3.0)] * finer
-    return table(rows + [(0, 0.0, 1, LOCALIZED, 12.0, 80.0)] * bad)
-
-
-def test_markdown_has_a_row_for_every_scene_split_and_band(summary) -> None:  # type: ignore[no-untyped-def]
-    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in label_markdown(summary, "Hut").split("\n")]
-    shares = ["12.5", "25.0", "37.5", "50.0", "25.0", "62.5", "12.5", "25.0", "25.0", "62.5", "0.38"]
-    assert ["hall", "train", "8", "4", *shares] in lines
-    assert [line[:2] for line in lines if line[:1] == [ALL]] == [[ALL, "train"], [ALL, "test"], [ALL, ALL]]
-    assert ["0–0.5", "5", "40.0", "60.0", "80.0", "80.0"] in lines
-    assert ["1–1.5", "0", "–", "–", "–", "–"] in lines
-    bands = ["0", "1–9", "1,000–2,999", "≥ 3,000"]
-    assert [line[0] for line in lines if line and line[0] in bands] == bands
-    assert ["0.001–0.01", "30.0", "10.0"] in lines
 
 
 @pytest.fixture

@@ -47,35 +47,6 @@ def test_rows_belong_to_the_labels_beside_them(room: MappedRoom, matched: pd.Dat
     assert lengths.min() == 0 and (lengths > matched["n_inliers"]).any() and matched["n_inliers"].max() > 50
 
 
-def test_inliers_lie_where_the_true_pose_puts_them(
-    room: MappedRoom, views: pd.DataFrame, matched: pd.DataFrame
-) -> None:
-    """Inliers project within RANSAC's limit of their keypoint; the other matches project beyond it."""
-    landmarks = Landmarks.load(room.landmarks)
-    localizer = Localizer(landmarks, CAMERA)
-    good = np.flatnonzero(is_good(matched))
-    assert len(good) >= 10
-    images = WarpRenderer(load_mesh(room.mesh)).render(CAMERA, poses(views)[good]).rgb
-    keypoints = localizer.extract(images)
-    distances: list[np.ndarray] = []
-    others: list[np.ndarray] = []
-    for row, found, (of_image, of_map) in zip(good, keypoints, localizer.match(keypoints), strict=True):
-        np.testing.assert_array_equal(np.sort(of_map), matched["matched_rows"][row])
-        in_camera = transform(poses(views)[row], landmarks.points[of_map])
-        projected = CAMERA.project(in_camera)
-        distance = np.linalg.norm(projected - found.pixels[of_image], axis=1)
-        inlier = np.isin(of_map, matched["inlier_rows"][row])
-        assert (in_camera[inlier, 2] > 0).all() and CAMERA.in_image(projected[inlier]).mean() > 0.99
-        distances.append(distance[inlier])
-        others.append(distance[~inlier & (in_camera[:, 2] > 0)])
-    inliers = np.concatenate(distances)
-    outliers = np.concatenate(others)
-    limit = localizer.config.max_error_px
-    slack = 3.0  # RANSAC judged by its own pose, before it was refined
-    assert inliers.max() < limit + slack and np.quantile(inliers, 0.99) < limit and np.median(inliers) < 0.5
-    assert len(outliers) > 50 and outliers.min() > limit - slack
-
-
 def test_labels_are_the_same_with_and_without(
     views: pd.DataFrame, matched: pd.DataFrame, expected: bytes, tmp_path: Path
 ) -> None:

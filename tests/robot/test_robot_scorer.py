@@ -125,17 +125,6 @@ def test_bundled_weights_on_maps_of_any_size(n: int, tmp_path: Path) -> None:
     assert views.n_visible.max() > 2048 if n == 25_000 else views.n_visible.min() == 0
 
 
-def test_a_camera_close_to_a_wall(tmp_path: Path) -> None:
-    """One landmark a few centimetres away has most of the information on the position."""
-    landmarks = walls(4000, 1)
-    localization_map = LocalizationMap(landmarks, PinholeCamera())
-    at = landmarks.points[:200]
-    poses = poses_looking_along(at * 0.985, at)
-    expected = load_scorer(BUNDLED, localization_map).score(poses)
-    scores = RobotScorer(export_robot(localization_map, BUNDLED, tmp_path)).score(poses)
-    np.testing.assert_allclose(scores, expected, atol=TOLERANCE, rtol=0)
-
-
 @pytest.fixture(scope="module")
 def room_map() -> LocalizationMap:
     """Landmarks on the walls of a room with a cabinet, which occludes some of them."""

@@ -41,8 +41,3 @@ def test_a_film_shows_both_paths_step_by_step(tmp_path: Path) -> None:
     assert main(["view", *options]) == 0
     with Image.open(tmp_path / "way.webp") as film:
         assert film.n_frames == len(POINTS)  # type: ignore[attr-defined]
-
-
-@pytest.mark.parametrize("options", [["--film", "way.mp4"], ["--record", "x.txt"], ["--film", "x.webp"]])
-def test_invalid_files(options: list[str]) -> None:
-    assert main(["view", "--map", "nowhere", *options]) == 2

@@ -13,7 +13,7 @@ from synthetic_dataset import CAMERA, make_dataset
 from wheretolook.dataset.viewpoint_table import pose_columns
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.select.where_to_look import WhereToLook
-from wheretolook.utils.errors import ConfigError, TableError
+from wheretolook.utils.errors import TableError
 from wheretolook.view import drawing
 from wheretolook.view.scores import FLOOR_DIRECTIONS, floor_at, score_labels, score_location, visible_landmarks
 from wheretolook.view.viewed_map import ViewedMap, open_map, open_named_scene
@@ -83,14 +83,6 @@ def test_labels_are_compared_with_scores(room: ViewedMap) -> None:
     np.testing.assert_array_equal(labels.false_positive, (labels.scores >= labels.threshold) & ~good)
     np.testing.assert_array_equal(labels.false_negative, (labels.scores < labels.threshold) & good)
     np.testing.assert_allclose(labels.positions, camera_centers(poses), atol=1e-9)
-
-
-def test_methods_and_occlusion_models_that_can_be_used(room: ViewedMap) -> None:
-    assert room.methods[0] == "set" and {"visible", "bins", "mlp-2d+z", "forward"} <= {*room.methods}
-    assert "random" not in room.methods and room.occlusions == ("hidden-points", "none")
-    for method, occlusion in (("nonsense", "none"), ("set", "mesh")):
-        with pytest.raises(ConfigError):
-            room.selector(method, occlusion)
 
 
 def test_a_scene_of_a_dataset_has_its_labels(tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ from urllib.parse import quote
 from urllib.request import urlopen
 
 import numpy as np
-import pycolmap
 import pytest
 
 pytest.importorskip("viser")
@@ -143,23 +142,6 @@ def test_a_flood_of_messages_does_not_delay_other_clients(viewer: Viewer) -> Non
         assert threading.active_count() < n_threads + 12
 
 
-def test_landmarks_are_thinned_by_level_of_detail(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wheretolook.view.scenery.FEWER_LANDMARKS", (500, 100, 20))  # of 400
-    with connect(viewer) as client:
-        session = join(viewer, client)
-
-        def sizes() -> list[int]:
-            clouds = [session.scene.get_handle_by_name(f"/landmarks{name}") for name in ("", "-1", "-2", "-3")]
-            return [len(cloud.points) for cloud in clouds if cloud is not None and cloud.visible]
-
-        shown = []
-        for level in (0, 1, 2, 3, 0):
-            session.scenery.set_level(level)
-            session.draw_scene()
-            shown.append(sizes())
-        assert shown == [[400], [400], [100], [20], [400]]
-
-
 def test_invalid_values_of_controls_are_reported_and_restored(viewer: Viewer) -> None:
     with connect(viewer) as client:
         session = join(viewer, client)
@@ -236,22 +218,6 @@ def test_a_mesh_in_another_frame_is_reported_in_terminal_and_page(
     viewed = open_map(sparse, tmp_path / "room.glb", weights=WEIGHTS)
     assert any(warning.category is MapWarning for warning in recwarn) == warned
     assert any("from the mesh" in text for text in viewed.warnings) == warned
-
-
-def test_a_map_that_is_not_metric_and_upright_is_reported(sparse: Path, tmp_path: Path) -> None:
-    model = pycolmap.Reconstruction(sparse)
-    turn = pycolmap.Rotation3d(np.array([np.sin(np.pi / 4), 0, 0, np.cos(np.pi / 4)]))  # y is up
-    model.transform(pycolmap.Sim3d(100.0, turn, np.zeros(3)))
-    model.write(tmp_path)
-    with pytest.warns(MapWarning):
-        shared = Shared(open_map(tmp_path, weights=WEIGHTS))
-    assert len(shared.viewed.warnings) == 2
-    viewer = Viewer(shared, port=0, state=STATE)
-    try:
-        with connect(viewer) as client:
-            assert join(viewer, client).controls.warnings.visible
-    finally:
-        viewer.stop()
 
 
 @pytest.mark.parametrize("format", FILES)

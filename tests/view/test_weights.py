@@ -42,12 +42,6 @@ def opened(dataset: Dataset, scene: str, weights: Path | None = None) -> ViewedM
     return open_named_scene(dataset.root.parent, scene, "", None, weights, "cpu")
 
 
-def test_bundled_weights_score_where_there_are_no_others(dataset: Dataset) -> None:
-    viewed = opened(dataset, "scene-1")
-    assert viewed.methods[0] == "set" and {"visible", "mlp-2d+z"} <= {*viewed.methods}
-    assert "bundled" in viewed.weights.describe("set") and viewed.weights.describe("visible") == ""
-
-
 def test_adapted_weights_score_in_their_scene_only(dataset: Dataset) -> None:
     path = dataset.root / "adapted" / "scene-1.safetensors"
     save_adapted(path, dataset.scene("scene-1").read_landmarks().points)

@@ -93,18 +93,3 @@ def test_detail_is_reduced_while_the_camera_of_a_slow_browser_moves(
         assert shown[-1] == 2  # begins with the last level
     else:
         assert shown == []
-
-
-def test_full_detail_is_restored_however_long_showing_less_took() -> None:
-    shown: list[int] = []
-
-    def show(level: int) -> None:
-        time.sleep(0.5 if level else 0.0)  # longer than until the camera counts as still
-        shown.append(level)
-
-    detail = LevelOfDetail(show, 1)
-    for step in range(5):
-        detail.moved((float(step), 0.0, 9.0), (0.0, 0.0, 0.0))
-        time.sleep(0.1)
-    wait_until(lambda: len(shown) > 1 and detail._timer is None)
-    assert shown[0] == 1 and shown[-1] == 0

@@ -143,9 +143,3 @@ def test_invalid_errors(text: str, tmp_path: Path) -> None:
     (tmp_path / "pose_errors.txt").write_text(text)
     with pytest.raises(TableError):
         scores_of(tmp_path)
-
-
-def test_a_quaternion_has_unit_length(tmp_path: Path) -> None:
-    (tmp_path / "poses.txt").write_text("1 1 1 0 0 0 0 0\n")
-    with pytest.raises(TableError):
-        read_poses(tmp_path / "poses.txt")

@@ -16,7 +16,6 @@ from wheretolook.figures.style import save_figure
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere, released_lattice
 from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.scorers.styles import method_style
 from wheretolook_paper.figures.inputs import BinnedImage, inputs_figure
 from wheretolook_paper.figures.lattices import covering_radius_deg, fibonacci_figure, nearest_angles_deg
 from wheretolook_paper.figures.look_story import Estimate, LookStory, film_frames, story_figure
@@ -165,14 +164,6 @@ def test_extrema_are_spread() -> None:
     assert cosines[~np.eye(len(peaks), dtype=bool)].max() <= np.cos(np.radians(40)) + 1e-12
     assert peaks[0] == 0 and np.all(np.diff(scores[peaks]) <= 0)
     assert spread_extrema(directions, scores, 1, 40.0, False).tolist() == [299]
-
-
-def test_fisher_methods_share_a_marker_by_metric_and_a_colour_by_approximation() -> None:
-    from wheretolook_paper.scorers.fisher import APPROXIMATIONS, METRICS
-
-    styles = {(m, a): method_style(f"fisher-{m}-{a}") for m in METRICS for a in APPROXIMATIONS}
-    assert len({style.label for style in styles.values()}) == 9
-    assert len({style.marker for style in styles.values()}) == len({style.color for style in styles.values()}) == 3
 
 
 def test_viewer_geometries_hold_the_scene() -> None:

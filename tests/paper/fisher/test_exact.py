@@ -66,13 +66,3 @@ def test_a_distorted_camera_sums_up_what_it_sees(random_views: RandomViews) -> N
         expected = bearing_numbers(seen - v.locations[v.location_rows[view]]).sum(0)
         np.testing.assert_allclose(found[view], expected, rtol=1e-5, atol=1e-5)  # offsets are rounded to float32
     assert (found @ TRACE > 0).sum() > 30
-
-
-def test_no_views_and_no_landmarks(device: str) -> None:
-    camera = PinholeCamera()
-    none = LandmarkSets.from_mask(np.ones((1, 0), bool))
-    assert exact_information(
-        PosedViews(camera, np.empty((0, 3, 4)), np.ones((1, 3)), none, np.empty(0, int)), device
-    ).shape == (0, 15)
-    poses = poses_looking_along(np.zeros((2, 3)), np.eye(3)[:2])
-    assert not exact_information(PosedViews(camera, poses, np.empty((0, 3)), none, np.zeros(2, int)), device).any()

@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from twins.fisher import eigenvalues_plain
 from wheretolook.geometry.pose_information import TRACE, bearing_numbers, information_matrices
 from wheretolook.geometry.poses import Float
-from wheretolook.utils.errors import ConfigError
-from wheretolook_paper.fisher.metrics import METRICS, eigenvalues, metric_of
+from wheretolook_paper.fisher.metrics import eigenvalues, metric_of
 
 
 def turn_of(vector: torch.Tensor) -> torch.Tensor:
@@ -129,17 +128,3 @@ def test_metrics_are_those_of_numpy(kind: str, pivoted: bool, device: str) -> No
     else:
         assert sure.any()
     assert np.any(found < -0.1) == (kind in ("indefinite", "any", "equal eigenvalues"))
-
-
-def test_what_is_not_a_number_comes_to_an_end() -> None:
-    numbers = np.ones((3, 15))
-    numbers[0, 4] = np.nan
-    numbers[1, 12] = np.inf
-    found = metric_of(numbers, "mineig")
-    assert not np.isfinite(found[:2]).any() and np.isfinite(found[2])
-
-
-def test_no_such_metric() -> None:
-    with pytest.raises(ConfigError):
-        metric_of(np.zeros((1, 15)), "det")
-    assert METRICS == ("mineig", "logdet", "trace")

@@ -41,9 +41,3 @@ def test_waypoints_every_20_cm() -> None:
     np.testing.assert_allclose(resample_path(path), [(min(s, 1), max(0, s - 1), 0) for s in along], atol=1e-12)
     assert len(resample_path(path[:2])) == 6  # the end is a waypoint once
     np.testing.assert_array_equal(resample_path([path[0], path[0]]), path[:1])
-
-
-@pytest.mark.parametrize("path, spacing", [(np.empty((0, 3)), 0.2), (np.ones((2, 2)), 0.2), (np.ones((2, 3)), 0.0)])
-def test_invalid_paths(path: np.ndarray, spacing: float) -> None:
-    with pytest.raises(ValueError):
-        resample_path(path, spacing)

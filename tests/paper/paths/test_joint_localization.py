@@ -106,14 +106,3 @@ def test_odometry_without_noise_is_the_way_itself() -> None:
         assert len(rig) == min(n, view + 1)
         for back, mount in enumerate(rig):
             np.testing.assert_allclose(chained(mount, way[view]), way[view - back], atol=1e-9)
-
-
-def test_without_stops_nothing_changes(compared: tuple) -> None:
-    single, further, labels, _ = compared
-    nothing = pd.DataFrame(columns=further.columns[:8])
-    localize = partial(label_sets, points=LANDMARKS.points, cameras=CAMERA)
-    views = localize_stops(single.views, nothing, labels, localize)
-    own = single.views[single.views["method"] == "set"]
-    pd.testing.assert_frame_equal(views.drop(columns="method"), own.drop(columns="method"))
-    paths = joint_paths(single.paths, views, nothing)
-    assert paths[["method", "turn_deg", "n_looks"]].to_numpy().tolist() == [["set with stops", 0.0, 6]]

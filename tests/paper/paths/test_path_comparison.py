@@ -19,8 +19,7 @@ from wheretolook.space.free_space import FreeSpace
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import finished_runs
 from wheretolook.tracking.store import client
-from wheretolook.utils.errors import ConfigError, PlanningError, SceneError
-from wheretolook_paper.figures.paths import paths_figure
+from wheretolook.utils.errors import PlanningError, SceneError
 from wheretolook_paper.paths.config import PathsConfig
 from wheretolook_paper.paths.path_comparison import ComparedPaths, Reachability, draw_pairs, plan_pairs
 from wheretolook_paper.paths.path_report import log_paths, summarize_paths
@@ -96,15 +95,6 @@ def test_ways_lead_round_walls_but_not_through_them() -> None:
     assert not closed.connects(left, (2.0, 0.5, 0.5))  # in the wall
 
 
-def test_scores_become_ranks() -> None:
-    viewpoint_map = build(room_landmarks(50))
-    ranks = shares_below(replace(viewpoint_map, scores=(1e6 * viewpoint_map.scores).astype(np.float32)))
-    flat = viewpoint_map.scores.ravel()
-    expected = [(flat < value).sum() / (flat.size - 1) for value in flat[:50]]
-    np.testing.assert_allclose(ranks.scores.ravel()[:50], expected, rtol=1e-5)
-    assert ranks.scores.min() == 0 and ranks.scores.max() <= 1
-
-
 def test_every_method_goes_the_same_way(compared: ComparedPaths, space: FreeSpace) -> None:
     paths = compared.paths
     assert paths["planned"].all()
@@ -162,26 +152,6 @@ def test_shares_by_hand() -> None:
     assert strict.loc["set", "localized"] == 0
 
 
-def test_what_failed_leaves_the_ratio_alone() -> None:
-    paths, views = _labelled()
-    some = {("forward", 0): (9, 10), ("forward", 1): (0, 10), ("forward", 2): (0, 10), ("set", 0): (9, 10)}
-    paths = pd.DataFrame([
-        {"scene": "a", "task": "planned", "method": method, "pair": pair, "planned": (method, pair) in some,
-         "length_m": 2.0 if (method, pair) in some else np.nan, "turn_deg": np.nan, "n_views": 10, "promised": np.nan}
-        for method in ("forward", "set") for pair in range(3)
-    ])  # fmt: skip
-    views = pd.DataFrame([
-        {"scene": "a", "task": "planned", "method": method, "pair": pair, "status": "localized",
-         "error_m": 0.1 if number < good else 9.0, "error_deg": 0.1}
-        for (method, pair), (good, n) in some.items() for number in range(n)
-    ])  # fmt: skip
-    table = summarize_paths(paths, views, QUICK).set_index("method")
-    assert table.loc["set", "failures"] == 2 and table.loc["set", "times_forward"] == pytest.approx(1)
-    assert table.loc["set", "times_forward_low"] == table.loc["set", "times_forward_high"] == pytest.approx(1)
-    nothing = summarize_paths(paths, views.assign(error_m=9.0), QUICK).set_index("method")
-    assert np.isnan(nothing.loc["set", "times_forward"]) and nothing.loc["set", "localized"] == 0
-
-
 def test_the_same_comparison_is_logged_once(tmp_path: Path) -> None:
     tracking = TrackingConfig(str(tmp_path / "mlruns"))
     summary = summarize_paths(*_labelled(), QUICK)
@@ -194,22 +164,3 @@ def test_the_same_comparison_is_logged_once(tmp_path: Path) -> None:
     assert parent.data.metrics["localized"] == pytest.approx(0.5)  # as by hand, above
     other = summary.assign(localized=1.0)
     assert log_paths({"dataset": "a", "seed": 1}, other, tmp_path, tracking) not in runs
-
-
-def test_the_figure_shows_every_share() -> None:
-    paths, views = _labelled()
-    both = [table if scene == "a" else table.assign(scene=scene) for table in (paths, views) for scene in "ab"]
-    summary = summarize_paths(pd.concat(both[:2]), pd.concat(both[2:]), QUICK)
-    (axes,) = paths_figure(summary).axes
-    shares = sorted(
-        round(float(value), 3) for line in axes.lines if len(line.get_xdata()) == 3 for value in line.get_xdata()
-    )
-    assert shares == sorted(round(100 * value, 3) for value in summary["localized"]) and len(shares) == 6
-    assert axes.get_xlabel().endswith("(%)")
-    assert [text.get_text() for text in axes.get_yticklabels()] == ["all scenes", "a", "b"]
-
-
-def test_impossible_options_of_a_comparison() -> None:
-    for name, value in (("pairs", 0), ("height_m", (2.0, 1.0)), ("methods", ("set",)), ("max_error_m", -1.0)):
-        with pytest.raises(ConfigError, match=name):
-            replace(QUICK, **{name: value})

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from planning.rooms import patiently
@@ -25,7 +24,6 @@ from wheretolook.tracking.runs import newest_artifact, newest_run
 from wheretolook_paper.figures.config import FiguresConfig
 from wheretolook_paper.figures.top_n import ROWS, top_n_figure, top_n_table
 from wheretolook_paper.release.catalog import ITEMS, write_items
-from wheretolook_paper.release.paper_architecture import paper_architecture_table
 from wheretolook_paper.release.runs import log_release
 from wheretolook_paper.release.showcase import open_showcase
 from wheretolook_paper.release.showcase_figures import planned_views
@@ -159,14 +157,3 @@ def test_paper_tables_for_reading(store: tuple[Dataset, TrackingConfig]) -> None
     assert (cells.xs("FIF trace GP app").loc[:, (slice(None), "paper")] == "–").all(axis=None)
     html = paper_styler(table).to_html()
     assert html.count("font-weight: bold;\n}") >= 1 and "72.9" in html
-
-
-def test_layers_are_those_that_were_trained() -> None:
-    small = paper_architecture_table({"method": "mlp-2d", "bins": "10", "hidden": "[50]", "dropout": "0.2"})
-    assert small["here"].tolist()[:5] == ["fully connected 200 × 50", "ReLU", "dropout 0.2", "fully connected 50 × 1",
-                                          "Sigmoid"]  # fmt: skip
-    assert small["layer"].tolist() == ["1", "1.1", "1.2", "2", "2.1", "2.2", "3", "3.1"]
-    assert small["here"].tolist()[5:] == ["", "", ""]
-    same = paper_architecture_table({"method": "mlp-2d+3d", "bins": "30", "hidden": "(300, 300)", "dropout": "0.5"})
-    different = pd.Series(same["paper"] != same["here"])
-    assert same.loc[different, "here"].tolist() == ["fully connected 4500 × 300"]

@@ -31,7 +31,6 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.report import score_markdown
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.mlp.network import ViewpointNetwork
-from wheretolook.scorers.set.config import SetConfig
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.training.data import load_views
 from wheretolook.training.trained_network import TrainedNetwork
@@ -43,7 +42,6 @@ from wheretolook_paper.commands.release import Release, release_settings
 from wheretolook_paper.release import copy as releases
 from wheretolook_paper.release.card import release_card
 from wheretolook_paper.release.copy import convert_to_float16
-from wheretolook_paper.scorers.trees.config import TreesConfig
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 
@@ -182,39 +180,6 @@ def test_the_best_on_validation_ships(finished: Path) -> None:
         progress=False,
     )
     assert models[0].reused
-
-
-@pytest.mark.slow
-def test_what_is_best_of_all_ships_beside_the_network(folder: Path, tmp_path: Path) -> None:
-    root = folder / "data" / "release"
-    release = Dataset.load(root)
-    tracking = TrackingConfig(str(folder / "mlruns"))
-    few = replace(TRAIN, set=SetConfig(epochs=4, batch_size=16), trees=TreesConfig(max_trees=3, min_leaf=5))
-    train(release, changed(few, methods=("set", "trees")), tracking, progress=False)
-    records = {name: root / "weights" / f"{name}.json" for name in ("set", "trees")}
-    for name, precision in (("set", 0.9999), ("trees", 0.5)):  # whatever they have learnt from so little
-        record = json.loads(records[name].read_text())
-        record["metrics"]["val_average_precision"] = precision
-        records[name].write_text(json.dumps(record))
-    experiment = replace(
-        experiment_of(folder, "release"), evaluate=replace(EVALUATE, methods=(*EVALUATE.methods, "set"))
-    )
-    run(Release, experiment, log=quiet)
-    (network,) = (path for path in (root / "weights").glob("mlp-*.safetensors"))
-    assert sorted(path.name for path in (root / "weights").glob("*.safetensors")) == [network.name, "set.safetensors"]
-    assert (root / "weights" / releases.SHELF / "trees.safetensors").is_file()
-    scores, variants = (pd.read_csv(root / "results" / f"{name}.csv") for name in ("scores", "variants"))
-    assert {network.stem, "set"} <= {*scores["method"]} and "trees" not in {*scores["method"]}
-    assert {network.stem, "set", "trees"} <= {*variants["method"]}
-    card = (root / "README.md").read_text()
-    assert card == card_of(release)
-    for said in (f"{network.name} and set.safetensors", "set of landmarks; and of the paper's best network", "0.9999"):
-        assert said in card, said
-    scorer = load_scorer(root / "weights", release.scenes[0].localization_map(release.camera))
-    assert scorer.name == "set"
-    before = contents(root)
-    run(Release, experiment, log=quiet)
-    assert contents(root) == before
 
 
 def test_done_again_it_gives_the_same_bytes(folder: Path) -> None:

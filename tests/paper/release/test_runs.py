@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import re
 import shutil
 from pathlib import Path
 
@@ -19,7 +17,7 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.results import latest_scores
 from wheretolook.evaluation.scores import read_scores
 from wheretolook.tracking.config import TrackingConfig
-from wheretolook.tracking.runs import experiment_ids, experiments, finished_runs, newest_artifact, newest_run
+from wheretolook.tracking.runs import experiment_ids, finished_runs, newest_artifact, newest_run
 from wheretolook.tracking.store import client
 from wheretolook_paper.release.runs import ReleaseRuns, log_release
 from wheretolook_paper.release.training_histories import histories, keep_histories, trained
@@ -93,33 +91,6 @@ def test_rows_over_all_scenes_are_nested(logged: tuple[Dataset, TrackingConfig, 
     looks = children(tracking, str(runs.looks))
     assert {*looks} == {f"{name} looks (looks release)" for name in ("together, 1", "together, 2", "random, 2")}
     assert looks["together, 2 looks (looks release)"][1] == {"good": 0.8, "any_good": 0.75}
-
-
-def test_each_dataset_and_purpose_has_an_experiment_that_says_what_to_look_at(
-    logged: tuple[Dataset, TrackingConfig, ReleaseRuns],
-) -> None:
-    tracking = logged[1]
-    found = {experiment.name: experiment for experiment in experiments(client(tracking), tracking)}
-    released = ("evaluation", "learners", "looks", "paths", "training")
-    assert found.keys() == {"interiors: evaluation", "benchmarks", *(f"release: {purpose}" for purpose in released)}
-    for experiment in found.values():
-        note = experiment.tags["mlflow.note.content"]
-        ids = [experiment.experiment_id]
-        logged_here = client(tracking).search_runs(ids, max_results=1000)
-        metrics = {name for run in logged_here for name in run.data.metrics}
-        named = {*re.findall(r"`((?:1|regret|kept|average_precision|times)_[a-z_]+|localized|good|any_good)`", note)}
-        assert (named and named <= metrics) or experiment.name == "benchmarks", (experiment.name, named - metrics)
-        for query in re.findall(r"`(params\.[^`]*)`", note):
-            assert client(tracking).search_runs(ids, query), query
-        for address in re.findall(r"\]\((#[^)]*)\)", note):
-            assert address.startswith(f"#/experiments/{experiment.experiment_id}/runs?viewStateShareKey=")
-            view = json.loads(experiment.tags[f"mlflow.sharedViewState.{address.rpartition('=')[2]}"])
-            order = f"{view['orderByKey']} {'ASC' if view['orderByAsc'] else 'DESC'}"
-            shown = client(tracking).search_runs(ids, view["searchFilter"], order_by=[order], max_results=1000)
-            for column in view["selectedColumns"]:
-                kind, _, name = column.replace("`", "").partition(".")
-                values = [(run.data.params if kind == "params" else run.data.metrics).get(name) for run in shown]
-                assert any(value is not None for value in values), (experiment.name, column)
 
 
 def test_a_release_is_logged_as_its_evaluation_was(tmp_path: Path) -> None:

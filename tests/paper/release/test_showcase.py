@@ -38,7 +38,7 @@ from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.visibility.config import OcclusionConfig
 from wheretolook.visibility.occlusion import MeshOcclusion
 from wheretolook_paper.release.showcase import Showcase, open_showcase
-from wheretolook_paper.release.showcase_figures import learning_of, peaks_of, pipeline_of, sampling_of
+from wheretolook_paper.release.showcase_figures import learning_of, peaks_of, pipeline_of
 from wheretolook_rooms.generator import generate_apartment
 
 CAMERA = PinholeCamera(96, 72, 48.0)
@@ -145,19 +145,6 @@ def test_pipeline_takes_the_best_views(showcase: Showcase) -> None:
         pipeline.best_axes, showcase.directions[[np.argmax(everywhere)] * len(pipeline.locations)]
     )
     assert pipeline.rgb.shape == (72, 96, 3) and pipeline.rgb.std() > 1
-
-
-def test_sampling_counts_what_the_table_counts(showcase: Showcase) -> None:
-    location = showcase.instructive_location()
-    sampling = sampling_of(showcase, location)
-    rows = showcase.viewpoints(location)
-    np.testing.assert_array_equal(sampling.n_visible[rows["direction_id"]], rows["n_visible"])
-    assert (sampling.kept == (sampling.n_visible > 0)).all()  # K is greater than the lattice
-    assert location in sampling.layer and set(sampling.layer[sampling.free]) <= set(showcase.free)
-    # what is in view in all directions together is what is not hidden
-    localization_map = showcase.localization_map
-    seen = np.unique(np.concatenate([localization_map.landmarks_in_view(pose[None])[0] for pose in poses(rows)]))
-    assert sampling.unoccluded[seen].all() and not sampling.unoccluded.all()
 
 
 def test_peaks_are_labelled_views_with_what_came_of_them(showcase: Showcase) -> None:

@@ -8,21 +8,18 @@ import numpy as np
 import pytest
 import torch
 
-from learning_options import train_config
 from synthetic_dataset import CAMERA, make_landmarks, make_mapping_poses
 from wheretolook.geometry.lattices import axes_of_angles, fibonacci_sphere, yaw_pitch_angles
-from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_paper.scorers.sphere.config import SphereConfig
 from wheretolook_paper.scorers.sphere.network import PITCHES, YAWS, SphereNetwork, on_lattice
 from wheretolook_paper.scorers.sphere.score import SphereScorer
-from wheretolook_paper.scorers.sphere.views import FEATURES, OFFSET_M, LocationDescriber
+from wheretolook_paper.scorers.sphere.views import LocationDescriber
 
 FEW = SphereConfig(points=48, cameras=8, width=32, heads=2, layers=1, dropout=0.0, epochs=10, batch_size=40)
-SMALL = train_config("sphere", accelerator="cpu", sphere=FEW)
-NAMES = {name: index for index, name in enumerate(FEATURES)}
 
 
 @pytest.fixture
@@ -54,53 +51,6 @@ def test_the_lattice_has_its_own_values_at_its_directions_and_means_between() ->
     torch.testing.assert_close(found[0], values[0, :2, 9:11].mean())
     found = on_lattice(values, torch.zeros(1, dtype=torch.int64), at_angles((25, 0)))
     torch.testing.assert_close(found[0], 0.75 * values[0, 3, 10] + 0.25 * values[0, 3, 11])
-
-
-def test_tokens_tell_of_landmarks_in_free_sight_and_of_cameras(localization_map: LocalizationMap) -> None:
-    points = localization_map.landmarks.points
-    locations = np.array([[0.5, -0.5, 1.2], [0.0, 1.0, 1.0], [1.0, 1.0, 2.0]])
-    mask = np.zeros((3, 200), dtype=bool)
-    mask[0, 7:40] = True  # the third sees nothing
-    mask[1] = True
-    hidden = replace(localization_map, occlusion=StoredOcclusion.from_mask(locations, mask))
-    first, all_seen, blind = LocationDescriber(hidden, FEW).describe(locations)
-    assert [len(tokens) for tokens in (first, all_seen, blind)] == [1 + 33 + 8, 1 + 48 + 8, 1 + 8]
-    offsets = points[7:40] - locations[0]
-    distance = np.linalg.norm(offsets, axis=1)
-    np.testing.assert_allclose(first[1:34, :3] * OFFSET_M, offsets, atol=1e-5)
-    np.testing.assert_allclose(first[1:34, 3:6], offsets / distance[:, None], atol=1e-5)
-    np.testing.assert_allclose(first[1:34, NAMES["log_distance"]], np.log1p(distance), atol=1e-5)
-    for tokens, n in ((first, 33), (all_seen, 200), (blind, 0)):
-        np.testing.assert_allclose(tokens[:, NAMES["log_landmarks"]], np.log1p(n), rtol=1e-6)
-        assert tokens[:, NAMES["is_camera"]].sum() == 8 and tokens[0, -2:].sum() == 0
-    # 48 of 200 landmarks, from the first to the last
-    chosen = all_seen[1:49, :3] * OFFSET_M + torch.from_numpy(locations[1])
-    np.testing.assert_allclose(chosen[[0, -1]], points[[0, -1]], atol=1e-5)
-    cameras = localization_map.mapping_poses
-    assert cameras is not None
-    np.testing.assert_allclose(blind[1, :3] * OFFSET_M, camera_centers(cameras)[0] - locations[2], atol=1e-5)
-    np.testing.assert_allclose(blind[[1, -1], 6:9], cameras[[0, -1], 2, :3], atol=1e-6)
-    assert not first[:34, 6:9].any()
-
-
-def test_turning_a_location_turns_all_that_has_a_direction() -> None:
-    torch.manual_seed(3)
-    tokens = torch.randn(4, 9, len(FEATURES))
-    axes = torch.randn(6, 3)
-    rows = torch.tensor([0, 0, 1, 2, 3, 3])
-    padding = torch.zeros(4, 9, dtype=torch.bool)
-    turned, _, same_rows, turned_axes = SphereNetwork(FEW).augment(SMALL, tokens, padding, rows, axes)
-    assert torch.equal(rows, same_rows)
-    torch.testing.assert_close(turned[..., [2, 5, 8, *range(9, len(FEATURES))]],
-                               tokens[..., [2, 5, 8, *range(9, len(FEATURES))]])  # fmt: skip
-    for start in (0, 3, 6):  # what lies in the direction of the axis still does
-        before = torch.einsum("btc,bc->bt", tokens[rows][..., start : start + 3], axes)
-        after = torch.einsum("btc,bc->bt", turned[rows][..., start : start + 3], turned_axes)
-        torch.testing.assert_close(after, before, rtol=1e-4, atol=1e-5)
-    angle = torch.atan2(turned[..., 1], turned[..., 0]) - torch.atan2(tokens[..., 1], tokens[..., 0])
-    angle = angle.remainder(2 * torch.pi)
-    torch.testing.assert_close(angle, angle[:, :1].expand(-1, 9), rtol=1e-4, atol=1e-4)
-    assert angle[:, 0].diff().abs().min() > 1e-3  # each by its own
 
 
 def test_a_pose_has_its_own_score(localization_map: LocalizationMap, model: TrainedNetwork[SphereNetwork]) -> None:

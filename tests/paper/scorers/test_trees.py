@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from scipy.special import expit
 
 from learning_options import train_config
@@ -16,8 +15,7 @@ from wheretolook.commands.train import train_methods as train
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import is_good, poses
 from wheretolook.tracking.config import TrackingConfig
-from wheretolook.training.weights import method_of_weights, read_training, write_weights
-from wheretolook.utils.errors import ConfigError, WeightsError
+from wheretolook.training.weights import method_of_weights, read_training
 from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.scorers.pooled_features import POOLED
 from wheretolook_paper.scorers.trees.config import TreesConfig
@@ -58,24 +56,6 @@ def test_weights_come_back_and_equal_seeds_give_equal_bytes(trees: BoostedTrees,
     again = fit_trees(some_views(3000, 0), some_views(1000, 1), CAMERA, FEW)[0]
     again.save(tmp_path / "again", {"method": "trees"})
     assert path.read_bytes() == (tmp_path / "again").read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("model", "changed"),
-    [(b"no model", {}), (None, {"features": ["height"]}), (None, {"camera": {"breadth": 3}}), (None, {"scale": "x"})],
-)
-def test_damaged_weights(trees: BoostedTrees, model: bytes | None, changed: dict, tmp_path: Path) -> None:
-    header = {"features": list(POOLED), "camera": CAMERA.record(), "scale": 1.0, "offset": 0.0, "training": {}}
-    text = torch.frombuffer(bytearray(model or trees.model.encode()), dtype=torch.uint8)
-    write_weights(tmp_path / "trees.safetensors", "trees", {"model": text}, header | changed)
-    with pytest.raises(WeightsError):
-        BoostedTrees.load(tmp_path / "trees.safetensors")
-
-
-@pytest.mark.parametrize("wrong", [{"max_trees": 0}, {"max_leaves": 1}, {"min_leaf": 0}, {"learning_rate": 0.0}])
-def test_invalid_options(wrong: dict[str, float]) -> None:
-    with pytest.raises(ConfigError):
-        TreesConfig(**wrong)  # type: ignore[arg-type]
 
 
 def test_the_scorer_is_the_trees_on_pooled_views(tmp_path: Path) -> None:

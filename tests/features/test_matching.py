@@ -73,17 +73,6 @@ def test_blocks_leave_no_seam(device: str, n: int, monkeypatch: pytest.MonkeyPat
         assert_nearest_two(device, sift_like_descriptors(n, seed=1), sift_like_descriptors(300))
 
 
-def test_both_nearest_may_lie_in_one_group_or_in_two(device: str) -> None:
-    landmarks = np.zeros((200, 128), dtype=np.uint8)
-    query = np.full((1, 128), 100, dtype=np.uint8)
-    for first, second in ((3, 4), (4, 3), (31, 32), (199, 0), (0, 199), (64, 95), (130, 67)):
-        landmarks[:] = 1
-        landmarks[first] = 90
-        landmarks[second] = 80
-        rows, best, next_best = DescriptorMatcher(landmarks, device).nearest_two(query)
-        assert (rows[0], best[0], next_best[0]) == (first, 128 * 9000, 128 * 8000)
-
-
 def lowe(queries: Descriptors, landmarks: Descriptors, max_ratio: float) -> dict[int, int]:
     """Keypoint to landmark, by brute force: ratio of distances, and of each landmark its nearest keypoint."""
     found: dict[int, tuple[int, int]] = {}

@@ -12,12 +12,6 @@ from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.warp_sift import WarpSift
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.rendering.warp_renderer import WarpRenderer
-from wheretolook.scenes.config import ApartmentConfig
-from wheretolook.space.free_space import FreeSpace
-from wheretolook_rooms.generator import generate_apartment
 
 EVERYTHING = ExtractorConfig(max_keypoints=100_000)
 
@@ -26,20 +20,6 @@ def texture(seed: int, rows: int = 240, columns: int = 320) -> np.ndarray:
     rng = np.random.default_rng(seed)
     image = sum(2 * s * gaussian_filter(rng.normal(0, 30, (rows, columns)), s) for s in (0.7, 1.5, 4, 10))
     return np.clip(128 + image, 0, 255).astype(np.uint8)
-
-
-@pytest.fixture(scope="module")
-def renders() -> np.ndarray:
-    """Views in an apartment, (4, 240, 320) uint8."""
-    config = ApartmentConfig(n_rooms=3, texture_size=2048, light_rays=4, light_spacing_m=0.5)
-    mesh = generate_apartment(config, 1)
-    rng = np.random.default_rng(2)
-    free = FreeSpace(mesh)
-    eyes = rng.uniform(*mesh.bounds, (1000, 3)) * (1, 1, 0) + (0, 0, 1.4)
-    eyes = eyes[free.is_free(eyes)][:4]
-    looks = rng.normal(size=(4, 3)) * (1, 1, 0.2)
-    rgb = WarpRenderer(mesh).render(PinholeCamera(320, 240, 160.0), poses_looking_along(eyes, looks)).rgb
-    return np.rint(rgb @ (0.2126, 0.7152, 0.0722)).astype(np.uint8)
 
 
 def opencv(grey: np.ndarray, config: ExtractorConfig) -> Keypoints:
@@ -70,14 +50,6 @@ def assert_agree(ours: Keypoints, theirs: Keypoints) -> None:
         assert np.mean(np.isfinite(cosine)) >= 0.97
         cosine = cosine[np.isfinite(cosine)]
         assert np.median(cosine) > 0.999 and np.quantile(cosine, 0.01) > 0.98
-
-
-@pytest.mark.parametrize("view", range(4))
-def test_agrees_with_opencv_on_renders(view, renders, device):
-    theirs = opencv(renders[view], EVERYTHING)
-    (ours,) = WarpSift(EVERYTHING, device).extract_many(renders[view][None])
-    assert len(theirs) > 50
-    assert_agree(ours, theirs)
 
 
 @pytest.mark.parametrize("shape", [(240, 320), (171, 237), (30, 301), (12, 90)])

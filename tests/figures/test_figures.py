@@ -120,5 +120,3 @@ def test_overview_draws_locations_scores_and_both_views() -> None:
     np.testing.assert_allclose(dots.get_offsets(), plan.pixels(locations)[order])
     np.testing.assert_allclose(dots.get_array(), shares[order])
     np.testing.assert_allclose(sphere.collections[0].get_offsets(), np.transpose(pan_tilt_angles(directions)))
-    for text, view in zip(sphere.texts, (best, worst), strict=True):
-        np.testing.assert_allclose(text.get_position(), np.ravel(pan_tilt_angles(view.direction)))

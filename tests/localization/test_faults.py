@@ -14,7 +14,8 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from localization.rooms import Deadly, MappedRoom, is_running, label, times, wait_until, workers_of
+from localization.rooms import Deadly, MappedRoom, is_running, label, times, workers_of
+from waiting import wait_until
 from wheretolook.dataset.viewpoint_table import read_table, write_table
 from wheretolook.localization import local_engine
 from wheretolook.localization.local_engine import run_local

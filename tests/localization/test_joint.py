@@ -26,7 +26,7 @@ def a_room(n=3000, seed=0, shift=(0.0, 0.0, 0.0)):
     return points * (4, 3, 1.5) + shift
 
 
-def look_at(points, cam_from_world, mount, rng, n=80, noise_px=0.0, outliers=0.0, camera=CAMERA):
+def look_at(points, cam_from_world, cam_from_rig, rng, n=80, noise_px=0.0, outliers=0.0, camera=CAMERA):
     """A look's matches with so many points in its image, some with wrong landmarks; (Look, right matches)."""
     there = points @ cam_from_world[:, :3].T + cam_from_world[:, 3]
     pixels = camera.project(there)
@@ -35,13 +35,16 @@ def look_at(points, cam_from_world, mount, rng, n=80, noise_px=0.0, outliers=0.0
     seen = pixels[rows] + rng.normal(0, noise_px, (len(rows), 2))
     wrong = rng.random(len(rows)) < outliers
     matched = np.where(wrong, rng.integers(0, len(points), len(rows)), rows)
-    return Look(mount, seen, matched, camera), ~wrong
+    return Look(cam_from_rig, seen, matched, camera), ~wrong
 
 
 def looks_from(points, center=(0.4, -0.7, 0.1), axes=AXES, seed=1, **options):
     rng = np.random.default_rng(seed)
     poses = poses_looking_along(np.tile(center, (len(axes), 1)), np.array(axes, dtype=float))
-    made = [look_at(points, pose, mount, rng, **options) for pose, mount in zip(poses, rig_of(poses), strict=True)]
+    made = [
+        look_at(points, pose, cam_from_rig, rng, **options)
+        for pose, cam_from_rig in zip(poses, rig_of(poses), strict=True)
+    ]
     return poses, [look for look, _ in made], [right for _, right in made]
 
 
@@ -50,32 +53,34 @@ def test_a_rig_whose_parts_are_apart_is_localized_as_one():
     points = a_room()
     rng = np.random.default_rng(3)
     other = ColmapCamera("OPENCV", 800, 600, (400.0, 410.0, 390.0, 310.0, -0.1, 0.02, 0.001, -0.001))
-    mounts = [np.eye(3, 4), np.eye(3, 4), np.eye(3, 4)]
-    mounts[1][0, 3] = -0.3
-    mounts[2][:, :3] = Rotation.from_euler("y", 170, degrees=True).as_matrix()
-    mounts[2][:, 3] = (0.0, 0.1, 0.2)
+    cams_from_rig = [np.eye(3, 4), np.eye(3, 4), np.eye(3, 4)]
+    cams_from_rig[1][0, 3] = -0.3
+    cams_from_rig[2][:, :3] = Rotation.from_euler("y", 170, degrees=True).as_matrix()
+    cams_from_rig[2][:, 3] = (0.0, 0.1, 0.2)
     rig = poses_looking_along([[0.5, 0.2, -0.2]], [[1.0, 0.4, 0.1]])[0]
     poses = np.stack([
-        np.concatenate([m[:, :3] @ rig[:, :3], (m[:, :3] @ rig[:, 3] + m[:, 3])[:, None]], axis=1) for m in mounts
+        np.concatenate([m[:, :3] @ rig[:, :3], (m[:, :3] @ rig[:, 3] + m[:, 3])[:, None]], axis=1) for m in cams_from_rig
     ])  # fmt: skip
     cameras = (CAMERA, CAMERA, other)
-    looks = [look_at(points, pose, m, rng, camera=c)[0] for pose, m, c in zip(poses, mounts, cameras, strict=True)]
+    looks = [
+        look_at(points, pose, m, rng, camera=c)[0] for pose, m, c in zip(poses, cams_from_rig, cameras, strict=True)
+    ]
     found = JointLocalizer(PoseEstimator(points)).localize_together(looks)
     np.testing.assert_allclose(found.cams_from_world, poses, atol=1e-5)
 
 
-def test_outliers_are_told_from_inliers():
+def test_outliers_are_separated_from_inliers():
     points = a_room()
     poses, looks, right = looks_from(points, outliers=0.7, noise_px=0.5)
     found = JointLocalizer(PoseEstimator(points)).localize_together(looks)
     error_m, error_deg = pose_error(found.cams_from_world, poses)
     assert error_m.max() < 0.02 and error_deg.max() < 0.2
-    told = np.concatenate(found.inliers)
-    assert (told[np.concatenate(right)]).mean() > 0.98 and told[~np.concatenate(right)].mean() < 0.02
+    inlier = np.concatenate(found.inliers)
+    assert (inlier[np.concatenate(right)]).mean() > 0.98 and inlier[~np.concatenate(right)].mean() < 0.02
     assert found.rival_support < 0.2 * found.support
 
 
-def test_looks_are_more_accurate_together_and_the_deviation_tells_how_accurate():
+def test_several_looks_are_more_accurate_and_the_deviation_is_calibrated():
     """Over 40 draws of noise the errors are as large as the deviation says, and smaller than those of one look."""
     points = a_room()
     localizer = JointLocalizer(PoseEstimator(points))
@@ -103,24 +108,6 @@ def test_one_look_is_localized_exactly_as_a_single_image():
         joint = JointLocalizer(estimator, turn_noise_deg=1.0).localize([look])
         np.testing.assert_allclose(joint.cams_from_world[0], pose, atol=1e-12)
         np.testing.assert_array_equal(joint.inliers[0], inliers)
-
-
-def test_of_two_rooms_alike_the_looks_together_tell_which():
-    """Two copies of a room, and one landmark in ten of its own in each. A look that is matched with the wrong copy has
-    more inliers there than any other has; together the others outvote it, and the wrong copy is found as the rival."""
-    room = a_room(2000)
-    points = np.concatenate([room, room + np.array([20.0, 0, 0])])
-    poses, looks, _ = looks_from(room, axes=(*AXES, (0, -1, 0)), n=60, noise_px=0.3)
-    wrong = looks[1]
-    rng = np.random.default_rng(5)
-    strong = look_at(room, poses[1], wrong.cam_from_rig, rng, n=110)[0]
-    looks[1] = Look(strong.cam_from_rig, strong.pixels, strong.rows + len(room), CAMERA)
-    localizer = JointLocalizer(PoseEstimator(points))
-    alone = localizer.localize([looks[1]])
-    assert alone.n_inliers > 100 and pose_error(alone.cams_from_world[0], poses[1])[0] > 19
-    found = localizer.localize_together(looks)
-    assert pose_error(found.cams_from_world, poses)[0].max() < 0.01
-    assert found.n_inliers == 180 and 100 < found.rival_support < 111
 
 
 def test_turns_that_are_known_to_a_degree_are_refined():
@@ -158,20 +145,11 @@ def test_a_map_in_national_coordinates_gives_the_same():
     assert away.n_inliers == near.n_inliers
 
 
-@pytest.mark.parametrize("invalid", ["one", "none", "mirrored", "pixels"])
-def test_invalid_views_are_refused(invalid):
+@pytest.mark.parametrize("n", [0, 1])
+def test_fewer_than_two_views_are_refused(n):
     points = a_room()
-    _, looks, _ = looks_from(points)
-    localizer = JointLocalizer(PoseEstimator(points))
-    mirrored = looks[0].cam_from_rig * np.array([-1, 1, 1, 1])
-    views = {
-        "one": looks[:1],
-        "none": [],
-        "mirrored": [Look(mirrored, looks[0].pixels, looks[0].rows, CAMERA), *looks],
-        "pixels": [Look(np.eye(3, 4), looks[0].pixels[:5], looks[0].rows, CAMERA), *looks],
-    }
     with pytest.raises(PoseError):
-        localizer.localize_together(views[invalid])
+        JointLocalizer(PoseEstimator(points)).localize_together(looks_from(points)[1][:n])
 
 
 def test_views_from_several_locations_are_no_rig():

@@ -76,7 +76,7 @@ def test_a_query_is_localized_by_the_images_that_see_the_same(corridor, tmp_path
     assert [len(part) for part in localizer.match([nothing])[0]] == [0, 0]
 
 
-def test_photographs_left_out_of_a_map_of_learned_features_are_localized(corridor, tmp_path):
+def test_held_out_photographs_of_a_map_of_learned_features_are_localized(corridor, tmp_path):
     """As `check` does, by what the database holds: nothing is extracted."""
     source = open_map(corridor, corridor / "database.db", metric=True)
     block = min(choose_blocks(source), key=lambda block: len(block.held_out))

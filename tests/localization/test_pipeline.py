@@ -42,7 +42,7 @@ class OwnError(BaseException):
 
 @pytest.mark.parametrize("place", ["source", "first", "last"])
 @pytest.mark.parametrize("error", [ValueError, OwnError])
-def test_an_error_anywhere_is_raised_after_the_items_before_it(place: str, error: type[BaseException]) -> None:
+def test_an_error_of_any_step_is_raised_after_the_items_before_it(place: str, error: type[BaseException]) -> None:
     def source() -> Iterator[int]:
         for item in range(1000):
             if place == "source" and item == 5:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import pytest
 
 from box_scenes import furnished_room
@@ -53,24 +52,11 @@ def test_a_mesh_and_the_camera_of_the_robot(model: Path, tmp_path: Path) -> None
     np.testing.assert_allclose(robot.score(views), expected, atol=1e-5, rtol=0)
 
 
-def test_one_of_several_cameras(model: Path, tmp_path: Path) -> None:
-    several = pycolmap.Reconstruction(str(model))
-    params = [400.0, 410.0, 320.0, 240.0]
-    several.add_camera_with_trivial_rig(
-        pycolmap.Camera(camera_id=2, model="PINHOLE", width=640, height=480, params=params)
-    )
-    several.write_binary(str(model))
-    assert export(model, tmp_path / "robot") == 2
-    assert export(model, tmp_path / "robot", "--camera-id", "2") == 0
-    assert RobotScorer(tmp_path / "robot").camera["fy"] == 410
-
-
 @pytest.mark.parametrize(
     "options",
     [
         ("--map", "nowhere"), ("--camera", "PINHOLE 640"), ("--camera-id", "7"), ("--weights", "none.safetensors"),
-        ("--camera-id", "1", "--camera", "PINHOLE,640,480,400,410,320,240"), ("--mesh", "none.glb"),
-        ("--camera", "OPENCV_FISHEYE,320,240,160,160,160,120,0,0,0,0"), ("--spacing", "-1"), ("--spacing", "wide"),
+        ("--mesh", "none.glb"), ("--camera", "OPENCV_FISHEYE,320,240,160,160,160,120,0,0,0,0"), ("--spacing", "-1"),
     ],
 )  # fmt: skip
 def test_invalid_options(options: tuple[str, ...], model: Path, tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import shutil
 import subprocess
 import sys
@@ -32,7 +31,7 @@ from wheretolook.space.free_space import FreeSpace
 from wheretolook.training.landmark_views import AttributeStatistics
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.training_range import TrainingRange
-from wheretolook.utils.errors import CameraError, ConfigError, WeightsError
+from wheretolook.utils.errors import CameraError, WeightsError
 from wheretolook.visibility.occlusion import MeshOcclusion
 from wheretolook.weights.resolve import load_scorer
 
@@ -189,18 +188,19 @@ def test_rotations_and_quaternions() -> None:
     np.testing.assert_allclose(wheretolook_robot.rotations_looking_along(along), expected, atol=1e-12)
 
 
-def test_invalid_arguments(folder: Path) -> None:
-    robot = RobotScorer(folder)
-    assert robot.score(np.empty((0, 3, 4))).shape == (0,)
-    for call in (
-        lambda: robot.score(np.eye(4)),
-        lambda: robot.score(np.full((1, 3, 4), np.nan)),
-        lambda: robot.score(some_poses(1), np.ones(7, bool)),
-        lambda: robot.best(PLACES[0], directions=[(0, 0, 2.0)], pitch_deg=(-10, 10)),
-        lambda: robot.best((0.0, np.nan, 1.0)),
-    ):
-        with pytest.raises(ValueError, match=r"unoccluded|cam_from_world|direction|position"):
-            call()
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda robot: robot.score(np.eye(4)),
+        lambda robot: robot.score(np.full((1, 3, 4), np.nan)),
+        lambda robot: robot.score(some_poses(1), np.ones(7, bool)),
+        lambda robot: robot.best(PLACES[0], directions=[(0, 0, 2.0)], pitch_deg=(-10, 10)),
+        lambda robot: robot.best((0.0, np.nan, 1.0)),
+    ],
+)
+def test_invalid_arguments(call, folder: Path) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError):
+        call(RobotScorer(folder))
 
 
 WITHOUT_PYTORCH = """
@@ -219,37 +219,20 @@ def test_the_folder_runs_by_itself(folder: Path, tmp_path: Path) -> None:
     np.save(copy / "poses.npy", poses)
     subprocess.run([sys.executable, "-c", WITHOUT_PYTORCH], cwd=copy, check=True)
     np.testing.assert_array_equal(np.load(copy / "scores.npy"), RobotScorer(folder).score(poses))
-    tree = ast.parse((copy / "wheretolook_robot.py").read_text())
-    modules = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
-    modules |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
-    assert {module.partition(".")[0] for module in modules} - {*sys.stdlib_module_names} == {"numpy", "onnxruntime"}
 
 
-def test_damaged_folders(folder: Path, tmp_path: Path) -> None:
-    copies = [tmp_path / str(number) for number in range(3)]
-    for copy in copies:
-        shutil.copytree(folder, copy)
+def test_landmarks_of_another_export_are_refused(folder: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(folder, tmp_path / "copy")
     other = export_robot(LocalizationMap(walls(50), CAMERA), BUNDLED, tmp_path / "other")
-    shutil.copy(other / "landmarks.npz", copies[0])
-    about = (folder / "robot.json").read_text()
-    (copies[1] / "robot.json").write_text(about.replace('"format_version": 1', '"format_version": 9'))
-    (copies[2] / "scorer.onnx").unlink()
-    for copy, error in zip(copies, (ValueError, ValueError, FileNotFoundError), strict=True):
-        with pytest.raises(error, match="Export again"):
-            RobotScorer(copy)
+    shutil.copy(other / "landmarks.npz", copy)
+    with pytest.raises(ValueError):
+        RobotScorer(copy)
 
 
-def test_invalid_exports(room_map: LocalizationMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cameras_and_weights_that_cannot_be_exported(room_map: LocalizationMap, tmp_path: Path) -> None:
     opencv = ColmapCamera("OPENCV", 160, 120, (80.0, 81.0, 79.0, 60.5, -0.1, 0.01, 1e-3, -1e-3))
     assert pinhole_of(opencv) == PinholeCamera(160, 120, 80.0, 81.0, (79.0, 60.5))
-    radial = ColmapCamera("SIMPLE_RADIAL", 160, 120, (80.0, 79.0, 60.5, -0.1))
-    assert pinhole_of(radial) == PinholeCamera(160, 120, 80.0, center_px=(79.0, 60.5))
-    with pytest.raises(CameraError):
-        pinhole_of(ColmapCamera("OPENCV_FISHEYE", 160, 120, (80.0, 80.0, 80.0, 60.0, 0.0, 0.0, 0.0, 0.0)))
     with pytest.raises(CameraError):
         export_robot(room_map.of_camera(opencv), BUNDLED, tmp_path)
     with pytest.raises(WeightsError):
         export_robot(room_map, BUNDLED.with_name("matchability.safetensors"), tmp_path)
-    monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(ConfigError):
-        export_robot(room_map, BUNDLED, tmp_path)

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from localization.rooms import is_running, wait_until, workers_of
+from localization.rooms import is_running, workers_of
+from waiting import wait_until
 from wheretolook.utils.errors import WorkerError
 from wheretolook.utils.processes import WorkerPool
 

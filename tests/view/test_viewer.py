@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,11 +23,12 @@ from markdown_it import MarkdownIt
 
 from box_scenes import furnished_room
 from selection.room import POINTS, WEIGHTS, write_room
+from waiting import wait_until
 from wheretolook.cli import main
 from wheretolook.scenes.loading import save_glb
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import ConfigError, InUseError, MapWarning
-from wheretolook.view.controls import FILES, check_value, value_of
+from wheretolook.view.controls import FILES
 from wheretolook.view.drawing import escape_markdown
 from wheretolook.view.paths import FORWARD, RecordedPath, looking_ahead
 from wheretolook.view.saving import views_at, views_file
@@ -80,13 +80,6 @@ def click(z: float = -1.0) -> bytes:
 def setting(session: Any, control: str, value: object, field: str = "value") -> bytes:
     handle = getattr(session.controls, control)
     return message("GuiUpdateMessage", uuid=handle._impl.uuid, updates={field: value})
-
-
-def wait_until(condition: Callable[[], object], seconds: float = 20.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 def join(viewer: Viewer, client: Any) -> Any:
@@ -156,12 +149,6 @@ def test_invalid_values_of_controls_are_reported_and_restored(viewer: Viewer) ->
         assert {type(error) for error in errors} == {ConfigError}
         assert controls.method.value == "visible" and 1 <= controls.n.value <= 20
         assert session.state.n == 5 and np.isfinite(session.state.height)
-        controls.format._impl.value = "/x"
-        with pytest.raises(ConfigError):
-            check_value(controls.format, "CSV")
-        assert controls.format.value == "CSV"
-        controls.height._impl.value = float("nan")  # not restored yet
-        assert value_of(controls.height, 1.5) == 1.5 and value_of(controls.n, 7) == controls.n.value
 
 
 def test_only_the_page_is_served(viewer: Viewer) -> None:
@@ -235,28 +222,21 @@ def test_rays_meet_the_floor() -> None:
         assert intersect_plane((0, 0, 5), direction, 1.0) is None
 
 
-def test_a_port_in_use(sparse: Path) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
+def test_a_port_in_use() -> None:
+    with socket.socket() as busy:
+        busy.bind(("127.0.0.1", 0))
+        busy.listen()
         with pytest.raises(InUseError):
-            check_port("127.0.0.1", port)
-        assert main(["view", "--map", str(sparse), "--port", str(port)]) == 2
+            check_port("127.0.0.1", busy.getsockname()[1])
 
 
 @pytest.mark.parametrize(
     "options",
     [
         "", "--map nowhere", "--map nowhere --scene x", "--scene x --data nowhere", "--scene x --mesh x.glb",
-        "--map nowhere --state n=0", "--map nowhere --port 70000", "--map nowhere --host no.such.host.invalid",
-        "--map nowhere --path nowhere.csv", "--map nowhere --images nowhere", "--scene half --data {data}",
+        "--map nowhere --state n=0", "--map nowhere --port 70000", "--map nowhere --path nowhere.csv",
+        "--map nowhere --film way.mp4", "--map nowhere --record x.txt",
     ],
 )  # fmt: skip
-def test_invalid_options(options: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    about = {"camera": {"width": 64, "height": 48, "focal_px": 32.0}, "scenes": [{"name": "half", "split": "test"}]}
-    (tmp_path / "set" / "half").mkdir(parents=True)  # a scene that has not been mapped
-    (tmp_path / "set" / "dataset.json").write_text(json.dumps(about))
-    port = [] if "--port" in options else ["--port", "0"]
-    assert main(["view", *options.format(data=tmp_path).split(), *port]) == 2
-    assert "Traceback" not in capsys.readouterr().err
+def test_invalid_options(options: str) -> None:
+    assert main(["view", *options.split(), *([] if "--port" in options else ["--port", "0"])]) == 2

@@ -38,26 +38,26 @@ def dataset(tmp_path: Path) -> Dataset:
     return make_dataset(tmp_path / "rooms", ("train", "test"), n_locations=4, n_directions=5)
 
 
-def opened(dataset: Dataset, scene: str, weights: Path | None = None) -> ViewedMap:
+def open_scene(dataset: Dataset, scene: str, weights: Path | None = None) -> ViewedMap:
     return open_named_scene(dataset.root.parent, scene, "", None, weights, "cpu")
 
 
 def test_adapted_weights_score_in_their_scene_only(dataset: Dataset) -> None:
     path = dataset.root / "adapted" / "scene-1.safetensors"
     save_adapted(path, dataset.scene("scene-1").read_landmarks().points)
-    viewed = opened(dataset, "scene-1")
+    viewed = open_scene(dataset, "scene-1")
     assert viewed.methods[0] == "adapted" and "adapted" in viewed.weights.describe("adapted")
     at = np.array([[0.0, 0.0, 1.2]])
     adapted, base = (
         viewed.selector(name, "none", 30).scorer.score_around(at, np.eye(3)) for name in ("adapted", "set")
     )
     np.testing.assert_allclose(2 * np.log(adapted / (1 - adapted)), np.log(base / (1 - base)), atol=1e-6)
-    assert opened(dataset, "scene-0").methods[0] == "set"
-    assert opened(dataset, "scene-1", WEIGHTS / "set.safetensors").methods[0] == "set"
+    assert open_scene(dataset, "scene-0").methods[0] == "set"
+    assert open_scene(dataset, "scene-1", WEIGHTS / "set.safetensors").methods[0] == "set"
     shutil.copy(path, path.with_name("scene-0.safetensors"))  # of another scene
-    assert opened(dataset, "scene-0").methods[0] == "set"
+    assert open_scene(dataset, "scene-0").methods[0] == "set"
     path.write_bytes(b"damaged")
-    assert opened(dataset, "scene-1").methods[0] == "set"
+    assert open_scene(dataset, "scene-1").methods[0] == "set"
 
 
 def test_weights_trained_with_a_dataset_score_its_scenes(dataset: Dataset) -> None:
@@ -67,9 +67,9 @@ def test_weights_trained_with_a_dataset_score_its_scenes(dataset: Dataset) -> No
     training = {"dataset": dataset.name, "dataset_fingerprint": training_fingerprint(dataset)}
     base.save(own / "set.safetensors", training)
     shutil.copy(WEIGHTS / "set.json", own)
-    assert opened(dataset, "scene-1").weights.files["set"] == own / "set.safetensors"
+    assert open_scene(dataset, "scene-1").weights.files["set"] == own / "set.safetensors"
     base.save(own / "set.safetensors", training | {"dataset_fingerprint": "of other data"})
-    assert opened(dataset, "scene-1").weights.files["set"] != own / "set.safetensors"
+    assert open_scene(dataset, "scene-1").weights.files["set"] != own / "set.safetensors"
 
 
 def test_weights_adapted_to_a_map(tmp_path: Path) -> None:

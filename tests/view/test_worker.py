@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
+from waiting import wait_until
 from wheretolook.view.level_of_detail import LevelOfDetail
 from wheretolook.view.worker import LATER, NOW, SOON, Worker
-
-
-def wait_until(condition: Callable[[], object], seconds: float = 20.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 def test_urgent_jobs_go_first_and_failures_stop_nothing_else() -> None:

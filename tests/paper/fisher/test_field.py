@@ -83,17 +83,13 @@ def test_sums_are_those_of_the_plain_twin(visibility: SoftVisibility, masked: bo
 
 
 @pytest.mark.parametrize("visibility", VISIBILITIES)
-def test_a_map_far_from_the_origin_and_landmarks_at_the_camera(visibility: SoftVisibility) -> None:
+def test_a_map_far_from_the_origin(visibility: SoftVisibility) -> None:
     rng = np.random.default_rng(0)
     far = np.array([4e6, -2e6, 512.0])
     locations = rng.integers(-512, 512, (3, 3)) / 256
     points = rng.integers(-2048, 2048, (200, 3)) / 256
     near = FisherField.build(locations, points, visibility)
     np.testing.assert_array_equal(FisherField.build(locations + far, points + far, visibility).factors, near.factors)
-    # one that is at a location, or as good as, has no bearing there
-    with_one = FisherField.build(locations, np.concatenate([points, locations[:1] + 1e-4]), visibility)
-    np.testing.assert_allclose(with_one.factors[0], near.factors[0], atol=1e-5 * np.abs(near.factors[0]).max())
-    assert np.abs(with_one.factors[1] - near.factors[1]).max() > 1e-3
     assert not FisherField.build(locations, np.empty((0, 3)), visibility).factors.any()
 
 

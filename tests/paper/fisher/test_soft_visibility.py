@@ -41,13 +41,6 @@ def test_published_coefficients(boundary: float, coefficients: tuple[float, ...]
     np.testing.assert_allclose(found, coefficients, atol=1e-8)
 
 
-def test_quadratic_passes_through_its_three_points() -> None:
-    visibility = QuadraticVisibility(0.6, boundary=0.4, boundary_to_mid=0.5)
-    axis = np.array([[0.0, 0.0, 1.0]])
-    bearings = np.array([[0, 0, -1], [np.sin(0.6), 0, np.cos(0.6)], [0, -np.sin(0.6), np.cos(0.6)], [0, 0, 1]])
-    np.testing.assert_allclose(values(visibility, axis, bearings), [[0, 0.4, 0.4, 0.8]], atol=1e-12)
-
-
 def test_scikit_learn_predicts_the_same() -> None:
     visibility = GaussianProcessVisibility(QUARTER, 0.45, n_factors=70)
     axes = random_directions(200, 0)

@@ -104,5 +104,5 @@ def test_odometry_without_noise_is_the_way_itself() -> None:
     for view, n in ((0, 3), (1, 3), (4, 3), (5, 6)):
         rig = rig_of_last(steps, view, n)
         assert len(rig) == min(n, view + 1)
-        for back, mount in enumerate(rig):
-            np.testing.assert_allclose(chained(mount, way[view]), way[view - back], atol=1e-9)
+        for back, cam_from_rig in enumerate(rig):
+            np.testing.assert_allclose(chained(cam_from_rig, way[view]), way[view - back], atol=1e-9)

@@ -34,7 +34,7 @@ from wheretolook.scorers.mlp.network import ViewpointNetwork
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.training.data import load_views
 from wheretolook.training.trained_network import TrainedNetwork
-from wheretolook.utils.errors import ConfigError, StorageError, TableError, WeightsError
+from wheretolook.utils.errors import ConfigError, StorageError, WeightsError
 from wheretolook.utils.files import write_json
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook.weights.resolve import load_scorer
@@ -131,24 +131,11 @@ def load(path: Path) -> ViewpointNetwork:
     return TrainedNetwork.load(path, ViewpointNetwork, "mlp-2d", "mlp-2d+z").network
 
 
-def test_a_release_scores_as_the_original(finished: Path, tmp_path: Path) -> None:
-    """The same weights, in half precision too, on both."""
+def test_weights_in_half_precision_score_as_before(finished: Path, tmp_path: Path) -> None:
     config = replace(EVALUATE, resamples=50)
     tracking = TrackingConfig(str(tmp_path / "mlruns"))
-    root = finished / "data" / "release"
-    original = Dataset.load(finished / "data" / "tiny")
-    release = Dataset.load(root)
-    shutil.copytree(root, tmp_path / "release")
-    shutil.copytree(original.root, tmp_path / "tiny")
-    release = replace(release, root=tmp_path / "release")
-    original = replace(original, root=tmp_path / "tiny")
-    fresh = train(original, TRAIN, tracking, progress=False)
-    weights = fresh[1].path
-    tables = [evaluate(one, config, tracking, [weights], progress=False) for one in (original, release)]
-    shares = [name for name in tables[0].columns if name.startswith(("raw", "normalized", "any"))]
-    shares += ["average_precision", "roc_auc"]
-    np.testing.assert_allclose(tables[0][shares], tables[1][shares], atol=0.02)
-
+    dataset = Dataset.load(Path(shutil.copytree(finished / "data" / "tiny", tmp_path / "tiny")))
+    weights = train(dataset, changed(TRAIN, methods=("mlp-2d",)), tracking, progress=False)[0].path
     halved = weights.with_name("half.safetensors")
     shutil.copyfile(weights, halved)
     convert_to_float16(halved)
@@ -156,8 +143,9 @@ def test_a_release_scores_as_the_original(finished: Path, tmp_path: Path) -> Non
     for name, value in load(halved).state_dict().items():
         np.testing.assert_allclose(value, load(weights).state_dict()[name], rtol=5e-4, atol=1e-7)
         assert str(value.dtype) == "torch.float32" or name.endswith("index")
-    rounded = evaluate(release, config, tracking, [halved], progress=False)
-    np.testing.assert_allclose(rounded[shares], tables[1][shares], atol=0.02)
+    before, after = (evaluate(dataset, config, tracking, [path], progress=False) for path in (weights, halved))
+    shares = [name for name in before.columns if name.startswith(("raw", "normalized", "any"))]
+    np.testing.assert_allclose(after[shares], before[shares], atol=0.02)
 
 
 def test_the_best_on_validation_ships(finished: Path) -> None:
@@ -196,24 +184,16 @@ def test_done_again_it_gives_the_same_bytes(folder: Path) -> None:
         assert (root / "results" / name).read_bytes() == before[f"results/{name}"]
 
 
-def test_the_card_tells_what_lies_there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_card_holds_scores_settings_and_an_example_that_runs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root = folder / "data" / "release"
     release = Dataset.load(root)
     card = (root / "README.md").read_text()
     scores = pd.read_csv(root / "results" / "scores.csv", keep_default_na=False, na_values=[""])
     tables = [line for line in score_markdown(scores).splitlines() if line.startswith("|")]
     assert len(tables) > 15 and all(line in card for line in tables)
-    row = scores[(scores["method"] == "random") & (scores["scene"] == "all") & (scores["top_n"] == 1)].iloc[0]
-    low, high = (100 * row[f"normalized_{end}_0.05m_0.4deg"] for end in ("low", "high"))
-    assert f"[{low:.1f}, {high:.1f}]" in card
     weights = next((root / "weights").glob("*.safetensors"))
-    for said in (
-        release.fingerprint(), releases.sha256(weights), "Apache-2.0", "numpy 2.9.9", "seeds 70 to 73", "method opencv",
-        "seed: 70", "hidden 16", "MLP, 2d ", "MLP, 2d + z",
-        "896 labelled viewpoints at 56 locations", "wheretolook evaluate --config configs/release.yaml",
-    ):  # fmt: skip
+    for said in (release.fingerprint(), releases.sha256(weights), "numpy 2.9.9", "seeds 70 to 73", "method opencv"):
         assert said in card, said
-    assert str(folder) not in card
     # its example runs where the release lies
     monkeypatch.chdir(folder)
     example = re.search(r"```python\n(.*?)```", card, re.DOTALL)
@@ -222,15 +202,11 @@ def test_the_card_tells_what_lies_there(folder: Path, monkeypatch: pytest.Monkey
     exec(example[1], names)
     assert len(names["scores"]) == 14 * 16  # type: ignore[arg-type]
 
-    (weights,) = releases.trained_weights(release)
     elsewhere = pd.concat([scores.assign(dataset="scans"), scores.assign(dataset="halls")])
     table = root / "results" / "generalization.csv"
     elsewhere.assign(weights_sha256=releases.sha256(weights)).to_csv(table, index=False)
-    (root / "results" / "generalization.md").write_text("Scans are from here, halls from there.\n")
     longer = card_of(release)
     assert "Localization score on scans" in longer and "Localization score on halls" in longer
-    assert "Scans are from here" in longer
-    assert "on other datasets" not in card
     elsewhere.assign(weights_sha256="0" * 64).to_csv(table, index=False)  # of weights that shipped before
     assert card_of(release) == card
 
@@ -258,19 +234,13 @@ def test_other_data_is_not_overwritten(folder: Path) -> None:
         run(Release, experiment_of(folder), log=quiet)
 
 
-def test_what_is_missing_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_release_too_large_or_without_weights_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root = folder / "data" / "release"
     experiment = experiment_of(folder, "release")
     monkeypatch.setattr(releases, "MAX_BYTES", 20_000)
     with pytest.raises(StorageError):
         run(Release, experiment, log=quiet)
     monkeypatch.undo()
-    (root / "results" / "scores.csv").unlink()
-    with pytest.raises(TableError):
-        card_of(Dataset.load(root))
-    shutil.copyfile(next((root / "weights").glob("*.safetensors")), root / "weights" / "mlp-2d+3d.safetensors")
-    with pytest.raises(WeightsError):
-        run(Release, experiment, log=quiet)
     shutil.rmtree(root / "weights")
     with pytest.raises(WeightsError):
         run(Release, experiment, log=quiet)

@@ -76,15 +76,9 @@ def test_rows_over_all_scenes_are_nested(logged: tuple[Dataset, TrackingConfig, 
         assert metrics[f"top-{n}/raw_0.05m_0.4deg"] == rows.loc[(n, "all"), "raw_0.05m_0.4deg"]
         assert metrics[f"top-{n}/regret_5m_10deg"] == rows.loc[(n, "all"), "regret_5m_10deg"]
         assert metrics[f"top-{n}/scene-1/regret_0.05m_0.4deg"] == rows.loc[(n, "scene-1"), "regret_0.05m_0.4deg"]
-    assert sorted(metrics)[:3] == ["1_auc", "1_regret", "1_share"]
-    assert metrics["1_regret"] == metrics["top-1/regret_0.05m_0.4deg"]
-    assert metrics["1_share"] == metrics["top-1/raw_0.05m_0.4deg"] and metrics["1_auc"] == metrics["roc_auc"]
     learners = children(tracking, str(runs.learners))
-    names = ("bins, seed 0", "set, apartments, seed 0", "set, apartments, seed 1")
-    assert {*learners} == {f"{name} (learners release)" for name in names}
     last = learners["set, apartments, seed 1 (learners release)"][1]
     assert last["regret_test"] == last["1_regret"] == pytest.approx(0.2)
-    assert last["average_precision/c"] == last["average_precision_others"] == pytest.approx(0.9)
     assert children(tracking, str(runs.paths)).keys() == {
         f"{method}, {task} (paths release)" for task in ("planned", "given") for method in ("forward", "bins")
     }
@@ -133,7 +127,7 @@ def test_histories_travel_with_a_release(store: tuple[Dataset, TrackingConfig]) 
     assert (release.root / "results" / "training.csv").is_file()
 
 
-def test_an_interrupted_run_is_not_taken_for_a_finished_one(store: tuple[Dataset, TrackingConfig]) -> None:
+def test_an_interrupted_run_is_logged_again(store: tuple[Dataset, TrackingConfig]) -> None:
     release, tracking = store
     run = newest_run(tracking, "paths")
     assert run is not None

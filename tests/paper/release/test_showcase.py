@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -108,7 +107,7 @@ def test_the_scene_is_the_one_that_was_sampled(showcase: Showcase) -> None:
     assert "400 landmarks" in showcase.summary() and "12 images" in showcase.summary()
 
 
-def test_another_scene_than_the_one_that_was_labelled_is_refused(release: Dataset, tmp_path: Path) -> None:
+def test_another_scene_than_the_one_that_was_labelled_is_refused(release: Dataset) -> None:
     about = json.loads((release.root / "release.json").read_text())
     original = (release.root / "release.json").read_text()
     about["settings"]["scenes"]["apartment"]["area_m2"] = 40
@@ -118,13 +117,8 @@ def test_another_scene_than_the_one_that_was_labelled_is_refused(release: Datase
             open_showcase(release)
     finally:
         (release.root / "release.json").write_text(original)
-    elsewhere = Dataset(release.root, (SceneFolder(release.root / "house", "test", CAMERA),))
-    with pytest.raises(SceneError):
-        open_showcase(elsewhere)
     with pytest.raises(ConfigError):
         open_showcase(release, "apartment-004")
-    with pytest.raises(ConfigError):
-        open_showcase(Dataset(tmp_path, ()))
 
 
 def test_pipeline_takes_the_best_views(showcase: Showcase) -> None:

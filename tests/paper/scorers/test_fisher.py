@@ -35,7 +35,7 @@ def two_walls(rng: np.random.Generator, n: int = 1500) -> Landmarks:
     return with_points(points)
 
 
-def views_around(locations: Float, directions: Float = DIRECTIONS) -> Float:
+def views_at(locations: Float, directions: Float = DIRECTIONS) -> Float:
     return poses_looking_along(np.repeat(locations, len(directions), 0), np.tile(directions, (len(locations), 1)))
 
 
@@ -46,7 +46,7 @@ def test_of_a_room_with_landmarks_on_two_walls_it_looks_at_them(metric: str, app
     localization_map = LocalizationMap(two_walls(rng), CAMERA)
     hits = 0
     for location in rng.uniform((-3, -3, 0.8), (2, 2, 1.8), (20, 3)):
-        scores = FisherScorer(localization_map, metric, approximation).score(views_around(location[None]))
+        scores = FisherScorer(localization_map, metric, approximation).score(views_at(location[None]))
         best = DIRECTIONS[np.argmax(scores)]
         # on the ray from here along the axis one of the two walls comes first, not the others, floor or ceiling
         ahead = np.where(best > 0, 4 - location, -4 - location) / best
@@ -63,7 +63,7 @@ def test_exact_scores_are_numpys_of_the_sums(about_origin: bool) -> None:
     landmarks = two_walls(rng, 400)
     locations = rng.uniform((-3, -3, 0.8), (2, 2, 1.8), (4, 3))
     mask = rng.random((4, 400)) < 0.6
-    poses = views_around(locations, fibonacci_sphere(25))
+    poses = views_at(locations, fibonacci_sphere(25))
     rows = np.repeat(np.arange(4), 25)
     numbers = exact_information_plain(PosedViews(CAMERA, poses, landmarks.points, LandmarkSets.from_mask(mask), rows))
     matrices = information_matrices(numbers, -camera_centers(poses) if about_origin else None)
@@ -84,7 +84,7 @@ def test_probes_look_away_from_the_landmarks() -> None:
     rng = np.random.default_rng(5)
     localization_map = LocalizationMap(two_walls(rng), CAMERA)
     locations = rng.uniform((-3, -3, 0.8), (2, 2, 1.8), (5, 3))
-    poses = views_around(locations)
+    poses = views_at(locations)
     for scorer in (WorstTraceScorer(localization_map), StationaryTraceScorer(localization_map)):
         scores = scorer.score(poses)
         assert np.all((scores >= 0) & (scores <= 1))

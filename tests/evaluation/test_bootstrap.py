@@ -74,9 +74,7 @@ def test_paired_p_is_that_of_all_sign_flips() -> None:
     assert p[2] == 1
 
 
-def test_paired_p_is_symmetric_and_never_zero() -> None:
+def test_paired_p_is_never_zero() -> None:
     bootstrap = ClusterBootstrap(np.arange(300), 500, seed=0)
     assert bootstrap.paired_p(np.ones((300, 1)))[0] == 1 / 501
-    differences = np.random.default_rng(0).normal(size=(300, 4))
-    np.testing.assert_array_equal(bootstrap.paired_p(-differences), bootstrap.paired_p(differences))
     assert np.isnan(ClusterBootstrap(np.empty(0, dtype=int), 10, seed=0).paired_p(np.empty((0, 2)))).all()

@@ -10,7 +10,7 @@ import pytest
 
 from synthetic_scores import KEYS, make_scores, older
 from wheretolook.evaluation.report import best_in_words, score_markdown
-from wheretolook.evaluation.scores import main_rows, reference_of
+from wheretolook.evaluation.scores import main_rows
 from wheretolook_paper.evaluation.comparisons import comparisons_markdown
 
 FINEST = KEYS[0]
@@ -50,39 +50,15 @@ def test_main_table(scores: pd.DataFrame) -> None:
     regret, low, high = (percent(row[f"{name}_{FINEST}"]) for name in ("regret", "regret_low", "regret_high"))
     assert cells["regret"] == f"{regret} [{low}, {high}]"
     assert cells["AP"] == f"{row['average_precision']:.3f}"
-    difference = re.fullmatch(r"([+-][\d.]+) \[([+-][\d.]+), ([+-][\d.]+)\], p 0\.040", cells["difference"])
-    assert difference is not None
-    expected = [100 * row[f"{name}_{FINEST}"] for name in ("difference", "difference_low", "difference_high")]
-    np.testing.assert_allclose([float(number) for number in difference.groups()], expected, atol=0.051)
     assert table["MLP, 2d + 3d"]["difference"] == "reference"
-
-
-def test_further_tables(scores: pd.DataFrame) -> None:
-    report = score_markdown(scores)
-    row = one_row(scores, "bins", n=5)
-    share, low, high = (percent(row[f"any_{end}{FINEST}"]) for end in ("", "low_", "high_"))
-    assert table_below(report, "At least one good")["reprojections with bins"]["best 5"] == f"{share} [{low}, {high}]"
-    row = one_row(scores, "forward", scene="b")
-    cell = table_below(report, "By scene")["forward"]["b"]
-    assert cell.startswith(percent(row[f"normalized_{FINEST}"]))
-    assert cell.endswith(f", {row[f'good_{FINEST}']:.0f} of 50")
-    assert "- MLP, 2d + z: 0.071 → 0.023 with T = 1.38" in report
-    main, probes = report.split("\n## Probes")
-    assert "probe" not in main and "probe: worst trace" in probes
 
 
 def test_missing_columns_and_numbers_are_left_out(scores: pd.DataFrame) -> None:
     report = score_markdown(older(scores).drop(columns="occlusion"))
-    assert "difference" not in table_below(report, "Best viewpoint of each location")["random"]
     empty = scores.copy()
     empty.loc[empty["scene"] == "b", [name for name in empty.columns if name.endswith(KEYS)]] = np.nan
     assert {cells["b"] for cells in table_below(score_markdown(empty), "By scene").values()} == {"–"}
     assert "nan" not in report + score_markdown(empty)
-
-
-def test_reference_of() -> None:
-    assert reference_of(make_scores(reference="")) == ""
-    assert reference_of(make_scores(reference="bins")) == "bins"
 
 
 def test_occlusion_models_and_candidates_are_compared(scores: pd.DataFrame) -> None:
@@ -96,9 +72,6 @@ def test_occlusion_models_and_candidates_are_compared(scores: pd.DataFrame) -> N
         row = one_row(table, "random")
         cell = table_below(report, heading)["random"][value]
         assert cell.startswith(f"{row['average_precision']:.3f}, {percent(row[f'normalized_{FINEST}'])} [")
-    assert table_below(report, "By set of candidates")["MLP, 2d"]["best 100"] == "–"
-    released = table_below(report, "Divided by 0.527")["random"]
-    assert released["5 m, 10°"] == percent(one_row(scores, "random")[f"raw_{KEYS[3]}"] / 0.527)
 
 
 def summary(reference: str = "", n: int = 1, **good: float) -> str:
@@ -116,21 +89,12 @@ def summary(reference: str = "", n: int = 1, **good: float) -> str:
     return best_in_words(table)
 
 
-def test_summary_counts_good_views() -> None:
-    assert summary(bins=36, visible=30, forward=35).startswith(
-        "Reprojections with bins chose a view that localizes within 5 cm, 0.4° at 36 of 50 locations; forward at 35, "
-        "random at 20.5, and the oracle, which knows, at 45."
-    )
-    assert "180 of 250 times (5 views at each of 50 locations); forward 175" in summary(n=5, bins=36, forward=35)
-
-
 @pytest.mark.parametrize(
     "reference, good, significant",
     [
         ("", {"bins": 36, "forward": 35}, False),
         ("", {"bins": 40, "visible": 30}, True),
         ("bins", {"bins": 40, "visible": 36}, True),
-        ("visible", {"bins": 40, "visible": 36}, True),
         ("visible", {"bins": 36, "visible": 35}, False),
     ],
 )

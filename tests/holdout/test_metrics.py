@@ -9,15 +9,7 @@ from sklearn.metrics import roc_auc_score
 
 from wheretolook.evaluation.bootstrap import ClusterBootstrap
 from wheretolook.evaluation.calibration import expected_calibration_error
-from wheretolook.holdout.metrics import (
-    RESAMPLES,
-    measure,
-    measured,
-    places_of,
-    regret_of_places,
-    resampled_auc,
-    resampled_calibration_error,
-)
+from wheretolook.holdout.metrics import measure, places_of, regret_of_places, resampled_auc, resampled_calibration_error
 
 
 @pytest.fixture(scope="module")
@@ -59,23 +51,6 @@ def test_auc_within_blocks_counts_pairs_of_one_block(views: pd.DataFrame) -> Non
     assert resampled_auc(bootstrap, good, shifted)[0] < wins / pairs
 
 
-def test_calibration_error_is_that_of_evaluations(views: pd.DataFrame) -> None:
-    score = views["score"].to_numpy()
-    good = views["good"].to_numpy()
-    errors = resampled_calibration_error(ClusterBootstrap(views["block"].to_numpy(), 10, seed=0), score, good)
-    assert errors[0] == pytest.approx(expected_calibration_error(score, good))
-
-
-def test_intervals_reflect_differences_between_blocks() -> None:
-    block = np.repeat(np.arange(10), 20)
-    bootstrap = ClusterBootstrap(block, RESAMPLES, seed=0)
-    same = measured(bootstrap, bootstrap.ratios(np.tile([1.0, 0.0], 100), np.ones(200)))
-    assert (same.value, same.low, same.high) == (0.5, 0.5, 0.5)
-    apart = measured(bootstrap, bootstrap.ratios((block < 5).astype(float), np.ones(200)))
-    # the mean of ten fair draws: binomial, whose 2.5 % points are 0.2 and 0.8
-    assert apart.value == 0.5 and apart.low == pytest.approx(0.2) and apart.high == pytest.approx(0.8)
-
-
 def test_places_are_within_a_radius_and_a_block() -> None:
     centers = np.array([(0, 0, 0), (0.3, 0, 0), (0.8, 0, 0), (0, 0, 0)], dtype=float)
     place = places_of(centers, np.array([1, 1, 1, 2]), 0.5)
@@ -90,22 +65,22 @@ def test_regret_is_of_places_where_another_view_was_better() -> None:
     assert possible.tolist() == [True, True, False] and chosen.tolist() == [False, True, False]
 
 
-def test_measure_tells_methods_apart(views: pd.DataFrame) -> None:
+def test_measure_compares_methods(views: pd.DataFrame) -> None:
     centers = np.random.default_rng(0).uniform(0, 2, (len(views), 3))
-    found = measure(views, ["set", "visible"], ["score", "visible"], centers, 0.5, True)
-    good = views["good"].to_numpy()
-    score = views["score"].to_numpy()
-    mine = found["methods"]["set"]
-    other = found["methods"]["visible"]
+    numbers = measure(views, ["set", "visible"], ["score", "visible"], centers, 0.5, True)
+    good, score = (views[name].to_numpy() for name in ("good", "score"))
+    mine, other = (numbers["methods"][name] for name in ("set", "visible"))
     assert mine["auc"]["value"] == pytest.approx(roc_auc_score(good, score))
+    bootstrap = ClusterBootstrap(views["block"].to_numpy(), 10, seed=0)
+    errors = resampled_calibration_error(bootstrap, score, good)
+    assert errors[0] == pytest.approx(expected_calibration_error(score, good))
     assert mine["auc_above_visible"]["value"] == pytest.approx(mine["auc"]["value"] - other["auc"]["value"])
-    assert other["auc_above_visible"] == {"value": 0.0, "low": 0.0, "high": 0.0}
     inliers = views["n_inliers"].to_numpy() * good
     expected = views["expected_inliers"].to_numpy()
-    ratio = found["inliers_found_over_expected"]
+    ratio = numbers["inliers_found_over_expected"]
     assert ratio["all"]["value"] == pytest.approx(inliers.sum() / expected.sum())
     assert ratio["localized"]["value"] == pytest.approx(inliers.sum() / expected[good].sum())
-    assert 0 < mine["regret"]["value"] < other["regret"]["value"] and found["n_places_of_both_kinds"] > 10
+    assert 0 < mine["regret"]["value"] < other["regret"]["value"] and numbers["n_places_of_both_kinds"] > 10
 
 
 def test_where_all_localize_there_is_no_auc(views: pd.DataFrame) -> None:

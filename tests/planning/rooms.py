@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
 from box_scenes import ROOM, furnished_room
 from synthetic_dataset import make_landmarks
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, direction_lattice
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -19,9 +21,11 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.scenes.loading import save_glb
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import PlanningError
+from wheretolook.utils.files import write_json
 from wheretolook.visibility.occlusion import MeshOcclusion, OcclusionModel
 
 CAMERA = PinholeCamera(160, 120, 80.0)
@@ -33,7 +37,7 @@ T = TypeVar("T")
 
 
 def patiently(plan: Callable[[float], T], seconds: float = 0.6) -> T:
-    """What is planned in the seconds that an idle machine needs, or else, on a busy one, in many more."""
+    """Plan in the time that an idle machine needs; on a busy one, retry with much more."""
     for times in (1, 8):
         try:
             return plan(times * seconds)
@@ -43,7 +47,7 @@ def patiently(plan: Callable[[float], T], seconds: float = 0.6) -> T:
 
 
 def room_landmarks(n: int, seed: int = 0, first_id: int = 0) -> Landmarks:
-    """Landmarks with attributes at random on the room's walls; the cabinet stands before some."""
+    """Return landmarks on the room's walls with random attributes; the cabinet occludes some."""
     rng = np.random.default_rng(seed)
     landmarks = make_landmarks(rng, n)
     points = rng.uniform(0, ROOM, (n, 3))
@@ -53,7 +57,7 @@ def room_landmarks(n: int, seed: int = 0, first_id: int = 0) -> Landmarks:
 
 
 def joined(a: Landmarks, b: Landmarks) -> Landmarks:
-    """The landmarks of both."""
+    """Return the landmarks of both, by id."""
     values = {
         name: None if value is None else np.concatenate([value, getattr(b, name)]) for name, value in vars(a).items()
     }
@@ -63,22 +67,33 @@ def joined(a: Landmarks, b: Landmarks) -> Landmarks:
 
 @cache
 def occlusion() -> MeshOcclusion:
-    """By the room's mesh."""
+    """Return occlusion by the room's mesh."""
     return MeshOcclusion(MeshRaycaster(furnished_room(), "cpu"))
 
 
 @cache
 def free_voxels() -> tuple[int, ...]:
-    """Ids of the voxels where a camera can be."""
+    """Return ids of the voxels where a camera can be."""
     free = FreeSpace(furnished_room()).is_free(GRID.centers())
     return tuple(np.flatnonzero(free).tolist())
 
 
 def room_map(landmarks: Landmarks, model: OcclusionModel | None = None) -> LocalizationMap:
-    """What a scorer is built from."""
+    """Return the localization map of the room."""
     return LocalizationMap(landmarks, CAMERA, model or occlusion())
 
 
 def build(landmarks: Landmarks, method: str = "bins", directions: Float = DIRECTIONS) -> ViewpointMap:
-    """The viewpoint map of the room."""
+    """Return the viewpoint map of the room."""
     return build_viewpoint_map(make_scorer(method, room_map(landmarks)), GRID, free_voxels(), directions, "fibonacci")
+
+
+def write_room_dataset(folder: Path, landmarks: Landmarks, camera: Camera = CAMERA, names: Iterable[str] = "a") -> None:
+    """Write dataset `folder`/data/rooms of furnished rooms with landmarks, as the map command leaves it."""
+    scenes = tuple(SceneFolder(folder / "data" / "rooms" / name, "test", camera) for name in names)
+    for scene in scenes:
+        scene.map.mkdir(parents=True)
+        save_glb(furnished_room(), scene.mesh)
+        landmarks.save(scene.landmarks)
+        write_json(scene.folder / "stages.json", {"scenes": "x", "map": "y"})
+    Dataset(folder / "data" / "rooms", scenes).save()

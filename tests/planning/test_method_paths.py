@@ -10,20 +10,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from box_scenes import furnished_room
-from planning.rooms import occlusion, patiently, room_landmarks
+from planning.rooms import occlusion, patiently, room_landmarks, write_room_dataset
 from wheretolook.cli import parse_command
-from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.planning.routes import PlannedPath
-from wheretolook.planning.viewpoint_map import ViewpointMap
-from wheretolook.scenes.loading import save_glb
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
-from wheretolook.utils.files import write_json
 
 LANDMARKS = room_landmarks(300)
 WEIGHTS = Path(__file__).parents[2] / "data" / "release" / "weights" / "set.safetensors"
@@ -40,13 +35,8 @@ def untracked(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def options(folder: Path, camera: Camera) -> list[str]:
-    """A dataset of one room as the map stage leaves it, and the options that ask for it."""
-    scene = SceneFolder(folder / "data" / "rooms" / "room", "test", camera)
-    scene.map.mkdir(parents=True)
-    save_glb(furnished_room(), scene.mesh)
-    LANDMARKS.save(scene.landmarks)
-    write_json(scene.folder / "stages.json", {"scenes": "x", "map": "y"})
-    Dataset(folder / "data" / "rooms", (scene,)).save()
+    """Write a dataset of one room; return the options that name it."""
+    write_room_dataset(folder, LANDMARKS, camera)
     model = camera.colmap
     described = f"{{model: {model.model}, width: {model.width}, height: {model.height}, params: {list(model.params)}}}"
     (folder / "rooms.yaml").write_text(f"name: rooms\ncamera: {described}\n")
@@ -54,10 +44,10 @@ def options(folder: Path, camera: Camera) -> list[str]:
 
 
 def planned(folder: Path, camera: Camera, method: str, film: str = "none") -> tuple[PlannedPath, pd.DataFrame, Scorer]:
-    """A path through the room, its table, and the scorer that it was planned by."""
+    """Plan a path through the room; return it, its table and its scorer."""
     ends = ["--start", str(list(START)), "--goal", str(list(GOAL)), "--out", str(folder / "way")]
     lattice = ["--plan.grid", "[3, 3, 2]", "--plan.directions", "40", "--plan.planner.spacing_m", "0.8"]
-    chosen = ["--scene", "room", "--method", method, "--film", film]
+    chosen = ["--scene", "a", "--method", method, "--film", film]
     chosen += ["--plan.weights", str(WEIGHTS)] if method == "set" else []
     experiment = parse_command("plan", [*options(folder, camera), *ends, *lattice, *chosen])
     assert experiment is not None
@@ -93,12 +83,3 @@ def test_a_fisheye_is_planned_for_and_shown(tmp_path: Path) -> None:
     assert scorer.localization_map.camera == FISHEYE and len(table) > 2
     np.testing.assert_allclose(table["score"], scorer.score(poses(table)), rtol=1e-9)
     assert {file.name for file in (tmp_path / "way").iterdir()} == {"path.csv", "path.png", "path.gif"}
-    given = parse_command("viewpoint-map", ["--config", str(tmp_path / "rooms.yaml"), "--data",
-        str(tmp_path / "data"), "--device", "cpu", "--method", "bins", "--viewpoint_map.grid", "[3, 3, 2]",
-        "--viewpoint_map.directions", "20"])  # fmt: skip
-    assert given is not None
-    given.run()
-    views = ViewpointMap.load(tmp_path / "data" / "rooms" / "room" / "viewpoint-map")
-    assert views.origin.camera["model"] == "OPENCV_FISHEYE"
-    at = poses_looking_along(np.repeat(views.locations[:1], 20, axis=0), views.directions)
-    np.testing.assert_allclose(views.scores[0], scorer.score(at), rtol=1e-6)

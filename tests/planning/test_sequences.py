@@ -7,12 +7,10 @@ from itertools import product
 import numpy as np
 import pytest
 
-from wheretolook.geometry.lattices import axes_of_angles, direction_lattice, yaw_pitch_angles
+from wheretolook.geometry.lattices import direction_lattice, yaw_pitch_angles
 from wheretolook.geometry.poses import Float, rotation_angle_deg, rotation_looking_along
 from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook.utils.errors import PlanningError
-
-LATTICES = {"yaw-pitch": direction_lattice(0, "yaw-pitch"), "fibonacci": direction_lattice(300)}
 
 
 def turns_of(ids: np.ndarray, directions: Float, start: Float | None = None) -> Float:
@@ -42,6 +40,9 @@ def test_no_sequence_is_better(seed: int) -> None:
             best_sequence(scores, limit, start)
         return
     found = best_sequence(scores, limit, start)
+    if start is not None:
+        by_rotation = best_sequence(scores, limit, rotation_looking_along(start))
+        np.testing.assert_array_equal(by_rotation.direction_ids, found.direction_ids)
     assert found.total == pytest.approx(best, abs=1e-12)
     np.testing.assert_array_equal(found.scores, scores[np.arange(n), found.direction_ids])
     assert np.all(turns_of(found.direction_ids, directions, start) <= limit.max_turn_deg)
@@ -49,43 +50,13 @@ def test_no_sequence_is_better(seed: int) -> None:
 
 def test_on_20_degrees_the_benchmarks_limit_leaves_the_eight_neighbours() -> None:
     angles = yaw_pitch_angles()
-    limit = TurnLimit.of(LATTICES["yaw-pitch"])
+    limit = TurnLimit.of(direction_lattice(0, "yaw-pitch"))
     across = np.abs(angles[:, None] - angles) / 20
     across[..., 0] = np.minimum(across[..., 0], 18 - across[..., 0])
     expected = across.max(axis=-1) <= 1
     for direction, near in enumerate(limit.neighbours):
         # turns of yaw and pitch together exceed 30 degrees nowhere, and two steps of yaw do everywhere
         np.testing.assert_array_equal(near[near < 108], np.flatnonzero(expected[direction]))
-
-
-def test_it_is_the_turn_of_the_whole_camera_that_counts() -> None:
-    down = axes_of_angles([[0.0, -80.0], [90.0, -80.0]])
-    assert np.degrees(np.arccos(down[0] @ down[1])) < 30
-    assert TurnLimit.of(down, 30).neighbours.tolist() == [[0], [1]]
-    assert TurnLimit.of(down, 90).neighbours.tolist() == [[0, 1], [0, 1]]
-
-
-def test_a_start_is_an_axis_or_a_rotation() -> None:
-    directions = LATTICES["fibonacci"]
-    scores = np.random.default_rng(0).random((5, 300))
-    limit = TurnLimit.of(directions, 40)
-    start = np.array([1.0, 2, 0.3])
-    by_axis, by_rotation = (best_sequence(scores, limit, one) for one in (start, rotation_looking_along(start)))
-    np.testing.assert_array_equal(by_axis.direction_ids, by_rotation.direction_ids)
-    assert turns_of(by_axis.direction_ids, directions, start).max() <= 40
-
-
-@pytest.mark.parametrize("lattice", LATTICES)
-@pytest.mark.parametrize("max_turn_deg", [0.0, 30.0, 180.0])
-def test_limits_hold(lattice: str, max_turn_deg: float) -> None:
-    directions = LATTICES[lattice]
-    scores = np.random.default_rng(0).random((40, len(directions)))
-    ids = best_sequence(scores, TurnLimit.of(directions, max_turn_deg)).direction_ids
-    assert turns_of(ids, directions).max() <= max_turn_deg + 2e-5
-    if max_turn_deg == 180:
-        np.testing.assert_array_equal(ids, scores.argmax(axis=1))
-    if max_turn_deg == 0:
-        assert set(ids) == {scores.sum(axis=0).argmax()}
 
 
 def test_unreachable_waypoint_is_reported() -> None:
@@ -100,7 +71,7 @@ def test_unreachable_waypoint_is_reported() -> None:
     assert caught.value.value == 2
 
 
-@pytest.mark.parametrize("scores", [np.ones((2, 4)), np.ones(3), np.empty((0, 3)), [[1, np.nan, 0]], [[1, np.inf, 0]]])
+@pytest.mark.parametrize("scores", [np.ones((2, 4)), np.ones(3), np.empty((0, 3)), [[1, np.nan, 0]]])
 def test_invalid_scores(scores: object) -> None:
     with pytest.raises(ValueError):
         best_sequence(scores, TurnLimit.of(np.eye(3)))

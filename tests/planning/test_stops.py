@@ -41,26 +41,24 @@ def path(scorer: Scorer) -> PlannedPath:
     return PlannedPath(POSITIONS, axes, scorer.score(poses_looking_along(POSITIONS, axes)), np.nan)
 
 
-def test_a_place_that_scores_too_little_becomes_a_stop(scorer: Scorer, path: PlannedPath) -> None:
+def test_a_place_with_a_low_score_becomes_a_stop(scorer: Scorer, path: PlannedPath) -> None:
     asked = float(np.median(path.scores))
-    config = StopConfig(3, asked)
-    stops = stops_along(scorer, path.positions, path.axes, DIRECTIONS, config, PLANNER)
-    low = np.flatnonzero(path.scores < asked)
-    assert len(stops) > 0 and {stop.place for stop in stops} <= {*low}
+    given = (scorer, path.positions, path.axes, DIRECTIONS)
+    stops = stops_along(*given, StopConfig(3, asked), PLANNER)
+    by_two = {stop.place: stop.together for stop in stops_along(*given, StopConfig(2, asked), PLANNER)}
+    assert len(stops) > 0 and {stop.place for stop in stops} <= {*np.flatnonzero(path.scores < asked)}
     for stop in stops:
         assert 1 <= len(stop.axes) <= 2 and stop.together > path.scores[stop.place]
         own = path.axes[stop.place]
-        np.testing.assert_allclose(np.linalg.norm(stop.axes, axis=1), 1)
         assert (np.abs(stop.axes[:, 2]) <= np.sin(np.radians(30))).all() and (stop.axes @ own < np.cos(0.26)).all()
         tour = np.array([own, *stop.axes, own])
         angles = np.degrees(np.arccos((tour[1:] * tour[:-1]).sum(1).clip(-1, 1)))
         assert stop.turn_deg == pytest.approx(angles.sum())
-        if len(stop.axes) == 2:  # one more look would not have done
-            two = stops_along(scorer, path.positions, path.axes, DIRECTIONS, StopConfig(2, asked), PLANNER)
-            assert all(other.together < asked for other in two if other.place == stop.place)
+        if len(stop.axes) == 2:  # one more look does not suffice
+            assert by_two.get(stop.place, 0) < asked
 
 
-def test_where_what_is_asked_is_out_of_reach_a_stop_must_gain_more_than_it_costs(
+def test_where_the_requested_score_is_out_of_reach_a_stop_must_gain_more_than_it_costs(
     scorer: Scorer, path: PlannedPath
 ) -> None:
     config = StopConfig(2, 1.0)  # nothing is certain
@@ -76,30 +74,28 @@ def test_where_what_is_asked_is_out_of_reach_a_stop_must_gain_more_than_it_costs
         assert gain > priced.turn_weight_m * np.radians(stop.turn_deg)
 
 
-def test_stops_are_off_unless_asked_for(scorer: Scorer, path: PlannedPath) -> None:
+def test_stops_are_off_by_default_and_need_probabilities(scorer: Scorer, path: PlannedPath) -> None:
+    rule = make_scorer("visible", scorer.localization_map)
+    with pytest.raises(ConfigError):
+        stops_along(rule, path.positions, path.axes, DIRECTIONS, StopConfig(2), PLANNER)
     assert stops_along(scorer, path.positions, path.axes, DIRECTIONS, StopConfig(), PLANNER) == ()
     assert stops_along(scorer, path.positions, path.axes, DIRECTIONS, StopConfig(3, 1e-6), PLANNER) == ()
 
 
-def test_the_looks_of_a_path_are_in_the_order_they_are_taken(scorer: Scorer, path: PlannedPath) -> None:
-    plain = replace(path, stops=())
-    np.testing.assert_array_equal(plain.all_axes, path.axes)
-    stops = stops_along(
-        scorer, path.positions, path.axes, DIRECTIONS, StopConfig(3, 0.999), replace(PLANNER, turn_weight_m=0.0)
-    )
+def test_the_looks_of_a_path_are_in_order(scorer: Scorer, path: PlannedPath) -> None:
+    free = replace(PLANNER, turn_weight_m=0.0)
+    stops = stops_along(scorer, path.positions, path.axes, DIRECTIONS, StopConfig(3, 0.999), free)
     some = replace(path, stops=(stops[1], stops[3]))
     places, looks = some.looks
-    first = len(stops[1].axes)
-    second = len(stops[3].axes)
+    first, second = (len(stops[place].axes) for place in (1, 3))
     assert places.tolist() == [0, 1, *[1] * first, 2, 3, *[3] * second, 4]
     assert looks.tolist() == [1, 1, *range(2, 2 + first), 1, 1, *range(2, 2 + second), 1]
     np.testing.assert_array_equal(some.all_axes[looks == 1], path.axes)
     np.testing.assert_array_equal(some.all_axes[2 : 2 + first], stops[1].axes)
-    np.testing.assert_allclose(
-        some.all_scores, scorer.score(poses_looking_along(path.positions[places], some.all_axes)), atol=0.05
-    )
-    assert some.turn_deg == pytest.approx(plain.turn_deg + stops[1].turn_deg + stops[3].turn_deg)
-    assert some.n_looks == 5 + first + second and some.scores_with_stops[3] == stops[3].together
+    expected = scorer.score(poses_looking_along(path.positions[places], some.all_axes))
+    np.testing.assert_allclose(some.all_scores, expected, atol=0.05)
+    turns = replace(path, stops=()).turn_deg + stops[1].turn_deg + stops[3].turn_deg
+    assert some.turn_deg == pytest.approx(turns) and some.scores_with_stops[3] == stops[3].together
     views = path_views(some, scorer.localization_map)
     assert [view.look for view in views] == looks.tolist()
     assert [view.n_looks for view in views if view.look == 1] == [1, 1 + first, 1, 1 + second, 1]
@@ -110,9 +106,3 @@ def test_the_looks_of_a_path_are_in_the_order_they_are_taken(scorer: Scorer, pat
 def test_invalid_options(options: tuple[int, float]) -> None:
     with pytest.raises(ConfigError):
         StopConfig(*options)
-
-
-def test_stops_need_probabilities(scorer: Scorer, path: PlannedPath) -> None:
-    rule = make_scorer("visible", scorer.localization_map)
-    with pytest.raises(ConfigError):
-        stops_along(rule, path.positions, path.axes, DIRECTIONS, StopConfig(2), PLANNER)

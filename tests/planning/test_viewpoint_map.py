@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from planning.rooms import CAMERA, DIRECTIONS, GRID, build, free_voxels, room_landmarks, room_map
+from planning.rooms import DIRECTIONS, GRID, build, free_voxels, room_landmarks, room_map
 from wheretolook.geometry.poses import poses_looking_along, rotation_angle_deg, rotation_looking_along
 from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewChoice, ViewpointMap
@@ -45,52 +45,40 @@ def id_of(choice: ViewChoice | None) -> int | None:
 def test_every_direction_of_every_free_voxel_has_its_score_and_count(viewpoint_map: ViewpointMap) -> None:
     localization_map = room_map(room_landmarks(400))
     centers = GRID.centers()[list(free_voxels())]
-    assert 10 < len(centers) < len(GRID)
     np.testing.assert_array_equal(viewpoint_map.locations, centers)
     views = poses_looking_along(np.repeat(centers, len(DIRECTIONS), axis=0), np.tile(DIRECTIONS, (len(centers), 1)))
     scores = make_scorer("bins", localization_map).score(views)
     np.testing.assert_array_equal(viewpoint_map.scores.ravel(), scores.astype(np.float32))
-    np.testing.assert_array_equal(
-        viewpoint_map.n_visible.ravel(), np.diff(localization_map.landmarks_in_view(views).starts)
-    )
-    order = np.lexsort([np.tile(np.arange(60), (len(centers), 1)), -scores.reshape(-1, 60)], axis=1)
+    n_visible = np.diff(localization_map.landmarks_in_view(views).starts)
+    np.testing.assert_array_equal(viewpoint_map.n_visible.ravel(), n_visible)
+    order = np.argsort(-scores.reshape(-1, 60), axis=1, kind="stable")
     np.testing.assert_array_equal(viewpoint_map.ranked, order)
     origin = viewpoint_map.origin
     assert (origin.scorer, origin.lattice, origin.occlusion) == ("bins", "fibonacci", "mesh")
     assert origin.camera == {"model": "PINHOLE", "width": 160, "height": 120, "params": [80.0, 80.0, 80.0, 60.0]}
-    assert CAMERA.matrix[0, 2] == 80
 
 
 def test_queries_equal_brute_force(viewpoint_map: ViewpointMap) -> None:
     rng = np.random.default_rng(1)
     points = points_about(150)
     everything = np.ones(len(DIRECTIONS), dtype=bool)
-    found = 0
     many = viewpoint_map.best_many(points)
     for number, point in enumerate(points):
         row = row_by_hand(viewpoint_map, point)
-        assert viewpoint_map.row(point) == viewpoint_map.row(point.tolist()) == row
+        assert viewpoint_map.row(point) == row
         best = viewpoint_map.best(point)
         expected = best_by_hand(viewpoint_map, row, everything)
-        assert id_of(best) == expected
-        assert many.found[number] == (row >= 0)
+        assert id_of(best) == expected and many.found[number] == (row >= 0)
         if best is None:
             assert viewpoint_map.best_n(point, 3) is None
-            assert viewpoint_map.interpolated(point) is None
             assert (many.direction_id[number], many.n_visible[number]) == (-1, 0) and np.isnan(many.score[number])
         else:
-            found += 1
-            assert (many.direction_id[number], many.score[number], many.n_visible[number]) == (
-                best.direction_id, best.score, best.n_visible,
-            )  # fmt: skip
+            found = (best.direction_id, best.score, best.n_visible)
+            assert (many.direction_id[number], many.score[number], many.n_visible[number]) == found
+            assert (viewpoint_map.scores[row, expected], viewpoint_map.n_visible[row, expected]) == found[1:]
             np.testing.assert_array_equal(best.axis, DIRECTIONS[expected])
-            assert (best.score, best.n_visible) == (
-                viewpoint_map.scores[row, expected], viewpoint_map.n_visible[row, expected],
-            )  # fmt: skip
             top = viewpoint_map.best_n(point, 7)
-            assert top is not None and top[0].direction_id == expected
             np.testing.assert_array_equal([c.score for c in top], np.sort(viewpoint_map.scores[row])[::-1][:7])
-            assert len(viewpoint_map.best_n(point, 1000) or []) == 60
         axis = rng.normal(size=3)
         limit = rng.uniform(1, 90)
         in_cone = np.degrees(np.arccos(np.clip(DIRECTIONS @ axis / np.linalg.norm(axis), -1, 1))) <= limit
@@ -99,37 +87,12 @@ def test_queries_equal_brute_force(viewpoint_map: ViewpointMap) -> None:
         reachable = best_by_hand(viewpoint_map, row, near)
         assert id_of(viewpoint_map.best_reachable(point, axis, limit)) == reachable
         assert id_of(viewpoint_map.best_reachable(point, rotation_looking_along(axis), limit)) == reachable
-    assert 20 < found < 130
-
-
-def test_a_limit_includes_its_border_and_a_cone_may_be_empty(viewpoint_map: ViewpointMap) -> None:
-    point = viewpoint_map.locations[0]
-    for axis in DIRECTIONS:
-        at = viewpoint_map.best_in_cone(point, axis, 0)
-        assert at is not None
-        np.testing.assert_array_equal(at.axis, axis)
-        assert id_of(viewpoint_map.best_reachable(point, axis, 0)) == at.direction_id
-        assert id_of(viewpoint_map.best_in_cone(point, 3 * axis, 180)) == id_of(viewpoint_map.best(point))
-    between = DIRECTIONS[30] + DIRECTIONS[31]
-    assert viewpoint_map.best_in_cone(point, between, 0.1) is None
-    assert viewpoint_map.best_reachable(point, between, 0.1) is None
-
-
-def test_the_grid_is_closed_and_what_is_outside_has_no_answer(viewpoint_map: ViewpointMap) -> None:
-    corners = np.array([GRID.lower, GRID.upper])
-    everywhere = build_viewpoint_map(
-        make_scorer("bins", room_map(room_landmarks(50))), GRID, free_voxels(), DIRECTIONS[:3]
-    )
-    np.testing.assert_array_equal(everywhere.rows(corners), [everywhere.row(corner) for corner in corners])
-    for beyond in (np.nextafter(corners[0], -1), np.nextafter(corners[1], 10), np.array([1e9, 1, 1])):
-        assert viewpoint_map.best(beyond) is None
-        assert not viewpoint_map.best_many(beyond[None]).found[0]
-    assert viewpoint_map.best_many(np.empty((0, 3))).found.shape == (0,)
+    assert 20 < many.found.sum() < 130
 
 
 def test_interpolation_lies_between_free_neighbours_and_is_trilinear(viewpoint_map: ViewpointMap) -> None:
     centers = GRID.centers()
-    n_between = 0
+    n_partial = 0
     for point in points_about(200, seed=2):
         scores = viewpoint_map.interpolated(point)
         if scores is None:
@@ -139,26 +102,28 @@ def test_interpolation_lies_between_free_neighbours_and_is_trilinear(viewpoint_m
         used = np.flatnonzero(weights > 0)
         neighbours = viewpoint_map.scores[viewpoint_map.row_of_voxel[used]].astype(np.float64)
         np.testing.assert_allclose(scores, weights[used] / weights[used].sum() @ neighbours, atol=1e-12)
-        assert np.all(scores >= neighbours.min(0) - 1e-12) and np.all(scores <= neighbours.max(0) + 1e-12)
-        n_between += 1 < len(used) < 8
-    assert n_between > 10  # some neighbours were not free, or not there
+        n_partial += 1 < len(used) < 8
+    assert n_partial > 10  # some neighbours were occupied or outside the grid
 
 
-def test_the_blocks_of_a_build_do_not_matter(viewpoint_map: ViewpointMap, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wheretolook.planning.map_building.VIEWS_AT_ONCE", 150)
-    again = build(room_landmarks(400))
-    for name in ("ranked", "scores", "n_visible"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(viewpoint_map, name))
+def test_limits_include_their_border(viewpoint_map: ViewpointMap) -> None:
+    point = viewpoint_map.locations[0]
+    for axis in DIRECTIONS:
+        at = viewpoint_map.best_in_cone(point, axis, 0)
+        np.testing.assert_array_equal(at.axis, axis)
+        assert id_of(viewpoint_map.best_reachable(point, axis, 0)) == at.direction_id
+    assert viewpoint_map.best_in_cone(point, DIRECTIONS[30] + DIRECTIONS[31], 0.1) is None
+    for beyond in (np.nextafter(GRID.lower, -1), np.nextafter(GRID.upper, 10), np.array([1e9, 1, 1])):
+        assert viewpoint_map.best(beyond) is None and not viewpoint_map.best_many(beyond[None]).found[0]
+    assert viewpoint_map.best_many(np.empty((0, 3))).found.shape == (0,)
 
 
 def test_looks_are_chosen_together_in_a_free_voxel(viewpoint_map: ViewpointMap) -> None:
     scorer = make_scorer("bins", room_map(room_landmarks(400)))
     point = viewpoint_map.locations[3]
     looks = viewpoint_map.best_looks(point, 3, scorer=scorer)
-    assert looks is not None and len({look.direction_id for look in looks}) == 3
-    assert viewpoint_map.best(point) in [looks[0], *(viewpoint_map.best_looks(point, 1, scorer=scorer) or [])]
+    assert len({look.direction_id for look in looks}) == 3
     near = viewpoint_map.best_looks(point, 3, 100.0, scorer=scorer, start=looks[0].axis)
-    assert near is not None
     rotations = rotation_looking_along(np.array([looks[0].axis, *(look.axis for look in near)]))
     assert rotation_angle_deg(rotations[:-1], rotations[1:]).sum() <= 100 + 1e-4
     assert viewpoint_map.best_looks(np.array(GRID.upper) + 1, 2, scorer=scorer) is None
@@ -175,14 +140,11 @@ AXIS = (1, 0, 0)
     "query, arguments",
     [
         ("best", [(1.0, np.nan, 1.0)]),
-        ("best_many", [[(1.0, np.inf, 1.0)]]),
         ("best_many", [INSIDE]),
         ("best_n", [INSIDE, 0]),
-        ("best_n", [INSIDE, 2.5]),
         ("best_in_cone", [INSIDE, AXIS, -1]),
         ("best_in_cone", [INSIDE, (0, np.nan, 0), 10]),
         ("best_reachable", [INSIDE, (0, 0, 0), 10]),
-        ("best_reachable", [INSIDE, 2 * np.eye(3), 10]),
         ("best_reachable", [INSIDE, np.diag([1.0, 1.0, -1.0]), 180.0]),
     ],
 )

@@ -13,7 +13,6 @@ from wheretolook.cli import main
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import is_good, poses, write_table
 from wheretolook.evaluation.adaptation import compare_log_odds
-from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import finished_runs
 from wheretolook.training.weights import read_training
@@ -36,38 +35,35 @@ def run(dataset: Dataset, *options: str) -> int:
     return main(["adapt", *where, "--device", "cpu", *camera, *options])
 
 
-def test_adapted_weights_are_truer_and_logged(dataset: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+def test_adapted_weights_have_a_lower_loss_and_are_logged(dataset: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
     shards = dataset.scenes[1].adapt_shards / "000000"
     shards.mkdir(parents=True)  # of a run before these views had labels
     assert run(dataset, "--scene", "scene-1") == 0
     assert not shards.parent.exists()
-    said = capsys.readouterr().out
     path = dataset.root / "adapted" / "scene-1.safetensors"
-    assert "the adapted weights are better" in said and path.is_file() and "| regret" in said
-    assert path.with_suffix(".md").is_file()
+    assert "the adapted weights are better" in capsys.readouterr().out and path.with_suffix(".md").is_file()
     scene = dataset.scenes[1]
-    around = scene.localization_map(scene.camera, "cpu")
+    localization_map = scene.localization_map(scene.camera, "cpu")
     table = scene.read_table()
     good = is_good(table)
     losses = []
     for weights in (None, path):
-        chance = load_scorer(weights, around).score(poses(table)).clip(1e-9, 1 - 1e-9)
-        losses.append(-np.log(np.where(good, chance, 1 - chance)).mean())
+        probability = load_scorer(weights, localization_map).score(poses(table)).clip(1e-9, 1 - 1e-9)
+        losses.append(-np.log(np.where(good, probability, 1 - probability)).mean())
     assert losses[1] < losses[0]
-    told = read_training(path)
-    assert told["scene"] == "scene-1" and told["after"]["log_loss"] < told["before"]["log_loss"]
+    training = read_training(path)
+    assert training["after"]["log_loss"] < training["before"]["log_loss"]
     tracking = TrackingConfig(dataset.root.parent / "mlruns")
     (one,) = finished_runs(tracking, "adapt")
     assert one.data.metrics["better"] == 1.0
 
 
-def test_where_nothing_is_gained_nothing_is_kept(dataset: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+def test_weights_without_a_gain_are_not_kept(dataset: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
     scene = dataset.scenes[1]
     table = scene.read_table()
-    around = LocalizationMap(scene.read_landmarks(), scene.camera, scene.localization_map(scene.camera).occlusion)
-    chance = load_scorer(around).score(poses(table))
+    scored = load_scorer(None, scene.localization_map(scene.camera)).score(poses(table))
     draws = np.random.default_rng(5).random(len(table))
-    localized = draws < chance  # the scorer is right
+    localized = draws < scored  # the scorer is right
     table["status"] = np.where(localized, "localized", "no_pose")
     table["error_m"] = np.where(localized, 0.01, np.nan).astype(np.float32)
     table["error_deg"] = np.where(localized, 0.1, np.nan).astype(np.float32)
@@ -86,9 +82,7 @@ def test_where_nothing_is_gained_nothing_is_kept(dataset: Dataset, capsys: pytes
         (),
         ("--scene", "house"),
         ("--scene", "scene-1", "--minutes", "0"),
-        ("--scene", "scene-1", "--adapt.seed", "-1"),
         ("--scene", "scene-1", "--out", "dataset/x.safetensors"),
-        ("--scene", "scene-1", "--out", "."),
         ("--scene", "scene-1", "--weights", "x.safetensors", "--out", "x.safetensors"),
         ("--scene", "scene-1", "--weights", "nowhere.safetensors"),
     ],
@@ -113,7 +107,6 @@ def test_gains_are_those_of_known_cases() -> None:
     assert gain.before["auc"] == 0.5 and gain.after["auc"] == 1
     expected = (np.log1p(np.exp(1)) + np.log1p(np.exp(-1))) / 2 - np.log1p(np.exp(-2))
     assert gain.log_loss_less[0] == pytest.approx(expected) and gain.regret_less[0] == 50
-    assert pd.notna(gain.log_loss_less[1])
 
 
 @pytest.mark.slow
@@ -135,7 +128,6 @@ label: {workers: 1, shard_size: 32}
 """)
     where = ["--config", str(settings), "--data", str(tmp_path / "data"), "--device", "cpu"]
     where += ["--tracking.folder", str(tmp_path / "mlruns")]
-    assert main(["adapt", *where]) == 2  # nothing is there
     for stage in ("scenes", "map", "sample"):
         assert main([stage, *where]) == 0
     (scene,) = Dataset.load(tmp_path / "data" / "small").scenes
@@ -143,14 +135,11 @@ label: {workers: 1, shard_size: 32}
     assert n_views > 128  # the clock is looked at after so many
     capsys.readouterr()
     assert main(["adapt", *where, "--minutes", "0.0001"]) == 0
-    said = capsys.readouterr()
-    assert f"labelling up to {n_views} views, for 0.0001 minutes at most" in said.out
-    assert f"128 of {n_views} views labelled; run it again to go on" in said.out and "fitting to 128" in said.out
-    assert "label:" in said.err  # the progress bar
+    said = capsys.readouterr().out
+    assert f"128 of {n_views} views labelled" in said and "fitting to 128" in said
     made = {path: path.stat().st_mtime_ns for path in scene.folder.glob("adapt-shards/*/*.parquet")}
     assert sum(len(pd.read_parquet(path)) for path in made) >= 128
     assert main(["adapt", *where]) == 0
-    said = capsys.readouterr()
-    assert f"fitting to {n_views} rendered views" in said.out and "run it again" not in said.out
+    said = capsys.readouterr().out
+    assert f"fitting to {n_views} rendered views" in said
     assert made == {path: path.stat().st_mtime_ns for path in made}  # nothing was labelled twice
-    assert len(list(finished_runs(TrackingConfig(tmp_path / "mlruns"), "adapt"))) == 2

@@ -11,33 +11,26 @@ import numpy as np
 import pandas as pd
 import pycolmap
 import pytest
-from scipy.spatial import cKDTree
 
 from mask_agreement import MaskAgreement
 from wheretolook.cli import main, parse_command
 from wheretolook.commands.preconditions import open_scene
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.viewpoint_table import is_good, poses, read_table, write_table
+from wheretolook.dataset.viewpoint_table import is_good, poses, read_table
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers
-from wheretolook.inputs.channels import CHANNELS
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.scorers.mlp.network import ViewpointNetwork
 from wheretolook.scorers.registry import scorers
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.space.tsdf_space import TsdfSpace
 from wheretolook.tracking.config import TrackingConfig
-from wheretolook.tracking.runs import artifact, finished_runs, newest_run
-from wheretolook.tracking.store import client
-from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook.tracking.runs import finished_runs, newest_run
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import fingerprint
-from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook.weights.resolve import load_scorer
-from wheretolook_paper.paths.path_comparison import draw_pairs
 
 pytestmark = pytest.mark.slow  # the whole line, several times over
 
@@ -94,47 +87,15 @@ def test_every_stage_leaves_its_result(demo: Path) -> None:
     scores = pd.read_csv(dataset.root / "results" / "scores.csv")
     rules = {"random", "visible", "bins", "fisher-trace-exact", "oracle"}
     assert {*rules, "mlp-2d", "mlp-2d+3d", "set", "set that ships"} == set(scores["method"])
-    for picture in ("scores.png", "overview.png"):
-        assert (dataset.root / "results" / picture).stat().st_size > 10_000
-    run_of_evaluation = newest_run(TrackingConfig(str(demo / "mlruns")), "evaluate")
-    assert run_of_evaluation is not None and run_of_evaluation.info.status == "FINISHED"
+    assert (dataset.root / "results" / "overview.png").stat().st_size > 10_000
 
 
 def test_run_again_it_reuses_what_is_there(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = {path: path.stat().st_mtime_ns for path in results(demo)}
-    runs = all_runs(demo)
     assert run("demo", demo) == 0
     assert {path: path.stat().st_mtime_ns for path in results(demo)} == before
-    assert all_runs(demo) == runs
-    said = capsys.readouterr().out
-    assert "[evaluate] reusing" in said and said.startswith(f"Data go to {demo / 'data' / 'tiny'}, runs to ")
-
-
-def all_runs(folder: Path) -> set[str]:
-    """Ids of all runs in the store."""
-    mlflow = client(TrackingConfig(str(folder / "mlruns")))
-    experiments = [one.experiment_id for one in mlflow.search_experiments()]
-    return {one.info.run_id for one in mlflow.search_runs(experiments, max_results=1000)}
-
-
-def test_the_demo_ends_in_a_sentence_a_picture_and_what_to_do_next(
-    copy: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run("demo", copy) == 0
-    end = capsys.readouterr().out.partition("\nDone in ")[2]
-    root = copy / "data" / "tiny"
-    scores = pd.read_csv(root / "results" / "scores.csv")
-    pooled = scores[scores["scene"] == "all"].set_index("method")
-    sentence, _, places = end.partition("\n\n")[2].partition("\n\n")
-    best = pooled.drop(index=["oracle", "random"])["good_0.05m_0.4deg"].max()
-    text = " ".join(sentence.split())
-    assert f"at {best:.0f} of {pooled['n_locations'].iloc[0]} locations; " in text
-    assert f"and the oracle, which knows, at {pooled.loc['oracle', 'good_0.05m_0.4deg']:.0f}." in text
-    assert "95 % interval" in text or "too few" in text
-    shown = dict(line.split(maxsplit=1) for line in places.replace("your own map", "next").splitlines() if line)
-    for name in ("picture", "tables"):
-        assert Path(shown[name]).is_file()
-    assert shown["next"].startswith("wheretolook select --map ") and "mlflow ui" in shown["runs"]
+    assert len([*finished_runs(TrackingConfig(str(demo / "mlruns")), "evaluate")]) == 1
+    assert "[evaluate] reusing" in capsys.readouterr().out
 
 
 def test_all_methods_are_trained_and_compared(copy: Path) -> None:
@@ -174,7 +135,7 @@ def test_a_changed_setting_remakes_what_depends_on_it(copy: Path) -> None:
 
 
 @pytest.mark.usefixtures("in_this_process", "no_pictures_here")
-def test_matches_are_stored_when_asked_for_and_go_with_the_labels_they_belong_to(copy: Path) -> None:
+def test_matches_are_stored_on_request_and_removed_with_their_labels(copy: Path) -> None:
     scenes = Dataset.load(copy / "data" / "tiny").scenes
     before = {scene: scene.table.read_bytes() for scene in scenes}
     stored = ("label", copy, "--label.store_matches", "true")
@@ -184,17 +145,11 @@ def test_matches_are_stored_when_asked_for_and_go_with_the_labels_they_belong_to
         assert (table["inlier_rows"].map(len) == table["n_inliers"]).all()
         assert all(np.isin(*rows).all() for rows in table[["inlier_rows", "matched_rows"]].itertuples(index=False))
         assert np.concatenate(table["matched_rows"].to_list()).max() < len(np.load(scene.landmarks)["ids"])
-        write_table(scene.read_table(), copy / "labels.parquet")
-        assert (copy / "labels.parquet").read_bytes() == before[scene]
-    after = {scene: scene.table.stat().st_mtime_ns for scene in scenes}
-    assert run(*stored) == 0
-    assert {scene: scene.table.stat().st_mtime_ns for scene in scenes} == after
-
     assert run("label", copy) == 0
     assert {scene: scene.table.read_bytes() for scene in scenes} == before
     assert run(*stored) == 0 and run("sample", copy, "--sample.seed", "5") == 0
     for scene in scenes:
-        with pytest.raises(TableError, match="store_matches"):
+        with pytest.raises(TableError):
             read_table(scene.table, matches=True)
 
 
@@ -205,13 +160,6 @@ def test_three_lines_score_viewpoints_of_a_colmap_model(demo: Path) -> None:
     weights = demo / "data" / "tiny" / "weights" / "mlp-2d+3d.safetensors"
     scores = load_scorer(weights, localization_map).score(poses(table))
     assert scores.shape == (len(table),) and np.all((scores > 0) & (scores < 1)) and np.ptp(scores) > 0
-    assert TrainedNetwork.load(weights, ViewpointNetwork, "mlp-2d+3d").network.spec.channels == CHANNELS
-    # the camera that mapped is the same pinhole, projected by COLMAP; landmarks on an edge may be rounded otherwise
-    by_colmap = LocalizationMap.from_colmap(scene.map, PinholeCamera(320, 240, 160.0).colmap, mesh=scene.mesh)
-    difference = by_colmap.bin_views(poses(table)).counts - localization_map.bin_views(poses(table)).counts
-    assert np.abs(difference).sum() <= 2
-    hidden = LocalizationMap.from_colmap(scene.map, PinholeCamera(320, 240, 160), occlusion=HiddenPointRemoval())
-    assert hidden.bin_views(poses(table)).counts.sum() > 0
     # the mesh's rays and the occlusion stored by the sample stage agree
     binned = scene.localization_map(PinholeCamera(320, 240, 160)).bin_views(poses(table))
     np.testing.assert_array_equal(localization_map.bin_views(poses(table)).counts, binned.counts)
@@ -230,14 +178,6 @@ def test_every_occlusion_model_scores_the_same_viewpoints(copy: Path) -> None:
     visible = scores[(scores["method"] == "visible") & (scores["scene"] == "all") & (scores["top_n"] == 1)]
     assert visible["average_precision"].nunique() > 1
     assert (root / "results" / "occlusion.png").stat().st_size > 10_000
-    assert "By occlusion model" in (root / "results" / "scores.md").read_text()
-    tracking = TrackingConfig(str(copy / "mlruns"))
-    parent = newest_run(tracking, "evaluate")
-    assert parent is not None
-    runs = client(tracking).search_runs(
-        [parent.info.experiment_id], f"tags.mlflow.parentRunId = '{parent.info.run_id}'"
-    )
-    assert {one.data.params["occlusion"] for one in runs} == set(scores["occlusion"])
 
 
 @pytest.mark.parametrize("model", ["tsdf", "hidden-points", "none"])
@@ -257,31 +197,24 @@ def test_viewpoints_can_be_sampled_with_every_occlusion_model(copy: Path, model:
     assert agreement.recall > {"tsdf": 0.9, "hidden-points": 0.6, "none": 0.999}[model]
 
 
-def test_a_stage_refuses_what_an_earlier_one_has_remade(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_stage_refuses_outdated_inputs(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    mesh = Dataset.load(copy / "data" / "tiny").scenes[0].mesh
+    before = mesh.stat().st_mtime_ns
+    assert run("scenes", copy, "--camera.focal_px", "200") == 0
+    assert mesh.stat().st_mtime_ns == before  # another camera does not change a mesh
     assert run("scenes", copy, "--scenes.apartment.texture_richness", "0.3") == 0
     for stage, needed in (("label", "sample"), ("sample", "map"), ("evaluate", "label")):
         assert run(stage, copy) == 2
         assert f"Run `wheretolook {needed}`" in capsys.readouterr().err
 
 
-def test_another_camera_makes_all_but_the_meshes_anew(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    mesh = Dataset.load(copy / "data" / "tiny").scenes[0].mesh
-    before = mesh.stat().st_mtime_ns
-    assert run("scenes", copy, "--camera.focal_px", "200") == 0
-    assert mesh.stat().st_mtime_ns == before
-    assert run("label", copy, "--camera.focal_px", "200") == 2
-    assert "Run `wheretolook sample`" in capsys.readouterr().err
-
-
-def test_weights_are_not_tested_on_what_they_learnt_from(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_weights_are_not_tested_on_scenes_they_were_trained_on(copy: Path) -> None:
     root = copy / "data" / "tiny"
     dataset = Dataset.load(root)
     replace(dataset, scenes=tuple(replace(scene, split="test") for scene in dataset.scenes)).save()
     weights = root / "weights" / "mlp-2d.safetensors"
     assert run("evaluate", copy, "--evaluate.methods", "[mlp]", "--evaluate.weights", f"[{weights}]") == 2
-    assert "learnt from a scene of the test split (got 'apartment-000')" in capsys.readouterr().err
     assert run("evaluate", copy) == 2
-    assert "trained on other data" in capsys.readouterr().err
 
 
 PATHS = ["--paths.grid", "[4, 4, 2]", "--paths.directions", "40", "--paths.min_distance_m", "1", "--paths.max_turn_deg",
@@ -295,127 +228,72 @@ def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.Cap
     table = pd.read_csv(root / "paths.csv")
     assert {*table["method"]} == {"forward", "visible", "visible greedy"} and {*table["pairs"]} == {2}
     views = pd.read_parquet(root / "paths" / "views.parquet")
-    assert views["status"].isin(["localized", "no_pose", "too_few_matches"]).all()
     planned = views[(views["task"] == "planned") & (views["method"] == "visible")]
     good = (planned["status"] == "localized") & (planned["error_m"] < 0.25) & (planned["error_deg"] < 2)
-    said = table[(table["task"] == "planned") & (table["method"] == "visible")]["localized"]
-    assert said.iloc[0] == pytest.approx(good.mean(), abs=1e-5)
-    assert (root / "paths.png").stat().st_size > 5000 and "| visible" in capsys.readouterr().out
-    assert newest_run(TrackingConfig(str(copy / "mlruns")), "paths") is not None
+    share = table[(table["task"] == "planned") & (table["method"] == "visible")]["localized"]
+    assert share.iloc[0] == pytest.approx(good.mean(), abs=1e-5)
+    assert (root / "paths.png").stat().st_size > 5000
     before = (root / "paths" / "views.parquet").read_bytes()
+    capsys.readouterr()
     assert run("compare-paths", copy, *options) == 0
     assert "reusing" in capsys.readouterr().out and (root / "paths" / "views.parquet").read_bytes() == before
     assert len(list(finished_runs(TrackingConfig(str(copy / "mlruns")), "paths"))) == 1  # nothing new to log
-    kept = next((root / "paths").glob("*/views.parquet"))
-    content = kept.read_bytes()
-    kept.write_bytes(content[: len(content) // 2])
-    assert run("compare-paths", copy, *options) == 0
-    assert len(pd.read_parquet(kept))
     assert run("compare-paths", copy, "--paths.scenes", "[nowhere]") == 2
-    assert "There are" in capsys.readouterr().err
 
 
-def test_views_along_paths_are_localized_together(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_views_along_paths_are_localized_together(copy: Path) -> None:
     options = ["--paths.pairs", "1", "--paths.methods", "[forward,set]", *PATHS]
     assert run("compare-paths", copy, *options) == 0
     root = copy / "data" / "tiny" / "results"
     plain = pd.read_csv(root / "paths.csv")
-    assert "looks" not in plain
     joint = ["--paths.stops.looks", "3", "--paths.stops.least_score", "0.95", "--paths.last_views", "2"]
     assert run("compare-paths", copy, *options, *joint) == 0
-    assert "| set with stops" in capsys.readouterr().out
     table = pd.read_csv(root / "paths.csv")
     more = {"set with stops", "forward last 2 together", "set last 2 together"}
     assert {*table["method"]} == {*plain["method"], *more}
     single = table[~table["method"].isin(more)].reset_index(drop=True)
     pd.testing.assert_frame_equal(single[plain.columns], plain)  # the same paths, localized as before
     stopped = table[table["method"] == "set with stops"].set_index("task")
-    alone = table[table["method"] == "set"].set_index("task")
-    assert (stopped["looks"] > 1).any() and (alone["looks"] == 1).all()
-    assert (stopped["turn_deg_per_m"] > alone["turn_deg_per_m"]).any()
-    scene = next((root / "paths").glob("*/stops.parquet")).parent
-    further = pd.read_parquet(scene / "stops.parquet")
-    assert further["look"].between(2, 3).all() and (stopped["looks"] * stopped["views"]).sum() == pytest.approx(
-        stopped["views"].sum() + len(further), rel=1e-4
-    )
-    kept = {path: path.stat().st_mtime_ns for path in [*scene.glob("*shards/*.parquet"), *scene.glob("*.parquet")]}
-    assert run("compare-paths", copy, *options, *joint) == 0
-    assert run("compare-paths", copy, *options) == 0  # what was localized with more than is needed
+    assert (stopped["looks"] > 1).any()
+    further = pd.read_parquet(next((root / "paths").glob("*/stops.parquet")))
+    assert (stopped["looks"] * stopped["views"]).sum() == pytest.approx(stopped["views"].sum() + len(further), rel=1e-4)
+    kept = {path: path.stat().st_mtime_ns for path in (root / "paths").glob("*/*.parquet")}
+    assert run("compare-paths", copy, *options) == 0  # reuses the views localized with more options
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
-    pd.testing.assert_frame_equal(pd.read_csv(root / "paths.csv"), plain)
     assert run("compare-paths", copy, *options, "--paths.methods", "[forward,visible]", *joint) == 2
-    assert "probabilities" in capsys.readouterr().err
 
 
-def test_a_path_is_planned_and_shown(
-    copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_path_is_planned_and_shown(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Dataset.load(copy / "data" / "tiny").split("test")[0]
     centers = camera_centers(poses(scene.read_table()))
+    out = tmp_path / "path"
     options = ["--scene", scene.name, "--plan.grid", "[4, 4, 2]", "--plan.directions", "40",
-               "--plan.planner.time_s", "2", "--plan.planner.spacing_m", "0.5"]  # fmt: skip
-    options += ["--out", str(tmp_path / "way")]
-    away = np.linalg.norm(centers - centers[0], axis=1)
-    goal = centers[np.where(away > 0.5, away, np.inf).argmin()]  # not far: there is little time
+               "--plan.planner.time_s", "2", "--plan.planner.spacing_m", "0.5", "--out", str(out)]  # fmt: skip
+    distance = np.linalg.norm(centers - centers[0], axis=1)
+    goal = centers[np.where(distance > 0.5, distance, np.inf).argmin()]  # not far: there is little time
     ends = ["--start", str(centers[0].tolist()), "--goal", str(goal.tolist())]
     assert run("plan", copy, *options, *ends, "--plan.against", "[forward]") == 0
-    assert "mean score" in capsys.readouterr().out
-    table = pd.read_csv(tmp_path / "way" / "path.csv")
+    table = pd.read_csv(out / "path.csv")
     np.testing.assert_allclose(table[["x_m", "y_m", "z_m"]].to_numpy()[[0, -1]], [centers[0], goal], atol=1e-6)
-    axes = table[["axis_x", "axis_y", "axis_z"]].to_numpy()
-    np.testing.assert_allclose(poses(table)[:, 2, :3], axes, atol=1e-6)
     assert table["score"].between(0, 1).all()
-    assert {path.name for path in (tmp_path / "way").iterdir()} == {
-        "path.csv", "path.png", "path.gif", "methods.png",
-    }  # fmt: skip
+    assert {path.name for path in out.iterdir()} == {"path.csv", "path.png", "path.gif", "methods.png"}
     logged = newest_run(TrackingConfig(str(copy / "mlruns")), "plan")
     assert logged is not None and logged.data.metrics["score"] == pytest.approx(table["score"].mean(), abs=1e-4)
-    assert artifact(TrackingConfig(str(copy / "mlruns")), logged.info.run_id, "methods.png").is_file()
     monkeypatch.setitem(sys.modules, "rerun", None)
-    assert run("plan", copy, *options, *ends, "--plan.rerun", "true") == 2
-    assert run("plan", copy, *options) == 2
-    assert "needs a start and a goal" in capsys.readouterr().err
     wall = ["--start", "[-99, 0, 1]", "--goal", str(goal.tolist()), "--film", "none", "--method", "forward"]
-    assert run("plan", copy, *options, *wall) == 2
-    assert "the start is not in free space" in capsys.readouterr().err
+    for invalid in ([*ends, "--plan.rerun", "true"], [], wall):
+        assert run("plan", copy, *options, *invalid) == 2
 
 
-def _longest_straight_way(pairs: np.ndarray, space: TsdfSpace) -> int:
-    """Which of pairs (P, 2, 3) m are farthest apart with nothing but free space straight between them and around.
-
-    Elsewhere a path may cross what is clear, yet not free, such as where depth images saw no floor below.
-    """
-    along = pairs[:, None, :1] + np.linspace(0, 1, 30)[1:-1, None, None] * (pairs[:, None, 1:] - pairs[:, None, :1])
-    around = along + 0.05 * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-    straight = space.is_free(around.reshape(-1, 3)).reshape(len(pairs), -1).all(1)
-    assert straight.any()
-    return int(np.where(straight, np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=1), 0).argmax())
-
-
-def test_paths_keep_clear_of_what_depth_images_saw(copy: Path, tmp_path: Path) -> None:
+def test_depth_images_bound_the_free_space(copy: Path) -> None:
     """With the occlusion model tsdf; locations are sampled by the mesh all the same."""
-    tsdf = ["--occlusion.model", "tsdf", "--occlusion.voxel_m", "0.04"]
-    options = ["--config", str(copy / "tiny.yaml"), "--data", str(copy / "data"), "--device", "cpu", *tsdf]
-    experiment = parse_command("plan", options)
-    assert experiment is not None
-    dataset = Dataset.load(experiment.root)
-    scene = dataset.split("test")[0]
-    opened = open_scene(experiment, scene)
-    by_mesh = opened.sampled_space
-    space = opened.space
-    assert type(by_mesh) is FreeSpace and isinstance(space, TsdfSpace) and opened.occlusion.name == "tsdf"
+    where = ["--config", str(copy / "tiny.yaml"), "--data", str(copy / "data"), "--device", "cpu"]
+    experiment = parse_command("plan", [*where, "--occlusion.model", "tsdf", "--occlusion.voxel_m", "0.04"])
+    environment = open_scene(experiment, Dataset.load(experiment.root).split("test")[0])
+    by_mesh = environment.sampled_space
+    assert type(by_mesh) is FreeSpace and isinstance(environment.space, TsdfSpace)
     points = np.random.default_rng(0).uniform(*by_mesh.bounds, (4000, 3))
-    free = space.is_free(points)
+    free = environment.space.is_free(points)
     expected = by_mesh.is_free(points)
     assert free.sum() > 100 and expected[free].mean() > 0.95 and free[expected].mean() < 1
     assert not free[by_mesh.raycaster.distance_to_surface(points, 1.0) < 0.25 - 2 * experiment.occlusion.voxel_m].any()
-    pairs = draw_pairs(space, replace(experiment.paths, pairs=20, min_distance_m=0.5))
-    way = pairs[_longest_straight_way(pairs, space)]
-    ends = ["--start", str(way[0].tolist()), "--goal", str(way[1].tolist()), "--out", str(tmp_path / "way")]
-    rest = ["--scene", scene.name, "--method", "forward", "--film", "none", "--plan.planner.time_s", "1"]
-    assert run("plan", copy, *tsdf, *ends, *rest) == 0
-    path = pd.read_csv(tmp_path / "way" / "path.csv")[["x_m", "y_m", "z_m"]].to_numpy()
-    assert len(path) > 1 and space.is_free(path).all()
-    assert (by_mesh.raycaster.distance_to_surface(path, 1.0) > 0.25 - 2 * experiment.occlusion.voxel_m).all()
-    unseen = space.cells.centers()[space.to_unseen_m.ravel() == 0]
-    assert cKDTree(unseen).query(path)[0].min() > space.config.clearance_m

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +16,12 @@ from synthetic_dataset import make_dataset
 from wheretolook.commands.train import train_methods as train
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import NO_POSE, UNLABELLED, is_good, write_table
-from wheretolook.inputs.bins import InputStatistics
 from wheretolook.scorers.mlp.network import ViewpointNetwork
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.store import client
-from wheretolook.training.data import BinnedBatches, ViewpointDataModule, hold_out_locations
+from wheretolook.training.data import ViewpointDataModule, hold_out_locations
 from wheretolook.training.provenance import training_fingerprint, was_trained_on
-from wheretolook.training.scenes import with_also
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.weights.resolve import load_scorer
@@ -60,14 +57,11 @@ def test_held_out_locations_are_whole_and_the_same_for_the_same_seed() -> None:
     location = np.repeat([3, 5, 7, 9, 3, 5], 5)
     held_out = hold_out_locations(scene, location, 0.3, seed=4)
     for number in (0, 1):
-        of_scene = scene == number
-        inside = {*location[of_scene & held_out]}
-        outside = {*location[of_scene & ~held_out]}
+        inside, outside = ({*location[(scene == number) & rows]} for rows in (held_out, ~held_out))
         assert inside and outside and not inside & outside
     assert len({*location[(scene == 0) & held_out]}) == 2  # 30 % of 4, rounded up
     np.testing.assert_array_equal(held_out, hold_out_locations(scene, location, 0.3, seed=4))
-    assert any(np.any(held_out != hold_out_locations(scene, location, 0.3, seed=seed)) for seed in range(5, 10))
-    assert not hold_out_locations(scene[:5], location[:5], 0.3, seed=0).any()  # one location only: it stays
+    assert not hold_out_locations(scene[:5], location[:5], 0.3, seed=0).any()  # the only location is trained on
 
 
 def test_data_module_reads_labelled_train_views_only(dataset: Dataset) -> None:
@@ -77,22 +71,16 @@ def test_data_module_reads_labelled_train_views_only(dataset: Dataset) -> None:
     write_table(table, scene.table)
     data = data_of(dataset, train_config(accelerator="cpu"))
     data.setup()
-    kept = table[table["status"] != UNLABELLED]
-    other = dataset.scenes[1].read_table()
-    assert len(data.views) == len(kept) + len(other)
-    expected = np.concatenate([is_good(kept), is_good(other)])
-    np.testing.assert_array_equal(data.views.labels.numpy() > 0, expected)
-    n_visible = np.concatenate([kept["n_visible"], other["n_visible"]])
-    np.testing.assert_array_equal(data.views.filled.any(2).any(1).numpy(), n_visible > 0)
-
+    labelled = pd.concat([table[table["status"] != UNLABELLED], dataset.scenes[1].read_table()])
+    np.testing.assert_array_equal(data.views.labels.numpy() > 0, is_good(labelled))
+    np.testing.assert_array_equal(data.views.filled.any(2).any(1).numpy(), labelled["n_visible"] > 0)
     sides = [{(data.views.scene[row], data.views.location[row]) for row in rows.tolist()}
              for rows in (data.train_rows, data.val_rows)]  # fmt: skip
     assert not sides[0] & sides[1]
     assert len(data.train_rows) + len(data.val_rows) == len(data.views)
     labels = data.views.labels[data.train_rows]
-    assert data.class_weights == pytest.approx(
-        (len(labels) / 2 / (len(labels) - labels.sum().item()), len(labels) / 2 / labels.sum().item())
-    )
+    n_good = labels.sum().item()
+    assert data.class_weights == pytest.approx((len(labels) / 2 / (len(labels) - n_good), len(labels) / 2 / n_good))
 
 
 def test_validation_scenes_are_used_where_there_are_some(tmp_path: Path) -> None:
@@ -103,46 +91,14 @@ def test_validation_scenes_are_used_where_there_are_some(tmp_path: Path) -> None
     assert {*data.views.scene[data.val_rows]} == {1}
 
 
-def test_every_pass_visits_every_training_view_once_in_its_own_order(dataset: Dataset) -> None:
+def test_every_epoch_visits_every_training_view_once_in_its_own_order(dataset: Dataset) -> None:
     data = data_of(dataset, changed(SMALL, batch_size=100))
     data.setup()
     loader = data.train_dataloader()
-    again = data.train_dataloader()
     first, second = (torch.cat([batch.labels for batch in loader]) for _ in range(2))
-    assert len(first) == len(data.train_rows)
-    assert first.sum() == data.views.labels[data.train_rows].sum()
+    assert len(first) == len(data.train_rows) and first.sum() == data.views.labels[data.train_rows].sum()
     assert not torch.equal(first, second)
-    assert torch.equal(first, torch.cat([batch.labels for batch in again]))
-    assert len(loader) == len(list(loader))
-
-
-def test_batches_hold_the_channels_asked_for(dataset: Dataset) -> None:
-    data = data_of(dataset, changed(SMALL, batch_size=7))
-    data.setup()
-    data.channels = ("z", "u")
-    batches = list(data.val_dataloader())
-    means = data.views.means[data.val_rows]
-    torch.testing.assert_close(torch.cat([batch.inputs[0] for batch in batches]), means[:, [4, 0]], rtol=0, atol=0)
-    filled = data.views.filled[data.val_rows]
-    labels = data.views.labels[data.val_rows]
-    assert torch.equal(torch.cat([batch.inputs[1] for batch in batches]), filled)
-    assert torch.equal(torch.cat([batch.labels for batch in batches]), labels)
-
-
-@pytest.mark.parametrize("world_size", [2, 3])
-def test_processes_share_out_every_batch(dataset: Dataset, world_size: int) -> None:
-    data = data_of(dataset, SMALL)
-    data.setup()
-    rows = data.train_rows[:101]  # the last batch has one view: some processes get none
-    whole = list(BinnedBatches(data.views, rows, data.channels, 10, 5))
-    loaders = [BinnedBatches(data.views, rows, data.channels, 10, 5, (rank, world_size)) for rank in range(world_size)]
-    shared_out = list(zip(*loaders, strict=True))
-    assert len(shared_out) == len(whole) == 11
-    for batch, shares in zip(whole, shared_out, strict=True):
-        assert torch.equal(torch.cat([share.inputs[0] for share in shares]), batch.inputs[0])
-        assert {share.total for share in shares} == {batch.total} == {len(batch.labels)}
-        sizes = [len(share.labels) for share in shares]
-        assert max(sizes) - min(sizes) <= 1
+    assert torch.equal(first, torch.cat([batch.labels for batch in data.train_dataloader()]))
 
 
 def test_balanced_training_views_are_equally_many_and_all_of_the_rarer_class(dataset: Dataset) -> None:
@@ -159,22 +115,18 @@ def test_balanced_training_views_are_equally_many_and_all_of_the_rarer_class(dat
     assert positives < chosen < {*plain.train_rows.tolist()}
     assert balanced.class_weights == (1.0, 1.0)
     assert torch.equal(plain.val_rows, balanced.val_rows)
-    views = balanced.views
-    assert balanced.statistics == InputStatistics.of(views.means, views.filled, balanced.train_rows)
 
 
 @pytest.mark.parametrize(
     "options",
     [
         {"methods": ("mlp-2d", "mlp-5d")},
-        {"methods": ()},
         {"epochs": 0},
         {"dropout": 1.0},
         {"val_fraction": 0.0},
         {"layout": "sideways"},
         {"learning_rate": float("nan")},
         {"l2": -1.0},
-        {"patience": 0},
         {"devices": 0},
     ],
 )
@@ -183,49 +135,36 @@ def test_options_out_of_range_are_refused(options: dict) -> None:
         changed(SMALL, **options)
 
 
-def test_training_learns_the_rule_logs_a_run_and_is_reused(
-    dataset: Dataset, store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    empty = tmp_path / "cwd"
-    empty.mkdir()
-    monkeypatch.chdir(empty)
+def test_training_learns_the_rule_logs_a_run_and_is_reused(dataset: Dataset, store: str) -> None:
     tracking = TrackingConfig(store, "tiny")
     config = changed(SMALL, methods=("mlp-2d", "mlp-2d+3d"), epochs=4, noise_px=0.5, noise_m=0.02, schedule="cosine")
     models = train(dataset, config, tracking, progress=False)
     assert [model.method for model in models] == ["mlp-2d", "mlp-2d+3d"]
     for model in models:
         assert model.metrics["val_average_precision"] > 0.9
-        assert model.metrics["train_bce"] < 0.69
         run = client(tracking).get_run(model.run_id)
         assert run.info.status == "FINISHED"
         assert run.data.params["method"] == model.method
-        assert run.data.params["epochs"] == "4"
-        assert len(run.data.params["dataset_fingerprint"]) == 16
-        assert run.data.tags["code_version"]
         history = client(tracking).get_metric_history(model.run_id, "val_average_precision")
         assert [metric.step for metric in history] == [0, 1, 2, 3]
         assert max(metric.value for metric in history) == pytest.approx(model.metrics["val_average_precision"])
         artifacts = Path(run.info.artifact_uri)
-        assert {file.name for file in artifacts.iterdir()} == {"history.csv", model.path.name}
-        assert artifacts.is_relative_to(Path(store) / "artifacts")
         assert len(pd.read_csv(artifacts / "history.csv")) == 4
         assert (artifacts / model.path.name).read_bytes() == model.path.read_bytes()
-    assert not list(empty.iterdir())
 
     before = {path: path.stat().st_mtime_ns for path in (dataset.root / "weights").iterdir()}
     again = train(dataset, config, tracking, progress=False)
-    assert all(model.reused for model in again)
-    assert [model.run_id for model in again] == [model.run_id for model in models]
+    assert [(model.run_id, model.reused) for model in again] == [(model.run_id, True) for model in models]
     assert {path: path.stat().st_mtime_ns for path in (dataset.root / "weights").iterdir()} == before
 
     models[0].path.write_bytes(b"changed")
     scene = dataset.split("test")[0]
-    write_table(scene.read_table().iloc[:-1], scene.table)  # the test scene has no say in training
+    write_table(scene.read_table().iloc[:-1], scene.table)  # test scenes do not change the training
     third = train(dataset, config, tracking, progress=False)
     assert [model.reused for model in third] == [False, True]
 
 
-def test_other_datasets_are_learnt_from_too(dataset: Dataset, store: str) -> None:
+def test_further_datasets_are_trained_on(dataset: Dataset, store: str) -> None:
     other = make_dataset(dataset.root.parent / "other", ("val", "test", "test", "test", "train"), n_locations=5)
     tracking = TrackingConfig(store, "also")
     config = changed(SMALL, epochs=1, also=("other",))
@@ -239,26 +178,20 @@ def test_other_datasets_are_learnt_from_too(dataset: Dataset, store: str) -> Non
     (again,) = train(dataset, config, tracking, progress=False)
     (without,) = train(dataset, changed(config, also=()), tracking, progress=False)
     assert again.reused and not without.reused
-    with pytest.raises(TableError, match="nowhere"):
-        train(dataset, changed(config, also=("nowhere",)), tracking, progress=False)
-    elsewhere = Dataset(dataset.root.parent / "moved" / "tiny", dataset.scenes)  # without the other one
-    assert was_trained_on(elsewhere, about)
-    assert not was_trained_on(Dataset(elsewhere.root, dataset.scenes[1:]), about)
-    for names in (("tiny",), ("other", "other")):
-        with pytest.raises(ConfigError, match="named twice"):
-            with_also(dataset, names)
-    leak = Dataset(other.root, (replace(other.scenes[2], split="train"),))
-    shutil.copy(dataset.split("test")[0].landmarks, leak.scenes[0].landmarks)
-    leak.save()
-    with pytest.raises(ConfigError, match=r"other/scene-2.*is the scene .*tiny/scene-2 again"):
-        train(dataset, config, tracking, progress=False)
-    Dataset(other.root, other.split("test")).save()
-    with pytest.raises(TableError, match=r"other.*no train scene"):
-        train(dataset, config, tracking, progress=False)
-    wider = replace(other.camera, width=other.camera.width + 2)
-    Dataset(other.root, tuple(replace(scene, camera=wider) for scene in other.scenes)).save()
-    with pytest.raises(ConfigError):
-        train(dataset, config, tracking, progress=False)
+
+
+def test_invalid_further_datasets(dataset: Dataset, store: str) -> None:
+    other = make_dataset(dataset.root.parent / "other", ("test", "train"), n_locations=5)
+    make_dataset(dataset.root.parent / "tests", ("test",), n_locations=2)
+    shutil.copy(dataset.split("test")[0].landmarks, other.scenes[1].landmarks)  # would train on a test scene
+    for names, error in (
+        (("nowhere",), TableError),
+        (("tests",), TableError),
+        (("tiny",), ConfigError),
+        (("other",), ConfigError),
+    ):
+        with pytest.raises(error):
+            train(dataset, changed(SMALL, also=names), TrackingConfig(store, "also"), progress=False)
 
 
 def test_the_same_seed_gives_the_same_weights(dataset: Dataset, store: str) -> None:
@@ -274,46 +207,34 @@ def test_the_same_seed_gives_the_same_weights(dataset: Dataset, store: str) -> N
 
 
 @pytest.mark.slow
-def test_two_processes_train_as_one_does(dataset: Dataset, store: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_two_processes_train_as_one_does(dataset: Dataset, store: str) -> None:
     # 920 training views: the last batch has one view, so that one of two processes has none
     tracking = TrackingConfig(store, "devices")
     one = changed(SMALL, dropout=0.0, batch_size=919)
     (alone,) = train(dataset, one, tracking, progress=False)
     expected = load(alone.path).state_dict()
-    capfd.readouterr()
     (shared,) = train(dataset, changed(one, devices=2), tracking, progress=False, force=True)
-    assert not "".join(capfd.readouterr())  # the processes are as quiet as one
     for name, weights in load(shared.path).state_dict().items():
         torch.testing.assert_close(weights, expected[name], rtol=1e-4, atol=1e-5)
     assert shared.metrics == pytest.approx(alone.metrics, rel=1e-4)
     experiment = client(tracking).get_experiment_by_name("devices")
     runs = client(tracking).search_runs([experiment.experiment_id])
     assert {run.info.run_id for run in runs} == {alone.run_id, shared.run_id}
-    histories = [
-        [(metric.step, metric.value) for metric in client(tracking).get_metric_history(model.run_id, "val_bce")]
-        for model in (alone, shared)
-    ]
-    assert [step for step, _ in histories[1]] == [0, 1, 2]
-    np.testing.assert_allclose(histories[1], histories[0], rtol=1e-4)
-    # which devices trained does not decide what was learnt
+    # weights do not depend on the number of devices
     assert train(dataset, one, tracking, progress=False)[0].reused
 
 
 def test_the_released_variant_trains_as_the_released_code(dataset: Dataset, store: str) -> None:
     config = changed(SMALL, methods=("mlp-2d+3d", "mlp-released"), epochs=2, hidden=(16,))
     ours, released = train(dataset, config, TrackingConfig(store), progress=False)
-    assert released.path.name == "mlp-released.safetensors"
     spec = load(released.path).spec
     assert (spec.layout, spec.input_dropout, spec.hidden) == ("compact", 0.5, (300, 300))
     assert spec.channels == ("u", "v", "x", "y", "z")
     params = client(TrackingConfig(store)).get_run(released.run_id).data.params
     expected = {"learning_rate": "0.0001", "l2": "0.0", "balance": "True", "keep": "last", "epochs": "2"}
     assert {name: params[name] for name in expected} == expected
-    assert float(params["positives_train"]) == 0.5  # so that no class weighs more than the other
+    assert float(params["positives_train"]) == 0.5  # classes weigh the same
     assert released.metrics["epoch"] == 1  # the last, whichever was best
     assert load(ours.path).spec.layout == "in_place"
-    assert all(model.reused for model in train(dataset, config, TrackingConfig(store), progress=False))
     localization_map = dataset.scenes[0].localization_map(dataset.camera)
-    assert [load_scorer(model.path, localization_map).name for model in (ours, released)] == [
-        "mlp-2d+3d", "mlp-released",
-    ]  # fmt: skip
+    assert load_scorer(released.path, localization_map).name == "mlp-released"

@@ -31,7 +31,6 @@ from wheretolook.mapping.imported_map import map_existing
 from wheretolook.planning.config import PathConfig, PlanConfig, ViewpointMapConfig
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.loading import save_glb
-from wheretolook.commands.scenes_config import ScenesConfig
 from wheretolook.space.config import MappedSpaceConfig
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError, WeightsError

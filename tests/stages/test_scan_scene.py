@@ -20,7 +20,6 @@ from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping.config import MapConfig
 from wheretolook.scans.config import RgbdConfig
 from wheretolook.scenes.loading import save_glb
-from wheretolook.commands.scenes_config import MeshSource, ScenesConfig
 
 
 @pytest.fixture(scope="module")

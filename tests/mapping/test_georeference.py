@@ -122,21 +122,11 @@ def test_invalid_tables_are_rejected(tmp_path: Path, name: str, text: str | None
         (read_marker_table if name[0] == "m" else read_positions)(tmp_path / name)
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"marker_size_m": 0.2, "marker_table": Path("markers.csv")},
-        {"marker_size_m": 0.2, "distance": KnownDistance("a.jpg", "marker:7", 1.5)},
-        {"positions": Path("positions.csv"), "distance": KnownDistance("a.jpg", "marker:7", 1.5)},
-        {"marker_size_m": -1.0},
-    ],
-)
-def test_invalid_settings_are_rejected(settings) -> None:
-    with pytest.raises(ConfigError):
-        ScaleConfig(**settings)
-
-
-def test_ends_of_a_known_distance() -> None:
-    assert KnownDistance("a.jpg", "marker:7", 1.5).marker_ids == (7,)
+def test_invalid_settings_are_rejected() -> None:
+    known = KnownDistance("a.jpg", "marker:7", 1.5)
+    assert known.marker_ids == (7,)
     with pytest.raises(ConfigError):
         KnownDistance("a.jpg", "a.jpg", 1.0)
+    for settings in ({"marker_size_m": 0.2, "distance": known}, {"marker_size_m": -1.0}):
+        with pytest.raises(ConfigError):
+            ScaleConfig(**settings)

@@ -181,49 +181,27 @@ def test_long_and_short_tracks_against_a_plain_loop(tmp_path):
         np.testing.assert_allclose(landmarks.mapping_direction[p], mean / np.linalg.norm(mean), atol=1e-6)
 
 
-def hand_written_landmarks(folder, model_dir, with_descriptors):
+@pytest.mark.parametrize("with_descriptors", [False, True])
+@pytest.mark.parametrize("compact", [False, True])
+def test_saved_landmarks_load_again(tmp_path, model_dir, with_descriptors, compact):
     database = None
     if with_descriptors:
         model, keypoints = hand_written_model()
-        database = write_database(
-            folder / "database.db", model, keypoints, random_descriptors([len(k) for k in keypoints])
-        )
-    return load_colmap_landmarks(model_dir, database)
-
-
-@pytest.mark.parametrize("with_descriptors", [False, True])
-def test_save_and_load(tmp_path, model_dir, with_descriptors):
-    landmarks = hand_written_landmarks(tmp_path, model_dir, with_descriptors)
-    landmarks.save(tmp_path / "a.npz")
+        descriptors = random_descriptors([len(k) for k in keypoints])
+        database = write_database(tmp_path / "database.db", model, keypoints, descriptors)
+    landmarks = load_colmap_landmarks(model_dir, database)
+    landmarks.save(tmp_path / "a.npz", compact=compact)
     again = Landmarks.load(tmp_path / "a.npz")
+    assert again.features == landmarks.features == ("sift" if with_descriptors else "")
+    assert (again.descriptors is None) == (compact or not with_descriptors)
     for name, value in vars(landmarks).items():
         other = getattr(again, name)
-        assert (value is None) == (other is None)
-        if value is not None:
-            assert value.dtype == other.dtype
-            np.testing.assert_array_equal(value, other)
-    again.save(tmp_path / "b.npz")
-    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-    assert not list(tmp_path.glob("*.partial"))
-
-
-@pytest.mark.parametrize("with_descriptors", [False, True])
-def test_compact_landmarks_keep_all_but_descriptors(tmp_path, model_dir, with_descriptors):
-    landmarks = hand_written_landmarks(tmp_path, model_dir, with_descriptors)
-    landmarks.save(tmp_path / "a.npz", compact=True)
-    again = Landmarks.load(tmp_path / "a.npz")
-    assert again.descriptors is None
-    assert np.isnan(again.ambiguity).all() == (not with_descriptors)
-    assert again.features == landmarks.features == ("sift" if with_descriptors else "")
-    for name, value in vars(landmarks).items():
-        if name not in ("descriptors", "described_by"):
-            other = getattr(again, name)
+        if other is not None and name != "described_by":
             assert other.dtype == value.dtype
-            rtol = 0 if value.dtype.kind == "i" else 1e-7 if name == "points" else 5e-4
-            np.testing.assert_allclose(other, value, rtol=rtol, atol=1e-7)
-    again.save(tmp_path / "b.npz", compact=True)
+            rtol = 0 if not compact or value.dtype.kind == "i" else 1e-7 if name == "points" else 5e-4
+            np.testing.assert_allclose(other, value, rtol=rtol, atol=1e-7 if compact else 0)
+    again.save(tmp_path / "b.npz", compact=compact)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-    assert not list(tmp_path.glob("*.partial"))
 
 
 def test_models_without_usable_points_are_rejected(tmp_path, model_dir):
@@ -248,24 +226,15 @@ def with_array(name, array):
     return edit
 
 
-def with_damage(path):
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2 :] = b""
-    path.write_bytes(data)
-
-
 @pytest.mark.parametrize(
     "edit",
     [
         Path.unlink,
-        with_damage,
+        lambda path: path.write_bytes(path.read_bytes()[:500]),
         with_array("points", None),
         with_array("points", np.zeros((4, 2))),
         with_array("points", np.full((4, 3), np.nan)),
         with_array("ids", np.zeros(3, np.int64)),
-        with_array("ids", np.zeros(4)),
-        with_array("ambiguity", np.zeros((4, 1))),
-        with_array("surprise", np.zeros(4)),
         with_array("described_by", np.array("orb")),
         with_array("descriptors", np.zeros((4, 64), np.uint8)),
     ],

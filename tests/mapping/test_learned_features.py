@@ -113,24 +113,26 @@ def test_the_number_of_columns_decides_the_kind_where_nothing_states_it(tmp_path
 
 @pytest.mark.parametrize("factor", [1.0, 6.0])  # of 640 x 480 pixels
 def test_hdf5_in_half_precision_fits_the_model_that_hloc_made_from_it(tmp_path, factor):
-    """hloc keeps pixels as halves, and adds half a pixel as halves when it writes them into COLMAP's database."""
+    """hloc keeps pixels as half_precision, and adds half a pixel as half_precision when it writes them into COLMAP's database."""
     kind = all_kinds()["superpoint"]
     model, keypoints = hand_written_model()
     stored = [kind.store(unit(len(found), kind.dimension, seed)) for seed, found in enumerate(keypoints)]
-    halves = []
+    half_precision = []
     for image_id, found in enumerate(keypoints, 1):
         found = found * factor
         found[-1] = np.array([639.3, 479.6]) * factor
-        halves.append((found - 0.5).astype(np.float16))
-        for point, pixel in zip(model.images[image_id].points2D, halves[-1] + np.float16(0.5), strict=True):
+        half_precision.append((found - 0.5).astype(np.float16))
+        for point, pixel in zip(model.images[image_id].points2D, half_precision[-1] + np.float16(0.5), strict=True):
             point.xy = pixel.astype(np.float64)
     folder = written(model, tmp_path / "model")
     path = tmp_path / "feats-superpoint-n4096-r1024.h5"
-    hdf5_of(path, [pixels + 0.5 for pixels in halves], stored, dtype=np.float16)
+    hdf5_of(path, [pixels + 0.5 for pixels in half_precision], stored, dtype=np.float16)
     assert load_colmap_landmarks(folder, path).features == kind.name
-    halves[0][-1] -= np.float16(8)  # as of other photographs
+    half_precision[0][-1] -= np.float16(8)  # as of other photographs
     with pytest.raises(MapError):
-        load_colmap_landmarks(folder, hdf5_of(path, [pixels + 0.5 for pixels in halves], stored, dtype=np.float16))
+        load_colmap_landmarks(
+            folder, hdf5_of(path, [pixels + 0.5 for pixels in half_precision], stored, dtype=np.float16)
+        )
 
 
 def test_pairs_of_images_are_matched_by_similarity(tmp_path):

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from mapping.conftest import BoxFreeSpace
 from wheretolook.mapping import walk
 from wheretolook.mapping.config import WalkConfig
 from wheretolook.mapping.walk import plan_walk
@@ -16,33 +17,14 @@ SIZE = (8.0, 6.0, 2.6)
 BOUNDS = np.array([(0, 0, 0), SIZE])
 
 
-class Room:
+def two_rooms(door_m: float, clearance_m: float = 0.2) -> BoxFreeSpace:
     """A box with a wall across it at x = 4 m that has a door of a given width at its low end."""
-
-    def __init__(self, door_m: float, clearance_m: float = 0.2) -> None:
-        self.door_m = door_m
-        self.clearance_m = clearance_m
-
-    def is_free(self, points):
-        inside = ((points > self.clearance_m) & (points < np.array(SIZE) - self.clearance_m)).all(1)
-        in_wall = (np.abs(points[:, 0] - 4) < 0.05 + self.clearance_m) & (points[:, 1] > self.door_m - self.clearance_m)
-        return inside & ~in_wall
-
-    def segments_are_free(self, a, b):
-        t = np.linspace(0, 1, 41)[:, None, None]
-        points = a * (1 - t) + b * t
-        return self.is_free(points.reshape(-1, 3)).reshape(points.shape[:2]).all(0)
-
-    def floor_below(self, points):
-        inside = ((points[:, :2] > 0) & (points[:, :2] < SIZE[:2])).all(1) & (points[:, 2] >= 0)
-        return np.where(inside, 0.0, np.nan)
+    reach = 0.05 + clearance_m
+    return BoxFreeSpace(SIZE, clearance_m, ((4 - reach, door_m - clearance_m), (4 + reach, 99.0)))
 
 
-class TwoStoreys(Room):
+class TwoStoreys(BoxFreeSpace):
     """The box again, twice as high, with a gallery 2.6 m up over x > 4 m and a ramp to it along y > 4.5 m."""
-
-    def __init__(self) -> None:
-        super().__init__(door_m=99)
 
     def _floors(self, points):
         x = points[:, 0]
@@ -74,7 +56,7 @@ def walked_distance_m(places: np.ndarray, path: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("coverage", [0.4, 0.7, 1.0])
 def test_walk_is_free_and_covers_what_was_asked(seed, coverage):
-    room = Room(door_m=1.2)
+    room = two_rooms(door_m=1.2)
     route = plan_walk(room, BOUNDS, 150, WalkConfig(coverage=coverage), seed)
     assert room.segments_are_free(route.path[:-1], route.path[1:]).all()
     assert room.is_free(route.positions).all()
@@ -89,7 +71,7 @@ def test_walk_is_free_and_covers_what_was_asked(seed, coverage):
 
 def test_poses_are_spaced_evenly_along_the_walk_and_look_ahead(monkeypatch):
     monkeypatch.setattr(walk, "PITCH_VARIATION_DEG", 8.0)
-    route = plan_walk(Room(door_m=1.2), BOUNDS, 120, WalkConfig(swing_deg=30, pitch_deg=-4), 3)
+    route = plan_walk(two_rooms(door_m=1.2), BOUNDS, 120, WalkConfig(swing_deg=30, pitch_deg=-4), 3)
     assert route.positions.shape == route.directions.shape == (120, 3)
     np.testing.assert_allclose(np.linalg.norm(route.directions, axis=1), 1, atol=1e-9)
     steps = np.linalg.norm(np.diff(route.positions[:, :2], axis=0), axis=1)
@@ -106,13 +88,13 @@ def test_poses_are_spaced_evenly_along_the_walk_and_look_ahead(monkeypatch):
 
 
 def test_only_the_largest_reachable_part_is_walked():
-    route = plan_walk(Room(door_m=0.0), BOUNDS, 60, WalkConfig(coverage=1.0), 0)  # no door
+    route = plan_walk(two_rooms(door_m=0.0), BOUNDS, 60, WalkConfig(coverage=1.0), 0)  # no door
     assert (route.positions[:, 0] < 4).all() or (route.positions[:, 0] > 4).all()
 
 
 def test_walk_climbs_to_another_storey(monkeypatch):
     monkeypatch.setattr(walk, "EYE_HEIGHT_VARIATION_M", 0.1)
-    scene = TwoStoreys()
+    scene = TwoStoreys(SIZE, 0.2)
     bounds = np.array([(0, 0, 0), (8, 6, 5.2)])
     route = plan_walk(scene, bounds, 300, WalkConfig(coverage=0.95), 1)
     assert scene.segments_are_free(route.path[:-1], route.path[1:]).all()
@@ -126,14 +108,14 @@ def test_walk_climbs_to_another_storey(monkeypatch):
 
 def test_scenes_without_a_floor_and_bad_settings(monkeypatch):
     with pytest.raises(SceneError):
-        plan_walk(Room(door_m=1.2, clearance_m=3.1), BOUNDS, 10)
+        plan_walk(two_rooms(door_m=1.2, clearance_m=3.1), BOUNDS, 10)
     with pytest.raises(SceneError):
-        plan_walk(Room(door_m=1.2), BOUNDS, 10, WalkConfig(eye_height_m=5.0))
+        plan_walk(two_rooms(door_m=1.2), BOUNDS, 10, WalkConfig(eye_height_m=5.0))
     with pytest.raises(ConfigError):
-        plan_walk(Room(door_m=1.2), BOUNDS, 1)
+        plan_walk(two_rooms(door_m=1.2), BOUNDS, 1)
     monkeypatch.setattr(walk, "CELL_M", 5.5)
     with pytest.raises(SceneError):
-        plan_walk(Room(door_m=1.2), BOUNDS, 10)
+        plan_walk(two_rooms(door_m=1.2), BOUNDS, 10)
     bad = ({"coverage": 0.0}, {"coverage": 1.1}, {"pitch_deg": 85.0}, {"eye_height_m": 0.1})
     for settings in bad:
         with pytest.raises(ConfigError):

@@ -42,8 +42,8 @@ def test_mesh_is_well_formed_and_follows_from_the_seed(kind: SceneKind) -> None:
     points = np.random.default_rng(0).uniform([*low[:2], 1.2], [*high[:2], 1.8], size=(400, 3))
     free = points[space.is_free(points)]
     assert not space.two_sided and len(free) > 80  # walls face the inside, and one can stand there
-    around = np.stack([np.cos(angle := np.arange(12) * np.pi / 6), np.sin(angle), np.full(12, -0.1)], axis=1)
-    hits = space.raycaster.cast(np.repeat(free, 12, axis=0), np.tile(around, (len(free), 1)))
+    horizontal = np.stack([np.cos(angle := np.arange(12) * np.pi / 6), np.sin(angle), np.full(12, -0.1)], axis=1)
+    hits = space.raycaster.cast(np.repeat(free, 12, axis=0), np.tile(horizontal, (len(free), 1)))
     assert np.isfinite(hits.distance_m).all() and hits.front.mean() > 0.98
     uv = mesh.corner_uvs[hits.triangle].mean(1) * mesh.textures[0].shape[1::-1]
     column, row = uv.astype(int).T

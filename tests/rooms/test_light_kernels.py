@@ -134,8 +134,8 @@ def test_gathered_light_is_that_of_its_plain_twin(device: str) -> None:
         a = np.cross(n, helper)
         a /= np.linalg.norm(a)
         u, turn = r2(k * rays + np.arange(rays)).T
-        around = np.column_stack([np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)]) @ np.stack([a, np.cross(n, a)])
-        d = np.sqrt(u)[:, None] * around + np.sqrt(1 - u)[:, None] * n  # cosine-weighted about the normal
+        sideways = np.column_stack([np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)]) @ np.stack([a, np.cross(n, a)])
+        d = np.sqrt(u)[:, None] * sideways + np.sqrt(1 - u)[:, None] * n  # cosine-weighted about the normal
         reach = (np.sign(d) - p) / d
         axis = reach.argmin(1)
         face = 2 * axis + (d[np.arange(rays), axis] > 0)

@@ -22,9 +22,6 @@ from wheretolook_rooms.style import Style
 
 SEEDS = (0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2)))
 CONFIG = ApartmentConfig()
-FAST = ApartmentConfig(
-    n_rooms=3, area_m2=26, texels_per_m=20, texture_size=1024, light_rays=4, light_spacing_m=0.5
-)  # fmt: skip
 
 
 @cache
@@ -43,14 +40,11 @@ def _raycasting_scene(surface: patches_module.Surface) -> Any:
     return scene
 
 
-def _rays(origins: NDArray[Any], directions: NDArray[Any]) -> Any:
+def _cast(scene: Any, origins: NDArray[Any], directions: NDArray[Any]) -> dict[str, NDArray[Any]]:
     import open3d as o3d
 
-    return o3d.core.Tensor(np.concatenate(np.broadcast_arrays(origins, directions), -1).astype(np.float32))
-
-
-def _cast(scene: Any, origins: NDArray[Any], directions: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    return {k: v.numpy() for k, v in scene.cast_rays(_rays(origins, directions)).items()}
+    rays = np.concatenate(np.broadcast_arrays(origins, directions), -1).astype(np.float32)
+    return {name: values.numpy() for name, values in scene.cast_rays(o3d.core.Tensor(rays)).items()}
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -94,16 +88,10 @@ def test_every_room_is_reached_on_foot(seed: int) -> None:
 FURNITURE: dict[str, Callable[[Style], list[patches_module.Patch]]] = {
     "sofa": lambda s: furniture.sofa(s, 3),
     "bed": lambda s: furniture.bed(s, 1.6),
-    "bookshelf": lambda s: furniture.bookshelf(s, 1.0, 2.0),
     "chair": lambda s: furniture.chair(s, s.wood, s.upholstery),
-    "desk": lambda s: furniture.desk(s, 1.3),
-    "nightstand": lambda s: furniture.nightstand(s, True),
     "plant": lambda s: decor.plant(s, 1.2, 30, 0.35),
-    "coat": decor.coat,
     "kitchen": lambda s: fixtures.kitchen_run(s, 2.4, 2.6, False),
     "bathtub": lambda s: fixtures.bathtub(s, 1.7),
-    "toilet": fixtures.toilet,
-    "radiator": lambda s: fixtures.radiator(s, 1.0, 0.5),
     "curtain": lambda s: fixtures.curtain(0.5, 2.0, s.upholstery),
 }
 
@@ -185,17 +173,9 @@ def test_apartments_of_before_keep_their_key() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "word"),
-    [
-        ({"n_rooms": 2}, "n_rooms"),
-        ({"repetition": -0.1}, "repetition"),
-        ({"enlarged": 0.0}, "enlarged"),
-        ({"enlarged": float("inf")}, "enlarged"),
-        ({"clutter": 1.5}, "clutter"),
-        ({"area_m2": 5.0}, "area_m2"),
-        ({"light_rays": 0}, "light_rays"),
-    ],
+    "options",
+    [{"n_rooms": 2}, {"repetition": -0.1}, {"enlarged": 0.0}, {"clutter": 1.5}, {"area_m2": 5.0}, {"light_rays": 0}],
 )
-def test_bad_options_are_named(options: dict[str, float], word: str) -> None:
+def test_invalid_options_are_rejected(options: dict[str, float]) -> None:
     with pytest.raises(ConfigError):
         ApartmentConfig(**options)  # type: ignore[arg-type]

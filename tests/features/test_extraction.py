@@ -6,6 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from features.textures import color_texture
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.descriptors import quantize_descriptors, unit_descriptors
 from wheretolook.features.extraction import KeypointExtractor
@@ -18,14 +19,6 @@ def blob(x: float, y: float, sigma: float) -> np.ndarray:
     rows, columns = np.mgrid[:120, :160] + 0.5
     grey = 60 + 150 * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * sigma**2))
     return np.repeat(np.rint(grey).astype(np.uint8)[..., None], 3, axis=2)
-
-
-def textured_image(seed: int = 0) -> np.ndarray:
-    from scipy.ndimage import gaussian_filter
-
-    rng = np.random.default_rng(seed)
-    image = sum(3 * s * gaussian_filter(rng.normal(0, 30, (240, 320, 3)), (s, s, 0)) for s in (1.5, 3, 6))
-    return np.clip(128 + image, 0, 255).astype(np.uint8)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -45,7 +38,7 @@ def test_colmap_method_gives_the_keypoints_of_colmaps_own_feature_extraction(tmp
     from PIL import Image
 
     (tmp_path / "images").mkdir()
-    image = textured_image(1)
+    image = color_texture(1)
     Image.fromarray(image).save(tmp_path / "images" / "a.png")
     options = pycolmap.FeatureExtractionOptions()
     options.sift.first_octave = 0
@@ -65,7 +58,7 @@ def test_colmap_method_gives_the_keypoints_of_colmaps_own_feature_extraction(tmp
 
 @pytest.mark.parametrize("method", ["opencv", pytest.param("colmap", marks=pytest.mark.slow)])
 def test_same_image_same_keypoints_in_any_process(method):
-    images = [textured_image(seed) for seed in range(5)]
+    images = [color_texture(seed) for seed in range(5)]
     extractor = KeypointExtractor(ExtractorConfig(method=method))
     here = list(extractor.extract_many(images, workers=1))
     there = list(extractor.extract_many(iter(images), workers=2))
@@ -82,7 +75,7 @@ def test_plain_image_has_no_keypoints(method):
 
 
 def test_quantized_descriptors_survive_the_round_trip():
-    descriptors = KeypointExtractor().extract(textured_image()).descriptors
+    descriptors = KeypointExtractor().extract(color_texture(0)).descriptors
     stored = quantize_descriptors(descriptors)
     assert stored.dtype == np.uint8
     np.testing.assert_array_equal(quantize_descriptors(unit_descriptors(stored)), stored)

@@ -5,21 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import warp as wp
-from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
+from features.textures import texture
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.warp_sift import WarpSift
 
 EVERYTHING = ExtractorConfig(max_keypoints=100_000)
-
-
-def texture(seed: int, rows: int = 240, columns: int = 320) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    image = sum(2 * s * gaussian_filter(rng.normal(0, 30, (rows, columns)), s) for s in (0.7, 1.5, 4, 10))
-    return np.clip(128 + image, 0, 255).astype(np.uint8)
 
 
 def opencv(grey: np.ndarray, config: ExtractorConfig) -> Keypoints:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wheretolook.geometry.camera import PinholeCamera
+from localization.test_joint import CAMERA, a_room
 from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.localization.estimation import PoseEstimator
 from wheretolook.localization.pose_ambiguity import PoseAmbiguity, most_likely, strongest_rival
 from wheretolook.localization.rig import Look, rig_of
 from wheretolook.localization.rig_localization import JointLocalizer
 
-CAMERA = PinholeCamera()
 BEYOND = np.array([20.0, 0, 0])
 
 
@@ -21,11 +20,7 @@ def two_rooms():
 
     Also rows of each: room, copy, column.
     """
-    rng = np.random.default_rng(0)
-    room = rng.uniform(-1, 1, (2000, 3))
-    axis = rng.integers(0, 3, len(room))
-    room[np.arange(len(room)), axis] = np.sign(room[np.arange(len(room)), axis])
-    room *= (4, 3, 1.5)
+    room = a_room(2000)
     column = np.column_stack([np.full((40, 2), (2.0, 0.5)), np.linspace(-1, 1, 40)])
     points = np.concatenate([room, room + BEYOND, column])
     return points, np.split(np.arange(len(points)), [2000, 4000])

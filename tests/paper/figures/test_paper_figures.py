@@ -82,18 +82,6 @@ def test_extrema_are_spread() -> None:
     assert spread_extrema(directions, scores, 1, 40.0, False).tolist() == [299]
 
 
-def test_viewer_geometries_hold_the_scene() -> None:
-    from wheretolook_paper.figures.viewer import scene_geometries
-
-    mesh = furnished_room()
-    landmarks = RNG.uniform(0, 3, (20, 3))
-    poses = poses_looking_along([[1.0, 1, 1]], [[1.0, 0, 0]])
-    parts = {one["name"]: one["geometry"] for one in scene_geometries(mesh, landmarks, poses, landmarks, CAMERA)}
-    assert {"landmarks", "cameras", "path"} < {*parts}
-    assert sum(len(part.triangles) for name, part in parts.items() if "mesh" in name) == len(mesh.triangles)
-    np.testing.assert_allclose(np.asarray(parts["landmarks"].points), landmarks)
-
-
 def test_a_story_of_views_is_a_figure_and_a_film() -> None:
     poses = poses_looking_along([[1.0, 1, 1]] * 2, [[1.0, 0, 0], [0, 1.0, 0]])
     good = Estimate(poses[:1], (np.ones((5, 2)),), 0.9, 0.01, 0.1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -16,13 +15,10 @@ from wheretolook.geometry.poses import camera_centers
 from wheretolook.planning.config import PathConfig
 from wheretolook.planning.scene_map import shares_below
 from wheretolook.space.free_space import FreeSpace
-from wheretolook.tracking.config import TrackingConfig
-from wheretolook.tracking.runs import finished_runs
-from wheretolook.tracking.store import client
 from wheretolook.utils.errors import PlanningError, SceneError
 from wheretolook_paper.paths.config import PathsConfig
 from wheretolook_paper.paths.path_comparison import ComparedPaths, Reachability, draw_pairs, plan_pairs
-from wheretolook_paper.paths.path_report import log_paths, summarize_paths
+from wheretolook_paper.paths.path_report import summarize_paths
 
 QUICK = PathsConfig(
     pairs=2, min_distance_m=1.5, height_m=(1.0, 1.4), methods=("forward", "bins"), max_turn_deg=30.0, resamples=200,
@@ -150,17 +146,3 @@ def test_shares_by_hand() -> None:
     assert table.loc["set", "localized_low"] < 0.5 < table.loc["set", "localized_high"] <= 0.8
     strict = summarize_paths(paths, views, replace(QUICK, max_error_deg=0.5)).set_index("method")
     assert strict.loc["set", "localized"] == 0
-
-
-def test_the_same_comparison_is_logged_once(tmp_path: Path) -> None:
-    tracking = TrackingConfig(str(tmp_path / "mlruns"))
-    summary = summarize_paths(*_labelled(), QUICK)
-    summary.to_csv(tmp_path / "paths.csv", index=False)
-    runs = [log_paths({"dataset": "a", "seed": seed}, summary, tmp_path, tracking) for seed in (0, 0, 1)]
-    assert runs[0] == runs[1] != runs[2]
-    assert [run.info.run_id for run in finished_runs(tracking, "paths")] == [runs[2], runs[0]]
-    parent = client(tracking).get_run(runs[0])
-    assert parent.info.run_name == "all methods (paths a)" and parent.data.tags["best"] == "set"
-    assert parent.data.metrics["localized"] == pytest.approx(0.5)  # as by hand, above
-    other = summary.assign(localized=1.0)
-    assert log_paths({"dataset": "a", "seed": 1}, other, tmp_path, tracking) not in runs

@@ -48,6 +48,8 @@ def test_csv(look: WhereToLook, tmp_path: Path) -> None:
     again = read_waypoints(tmp_path / "views.csv")
     np.testing.assert_array_equal(again.points.round(6), POINTS)
     assert again.ids == names
+    views.save(tmp_path / "poses.txt", "benchmark")  # fields are separated by blanks
+    assert np.loadtxt(tmp_path / "poses.txt", dtype=str)[2][0] == "a_b"
 
 
 def test_json(views: SelectedViews, tmp_path: Path) -> None:

@@ -98,6 +98,12 @@ def test_the_sequence_is_the_best_of_all(sparse: Path) -> None:
     assert (turned <= limit + 1e-4).all()
 
 
+def test_limits_on_pitch(look: WhereToLook) -> None:
+    views = look.best(POINTS, 5, pitch_deg=(-20, 10))
+    assert (views.pitch_deg >= -20).all() and (views.pitch_deg <= 10).all()
+    assert len(views) == 20 and len({tuple(axis) for axis in views.axes[:5].round(6)}) == 5
+
+
 def test_waypoints_outside_the_map(look: WhereToLook) -> None:
     given = np.concatenate([POINTS[:2], [[300.0, 2.0, 1.5]], POINTS[2:]])
     with pytest.raises(TableError):

@@ -168,7 +168,9 @@ def test_scores_are_the_same_by_every_method() -> None:
             continue
         weights = WEIGHTS / f"{released[name]}.safetensors" if name in released else None
         views = (near, poses), (far, far_poses(poses))
-        scores, there = (make_scorer(name, around, weights=weights).score(at) for around, at in views)
+        scores, there = (
+            make_scorer(name, localization_map, weights=weights).score(at) for localization_map, at in views
+        )
         np.testing.assert_allclose(there, scores, rtol=2e-4, atol=1e-5, err_msg=name)
 
 
@@ -232,16 +234,16 @@ def test_a_viewpoint_map_and_a_robots_file_are_the_same(tmp_path: Path) -> None:
     grid = VoxelGrid(tuple(SHIFT), tuple(SHIFT + ROOM), GRID.shape)
     maps = []
     robots = []
-    for name, around, voxels in (
+    for name, localization_map, voxels in (
         ("near", LocalizationMap(landmarks, CAMERA, MeshOcclusion(MeshRaycaster(furnished_room()))), GRID),
         ("far", LocalizationMap(far_landmarks(landmarks), CAMERA, MeshOcclusion(MeshRaycaster(far_room()))), grid),
     ):
-        scorer = make_scorer("set", around, weights=WEIGHTS / "set.safetensors")
+        scorer = make_scorer("set", localization_map, weights=WEIGHTS / "set.safetensors")
         build_viewpoint_map(scorer, voxels, free_voxels(), DIRECTIONS, "fibonacci").save(tmp_path / name)
         maps.append(ViewpointMap.load(tmp_path / name))
         pytest.importorskip("onnx")
         places = voxels.centers()[list(free_voxels())]
-        export_robot(around, WEIGHTS / "set.safetensors", tmp_path / f"robot-{name}", places, progress=False)
+        export_robot(localization_map, WEIGHTS / "set.safetensors", tmp_path / f"robot-{name}", places, progress=False)
         robots.append(RobotScorer(tmp_path / f"robot-{name}"))
     near, far = maps
     np.testing.assert_allclose(far.scores, near.scores, atol=1e-4)

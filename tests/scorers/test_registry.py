@@ -45,7 +45,7 @@ class LinearConfig:
     """Options of a line through the number of landmarks.
 
     Args:
-        slope: how much a landmark is worth.
+        slope: weight of a landmark.
     """
 
     slope: float = 0.1
@@ -160,7 +160,7 @@ def plan_within(seconds):
 path = patiently(plan_within)
 assert path.scores.max() > 0.5 and path.scores.max() <= 1, path.scores
 assert newest_run(tracking, "plan").data.params["methods"] == "fewest linear"
-print("learnt, compared, drawn and planned with")
+print("trained, compared, drawn and planned with")
 """
 
 
@@ -182,7 +182,7 @@ def test_another_package_adds_a_learner_and_a_rule(tmp_path: Path) -> None:
     tests = Path(__file__).parents[1]
     done = run_python(PROGRAM, str(tmp_path), path=[installed, SOURCE.parent, tests])
     assert done.returncode == 0, done.stderr[-3000:]
-    assert "learnt, compared, drawn and planned with" in done.stdout
+    assert "trained, compared, drawn and planned with" in done.stdout
 
 
 @pytest.mark.parametrize(
@@ -231,7 +231,7 @@ def test_an_attribute_that_maps_do_not_know_is_named(tmp_path: Path) -> None:
 
 
 def test_weights_of_many_cameras_come_before_those_of_one(tmp_path: Path) -> None:
-    """Precision on views of many cameras is lower than on those of one, so that it does not tell which is better."""
+    """Precision on views of many cameras is lower than on those of one, and does not rank weights."""
     localization_map = LocalizationMap(make_landmarks(np.random.default_rng(0), 50), CAMERA)
     for name in ("set", "matchability", "mlp-2d+z"):
         for suffix in ("safetensors", "json"):

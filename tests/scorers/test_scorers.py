@@ -138,7 +138,7 @@ def test_counting_scorers_on_hand_counted_bins(localization_map: LocalizationMap
         VisibleScorer(localization_map, bins=2).score_bins(binned) * 200, [0, 9, 2, 3, 4, 200], rtol=1e-12
     )
     by_bins = BinsScorer(localization_map, bins=2).score_bins(binned)
-    # one bin with nine landmarks loses to two bins with one each; equal bins are told apart by their landmarks
+    # one bin with nine landmarks loses to two bins with one each; landmarks decide between equal bins
     np.testing.assert_array_equal(np.argsort(by_bins), [0, 1, 2, 3, 4, 5])
     np.testing.assert_array_equal(np.floor(by_bins * 5), [0, 1, 2, 2, 4, 4])
     assert by_bins.max() < 1

@@ -59,7 +59,7 @@ def test_unreliable_winding_is_found_out(winding):
     points = np.random.default_rng(0).uniform((-1, -1, -1), np.array(ROOM) + 1, (3000, 3))
     free = free_space.is_free(points)
     expected = expected_free(points, 0.25)
-    # The inside of the cabinet, 1.8 x 1.6 x 2 m, cannot be told from a small room.
+    # The inside of the cabinet, 1.8 x 1.6 x 2 m, cannot be distinguished from a small room.
     decided = ~inside(points, *CABINET)
     np.testing.assert_array_equal(free[decided], expected[decided])
 
@@ -110,7 +110,7 @@ def test_segments():
         free_space.segments_are_free([a, a, a, a], [b, corner, (5.0, 0.4, 1.2), (3.1, 0.5, 1.2)]),
         [True, True, False, False],
     )
-    # The door is 1 m wide: 0.45 m of clearance passes on its axis, and 0.1 m beside it does not.
+    # The door is 1 m wide: 0.45 m of clearance passes on its axis, and 0.1 m off it does not.
     tight = FreeSpace(house(), FreeSpaceConfig(clearance_m=0.45))
     np.testing.assert_array_equal(tight.segments_are_free([a, (1.0, 1.6, 1.2)], [b, (5.0, 1.6, 1.2)]), [True, False])
 

@@ -62,7 +62,7 @@ def same_labels_other_outcomes(source: Dataset, root: Path) -> Dataset:
 
 
 def test_only_the_labels_reach_a_learner(tmp_path: Path, tracking: TrackingConfig) -> None:
-    one = make_dataset(tmp_path / "one", n_locations=14, n_directions=16)
+    one = make_dataset(tmp_path / "one", n_locations=12, n_directions=12)
     other = same_labels_other_outcomes(one, tmp_path / "other")
     assert other.fingerprint() != one.fingerprint()
     for first, second in zip(*(train(data, CONFIG, tracking, progress=False) for data in (one, other)), strict=True):

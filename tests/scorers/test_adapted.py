@@ -12,6 +12,7 @@ from sklearn.gaussian_process import GaussianProcessClassifier
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
 from synthetic_dataset import make_dataset
+from wheretolook.evaluation.calibration import expected_calibration_error
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -77,6 +78,30 @@ def test_noise_is_not_fitted() -> None:
     good = np.random.default_rng(3).random(len(views)) < expit(views.log_odds)
     honest = LocalizedViews(views.log_odds, good, views.centers, views.axes, views.group)
     assert log_losses(adapt(honest).held_out, good).mean() < log_losses(views.log_odds, good).mean() + 0.01
+
+
+def photographed(shift: float, seed: int = 0) -> LocalizedViews:
+    """120 photographs in six blocks, each twice: with its block, and with one of two large ones. Everywhere alike, the
+    scorer hopes too little, by a shift of its log-odds."""
+    rng = np.random.default_rng(seed)
+    n = 120
+    photograph = np.concatenate([np.arange(n), np.arange(n)])
+    group = np.concatenate([np.repeat(np.arange(6), n // 6), np.repeat([6, 7], n // 2)])
+    centers = rng.uniform((-3, -3, 0.5), (3, 3, 2), (n, 3))[photograph]
+    axes = fibonacci_sphere(n)[rng.permutation(n)][photograph]
+    log_odds = rng.normal(0, 2, 2 * n)
+    good = rng.random(2 * n) < expit(log_odds + shift)
+    return LocalizedViews(log_odds, good, centers, axes, group, photograph, photograph // 4)
+
+
+def test_photographs_calibrate() -> None:
+    views = photographed(2.0)
+    fitted = adapt(views)
+    assert log_losses(fitted.held_out, views.good).mean() < log_losses(views.log_odds, views.good).mean() - 0.1
+    before, after = (expected_calibration_error(expit(z), views.good) for z in (views.log_odds, fitted.held_out))
+    assert after < before / 2
+    assert fitted.adaptation.scale == pytest.approx(1, abs=0.4)
+    assert fitted.adaptation.offset == pytest.approx(2, abs=0.8)
 
 
 def test_photographs_are_judged_by_blocks_that_share_none_with_those_trained_on() -> None:

@@ -247,3 +247,50 @@ def test_weights_of_many_cameras_come_before_those_of_one(tmp_path: Path) -> Non
         assert resolve_weights(path=tmp_path).stem == best
         if best == "set":
             assert load_scorer(tmp_path, localization_map).name == "set"
+
+
+NEW_ATTRIBUTE = """
+import sys
+import numpy as np
+from pathlib import Path
+from synthetic_dataset import CAMERA, make_landmarks
+from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
+from wheretolook.scorers.registry import make_scorer
+from wheretolook.weights.resolve import load_scorer
+
+weights, out = Path(sys.argv[1]), Path(sys.argv[2])
+rng = np.random.default_rng(1)
+views = poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (40, 3)), rng.normal(size=(40, 3)))
+at = LocalizationMap(make_landmarks(np.random.default_rng(0), 200), CAMERA)
+wide = LocalizationMap(at.landmarks, type(CAMERA)(640, 480, 320.0))
+scores = {name: load_scorer(weights / f"{name}.safetensors", wide).score(views) for name in ("set", "mlp-2d+z")}
+scores["expected"] = make_scorer("expected-bins", wide, weights=weights / "matchability.safetensors").score(views)
+scores["n_attributes"] = np.array([len(MAP_ATTRIBUTES)])
+np.savez(out, **scores)
+"""
+
+
+def test_a_new_attribute_leaves_shipped_weights_as_they_are(tmp_path: Path) -> None:
+    """Adding an attribute to two files leaves the scores of bundled weights identical."""
+    changed = tmp_path / "changed"
+    shutil.copytree(SOURCE, changed / "wheretolook", ignore=shutil.ignore_patterns("__pycache__"))
+    for file, old, new in (
+        ("attribute_names.py", "MAP_ATTRIBUTES = (", 'MAP_ATTRIBUTES = (\n    "height",'),
+        ("landmarks.py", '"track_length": np.log', '"height": self.points[:, 2],\n            "track_length": np.log'),
+    ):
+        path = changed / "wheretolook" / "mapping" / file
+        text = path.read_text()
+        assert text.count(old) == 1
+        path.write_text(text.replace(old, new))
+    runs = []
+    for place in (SOURCE.parent, changed):
+        out = tmp_path / f"{len(runs)}.npz"
+        done = run_python(NEW_ATTRIBUTE, str(WEIGHTS), str(out), path=[place, Path(__file__).parents[1]])
+        assert done.returncode == 0, done.stderr[-3000:]
+        runs.append(dict(np.load(out)))
+    assert runs[1].pop("n_attributes") == runs[0].pop("n_attributes") + 1
+    for name, scores in runs[0].items():
+        np.testing.assert_array_equal(runs[1][name], scores)
+        assert len(np.unique(scores)) > 20

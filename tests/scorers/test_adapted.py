@@ -81,8 +81,7 @@ def test_noise_is_not_fitted() -> None:
 
 
 def photographed(shift: float, seed: int = 0) -> LocalizedViews:
-    """120 photographs in six blocks, each twice: with its block, and with one of two large ones. Everywhere alike, the
-    scorer hopes too little, by a shift of its log-odds."""
+    """Return 120 photographs held out in six groups and again in two large ones; log-odds are too low by a shift."""
     rng = np.random.default_rng(seed)
     n = 120
     photograph = np.concatenate([np.arange(n), np.arange(n)])

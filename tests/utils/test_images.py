@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
+from wheretolook.io.depth import read_depth
 from wheretolook.mapping.photographs import read_photograph
-from wheretolook.scans.depth_images import _read_depth
 from wheretolook.scans.frames import _size
-from wheretolook.utils.errors import ConfigError, MapError, SceneError
+from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.images import image_size, read_image
 from wheretolook.view.photographs import Photographs
 
@@ -34,8 +34,8 @@ def test_a_bomb_is_refused_by_its_size(tmp_path: Path) -> None:
     path = png(tmp_path / "a.png", 32_000)
     with pytest.raises(MapError):
         read_photograph(path)
-    with pytest.raises(SceneError):
-        _read_depth(path, 1000.0)
+    with pytest.raises(ValueError):
+        read_depth(path)
     assert _size(path) is None
     shown = Photographs(tmp_path, ("a.png",), np.eye(3, 4)[None])
     with pytest.raises(ConfigError):

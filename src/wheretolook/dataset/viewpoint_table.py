@@ -15,14 +15,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation, rotation_from_quaternion
+from wheretolook.geometry.poses import Float, camera_centers, rotation_from_quaternion
+from wheretolook.io.poses import POSE_COLUMNS, QUATERNION_COLUMNS, TRANSLATION_COLUMNS, pose_values, poses_of_values
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import atomic_write
 from wheretolook.utils.parquet_files import open_parquet, read_columns
 
-QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
-TRANSLATION_COLUMNS = ("tx", "ty", "tz")
-POSE_COLUMNS = (*QUATERNION_COLUMNS, *TRANSLATION_COLUMNS)
 CENTER_COLUMNS = ("x_m", "y_m", "z_m")
 
 _COLUMNS = {"viewpoint_id": pa.int64(), "location_id": pa.int32(), "direction_id": pa.int32()}
@@ -73,14 +71,12 @@ NO_POSE = "no_pose"
 
 def poses(table: pd.DataFrame) -> Float:
     """cam_from_world poses (B, 3, 4) of a table's rows."""
-    rotation = rotation_from_quaternion(table[list(QUATERNION_COLUMNS)].to_numpy(np.float64))
-    return np.concatenate([rotation, table[list(TRANSLATION_COLUMNS)].to_numpy(np.float64)[..., None]], axis=-1)
+    return poses_of_values(table[[*POSE_COLUMNS]])
 
 
 def pose_columns(cam_from_world: Float) -> dict[str, Float]:
     """Pose columns, by name, of poses (B, 3, 4)."""
-    values = np.concatenate([quaternion_from_rotation(cam_from_world[..., :3]), cam_from_world[..., 3]], axis=-1)
-    return dict(zip(POSE_COLUMNS, values.T, strict=True))
+    return dict(zip(POSE_COLUMNS, pose_values(cam_from_world).T, strict=True))
 
 
 def is_good(table: pd.DataFrame, max_error_m: float = 0.05, max_error_deg: float = 0.4) -> np.ndarray:

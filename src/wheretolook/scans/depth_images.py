@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import Camera, PinholeCamera, cameras_by_id
+from wheretolook.io.depth import read_depth
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.utils.images import MAX_DEPTH_PIXELS, read_image
-from wheretolook.utils.npz_files import load_npy
 
 if TYPE_CHECKING:
     from wheretolook.geometry.tsdf import DepthImage
@@ -42,36 +40,17 @@ def read_depth_images(model: Path, folder: Path, scale: float = 1000.0) -> list[
         stems = [stem, *(stem.replace(word, "depth") for word in ("color", "colour", "rgb"))]
         path = next((files[name] for name in stems if name in files), None)
         if path is not None and image.has_pose:
-            values = _read_depth(path, scale)
+            try:
+                values = read_depth(path, scale)
+            except (OSError, ValueError) as error:
+                problem = f"cannot read the depth image: {error}"
+                raise SceneError(problem, path=path, fix="Export it again.") from error
             camera = _scaled(cameras[image.camera_id], values.shape[1], values.shape[0], path)
             images.append(DepthImage(values, camera, image.cam_from_world().matrix()))
     if not images:
         fix = f"Name them as the images of the map, such as {Path(found.images[min(found.images)].name).stem}.png."
         raise SceneError("no depth image belongs to an image of the map", path=folder, fix=fix)
     return images
-
-
-def _read_depth(path: Path, scale: float) -> NDArray[np.float32]:
-    if path.suffix.lower() == ".npy":
-        try:
-            values: NDArray[Any] | None = load_npy(path)
-        except ValueError as error:
-            raise SceneError(f"cannot read the depth image: {error}", path=path, fix="Export it again.") from error
-    else:
-        import cv2
-
-        try:
-            values = read_image(path, cv2.IMREAD_UNCHANGED, MAX_DEPTH_PIXELS)
-        except (OSError, ValueError) as error:
-            raise SceneError(f"cannot read the depth image: {error}", path=path, fix="Export it again.") from error
-    if values is None or values.ndim != 2 or values.dtype.kind not in "fui":
-        shape = None if values is None else values.shape
-        raise SceneError("not a depth image of one channel", path=path, value=shape, fix="Export it again.")
-    unit = 1.0 if values.dtype.kind == "f" else scale
-    depth = (values / unit).astype(np.float32)
-    if values.dtype == np.uint16:
-        depth[values == np.iinfo(np.uint16).max] = 0  # "no reading" of several cameras
-    return depth
 
 
 def _scaled(camera: Camera, width: int, height: int, path: Path) -> PinholeCamera:

@@ -15,12 +15,13 @@ from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import Float
+from wheretolook.io.depth import read_depth
 from wheretolook.mapping.colmap_model import camera_of_model, colmap_poses, read_model, registered_names
 from wheretolook.scans.config import RgbdConfig
 from wheretolook.scans.depth_correction import DepthCorrection
 from wheretolook.scans.layouts import FrameFiles, Skipped, find_layout, frame_files
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.utils.images import MAX_DEPTH_PIXELS, MAX_PIXELS, image_size, read_image
+from wheretolook.utils.images import image_size, read_image
 
 SURVEY_STRIDE = 8  # pixels between the readings of each depth image that stay in memory
 _MIN_READINGS = 0.02  # share of a depth image's pixels; with fewer it counts as without depth
@@ -168,15 +169,10 @@ class RgbdFrames:
 
     def _read_depth(self, path: Path) -> NDArray[np.float32] | None:
         """Metres along the depth camera's axis, 0 without a reading; None if the file is damaged."""
-        image = _read(path, cv2.IMREAD_UNCHANGED, MAX_DEPTH_PIXELS)
-        if image is None:
+        try:
+            return self.depth_correction.apply(read_depth(path, self.depth_scale))
+        except (OSError, ValueError):
             return None
-        if image.ndim != 2 or image.dtype != np.uint16:
-            value = f"{image.dtype}, shape {image.shape}"
-            fix = "Write depth as PNG of one channel of 16 bits."
-            raise SceneError("this is no depth image", path=path, value=value, fix=fix)
-        read_m = np.where(image == self.layout.no_reading, 0, image).astype(np.float32) / np.float32(self.depth_scale)
-        return self.depth_correction.apply(read_m)
 
     def _registered(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """Register depth to the pinhole camera: the nearest reading that falls into each pixel."""
@@ -239,10 +235,10 @@ def _size(path: Path) -> tuple[int, int] | None:
         return None
 
 
-def _read(path: Path, flags: int, at_most: int = MAX_PIXELS) -> NDArray[Any] | None:
+def _read(path: Path, flags: int) -> NDArray[Any] | None:
     """An image; None if it cannot be read."""
     try:
-        return read_image(path, flags, at_most)
+        return read_image(path, flags)
     except (OSError, ValueError):
         return None
 

@@ -34,14 +34,13 @@ class Layout:
     camera: tuple[float, float, float, float]
     depth_camera: tuple[float, float, float, float] | None  # None: depth images are registered to the colour images
     color_from_depth_m: tuple[float, float, float]
-    no_reading: int  # value of a depth pixel without reading, in addition to 0
 
 
 # Kinect's nominal cameras, 2.5 cm apart. The pose is the depth camera's.
 SEVEN_SCENES = Layout(
-    "7-scenes", 1000.0, (525.0, 525.0, 320.0, 240.0), (585.0, 585.0, 320.0, 240.0), (-0.025, 0.0, 0.0), 65535
+    "7-scenes", 1000.0, (525.0, 525.0, 320.0, 240.0), (585.0, 585.0, 320.0, 240.0), (-0.025, 0.0, 0.0)
 )
-TUM = Layout("tum", 5000.0, (525.0, 525.0, 320.0, 240.0), None, (0.0, 0.0, 0.0), 0)  # ROS's defaults, as TUM advises
+TUM = Layout("tum", 5000.0, (525.0, 525.0, 320.0, 240.0), None, (0.0, 0.0, 0.0))  # ROS's defaults, as TUM advises
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,44 @@
+"""Pose files hold the poses that were written, and invalid ones are rejected."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from wheretolook.geometry.poses import camera_centers, invert_poses, poses_looking_along, quaternion_from_rotation
+from wheretolook.io.poses import POSE_COLUMNS, pose_texts, pose_values, poses_of_values, read_poses, read_rows, tum_text
+from wheretolook.utils.errors import TableError
+
+POSES = poses_looking_along([(1.5, -2, 0.25), (0, 3, 1)], [(1, 0, 0), (-1, 2, 0.5)])
+
+
+def test_round_trips(tmp_path: Path) -> None:
+    (tmp_path / "path.tum").write_text("# a comment\n" + tum_text(["0.5", "1"], POSES))
+    pd.DataFrame(pose_values(POSES), columns=[*POSE_COLUMNS]).to_csv(tmp_path / "path.csv")
+    world = invert_poses(POSES)
+    views = pd.DataFrame(quaternion_from_rotation(world[..., :3]), columns=["qw", "qx", "qy", "qz"])
+    views.assign(**dict(zip("xyz", world[..., 3].T, strict=True))).to_csv(tmp_path / "views.csv")
+    for name in ("path.tum", "path.csv", "views.csv"):
+        np.testing.assert_allclose(read_poses(tmp_path / name), POSES, atol=1e-8)
+
+
+def test_texts_keep_the_centre_of_a_camera_far_away() -> None:
+    for exact, offset, limit in ((True, 0, 1e-15), (False, 0, 1e-8), (False, 1e6, 1e-8)):
+        poses = poses_looking_along(camera_centers(POSES) + offset, POSES[:, 2, :3])
+        again = poses_of_values([[float(cell) for cell in text.split()] for text in pose_texts(poses, exact)])
+        np.testing.assert_allclose(camera_centers(again), camera_centers(poses), rtol=1e-15, atol=limit)
+
+
+def test_rows(tmp_path: Path) -> None:
+    path = tmp_path / "rows"
+    path.write_text('\ufeff# comment\n\n"a; b"; 1;2\nc;3\n', encoding="utf-8")
+    assert read_rows(path) == [(3, ["a; b", "1", "2"]), (4, ["c", "3"])]
+
+
+@pytest.mark.parametrize("content", [b"", b"# x\n", b"\xff\xfe\x00", b"1 2 3\n", b"1 2 3 4 5 6 7 x\n"])
+def test_invalid_files(content: bytes, tmp_path: Path) -> None:
+    for name in ("path.tum", "path.csv"):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(TableError):
+            read_poses(tmp_path / name)

@@ -94,15 +94,13 @@ def held_out_photographs(options: Evaluate, dataset: Dataset, log: Log) -> list[
     from wheretolook.holdout.photo_map import says_metric
 
     held_out = []
-    for files in dataset.split(options.evaluate.split):
-        if knows_photographs(files):
-            metric = options.map.photographs.assume_metric or not files.is_photographed or says_metric(files.map)
-            name = check_name(options, files)
-            keep_frame = files.mesh.is_file()
-            how = (metric, keep_frame, None, None, log)
-            source, views = hold_out_photographs(options, "evaluate", files.map, name, *how)
-            occlusion = open_scene(options, files).occlusion
-            held_out.append(evaluated_photographs(files, source, views, occlusion, options.warp_device))
+    for files in filter(knows_photographs, dataset.split(options.evaluate.split)):
+        log(f"{files.name}: holding out blocks of photographs")
+        metric = options.map.photographs.assume_metric or not files.is_photographed or says_metric(files.map)
+        how = (check_name(options, files), metric, files.mesh.is_file())
+        source, views = hold_out_photographs(options, "evaluate", files.map, *how)
+        occlusion = open_scene(options, files).occlusion
+        held_out.append(evaluated_photographs(files, source, views, occlusion, options.warp_device))
     if not held_out:
         problem = "no scene of the split has a map whose photographs, or their features, are known"
         fix = "Map photographs (`wheretolook map --images`), or a model with its database or images."

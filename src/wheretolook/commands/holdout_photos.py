@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from wheretolook.commands.options import LabelOptions, Log
+from wheretolook.commands.options import LabelOptions
 from wheretolook.dataset.layout import SceneFolder
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.locks import hold
@@ -21,10 +21,7 @@ def knows_photographs(files: SceneFolder, images: Path | None = None, database: 
     from wheretolook.mapping.colmap_model import holds_model
     from wheretolook.mapping.sources import find_features, find_photographs
 
-    if not holds_model(files.map):
-        return False
-    given = images or database or find_features(files.map) or find_photographs(files.map)
-    return given is not None
+    return holds_model(files.map) and any((images, database, find_features(files.map), find_photographs(files.map)))
 
 
 def check_name(options: LabelOptions, files: SceneFolder) -> str:
@@ -42,15 +39,14 @@ def hold_out_photographs(
     name: str,
     metric: bool,
     keep_frame: bool,
-    images: Path | None,
-    database: Path | None,
-    log: Log,
+    given: tuple[Path | None, Path | None] = (None, None),
     upright: bool = False,
 ) -> tuple[PhotographedMap, list[HoldoutResult]]:
     """Return a map and its photographs, held out in blocks; finished blocks are shared with `wheretolook check`.
 
-    See `wheretolook.holdout.photo_map.open_map` for arguments and errors; `upright` raises MapError if the model's
-    cameras seem to be on their side.
+    `given` are the folder of the photographs and the database, if they are not next to the map. `upright` raises
+    MapError if the model's cameras seem to be on their side. See `wheretolook.holdout.photo_map.open_map` for the other
+    arguments and errors.
     """
     from wheretolook.holdout.holdout import hold_out_blocks
     from wheretolook.holdout.photo_map import WORK, features_of, folder_of_check, open_map
@@ -60,12 +56,11 @@ def hold_out_photographs(
     device = options.warp_device
     try:
         with hold(out / ".lock", stage):
-            folder, features = features_of(model, images, database, out / WORK, workers, device)
+            folder, features = features_of(model, *given, out / WORK, workers, device)
             source = open_map(folder, features, metric, name, keep_frame=keep_frame)
             if upright and source.is_turned:
                 fix = "Make a scene of it: `wheretolook map --name NAME --model SPARSE --map.existing.level true`."
-                raise MapError("the map lies on its side, and this needs z up", path=model, fix=fix)
-            log(f"{name}: leaving out blocks of {len(source.poses)} photographs")
+                raise MapError("the map is on its side, and this needs z up", path=model, fix=fix)
             return source, hold_out_blocks(source, out / WORK, workers=workers, device=device)
     finally:
         with suppress(OSError):  # created for the lock only

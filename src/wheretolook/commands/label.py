@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections import Counter
 from collections.abc import Mapping
-from contextlib import closing
-from dataclasses import dataclass, field
+from contextlib import closing, suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from wheretolook.commands.options import LabelOptions, Log, MapUseOptions, Progress, ignore_progress
-from wheretolook.commands.preconditions import existing, extractor_of, load_dataset
+from wheretolook.commands.preconditions import existing, extractor_of, load_dataset, naming_file, scene_job
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.thresholds import ALL
@@ -27,7 +28,6 @@ from wheretolook.utils.reading import read_json_object
 if TYPE_CHECKING:
     import pandas as pd
 
-    from wheretolook.localization.labeller import LabelTask
     from wheretolook.localization.report import LabelSummary
 
 
@@ -63,7 +63,7 @@ class Label(LabelOptions):
                 problem = "without a mesh, viewpoints of a scene of photographs cannot be rendered and labelled"
                 fix = "Score its viewpoints with weights trained elsewhere, or use a scene with a mesh."
                 raise SceneError(problem, path=files.folder, fix=fix)
-        to_label: list[tuple[SceneFolder, str]] = []
+        to_label: dict[SceneFolder, str] = {}
         for files in sorted(dataset.scenes, key=lambda files: files.split == "train"):  # val and test scenes first
             key = self._key(files)
             if files.stage_cache("label", key).is_current(files.table):
@@ -71,12 +71,13 @@ class Label(LabelOptions):
                 _report(files, files.read_table(), log)
                 progress(1)
             else:
-                to_label.append((files, key))
+                to_label[files] = key
         summary = dataset.root / "results" / LABELS_MD
-        if to_label or not summary.is_file() or _not_logged(dataset).is_file():
+        to_log = bool(to_label) or not summary.is_file() or _not_logged(dataset).is_file()
+        if to_log:
             check_store(self.tracking)
-        seconds = self._label(dataset, to_label, log, progress) if to_label else {}
-        if not summary.is_file() or _not_logged(dataset).is_file():
+        seconds = self._label(to_label, summary, log, progress) if to_label else {}
+        if to_log:
             log_labels(dataset, self.tracking, seconds)
         if to_label:
             times = ", ".join(f"{step} {spent:.1f}" for step, spent in seconds.items())
@@ -90,44 +91,35 @@ class Label(LabelOptions):
         matches = [name for name in ("store_matches", "store_pixels") if getattr(self.label, name)]
         return cache_key("label", [*settings, *made_from, files.stage_cache("sample").stored_key, *matches])
 
-    def _task(self, files: SceneFolder) -> LabelTask:
-        from wheretolook.localization.labeller import LabelTask
-        from wheretolook.localization.shard import SceneJob
-
-        config = self.label
-        options = (config.localizer, extractor_of(files, self.map.extractor), self.warp_device, config.store_matches)
-        cameras = tuple(files.cameras().items()) if files.cameras_file.is_file() else ()
-        job = SceneJob(files.mesh, files.landmarks, files.camera, *options, cameras, config.store_pixels)
-        return LabelTask(files.name, job, files.read_table(), _shards(files))
-
     def _label(
-        self, dataset: Dataset, to_label: list[tuple[SceneFolder, str]], log: Log, progress: Progress
+        self, to_label: Mapping[SceneFolder, str], summary: Path, log: Log, progress: Progress
     ) -> dict[str, float]:
         """Label scenes and store their keys. Returns the seconds that each step took."""
         from wheretolook.dataset.viewpoint_table import write_table
-        from wheretolook.localization.labeller import label_scenes
-        from wheretolook.localization.report import LABELS_MD
+        from wheretolook.localization.labeller import LabelTask, label_scenes
 
-        keys = {files.name: (files, key) for files, key in to_label}
-        tasks = [self._task(files) for files, _ in to_label]
-        seconds: dict[str, float] = {}
+        config = self.label
+        scenes = {files.name: files for files in to_label}
+        tasks = []
+        for files in to_label:
+            job = scene_job(files, config, extractor_of(files, self.map.extractor), self.warp_device)
+            job = replace(job, store_matches=config.store_matches, store_pixels=config.store_pixels)
+            tasks.append(LabelTask(files.name, job, files.read_table(), _shards(files)))
+        seconds = Counter[str]()
         start = time.monotonic()
-        replacing = False
-        with closing(label_scenes(tasks, self.label)) as results:  # an interrupt here ends the workers
-            for labelled in results:
-                files, key = keys[labelled.task.name]
-                if not replacing:  # labels are unusable until all scenes have the new ones, and these are logged
-                    replacing = True
-                    (dataset.root / "results" / LABELS_MD).unlink(missing_ok=True)
-                    for other, _ in to_label:
+        with closing(label_scenes(tasks, config)) as results:  # an interrupt here ends the workers
+            for number, labelled in enumerate(results):
+                files = scenes[labelled.task.name]
+                if number == 0:  # labels are unusable until all scenes have the new ones, and these are logged
+                    summary.unlink(missing_ok=True)
+                    for other in to_label:
                         other.stage_cache("label").clear()
                 write_table(labelled.table, files.table)
                 write_json(files.label_manifest, labelled.manifest)
-                files.stage_cache("label", key).store()
+                files.stage_cache("label", to_label[files]).store()
                 shutil.rmtree(labelled.task.shards, ignore_errors=True)
                 shutil.rmtree(files.adapt_shards, ignore_errors=True)
-                for step, spent in labelled.seconds.items():
-                    seconds[step] = seconds.get(step, 0.0) + spent
+                seconds.update(labelled.seconds)  # type: ignore[call-overload]
                 _report(files, labelled.table, log)
                 progress(1)
         return {**seconds, "wall": time.monotonic() - start}
@@ -164,23 +156,22 @@ def log_labels(
     summary = report.label_summary(tables, {scene.name: scene.split for scene in dataset.scenes})
     folder = dataset.root / "results"
     note = _not_logged(dataset)
-    if not seconds and note.is_file():
-        seconds = _seconds_of(note)
-    write_json(note, seconds or {})  # before the files, which count as logged without it
-    write_text(folder / report.LABELS_CSV, summary.shares.to_csv(index=False))
-    save_figure(label_figure(summary), folder / report.LABELS_PNG)
-    write_text(folder / report.LABELS_MD, report.label_markdown(summary, f"Labels of {dataset.name}"))
-
-    params = {"dataset": dataset.name, "dataset_fingerprint": dataset.fingerprint(), "scenes": " ".join(tables)}
+    if not seconds:
+        with suppress(OSError, ValueError):
+            seconds = read_json_object(note)
     metrics = {f"seconds_{name}": value for name, value in (seconds or {}).items()}
     for row in summary.shares[summary.shares["scene"] == ALL].to_dict("records"):
         prefix = "" if row["split"] == ALL else f"{row['split']}_"
         metrics |= {f"{prefix}{name}": value for name, value in row.items() if name not in ("scene", "split")}
-    run_context = start_run(tracking, "all scenes", "label", params, tags={"dataset": dataset.name})
-    with kept_if_not_logged(f"the summary of labels in {folder}", note, seconds or {}), run_context as (client, run):
-        log_to_run(client, run, metrics=metrics)
-        for name in (report.LABELS_CSV, report.LABELS_MD, report.LABELS_PNG):
-            client.log_artifact(run, str(folder / name))
+    params = {"dataset": dataset.name, "dataset_fingerprint": dataset.fingerprint(), "scenes": " ".join(tables)}
+    with kept_if_not_logged(f"the summary of labels in {folder}", note, seconds or {}):
+        write_text(folder / report.LABELS_CSV, summary.shares.to_csv(index=False))
+        save_figure(label_figure(summary), folder / report.LABELS_PNG)
+        write_text(folder / report.LABELS_MD, report.label_markdown(summary, f"Labels of {dataset.name}"))
+        with start_run(tracking, "all scenes", "label", params, tags={"dataset": dataset.name}) as (client, run):
+            log_to_run(client, run, metrics=metrics)
+            for name in (report.LABELS_CSV, report.LABELS_MD, report.LABELS_PNG):
+                client.log_artifact(run, str(folder / name))
     return summary
 
 
@@ -189,21 +180,12 @@ def _not_logged(dataset: Dataset) -> Path:
     return dataset.root / "labels_not_logged.json"
 
 
-def _seconds_of(note: Path) -> dict[str, float]:
-    try:
-        return {name: float(value) for name, value in read_json_object(note).items()}
-    except (OSError, ValueError, TypeError):
-        return {}
-
-
 def _labelled_table(scene: SceneFolder) -> pd.DataFrame:
     from wheretolook.dataset.viewpoint_table import is_good
 
     table = scene.read_table()
-    if table.empty:
-        raise TableError("the table has no viewpoints", path=scene.table, fix="Run `wheretolook sample` again.")
-    try:
+    with naming_file(scene.table):
+        if table.empty:
+            raise TableError("the table has no viewpoints", fix="Run `wheretolook sample` again.")
         is_good(table)
-    except TableError as error:
-        raise TableError(error.problem, path=scene.table, value=error.value, fix=error.fix) from None
     return table

@@ -14,7 +14,7 @@ from wheretolook.commands.preconditions import (
     existing,
     load_dataset,
     mesh_fingerprint,
-    naming_scene,
+    naming_file,
     open_scene,
     refuse_release,
 )
@@ -23,12 +23,12 @@ from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, describe_camera, draw_camera
 from wheretolook.geometry.poses import Float
-from wheretolook.mapping.config import MapConfig, ScaleConfig
+from wheretolook.mapping.config import ExistingModelConfig, MapConfig, ScaleConfig
 from wheretolook.mapping.georeference import read_scale
 from wheretolook.utils.artifact_cache import cache_key
-from wheretolook.utils.confine import check_folder_name, path_within, safe_child
+from wheretolook.utils.confine import check_folder_name, path_within
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
-from wheretolook.utils.files import fingerprint
+from wheretolook.utils.files import fingerprint, size_and_time
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,16 +66,19 @@ class Map(SceneOptions, LabelOptions):
         scene of photographs, without a mesh; `map.existing.model` one of that model, with or without a mesh. Raises
         SceneError or MapError if a mesh or a model cannot be read, or no landmark could be triangulated.
         """
-        if self.map.existing.model is not None:
-            refuse_release(self.root)
-            return _import_model(self, self.map.existing.model, log, progress)
-        if self.map.photographs.images is not None:
-            refuse_release(self.root)
-            return _map_photographs(self, self.map.photographs.images, log, progress)
-        dataset = load_dataset(self, "scenes")
-        for files in dataset.scenes:
-            _map_mesh(self, files, log)
-            progress(1)
+        if self.map.existing.model is None and self.map.photographs.images is None:
+            dataset = load_dataset(self, "scenes")
+            for files in dataset.scenes:
+                _map_mesh(self, files, log)
+                progress(1)
+            return dataset
+        refuse_release(self.root)
+        scene, dataset = (_map_photographs if self.map.existing.model is None else _import_model)(self, log)
+        scale = read_scale(scene.map)
+        assert scale is not None
+        log(f"{scene.name}: {scale.describe()}; camera {describe_camera(scene.camera)}")
+        dataset.save()
+        progress(1)
         return dataset
 
 
@@ -99,7 +102,7 @@ def _map_mesh(options: Map, files: SceneFolder, log: Log) -> None:
     from wheretolook.mapping.walk import PartOfFloor
 
     poses = _poses_of_recording(files, config.n_images)
-    with naming_scene(files.mesh):
+    with naming_file(files.mesh):
         space = PartOfFloor(scene.mesh_space, floor) if floor else scene.mesh_space
         shown = (scene.mesh, scene.renderer, space, camera)
         how = (scene.raycaster, options.n_workers, scene.device)
@@ -110,14 +113,14 @@ def _map_mesh(options: Map, files: SceneFolder, log: Log) -> None:
     log(f"{scene.name}: {landmarks}, {distance} -> {files.map}")
 
 
-def _poses_of_recording(scene: SceneFolder, at_most: int) -> Float | None:
-    """Return at most `at_most` poses (M, 3, 4), evenly spaced, of a scan's frames; the mesh is complete only there."""
+def _poses_of_recording(scene: SceneFolder, limit: int) -> Float | None:
+    """Return at most `limit` poses (M, 3, 4), evenly spaced, of a scan's frames; the mesh is complete only there."""
     if not scene.is_scanned:
         return None
     from wheretolook.mapping.colmap_model import colmap_poses
 
     poses = colmap_poses(scene.frames)
-    return poses[np.unique(np.linspace(0, len(poses) - 1, min(len(poses), at_most)).round().astype(int))]
+    return poses[np.unique(np.linspace(0, len(poses) - 1, min(len(poses), limit)).round().astype(int))]
 
 
 def _mapping_camera(config: MapConfig, looking: Camera, seed: int) -> PinholeCamera:
@@ -136,141 +139,127 @@ def _seed(scene: SceneFolder) -> int:
     return zlib.crc32(scene.name.encode()) % 2**31
 
 
-def _map_photographs(options: Map, folder: Path, log: Log, progress: Progress) -> Dataset:
+def _map_photographs(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     """Map the photographs in `map.photographs.images`: `<scene>/map/`, with finished steps in `<scene>/photographs/`.
 
-    The scene joins those of the dataset that are made of photographs too. Raises what `map_photographs` does, and
-    ConfigError if the dataset holds scenes with meshes.
+    Returns the scene, and the dataset with it. Raises what `map_photographs` does.
     """
     from wheretolook.mapping.photographs import list_photographs
 
     settings = options.map.photographs
-    root = options.root
-    name = settings.name or folder.resolve().name
-    check_folder_name("a scene's name, map.photographs.name,", name, NOT_SCENES)
-    scene = SceneFolder(safe_child(root, name, "a scene's name"), "test", options.camera.camera)
-    dataset = _with_photographs(scene, options)
-    files = [folder / name for name in list_photographs(folder)]
+    folder = settings.images
+    assert folder is not None
+    scene = _new_scene(options, settings.name or folder.resolve().name)
+    dataset = _with_scene(scene, options.root)
     tables = [path for path in (settings.scale.marker_table, settings.scale.positions) if path is not None]
-    missing = next((path for path in tables if not path.is_file()), None)
-    if missing is not None:
-        raise ConfigError("there is no such table", path=missing, fix="Check map.photographs.scale.")
-    images = [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+    for path in tables:
+        if not path.is_file():
+            raise ConfigError("there is no such table", path=path, fix="Check map.photographs.scale.")
+    images = size_and_time([folder / name for name in list_photographs(folder)])
     used = [replace(settings, assume_metric=False).record(), options.map.extractor.record()]
     made_from = [images, [fingerprint(path) for path in tables]]
-    key = cache_key("map", [*used, options.map.keep_database, _seed(scene), *made_from])
-    if not scene.stage_cache("map", key).is_current(scene.landmarks, scene.mapping_cameras):
-        from wheretolook.mapping.photograph_map import map_photographs
-
-        how = (scene.folder / "photographs", _seed(scene), options.n_workers, options.warp_device)
-        forget = scene.stage_cache("map").clear
-        report = map_photographs(options.map, scene.map, *how, before_replace=forget)
-        scene.stage_cache("map", key).store()
-        used_images = f"{report.n_registered} of {report.n_images} photographs"
-        log(f"{scene.name}: {report.n_landmarks:,} landmarks from {used_images} -> {scene.map}")
-        if report.unregistered:
-            log(f"{scene.name}: not placed: {', '.join(report.unregistered)}")
-    else:
+    cache = scene.stage_cache("map", cache_key("map", [*used, options.map.keep_database, _seed(scene), *made_from]))
+    if cache.is_current(scene.landmarks, scene.mapping_cameras):
         log(f"{scene.name}: reusing {scene.map}")
-    scale = read_scale(scene.map)
-    assert scale is not None
-    log(f"{scene.name}: {scale.describe()}")
-    dataset.save()
-    progress(1)
-    return dataset
+        return scene, dataset
+    from wheretolook.mapping.photograph_map import map_photographs
+
+    how = (scene.folder / "photographs", _seed(scene), options.n_workers, options.warp_device)
+    report = map_photographs(options.map, scene.map, *how, before_replace=cache.clear)
+    cache.store()
+    used_images = f"{report.n_registered} of {report.n_images} photographs"
+    log(f"{scene.name}: {report.n_landmarks:,} landmarks from {used_images} -> {scene.map}")
+    if report.unregistered:
+        log(f"{scene.name}: not placed: {', '.join(report.unregistered)}")
+    return scene, dataset
 
 
-def _import_model(options: Map, folder: Path, log: Log, progress: Progress) -> Dataset:
+def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     """Make a scene of the model in `map.existing.model`: `<scene>/map/`, and `<scene>/mesh.glb` if a mesh is given.
 
-    The scene joins those of the dataset that are made of photographs or models too. Raises what `map_existing` does,
-    ConfigError if the dataset holds other scenes, and SceneError if the mesh cannot be used.
+    Returns the scene, and the dataset with it. Raises what `map_existing` does, ConfigError for a mesh of a model that
+    is transformed, and SceneError if the mesh cannot be used.
     """
     from wheretolook.mapping.colmap_model import read_model
 
     settings = options.map.existing
     photographs = options.map.photographs
-    root = options.root
-    name = settings.scene_name
-    check_folder_name("a scene's name, map.existing.name,", name, NOT_SCENES)
+    folder = settings.model
+    assert folder is not None
+    scene = _new_scene(options, settings.scene_name)
     if settings.mesh is not None and (settings.level or photographs.scale != ScaleConfig()):
         fix = "Give a model and a mesh that are both in metres with z up."
         raise ConfigError("a model that is turned or scaled leaves its mesh", value=str(settings.mesh), fix=fix)
     model = read_model(folder)
-    scene = SceneFolder(safe_child(root, name, "a scene's name"), "test", options.camera.camera)
-    scene = _with_own_camera(scene, model, folder, options)
-    dataset = _with_photographs(scene, options)
+    if options.camera == CameraConfig():
+        scene = _with_own_camera(scene, model, settings)
+    dataset = _with_scene(scene, options.root)
     tables = [photographs.scale.marker_table, photographs.scale.positions, settings.database]
-    files = [*sorted(folder.iterdir()), *(path for path in tables if path is not None)]
+    files = [*sorted(folder.iterdir()), *filter(None, tables)]
     if photographs.images is not None:
         names = [image.name for _, image in sorted(model.images.items())]
         files += [path_within(photographs.images, name, "the name of a model's image") for name in names]
-    stats = [(path, path.stat()) for path in files if path.is_file()]
-    made_from = [(str(path), stat.st_size, stat.st_mtime_ns) for path, stat in stats]
     mesh = [] if settings.mesh is None else [mesh_fingerprint(settings.mesh)]
     chosen = {name: value for name, value in options.map.record().items() if name not in ("camera", "draw_camera")}
-    key = cache_key("map", [chosen, _seed(scene), made_from, mesh])
-    if scene.stage_cache("map", key).is_current(
-        scene.landmarks, scene.mapping_cameras, *([scene.mesh] if mesh else [])
-    ):
+    made_from = size_and_time(filter(Path.is_file, files))
+    cache = scene.stage_cache("map", cache_key("map", [chosen, _seed(scene), made_from, mesh]))
+    if cache.is_current(scene.landmarks, scene.mapping_cameras, *([scene.mesh] if mesh else [])):
         log(f"{scene.name}: reusing {scene.map}")
-    else:
-        from wheretolook.mapping.imported_map import map_existing
-        from wheretolook.mapping.sanity import warn_of_mesh
-        from wheretolook.rendering.raycasting import MeshRaycaster
-        from wheretolook.scenes.loading import load_mesh, save_glb
+        return scene, dataset
+    from wheretolook.mapping.imported_map import map_existing
+    from wheretolook.mapping.sanity import warn_of_mesh
+    from wheretolook.rendering.raycasting import MeshRaycaster
+    from wheretolook.scenes.loading import load_mesh, save_glb
 
-        loaded = None if settings.mesh is None else load_mesh(settings.mesh, settings.mesh_up, colored=False)
-        scene.stage_cache("map").clear()
-        how = (scene.folder / "photographs", _seed(scene), options.n_workers, options.warp_device)
-        report = map_existing(options.map, scene.map, *how, reconstruction=model)
-        scene.mesh.unlink(missing_ok=True)
-        if settings.mesh is not None and loaded is not None:
-            caster = MeshRaycaster(loaded, options.warp_device)
-            warn_of_mesh(settings.mesh, scene.read_landmarks().points, caster)
-            save_glb(loaded, scene.mesh)
-        scene.stage_cache("map", key).store()
-        removed = f", {report.n_landmarks_removed:,} points removed" if report.n_landmarks_removed else ""
-        again = ", triangulated again," if report.triangulated_anew else ""
-        found = f"{report.n_landmarks:,} landmarks{again} from {report.n_images} images{removed}"
-        log(f"{scene.name}: {found} -> {scene.map}")
-    scale = read_scale(scene.map)
-    assert scale is not None
-    log(f"{scene.name}: {scale.describe()}; camera {describe_camera(scene.camera)}")
-    dataset.save()
-    progress(1)
-    return dataset
+    loaded = None if settings.mesh is None else load_mesh(settings.mesh, settings.mesh_up, colored=False)
+    cache.clear()
+    how = (scene.folder / "photographs", _seed(scene), options.n_workers, options.warp_device)
+    report = map_existing(options.map, scene.map, *how, reconstruction=model)
+    scene.mesh.unlink(missing_ok=True)
+    if settings.mesh is not None and loaded is not None:
+        warn_of_mesh(settings.mesh, scene.read_landmarks().points, MeshRaycaster(loaded, options.warp_device))
+        save_glb(loaded, scene.mesh)
+    cache.store()
+    removed = f", {report.n_landmarks_removed:,} points removed" if report.n_landmarks_removed else ""
+    again = ", triangulated again," if report.triangulated_anew else ""
+    log(f"{scene.name}: {report.n_landmarks:,} landmarks{again} from {report.n_images} images{removed} -> {scene.map}")
+    return scene, dataset
 
 
-def _with_own_camera(scene: SceneFolder, model: Any, folder: Path, options: Map) -> SceneFolder:
-    """Return the scene with the model's camera, unless the options name one."""
+def _new_scene(options: Map, name: str) -> SceneFolder:
+    """Return the scene of photographs or of a model. Raises ConfigError if the name cannot be a folder's."""
+    check_folder_name("a scene's name, map.photographs.name or map.existing.name,", name, NOT_SCENES)
+    return SceneFolder(options.root / name, "test", options.camera.camera)
+
+
+def _with_own_camera(scene: SceneFolder, model: Any, settings: ExistingModelConfig) -> SceneFolder:
+    """Return the scene with the model's camera."""
     from wheretolook.mapping.colmap_model import camera_of_model
 
-    if options.camera != CameraConfig():
-        return scene
+    assert settings.model is not None
     try:
-        camera = camera_of_model(model, folder, options.map.existing.camera_id)
-        return replace(scene, camera=camera, own_camera=True)
+        return replace(scene, camera=camera_of_model(model, settings.model, settings.camera_id), own_camera=True)
     except MapError as error:
         fix = "Name one of the model's, --map.existing.camera_id 1, or describe another, such as --camera.fov_deg 70."
         raise MapError(error.problem, path=error.path, value=error.value, fix=fix) from error
 
 
-def _with_photographs(scene: SceneFolder, options: Map) -> Dataset:
-    """Return the dataset with this scene added or replaced."""
-    root = options.root
+def _with_scene(scene: SceneFolder, root: Path) -> Dataset:
+    """Return the dataset with a scene of photographs or of a model added or replaced.
+
+    Raises ConfigError if the dataset holds scenes that are mapped from meshes.
+    """
+    known = Dataset.load(root).scenes if (root / "dataset.json").is_file() else ()
+    if not all(read_scale(other.map) for other in known):  # maps of meshes have none
+        problem = "this dataset holds scenes with meshes, which photographs do not join"
+        names = [other.name for other in known]
+        raise ConfigError(problem, path=root, value=names, fix="Give the photographs a dataset of their own: --name.")
     scenes = [scene]
-    if (root / "dataset.json").is_file():
-        known = Dataset.load(root)
-        scenes += [other for other in known.scenes if other.name != scene.name]
-        if not all(read_scale(other.map) for other in known.scenes):  # maps of meshes have none
-            problem = "this dataset holds scenes with meshes, which photographs do not join"
-            names = [other.name for other in known.scenes]
-            fix = "Give the photographs a dataset of their own: --name."
-            raise ConfigError(problem, path=root, value=names, fix=fix)
-        others = [other for other in known.scenes if not (other.own_camera or scene.own_camera)]
-        for other in others:
-            if other.camera != scene.camera:  # what was sampled with another camera is no longer valid
-                other.stage_cache("map", other.stage_cache("map").stored_key or "").store()
-        scenes = [replace(other, camera=scene.camera) if other in others else other for other in scenes]
+    for other in known:
+        if not (other.own_camera or scene.own_camera or other.camera == scene.camera):
+            stage = other.stage_cache("map")  # what was sampled with another camera is no longer valid
+            other.stage_cache("map", stage.stored_key or "").store()
+            other = replace(other, camera=scene.camera)
+        if other.name != scene.name:
+            scenes.append(other)
     return Dataset(root, tuple(sorted(scenes, key=lambda scene: scene.name)))

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from wheretolook.dataset.environment import EnvironmentConfig, SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.names import RELEASE_FILE
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError
 from wheretolook.utils.files import fingerprint
@@ -19,7 +20,8 @@ from wheretolook.utils.records import from_record
 
 if TYPE_CHECKING:
     from wheretolook.commands.options import DatasetOptions, SceneOptions
-    from wheretolook.features.config import ExtractorConfig
+    from wheretolook.localization.config import LabelConfig
+    from wheretolook.localization.shard import SceneJob
 
 
 def load_dataset(
@@ -65,11 +67,11 @@ def refuse_release(root: Path) -> None:
 
 
 @contextmanager
-def naming_scene(path: Path) -> Iterator[None]:
-    """Add a scene's file to errors of code that knows only the content."""
+def naming_file(path: Path) -> Iterator[None]:
+    """Add a file's path to errors of code that knows only its content."""
     try:
         yield
-    except (SceneError, MapError) as error:
+    except (SceneError, MapError, TableError) as error:
         if error.path is not None:
             raise
         raise type(error)(error.problem, path=path, value=error.value, fix=error.fix) from error
@@ -81,8 +83,6 @@ def extractor_of(scene: SceneFolder, given: ExtractorConfig | None = None) -> Ex
     `given` of the same method may name other weights, as the map's may have moved. Raises MapError without the map's
     report, or if its landmarks have no descriptors to match queries with; WeightsError if the weights are missing.
     """
-    from wheretolook.features.config import ExtractorConfig
-
     path = scene.map / "report.json"
     try:
         report = read_json_object(path)
@@ -98,6 +98,14 @@ def extractor_of(scene: SceneFolder, given: ExtractorConfig | None = None) -> Ex
         fix = f"Say where they are: --map.extractor.method {extractor.method} --map.extractor.weights FILE."
         raise WeightsError("the weights that this map was made with are not there", path=extractor.weights, fix=fix)
     return extractor
+
+
+def scene_job(files: SceneFolder, label: LabelConfig, extractor: ExtractorConfig, device: str) -> SceneJob:
+    """Return what workers need to label viewpoints of a scene on a device, with keypoints of the map's extractor."""
+    from wheretolook.localization.shard import SceneJob
+
+    cameras = tuple(files.cameras().items()) if files.cameras_file.is_file() else ()
+    return SceneJob(files.mesh, files.landmarks, files.camera, label.localizer, extractor, device, cameras=cameras)
 
 
 def existing(path: Path, error: type[SceneError] | type[MapError], stage: str) -> str:

@@ -12,10 +12,9 @@ from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import CameraConfig, camera_of_record, describe_camera
 from wheretolook.scans.config import RgbdConfig
 from wheretolook.utils.artifact_cache import cache_key
-from wheretolook.utils.confine import check_folder_name, safe_child
+from wheretolook.utils.confine import check_folder_name
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.utils.files import write_json
-from wheretolook.utils.reading import read_json_object
+from wheretolook.utils.files import size_and_time, write_json
 
 REPORT = "rgbd.json"
 """In the scene's folder: what was made of the recording."""
@@ -29,29 +28,33 @@ def fuse_recording(options: DatasetOptions, settings: RgbdConfig, log: Log, prog
     """
     root = options.root
     check_folder_name("a scene's name, scenes.rgbd.name,", settings.scene_name, NOT_SCENES)
-    scene = SceneFolder(safe_child(root, settings.scene_name, "a scene's name"), settings.split, options.camera.camera)
+    scene = SceneFolder(root / settings.scene_name, settings.split, options.camera.camera)
     known = {other.name: other for other in Dataset.load(root).scenes} if (root / "dataset.json").is_file() else {}
-    others = [other for other in known.values() if other.name != scene.name]
-    if without := [other.name for other in others if other.stage_cache("scenes").stored_key is None]:
+    before = known.pop(scene.name, scene)
+    if without := [other.name for other in known.values() if other.stage_cache("scenes").stored_key is None]:
         fix = "Give the recording a dataset of its own: --name."
         raise ConfigError("this dataset holds scenes without meshes", path=root, value=without, fix=fix)
-    key = cache_key("scenes", ["rgbd", *_made_from(settings)])
-    if scene.stage_cache("scenes", key).is_current(scene.mesh, scene.folder / REPORT, scene.frames):
+    cache = scene.stage_cache("scenes", cache_key("scenes", ["rgbd", *_made_from(settings)]))
+    stored = cache.load(REPORT)
+    if stored is not None and cache.is_current(scene.mesh, scene.frames):
+        report = stored[REPORT]
         log(f"{scene.name}: reusing {scene.mesh}")
     else:
-        _fuse(scene, settings, options.warp_device, key, log)
+        report = _fuse(scene, settings, options.warp_device, log)
+        cache.store()
     if options.camera == CameraConfig():
-        scene = replace(scene, camera=_colour_camera(scene), own_camera=True)
+        scene = replace(scene, camera=camera_of_record(report["camera"]), own_camera=True)
     log(f"{scene.name}: camera {describe_camera(scene.camera)}")
-    if scene.name in known and known[scene.name].camera != scene.camera:
+    if before is not scene and before.camera != scene.camera:
         scene.stage_cache("sample").clear()
-    dataset = Dataset(root, tuple(sorted([*others, scene], key=lambda one: one.name)))
+    dataset = Dataset(root, tuple(sorted([*known.values(), scene], key=lambda one: one.name)))
     dataset.save()
     progress(1)
     return dataset
 
 
-def _fuse(scene: SceneFolder, settings: RgbdConfig, device: str, key: str, log: Log) -> None:
+def _fuse(scene: SceneFolder, settings: RgbdConfig, device: str, log: Log) -> dict[str, Any]:
+    """Write mesh, frames and report of a recording; return the report."""
     from wheretolook.scans.fusion import make_scan
     from wheretolook.scenes.loading import save_glb
 
@@ -62,11 +65,12 @@ def _fuse(scene: SceneFolder, settings: RgbdConfig, device: str, key: str, log: 
     scene.save_mapped_floor(())
     scan.save_model(scene.frames)
     texts = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(settings).items()}
-    write_json(scene.folder / REPORT, {**scan.report(), "config": texts})
-    scene.stage_cache("scenes", key).store()
+    report = {**scan.report(), "config": texts}
+    write_json(scene.folder / REPORT, report)
     for line in scan.describe():
         log(f"{scene.name}: {line}")
     log(f"{scene.name}: {len(scan.mesh.triangles):,} triangles -> {scene.mesh}")
+    return report
 
 
 def _made_from(settings: RgbdConfig) -> list[object]:
@@ -75,15 +79,6 @@ def _made_from(settings: RgbdConfig) -> list[object]:
     if not settings.folder.is_dir():
         raise SceneError("there is no such folder", path=settings.folder, fix="Name the folder of an RGB-D recording.")
     chosen = {name: value for name, value in asdict(settings).items() if name not in ("name", "split")}
-    folders = [settings.folder, *([settings.model] if settings.model else [])]
-    stats = [(str(path), path.stat()) for folder in folders for path in sorted(folder.rglob("*")) if path.is_file()]
-    return [chosen, [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]]
-
-
-def _colour_camera(scene: SceneFolder) -> Any:
-    path = scene.folder / REPORT
-    try:
-        return camera_of_record(read_json_object(path)["camera"])
-    except (OSError, ValueError, KeyError, TypeError, ConfigError) as error:
-        fix = "Remove it, and run `wheretolook scenes` again."
-        raise SceneError(f"the recording's report is damaged: {error}", path=path, fix=fix) from error
+    folders = filter(None, (settings.folder, settings.model))
+    files = [path for folder in folders for path in sorted(folder.rglob("*")) if path.is_file()]
+    return [chosen, size_and_time(files)]

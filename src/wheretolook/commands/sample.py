@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from wheretolook.commands.options import Log, Progress, SceneOptions, ignore_progress
-from wheretolook.commands.preconditions import existing, load_dataset, naming_scene, open_scene
+from wheretolook.commands.preconditions import existing, load_dataset, naming_file, open_scene
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset
@@ -85,7 +85,7 @@ def _sample(scene: SceneEnvironment, config: SampleConfig, log: Log) -> None:
     from wheretolook.dataset.viewpoint_table import write_table
 
     files = scene.files
-    with naming_scene(scene.source):
+    with naming_file(scene.source):
         grid, free = scene.free_voxels(config, scene.sampled_space)
         cameras = _cameras(scene, config)
         visible = (scene.landmarks, cameras, scene.occlusion)

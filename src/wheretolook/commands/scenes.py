@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import entry_points
@@ -15,8 +15,9 @@ from wheretolook.commands.rgbd_scene import fuse_recording
 from wheretolook.commands.scenes_config import MeshSource, ScenesConfig
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, MappedFloor, SceneFolder
+from wheretolook.dataset.sampling_config import Split
+from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.utils.artifact_cache import cache_key
-from wheretolook.utils.confine import safe_child
 from wheretolook.utils.errors import ConfigError, SceneError
 
 if TYPE_CHECKING:
@@ -52,57 +53,44 @@ class Scenes(DatasetOptions):
         refuse_release(self.root)
         if self.scenes.rgbd.folder is not None:
             return fuse_recording(self, self.scenes.rgbd, log, progress)
-        keys: dict[SceneFolder, str] = {}
-        sources: dict[SceneFolder, MakeMesh] = {}
+        sources: dict[SceneFolder, tuple[MakeMesh, str]] = {}
         for scene, make, cache_inputs in [*self._generated(), *self._loaded()]:
             if scene.name in {other.name for other in sources}:
                 raise SceneError("two scenes have the same name", path=self.root, value=scene.name, fix="Give a name.")
-            sources[scene] = make
-            keys[scene] = cache_key("scenes", cache_inputs)
-        for scene, make in sources.items():
-            if scene.stage_cache("scenes", keys[scene]).is_current(scene.mesh):
+            sources[scene] = make, cache_key("scenes", cache_inputs)
+        for scene, (make, key) in sources.items():
+            if scene.stage_cache("scenes", key).is_current(scene.mesh):
                 log(f"{scene.name}: reusing {scene.mesh}")
             else:
-                save_scene(scene, make, keys[scene], log)
+                save_scene(scene, make, key, log)
             progress(1)
         dataset = self._with_scans(tuple(sources))
         dataset.save()
         return dataset
 
-    def _generated(self) -> list[tuple[SceneFolder, MakeMesh, list[Any]]]:
+    def _generated(self) -> Iterator[tuple[SceneFolder, MakeMesh, list[Any]]]:
         config = self.scenes
-        splits = [*["train"] * config.train, *["val"] * config.val, *["test"] * config.test]
-        generated: list[tuple[SceneFolder, MakeMesh, list[Any]]] = []
+        splits: list[Split] = [*["train"] * config.train, *["val"] * config.val, *["test"] * config.test]  # type: ignore[list-item]
         for seed, split in enumerate(splits, config.seed):
             kind = config.kind_of(seed)
-            scene = self._scene(f"{kind}-{seed:03d}", split)
-            make = partial(_generate, self, kind, seed)
-            generated.append((scene, make, [config.apartment.key(), seed, *([] if kind == "apartment" else [kind])]))
-        return generated
+            scene = SceneFolder(self.root / f"{kind}-{seed:03d}", split, self.camera.camera)
+            make = partial(generate_scene, kind, config.apartment, seed, self.warp_device)
+            yield scene, make, [config.apartment.key(), seed, *([] if kind == "apartment" else [kind])]
 
-    def _loaded(self) -> list[tuple[SceneFolder, MakeMesh, list[Any]]]:
-        return [
-            (self._scene(mesh.scene_name, mesh.split), partial(_load, mesh), [mesh_fingerprint(mesh.path), mesh.up])
-            for mesh in self.scenes.meshes
-        ]
-
-    def _scene(self, name: str, split: Any) -> SceneFolder:
-        return SceneFolder(safe_child(self.root, name, "a scene's name"), split, self.camera.camera)
+    def _loaded(self) -> Iterator[tuple[SceneFolder, MakeMesh, list[Any]]]:
+        for mesh in self.scenes.meshes:
+            scene = SceneFolder(self.root / mesh.scene_name, mesh.split, self.camera.camera)
+            yield scene, partial(_load, mesh), [mesh_fingerprint(mesh.path), mesh.up]
 
     def _with_scans(self, made: tuple[SceneFolder, ...]) -> Dataset:
         """Return the dataset of the scenes made and of the scans that it had; clear the sample cache of scenes whose camera changed."""
-        if not (self.root / "dataset.json").is_file():
-            return Dataset(self.root, made)
-        before = Dataset.load(self.root).scenes
+        before = Dataset.load(self.root).scenes if (self.root / "dataset.json").is_file() else ()
         names = {scene.name for scene in made}
-        dataset = Dataset(
-            self.root, (*made, *(scene for scene in before if scene.is_scanned and scene.name not in names))
-        )
-        cameras = {scene.name: scene.camera for scene in before}
-        for scene in dataset.scenes:
-            if cameras.get(scene.name, self.camera.camera) != self.camera.camera:
+        scans = [scene for scene in before if scene.is_scanned and scene.name not in names]
+        for scene in before:
+            if scene.camera != self.camera.camera and (scene in scans or scene.name in names):
                 scene.stage_cache("sample").clear()
-        return dataset
+        return Dataset(self.root, (*made, *scans))
 
 
 def save_scene(scene: SceneFolder, make: MakeMesh, key: str, log: Log) -> None:
@@ -119,19 +107,17 @@ def save_scene(scene: SceneFolder, make: MakeMesh, key: str, log: Log) -> None:
     log(f"{scene.name}: {len(mesh.triangles):,} triangles -> {scene.mesh}")
 
 
-def scene_generator() -> Callable[..., tuple[TexturedMesh, MappedFloor]]:
-    """Return the installed generator of scenes, `generate(kind, config, seed, device=...)`.
+def generate_scene(
+    kind: SceneKind, config: ApartmentConfig, seed: int, device: str
+) -> tuple[TexturedMesh, MappedFloor]:
+    """Return a generated scene by the installed generator, `generate(kind, config, seed, device=...)`.
 
     Raises ConfigError if no package registers one in the entry-point group `wheretolook.scene_generators`.
     """
     for entry in entry_points(group="wheretolook.scene_generators"):
-        generator: Callable[..., tuple[TexturedMesh, MappedFloor]] = entry.load()
-        return generator
+        made: tuple[TexturedMesh, MappedFloor] = entry.load()(kind, config, seed, device=device)
+        return made
     raise ConfigError("no generator of scenes is installed", fix="Install wheretolook again, or name scenes.meshes.")
-
-
-def _generate(options: Scenes, kind: str, seed: int) -> tuple[TexturedMesh, MappedFloor]:
-    return scene_generator()(kind, options.scenes.apartment, seed, device=options.warp_device)
 
 
 def _load(source: MeshSource) -> tuple[TexturedMesh, MappedFloor]:

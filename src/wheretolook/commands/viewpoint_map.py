@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar
 
 from wheretolook.commands.options import Log, Progress, SceneOptions, ignore_progress
-from wheretolook.commands.preconditions import load_dataset, naming_scene, open_scene
+from wheretolook.commands.preconditions import load_dataset, naming_file, open_scene
 from wheretolook.dataset.dataset_lock import reads_dataset
 from wheretolook.planning.config import ViewpointMapConfig
 
@@ -58,7 +58,7 @@ class BuildViewpointMap(SceneOptions):
         built: dict[str, ViewpointMap] = {}
         for files in [dataset.scene(config.scene)] if config.scene else dataset.scenes:
             scene = open_scene(self, files)
-            with naming_scene(scene.source):
+            with naming_file(scene.source):
                 scorer = scene_scorer(scene, config.method, config.weights, config.anywhere)
                 viewpoint_map = scene_viewpoint_map(scene, config, scorer)
             folder = config.out or files.folder / "viewpoint-map"

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -121,3 +121,9 @@ def sha256(path: Path) -> str:
 def fingerprint(path: Path) -> str:
     """First 16 hexadecimal digits of a file's SHA-256."""
     return sha256(path)[:16]
+
+
+def size_and_time(paths: Iterable[Path]) -> list[tuple[str, int, int]]:
+    """Path, size in bytes and time of the last change of files, which change when a file does."""
+    stats = [(path, path.stat()) for path in paths]
+    return [(str(path), stat.st_size, stat.st_mtime_ns) for path, stat in stats]

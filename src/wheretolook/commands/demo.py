@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from tqdm.auto import tqdm
@@ -22,27 +22,22 @@ from wheretolook.commands.scenes import Scenes
 from wheretolook.commands.train import Train
 from wheretolook.dataset.layout import STAGES, Dataset
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
+from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.scorers.registry import methods_named, scorers
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.tracking.runs import ui_command
 from wheretolook.tracking.store import check_store
-from wheretolook.utils.artifact_cache import cache_key
+from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.files import fingerprint, write_json
-from wheretolook.utils.reading import read_json
+from wheretolook.utils.files import fingerprint
 from wheretolook.utils.version import VERSION
 from wheretolook.weights.resolve import load_scorer, resolve_weights
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 SECONDS = {"scenes": 5.0, "map": 15.0, "sample": 1.0, "label": 75.0, "train": 25.0, "evaluate": 6.0}
 """Rough cost of a stage on two cores (the first four for each scene), from which the share done is estimated."""
 
 OVERVIEW = "overview.png"
 LEVEL_DEG = 25.0  # pitch at most of a camera held level
-STAMP = "compared.json"  # in the dataset's folder: what the demo's comparison was made from
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,43 +117,37 @@ def compare(options: Demo, log: Log, progress: Progress) -> None:
     config = options.evaluate
     tracking = options.tracking
     results = results_folder(dataset, config)
-    stamp = options.root / STAMP
+    written = (results / SCORES_CSV, results / SCORES_MD)
     bundled = resolve_weights(features=dataset.features)
     assert bundled is not None
     files = config.weights or [*sorted((options.root / "weights").glob("*.safetensors")), bundled]
-    made_from: list[Any] = [dataset.fingerprint(), [fingerprint(path) for path in files if path.is_file()]]
-    made_from += [asdict(config), asdict(options.occlusion), VERSION]
-    scores = results / SCORES_CSV
-    report = results / SCORES_MD
+    settings = [asdict(config), asdict(options.occlusion), VERSION, tracking.root]
 
-    def made() -> dict[str, str]:
-        content = [fingerprint(path) for path in (scores, report)]
-        return {"key": cache_key("evaluate", [*made_from, *content]), "runs": str(tracking.root)}
+    def cache() -> ArtifactCache:
+        content = [fingerprint(path) for path in (*files, *written) if path.is_file()]
+        key = cache_key("evaluate", dataset.fingerprint(), content, settings)
+        return ArtifactCache(options.root, key, manifest="compared.json")
 
-    try:
-        known = read_json(stamp) == made() and (tracking.root / "mlflow.db").is_file()
-        known = known and not not_logged(dataset).exists()
-    except (OSError, ValueError):
-        known = False
-    if not known:
+    current = cache().is_current(*written, tracking.root / "mlflow.db") and not not_logged(dataset).exists()
+    if not current:
         from wheretolook.evaluation.scoring import own_weights
 
         models = list(config.weights) or [*own_weights(dataset), bundled]
         (results / OVERVIEW).unlink(missing_ok=True)
         device = options.warp_device
-        occlusion = options.occlusion
-        evaluate_methods(dataset, config, tracking, models, device=device, occlusion=occlusion, show=False)
-        write_json(stamp, made())
-    log(f"{'reusing' if known else 'all methods compared ->'} {report}")
+        evaluate_methods(dataset, config, tracking, models, device=device, occlusion=options.occlusion, show=False)
+        cache().store()
+    log(f"{'reusing' if current else 'all methods compared ->'} {written[1]}")
     progress(1)
 
 
 def draw_overview(options: Demo, weights: Path) -> None:
-    """Draw `<dataset>/results/overview.png`: the last scene's map, and what a network thinks of one place in it.
+    """Draw `<dataset>/results/overview.png`: the last scene's map, and the scores of all directions at one location.
 
-    The place is one where to look matters (`wheretolook.dataset.viewpoint_table.instructive_location`). The weights are a
-    file, or a folder of files of which the best is taken, for a camera of the dataset's field of view. Raises
-    TableError if there is no dataset or its last scene is not labelled, WeightsError if the weights cannot be used.
+    The location is one where the direction matters (`wheretolook.dataset.viewpoint_table.instructive_location`); the
+    worst view is that of a camera held about level, if there is one, not of the bare ceiling. The weights are a file, or
+    a folder of which the best file is taken. Raises TableError if the last scene is not labelled, WeightsError if the
+    weights cannot be used.
     """
     from wheretolook.dataset.viewpoint_table import instructive_location, outcome_in_words, poses, shares_good
     from wheretolook.figures.dollhouse import dollhouse
@@ -166,51 +155,36 @@ def draw_overview(options: Demo, weights: Path) -> None:
     from wheretolook.figures.style import save_figure, scene_label
     from wheretolook.scorers.styles import method_style
 
-    dataset = Dataset.load(options.root)
-    scene = open_scene(options, dataset.scenes[-1])
+    scene = open_scene(options, Dataset.load(options.root).scenes[-1])
     table = scene.files.read_table()
-    localization_map = scene.files.localization_map(scene.camera, scene.device)
-    scorer = load_scorer(weights, localization_map)
-
+    scorer = load_scorer(weights, scene.files.localization_map(scene.camera, scene.device))
     ids, first = np.unique(table["location_id"], return_index=True)
     locations = camera_centers(poses(table))[first]
     chosen = instructive_location(table)
-    place = locations[np.searchsorted(ids, chosen)]
+    location = locations[np.searchsorted(ids, chosen)]
     candidates = table[table["location_id"] == chosen]
-    scores = scorer.score(poses(candidates))
-    best, worst = rendered_views(scene, *_ends(candidates, scores), outcome_in_words)
+    cam_from_world = poses(candidates)
+    scores = scorer.score(cam_from_world)
+    level = np.abs(np.arcsin(np.clip(cam_from_world[:, 2, 2], -1, 1))) <= np.radians(LEVEL_DEG)
+    worst_row = np.argmin(np.where(level | ~level.any(), scores, np.inf))
+    shown_rows = [int(np.argmax(scores)), int(worst_row)]
+    best, worst = rendered_views(scene, candidates.iloc[shown_rows], scores[shown_rows], outcome_in_words)
     directions = options.sample.axes()
-    scores = scorer.score(poses_looking_along(np.tile(place, (len(directions), 1)), directions))
-    by_height = np.argsort(np.abs(locations[:, 2] - place[2]), kind="stable")
+    by_height = np.argsort(np.abs(locations[:, 2] - location[2]), kind="stable")
     shown = by_height[np.unique(locations[by_height, :2].round(2), axis=0, return_index=True)[1]]
     drawn = Overview(
-        scene=scene_label(dataset.scenes[-1].name),
+        scene=scene_label(scene.name),
         method=method_style(scorer.name).label,
-        plan=dollhouse(scene.mesh, elevation_deg=90, cut_m=float(place[2]), one_sided=False, device=scene.device),
+        plan=dollhouse(scene.mesh, elevation_deg=90, cut_m=float(location[2]), one_sided=False, device=scene.device),
         locations=locations[shown],
         share_good=shares_good(table)[1][shown],
-        place=place,
+        place=location,
         directions=directions,
-        scores=scores,
+        scores=scorer.score(poses_looking_along(np.tile(location, (len(directions), 1)), directions)),
         best=best,
         worst=worst,
     )
-    save_figure(overview_figure(drawn), dataset.root / "results" / OVERVIEW)
-
-
-def _ends(candidates: pd.DataFrame, scores: Float) -> tuple[pd.DataFrame, Float]:
-    """Rows and scores of the viewpoint with the highest score, and of the one with the lowest.
-
-    The lowest is that of a camera held about level, if there is one: what a robot sees that looks ahead, and not the
-    bare ceiling.
-    """
-    from wheretolook.dataset.viewpoint_table import poses
-
-    pitch = np.arcsin(np.clip(poses(candidates)[:, 2, 2], -1, 1))
-    level = np.abs(pitch) <= np.radians(LEVEL_DEG)
-    lowest = np.where(level, scores, np.inf) if level.any() else scores
-    ends = [int(np.argmax(scores)), int(np.argmin(lowest))]
-    return candidates.iloc[ends], scores[ends]
+    save_figure(overview_figure(drawn), options.root / "results" / OVERVIEW)
 
 
 def _write(step: str, text: str) -> None:

@@ -11,12 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wheretolook.geometry.poses import quaternion_from_rotation
+from wheretolook.io.poses import images_text, pose_texts, tum_text
 from wheretolook.mapping.colmap_model import holds_model
 from wheretolook.utils.errors import ConfigError, StorageError
 from wheretolook.utils.files import write_json, write_text
+from wheretolook.utils.validation import check_choice
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from wheretolook.select.views import SelectedViews
 
 FORMATS = {
@@ -29,29 +32,16 @@ FORMATS = {
 """Formats, and the frames in which they have poses."""
 
 
-def format_of(path: Path, format: str | None = None) -> str:
-    """Return the given format, or else that of the file's name: .csv, .json, .tum, images.txt; a folder is for COLMAP.
-
-    Raises ConfigError if there is no such format, or the name has no known ending.
-    """
-    if format is None:
-        by_suffix = {".csv": "csv", ".json": "json", ".tum": "tum", "": "colmap"}
-        format = "colmap" if path.name == "images.txt" else by_suffix.get(path.suffix.lower())
-        if format is None:
-            fix = f"Name a format ({', '.join(FORMATS)}), or a file that ends on .csv, .json or .tum."
-            raise ConfigError("the file's name has no known format", path=path, fix=fix)
-    if format not in FORMATS:
-        raise ConfigError("unknown format of views", value=format, fix=f"There are {', '.join(FORMATS)}.")
-    return format
-
-
 def check_format(path: Path, format: str | None, n: int) -> str:
-    """Return the format of a file for n views of each waypoint.
+    """Return the format for n views of each waypoint: the given one, or else that of the file's name.
 
-    Raises ConfigError if the format holds one view only, or the path holds something else; StorageError if nothing can
-    be written there.
+    The names are .csv, .json, .tum, images.txt; a folder is for COLMAP. Raises ConfigError if there is no such format,
+    the format holds one view only, or the path holds something else; StorageError if nothing can be written there.
     """
-    chosen = format_of(path, format)
+    by_suffix = {".csv": "csv", ".json": "json", ".tum": "tum", "": "colmap"}
+    by_name = "colmap" if path.name == "images.txt" else by_suffix.get(path.suffix.lower(), path.suffix)
+    chosen = format or by_name
+    check_choice("format of views", chosen, FORMATS)
     if chosen in ("tum", "benchmark") and n > 1:
         fix = "Ask for one view, or write csv, json or colmap."
         raise ConfigError(f"a file of the format {chosen} has one view of each waypoint", value=n, fix=fix)
@@ -78,7 +68,8 @@ def save_views(views: SelectedViews, path: Path, format: str | None = None) -> N
     elif chosen == "tum":
         write_text(path, _tum(views))
     elif chosen == "benchmark":
-        write_text(path, _benchmark(views))
+        lines = zip(_names(views), pose_texts(views.cam_from_world), strict=True)
+        write_text(path, "# id qw qx qy qz tx ty tz\n" + "".join(f"{name} {pose}\n" for name, pose in lines))
     elif path.suffix:
         write_text(path, _images(views))
     else:
@@ -95,108 +86,71 @@ def _is_ours(folder: Path) -> bool:
     return images.is_file() and images.read_text(errors="replace").startswith(_MARK)
 
 
-def _rows(views: SelectedViews) -> list[dict[str, Any]]:
-    """Return a record for each view; expected inliers are None where the method does not report them."""
+def _table(views: SelectedViews) -> pd.DataFrame:
+    """Return a row for each view; expected inliers are NaN where the method does not report them."""
+    import pandas as pd
+
     columns = {
+        "waypoint": list(views.waypoint_id),
         "rank": views.rank,
         **dict(zip("xyz", views.positions.T, strict=True)),
         "yaw_deg": views.yaw_deg,
         "pitch_deg": views.pitch_deg,
         "score": views.score,
         **({} if views.set_score is None else {"set_score": views.set_score}),
-        "expected_inliers": [value if np.isfinite(value) else None for value in views.expected_inliers.tolist()],
+        "expected_inliers": views.expected_inliers,
         "n_visible": views.n_visible,
         "in_range": views.in_range,
         **dict(zip(("qw", "qx", "qy", "qz"), views.quaternions_wxyz.T, strict=True)),
     }
-    values = [
-        np.asarray(column, dtype=object if name == "expected_inliers" else None).tolist()
-        for name, column in columns.items()
-    ]
-    rows = zip(views.waypoint_id, *values, strict=True)
-    return [dict(zip(("waypoint", *columns), row, strict=True)) for row in rows]
+    return pd.DataFrame(columns)
 
 
-FAR_M = 1000.0  # of a camera from the origin
 _DIGITS = {"yaw_deg": ".3f", "pitch_deg": ".3f", "score": ".9g", "set_score": ".9g", "expected_inliers": ".2f"}
 
 
 def _csv(views: SelectedViews) -> str:
-    lines: list[str] = []
-    for row in _rows(views):
-        cells = {name: _cell(name, value) for name, value in row.items()}
-        cells["quaternion_xyzw"] = " ".join(cells[name] for name in ("qx", "qy", "qz", "qw"))
-        if not lines:
-            lines.append(",".join(cells))
-        lines.append(",".join(cells.values()))
-    return "\n".join(lines) + "\n"
-
-
-def _cell(name: str, value: Any) -> str:
-    if value is None:
-        return ""
-    if isinstance(value, bool) or not isinstance(value, float):
-        text = str(value)
-        return '"' + text.replace('"', '""') + '"' if "," in text or '"' in text else text
-    return format(value, _DIGITS.get(name, ".9f"))
+    table = _table(views)
+    for name in table.select_dtypes("floating"):
+        pattern = f"{{:{_DIGITS.get(name, '.9f')}}}"
+        table[name] = table[name].map(pattern.format, na_action="ignore")
+    table["quaternion_xyzw"] = table[["qx", "qy", "qz", "qw"]].agg(" ".join, axis=1)
+    return str(table.to_csv(index=False, lineterminator="\n"))
 
 
 def _json(views: SelectedViews) -> dict[str, Any]:
     frames = "x, y, z: camera centre in the world, m; qw, qx, qy, qz: camera-to-world; world z up, camera z forward"
-    about = {"frames": frames, "method": views.method, "camera": views.camera.colmap.record()}
-    poses = zip(_rows(views), views.quaternions_xyzw.tolist(), views.cam_from_world.tolist(), strict=True)
-    rows = [row | {"quaternion_xyzw": xyzw, "cam_from_world": pose} for row, xyzw, pose in poses]
-    return about | {"views": rows}
+    table = _table(views).astype(object)
+    table = table.where(table.notna(), None)
+    table["quaternion_xyzw"] = views.quaternions_xyzw.tolist()
+    table["cam_from_world"] = views.cam_from_world.tolist()
+    camera = views.camera.colmap.record()
+    return {"frames": frames, "method": views.method, "camera": camera, "views": table.to_dict("records")}
 
 
 def _tum(views: SelectedViews) -> str:
-    lines = [
-        "# t x y z qx qy qz qw, camera-to-world, metres; t is the waypoint's name if that is a number, else a count"
-    ]
-    stamps = list(views.waypoint_id)
+    stamps = views.waypoint_id
     try:
-        [float(stamp) for stamp in stamps]
+        np.array(stamps, dtype=float)
     except ValueError:
-        stamps = [str(row) for row in range(len(views))]
-    for stamp, position, quaternion in zip(stamps, views.positions, views.quaternions_xyzw, strict=True):
-        lines.append(" ".join([stamp, *_numbers(position), *_numbers(quaternion)]))
-    return "\n".join(lines) + "\n"
+        stamps = tuple(map(str, range(len(views))))
+    about = "# t x y z qx qy qz qw, camera-to-world, metres; t is the waypoint's name if that is a number, else a count"
+    return f"{about}\n{tum_text(stamps, views.cam_from_world)}"
 
 
-def _benchmark(views: SelectedViews) -> str:
-    lines = ["# id qw qx qy qz tx ty tz"]
-    for name, pose in zip(views.waypoint_id, _cam_from_world(views), strict=True):
-        lines.append(" ".join([name.replace(" ", "_"), *pose]))
-    return "\n".join(lines) + "\n"
+def _names(views: SelectedViews) -> list[str]:
+    return [name.replace(" ", "_") for name in views.waypoint_id]
 
 
 def _images(views: SelectedViews) -> str:
-    lines = [_MARK + ": world-to-camera; a name is that of the waypoint, and of several views the rank"]
-    lines += ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# an empty line follows: no points"]
-    several = views.rank.max(initial=1) > 1
-    for number, pose in enumerate(_cam_from_world(views), 1):
-        name = views.waypoint_id[number - 1].replace(" ", "_")
-        name += f"-{views.rank[number - 1]}" if several else ""
-        lines += [" ".join([str(number), *pose, "1", name]), ""]
-    return "\n".join(lines) + "\n"
+    names = _names(views)
+    if views.rank.max(initial=1) > 1:
+        names = [f"{name}-{rank}" for name, rank in zip(names, views.rank, strict=True)]
+    about = f"{_MARK}: world-to-camera; a name is that of the waypoint, and of several views the rank"
+    return f"{about}\n{images_text(names, views.cam_from_world)}"
 
 
 def _cameras(views: SelectedViews) -> str:
     record = views.camera.colmap.record()
     values = [1, record["model"], record["width"], record["height"], *record["params"]]
     return "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n" + " ".join(map(str, values)) + "\n"
-
-
-def _cam_from_world(views: SelectedViews) -> list[list[str]]:
-    """qw qx qy qz tx ty tz of each view, world-to-camera.
-
-    Far from the origin quaternions get more decimals, which decide where the camera is: its centre follows from both.
-    """
-    quaternions = quaternion_from_rotation(views.cam_from_world[:, :, :3])
-    poses = zip(quaternions, views.cam_from_world[:, :, 3], strict=True)
-    decimals = 9 if np.abs(views.cam_from_world[:, :, 3]).max(initial=0) < FAR_M else 15
-    return [[*_numbers(quaternion, decimals), *_numbers(shift)] for quaternion, shift in poses]
-
-
-def _numbers(values: Any, decimals: int = 9) -> list[str]:
-    return [f"{value:.{decimals}f}" for value in values]

@@ -1,52 +1,60 @@
-"""Places to look from: read from a file in any of the usual formats, or given as numbers."""
+"""Locations to look from: read from files, on a grid in free space, and checked against a map."""
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.poses import Float
-from wheretolook.utils.errors import TableError
+from wheretolook.geometry.lattices import VoxelGrid
+from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.io.poses import read_rows
+from wheretolook.utils.errors import ConfigError, SceneError, TableError
+
+if TYPE_CHECKING:
+    from wheretolook.inputs.localization_map import LocalizationMap
 
 FORMATS = """\
 CSV with columns x, y, z (and id, if there is one; a line of names or none), the Active Localization Benchmark's text
 "id x y z", a TUM trajectory "t x y z qx qy qz qw", or "x y z"; lines that start with # are comments"""
 
-_NAMES = {"x": ("x", "tx"), "y": ("y", "ty"), "z": ("z", "tz")}
-_IDS = ("id", "waypoint", "name", "t", "timestamp")
+_IDS = ("id", "waypoint", "name", "t", "timestamp")  # names of the column of ids
+MAX_LOCATIONS = 1_000_000  # voxels of a grid
+REACH_SHARE = 0.95  # of the landmarks' mapping distances; farther from all of them the map is unknown
+ON_LANDMARK_M = 1e-6  # a location this close to a landmark is on a surface
+LISTED = 5  # waypoints that an error names
 
 
 @dataclass(frozen=True, eq=False)
 class Waypoints:
-    """W places, in the order given."""
+    """W locations, in the order given."""
 
     points: Float  # (W, 3) float64, world, metres
     ids: tuple[str, ...]  # W names: those of the file, a trajectory's time stamps, or 0, 1, ...
-    lines: tuple[int, ...] = ()  # line of the file that each stands in, counted from 1; empty if they are of no file
+    lines: tuple[int, ...] = ()  # line of the file that each is in, counted from 1; empty without a file
     path: Path | None = None  # the file
 
     def __len__(self) -> int:
         return len(self.points)
 
     def __getitem__(self, rows: NDArray[np.integer] | NDArray[np.bool_]) -> Waypoints:
-        """Some of them."""
+        """Return some of them."""
         kept = np.arange(len(self))[rows]
         lines = tuple(self.lines[row] for row in kept) if self.lines else ()
         return Waypoints(self.points[kept], tuple(self.ids[row] for row in kept), lines, self.path)
 
     def where(self, row: int) -> str:
-        """A waypoint in words: its line or name, and its coordinates."""
+        """Describe a waypoint by its line or name, and its coordinates."""
         at = ", ".join(f"{value:.10g}" for value in self.points[row])
         return f"{f'line {self.lines[row]}' if self.lines else f'waypoint {self.ids[row]}'}: ({at})"
 
     @classmethod
     def of(cls, points: ArrayLike | Waypoints, ids: Sequence[str] = ()) -> Waypoints:
-        """From coordinates (W, 3) or (3,) in metres; their names, if they have any.
+        """Make waypoints from coordinates (W, 3) or (3,) in metres and optional names.
 
         Raises a TableError if there are none, they have another shape, or one is not finite.
         """
@@ -75,63 +83,43 @@ def read_waypoints(path: str | Path) -> Waypoints:
     Raises a TableError, with the line, if the file is missing, empty, has other columns, or a value is not a number.
     """
     path = Path(path)
-    if not path.is_file():
-        fix = "Give a file, or coordinates such as 1,2,1.5."
-        raise TableError("there is no such file of waypoints", path=path, fix=fix)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise TableError("not a UTF-8 text file", path=path, fix=f"Give {FORMATS}.") from error
-    stripped = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
-    rows = [(number, line) for number, line in stripped if line and not line.startswith("#")]
-    if not rows:
-        raise TableError("there are no waypoints in the file", path=path, fix=f"Give {FORMATS}.")
-    separator = next((mark for mark in ",;" if mark in rows[0][1]), None)
-    cells = [(number, _cells(line, separator)) for number, line in rows]
-    header = cells[0][1] if not any(map(_is_number, cells[0][1])) and len(cells[0][1]) > 1 else None
-    if header is not None:
-        columns, id_column = _columns_from_header(header, path)
-        cells = cells[1:]
-        if not cells:
-            raise TableError("there are no waypoints below the header", path=path, fix=f"Give {FORMATS}.")
-    else:
-        columns, id_column = _columns_by_count(*cells[0], path)
-    n_named = 1 + max(*columns, id_column or 0)  # a header may be longer than what stands below it
+    rows = read_rows(path)
+    columns, id_column = _columns(rows[0][1], path)
+    if _is_header(rows[0][1]):
+        rows = rows[1:]
     points: list[list[float]] = []
     ids: list[str] = []
-    for number, row in cells:
-        width = len(cells[0][1])
-        if len(row) != width or width < n_named or not all(_is_number(row[column]) for column in columns):
-            value = f"line {number}: {(separator or ' ').join(row)[:80]}"
-            n, like = (n_named, "the header names") if width < n_named else (width, "as the first has")
-            problem = f"a waypoint needs numbers in {n} columns, {like}"
-            raise TableError(problem, path=path, value=value, fix=f"Give {FORMATS}.")
-        points.append([float(row[column]) for column in columns])
-        ids.append(str(len(ids)) if id_column is None else row[id_column])
-    found = Waypoints(np.array(points), tuple(ids), tuple(number for number, _ in cells), path)
-    return found._checked()
+    for number, row in rows:
+        try:
+            if len(row) != len(rows[0][1]):
+                raise ValueError(f"{len(row)} columns, unlike the first waypoint's {len(rows[0][1])}")
+            points.append([float(row[column]) for column in columns])
+            ids.append(str(len(ids)) if id_column is None else row[id_column])
+        except (ValueError, IndexError) as error:
+            value = f"line {number}: {' '.join(row)[:80]}"
+            raise TableError(f"not a waypoint: {error}", path=path, value=value, fix=f"Give {FORMATS}.") from error
+    if not rows:
+        raise TableError("there are no waypoints below the header", path=path, fix=f"Give {FORMATS}.")
+    return Waypoints(np.array(points), tuple(ids), tuple(number for number, _ in rows), path)._checked()
 
 
-def parse_points(texts: Sequence[str]) -> Waypoints:
-    """Parse texts "x,y,z". Raises TableError if one is not three numbers."""
-    points = []
-    for text in texts:
-        cells = text.strip().split(",")
-        if len(cells) != 3 or not all(map(_is_number, cells)):
-            fix = "Write x,y,z in metres without blanks, such as 1.5,-2,1.2, or name a file."
-            raise TableError("a waypoint is three numbers", value=text.strip(), fix=fix)
-        points.append([float(cell) for cell in cells])
-    return Waypoints.of(points)
+def _is_header(row: list[str]) -> bool:
+    return len(row) > 1 and not any(map(_is_number, row))
 
 
-def _cells(line: str, separator: str | None) -> list[str]:
-    """Cells of a line; between commas or semicolons they may stand in quotes."""
-    if separator is None:
-        return line.split()
-    try:
-        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
-    except csv.Error:  # longer than any table's cell
-        return line.split(separator)
+def _columns(row: list[str], path: Path) -> tuple[list[int], int | None]:
+    """Return the columns of x, y, z and of the ids (or None) from the first row: a header, or a waypoint."""
+    if not _is_header(row):
+        if len(row) not in (3, 4, 8):
+            problem = f"waypoints have 3, 4 or 8 columns, these have {len(row)}"
+            raise TableError(problem, path=path, value=" ".join(row)[:80], fix=f"Give {FORMATS}.")
+        return ([0, 1, 2], None) if len(row) == 3 else ([1, 2, 3], 0)
+    index = {name.strip("\"' ").lower(): column for column, name in reversed([*enumerate(row)])}
+    columns = [index.get(axis, index.get(f"t{axis}", -1)) for axis in "xyz"]
+    if -1 in columns:
+        fix = "Name the columns x, y and z."
+        raise TableError("the columns of waypoints are missing", path=path, value=",".join(row)[:80], fix=fix)
+    return columns, next((index[name] for name in _IDS if name in index), None)
 
 
 def _is_number(text: str) -> bool:
@@ -142,20 +130,63 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _columns_from_header(header: list[str], path: Path) -> tuple[list[int], int | None]:
-    """Return the columns of x, y, z and of the ids (or None) from the header."""
-    names = [cell.strip("\"' ").lower() for cell in header]
-    columns = [next((names.index(name) for name in known if name in names), None) for known in _NAMES.values()]
-    if None in columns:
-        fix = "Name the columns x, y and z."
-        raise TableError("the columns of waypoints are missing", path=path, value=",".join(header)[:80], fix=fix)
-    return [c for c in columns if c is not None], next((names.index(name) for name in _IDS if name in names), None)
+def parse_points(texts: Sequence[str]) -> Waypoints:
+    """Parse texts "x,y,z" in metres. Raises TableError if one is not three numbers."""
+    return Waypoints.of([text.split(",") for text in texts])
 
 
-def _columns_by_count(number: int, row: list[str], path: Path) -> tuple[list[int], int | None]:
-    """Return the columns of x, y, z and of the ids (or None) from the number of columns."""
-    if len(row) not in (3, 4, 8):
-        value = f"line {number}: {' '.join(row)[:80]}"
-        problem = f"waypoints have 3, 4 or 8 columns, these have {len(row)}"
-        raise TableError(problem, path=path, value=value, fix=f"Give {FORMATS}.")
-    return ([0, 1, 2], None) if len(row) == 3 else ([1, 2, 3], 0)
+def grid_waypoints(localization_map: LocalizationMap, space: Any, spacing_m: float) -> Waypoints:
+    """Return locations `spacing_m` apart in all free space; their names are voxel ids.
+
+    Raises a ConfigError if the spacing is no length or makes too many, a SceneError if none is free.
+    """
+    if not 0 < spacing_m < np.inf:
+        raise ConfigError("the spacing of a grid is a length in metres", value=spacing_m, fix="Such as 0.5.")
+    low, high = np.asarray(space.bounds, dtype=np.float64)
+    cells = np.maximum(np.ceil((high - low) / spacing_m), 1)
+    if np.prod(cells) > MAX_LOCATIONS:
+        fix = f"The map is {high[0] - low[0]:.3g} x {high[1] - low[1]:.3g} x {high[2] - low[2]:.3g} m; widen the grid."
+        raise ConfigError(f"the grid has more than {MAX_LOCATIONS:,} locations", value=spacing_m, fix=fix)
+    nx, ny, nz = (int(n) for n in cells)
+    middle = (low + high) / 2
+    half = cells * spacing_m / 2
+    centers = VoxelGrid.over(np.stack([middle - half, middle + half]), (nx, ny, nz)).centers()
+    free = np.flatnonzero(space.is_free(centers))
+    free = free[~localization_map.occlusion.inside_geometry(centers[free])]
+    if len(free) == 0:
+        raise SceneError("no location of the grid is free", value=spacing_m, fix="Narrow the grid.")
+    return Waypoints(centers[free], tuple(map(str, free)))
+
+
+def usable_waypoints(localization_map: LocalizationMap, waypoints: Waypoints, skip: bool = False) -> NDArray[np.bool_]:
+    """Return at which waypoints views can be scored, (W,): at all of them, unless `skip` leaves others out.
+
+    A waypoint is outside the map if it is farther from every landmark, and from every mapping camera, than all but 5 %
+    of the landmarks were from the cameras that mapped them. Raises a TableError that names the first of those outside
+    the map or inside geometry, or if none is left.
+    """
+    from scipy.spatial import cKDTree
+
+    landmarks = localization_map.landmarks
+    reach = float(np.quantile(landmarks.mapping_distance_m, REACH_SHARE))
+    to_landmark = cKDTree(landmarks.points).query(waypoints.points)[0]
+    nearest: Float = to_landmark
+    if localization_map.mapping_poses is not None:
+        centers = camera_centers(localization_map.mapping_poses.astype(np.float64))
+        nearest = np.minimum(nearest, cKDTree(centers).query(waypoints.points)[0])
+    outside = nearest > reach
+    inside = ~outside & (to_landmark <= ON_LANDMARK_M)
+    rest = np.flatnonzero(~outside & ~inside)
+    inside[rest] = localization_map.occlusion.inside_geometry(waypoints.points[rest])
+    bad = outside | inside
+    if not bad.any() or (skip and not bad.all()):
+        return np.asarray(~bad)
+    problems = []
+    for row in np.flatnonzero(bad)[:LISTED]:
+        why = f"{nearest[row]:.3g} m from all landmarks and cameras" if outside[row] else "inside geometry"
+        problems.append(f"{waypoints.where(row)} {why}")
+    low, high = np.quantile(landmarks.points, (0.01, 0.99), axis=0).round(1).tolist()
+    fix = f"The map's landmarks are within {low} to {high}, in its unit: check unit and axes"
+    fix += "." if bad.all() else ", or leave these out: --skip, in Python skip=True."
+    problem = f"{bad.sum()} of {len(waypoints)} waypoints are outside the map or inside geometry"
+    raise TableError(problem, path=waypoints.path, value="; ".join(problems), fix=fix)

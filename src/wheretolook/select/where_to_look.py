@@ -1,4 +1,4 @@
-"""Where to look at places of one's own map: the best views by any method of scoring."""
+"""Where to look at locations of a COLMAP map: the best views by any method of scoring."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, EnvironmentConfig
-from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.camera import Camera, PinholeCamera, parse_camera
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers, check_poses, poses_looking_along
@@ -20,12 +20,11 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.looks.selection import best_views
 from wheretolook.planning.config import StopConfig
 from wheretolook.planning.routes import PlannedPath
-from wheretolook.planning.stops import check_stopping, stops_along
+from wheretolook.planning.stops import stops_along
 from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook.select.request import SelectionRequest
-from wheretolook.select.surroundings import grid_waypoints, usable_waypoints
 from wheretolook.select.views import SelectedViews, joined
-from wheretolook.select.waypoints import Waypoints
+from wheretolook.select.waypoints import Waypoints, grid_waypoints, usable_waypoints
 from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError
@@ -33,14 +32,11 @@ from wheretolook.utils.errors import ConfigError
 if TYPE_CHECKING:
     from wheretolook.scorers.base import Scorer
 
-VIEWS_AT_ONCE = {
-    "cpu": 1 << 13,
-    "cuda": 1 << 17,
-}  # views scored between two steps of the progress bar, in whole waypoints
+VIEWS_PER_STEP = {"cpu": 1 << 13, "cuda": 1 << 17}  # of the progress bar, in whole waypoints
 
 SPARE = 3
 """Views of a waypoint, beyond those asked for, whose scores are computed again: where many landmarks are in view, the
-scores of all directions stand on other samples of them."""
+scores of all directions are computed from other samples of them."""
 
 OCCLUSION_CACHE_BYTES = 1 << 30
 
@@ -48,15 +44,15 @@ SIGHT_LINES = 1 << 24  # lines of sight tested at once
 
 
 class WhereToLook:
-    """Scores views of a map, and finds the best ones at any place.
+    """Scores views of a map, and selects the best ones at any location.
 
         look = WhereToLook.from_colmap("sparse/0")
         views = look.best([(1.0, 2.0, 1.5), (1.2, 2.0, 1.5)])
         views.save("views.csv")
 
     World in metres, z up. `scorer` is any method on a localization map; `directions` (D, 3) are the optical axes that
-    are looked along at each place, in the world; cameras do not roll. `space` tells where a camera can be, for grids;
-    None for the space near the mapping cameras.
+    are scored at each location, in the world; cameras do not roll. `space` is where a camera can be, for grids; None for
+    the space near the mapping cameras.
     """
 
     def __init__(self, scorer: Scorer, directions: ArrayLike | None = None, space: Any = None) -> None:
@@ -64,7 +60,6 @@ class WhereToLook:
         self._space = space
         axes = direction_lattice(500) if directions is None else np.asarray(directions, dtype=np.float64)
         self.directions = axes / np.linalg.norm(axes, axis=1, keepdims=True)
-        self.views: SelectedViews | None = None  # of the last selection
 
     @classmethod
     def from_colmap(
@@ -86,13 +81,13 @@ class WhereToLook:
         device: str = "auto",
         anywhere: bool = False,
     ) -> WhereToLook:
-        """From any COLMAP model (binary or text) in metres, z up.
+        """Open any COLMAP model (binary or text) in metres, z up.
 
         Args:
             path: folder of the model.
-            weights: file or folder of weights; None for those that ship.
+            weights: file or folder of weights; None for the bundled ones.
             method: name of a method, such as "set" or "visible"; "" for that of the weights.
-            camera: the camera that will look: a camera, a text such as "PINHOLE,640,480,320,320,320,240", or the
+            camera: the camera of the views: a camera, a text such as "PINHOLE,640,480,320,320,320,240", or the
                 camera_id of one of the model. None for the model's own.
             fov_deg: instead, a pinhole of that horizontal field of view in degrees, of 640 x 480 px.
             mesh: mesh of the scene, for true occlusion.
@@ -100,13 +95,13 @@ class WhereToLook:
                 `wheretolook.scans.depth_images.read_depth_images`.
             depth_scale: units of integer depth images in a metre.
             occlusion: "mesh", "tsdf" (depth images), "hidden-points" (from the landmarks alone) or "none" (landmarks
-                are seen through walls); None for the first of these that there is something for.
+                are visible through walls); None for the first of these that there is data for.
             database: the model's database, for descriptors and so the landmarks' ambiguity.
-            directions: how many directions are looked along at each place.
-            lattice: how they are spread: "fibonacci" evenly; "yaw-pitch" 6 pitches x 18 yaws as in ActLoc.
+            directions: number of directions that are scored at each location.
+            lattice: how they are distributed: "fibonacci" evenly; "yaw-pitch" 6 pitches x 18 yaws as in ActLoc.
             max_reprojection_error_px: landmarks with a larger mean error are left out; None for the map's own default.
             device: "auto" for a GPU if there is one, "cpu", or "cuda:0".
-            anywhere: whether weights that are adapted to another scene may score here.
+            anywhere: whether weights that are adapted to another scene may score in this one.
 
         Raises:
             MapError: no usable model in the folder, or database.
@@ -114,11 +109,9 @@ class WhereToLook:
             WeightsError: the weights cannot be used, or there are none.
             ConfigError: no such method, camera, occlusion, lattice or device.
         """
-        from wheretolook.geometry.camera import PinholeCamera, parse_camera
         from wheretolook.scorers.registry import make_scorer
         from wheretolook.weights.resolve import load_scorer, resolve_weights
 
-        model = Path(path)
         device = usable_device(device)
         if camera is not None and fov_deg is not None:
             raise ConfigError("a camera is described in two ways", value=fov_deg, fix="Give camera or fov_deg.")
@@ -127,50 +120,39 @@ class WhereToLook:
             camera = parse_camera(camera)
         elif fov_deg is not None:
             camera = PinholeCamera.of_field_of_view(fov_deg, 640, 480)
-        resolve_weights(method, weights)  # so that one that cannot be had is known before anything is read
-        environment = ColmapEnvironment(
-            ColmapFiles(
-                model,
-                mesh=None if mesh is None else Path(mesh),
-                depth=None if depth is None else Path(depth),
-                depth_scale=depth_scale,
-                database=None if database is None else Path(database),
-                max_reprojection_error_px=max_reprojection_error_px,
-            ),
-            camera,
-            occlusion or "",
-            EnvironmentConfig(occlusion_cache_bytes=OCCLUSION_CACHE_BYTES),
-            device,
-        )
+        resolve_weights(method, weights)  # so that missing ones are reported before anything is read
+        mesh, depth, database = (None if file is None else Path(file) for file in (mesh, depth, database))
+        files = ColmapFiles(Path(path), mesh, depth, depth_scale, database, max_reprojection_error_px)
+        config = EnvironmentConfig(occlusion_cache_bytes=OCCLUSION_CACHE_BYTES)
+        environment = ColmapEnvironment(files, camera, occlusion or "", config, device)
         localization_map = environment.localization_map
         weights = resolve_weights(method, weights, localization_map.landmarks.features)
         if method:
             scorer = make_scorer(method, localization_map, weights=weights, anywhere=anywhere)
         else:
-            scorer = load_scorer(str(weights), localization_map, anywhere=anywhere)
+            scorer = load_scorer(weights, localization_map, anywhere)
         return cls(scorer, axes, environment.space)
 
     @property
     def localization_map(self) -> LocalizationMap:
-        """The map, with the camera that looks and what hides landmarks."""
+        """The map, with the camera of the views and the occlusion model."""
         return self.scorer.localization_map
 
     @property
     def space(self) -> Any:
         """Where a camera can be, by mesh, depth images, or the map only."""
         if self._space is None:
-            here = self.localization_map
-            assert here.mapping_poses is not None
-            centers = camera_centers(here.mapping_poses.astype(np.float64))
-            self._space = MappedSpace(here.landmarks.points, centers)
+            poses = self.localization_map.mapping_poses
+            assert poses is not None
+            self._space = MappedSpace(self.localization_map.landmarks.points, camera_centers(poses.astype(np.float64)))
         return self._space
 
     def grid(self, spacing_m: float) -> Waypoints:
-        """Places so far apart in all free space, in metres, for `best`. Raises ConfigError or SceneError if none."""
+        """Return waypoints so far apart in all free space, in metres. Raises ConfigError or SceneError if none."""
         return grid_waypoints(self.localization_map, self.space, spacing_m)
 
     def score(self, cam_from_world: ArrayLike) -> Float:
-        """Scores (B,) of poses (B, 3, 4), world-to-camera; higher is better, of learned methods a probability."""
+        """Score poses (B, 3, 4), world-to-camera, (B,); higher is better, of learned methods a probability."""
         return self.scorer.score(check_poses(cam_from_world))
 
     def best(
@@ -200,86 +182,66 @@ class WhereToLook:
             PlanningError: no sequence, or no set of looks, keeps the limit on turns.
         """
         request = SelectionRequest(n=n, **options)
-        looks = request.looks
-        max_turn_deg = request.max_turn_deg
-        if request.least_score is not None:
-            check_stopping(self.scorer.name)
-        axes = self._allowed(looks or n, request.pitch_deg)
+        axes = self._allowed(request)
         waypoints = Waypoints.of(points, ids)
         rows = np.flatnonzero(usable_waypoints(self.localization_map, waypoints, request.skip))
-        at = waypoints.points[rows]
-        scores = self._candidate_scores(at, axes, progress)
-        if looks is not None and max_turn_deg is not None and request.least_score is not None:
-            stops = StopConfig(int(looks), request.least_score)
-            self.views = self._sequence_with_stops(waypoints, rows, axes, scores, max_turn_deg, stops, progress)
-            return self.views
-        if looks is not None:
-            self.views = self._looks(waypoints, rows, axes, scores, looks, request.max_total_turn_deg, progress)
-            return self.views
-        if max_turn_deg is not None:
-            chosen = best_sequence(scores, TurnLimit.of(axes, max_turn_deg)).direction_ids[:, None]
+        waypoints = waypoints[rows]
+        scores = self._candidate_scores(waypoints.points, axes, progress)
+        if request.looks is None:
+            views = self._single_views(waypoints, axes, scores, request)
+        elif request.least_score is None:
+            views = self._view_sets(waypoints, axes, scores, request.looks, request.max_total_turn_deg, progress)
         else:
-            chosen = np.argsort(-scores, axis=1, kind="stable")[:, : n + SPARE]
-        step = max(1, SIGHT_LINES // max(1, len(self.localization_map.landmarks)))
-        blocks = [slice(begin, begin + step) for begin in range(0, len(rows), step)]
-        self.views = joined([self._described(waypoints, rows[block], axes[chosen[block]], n) for block in blocks])
-        return self.views
+            views = self._sequence_with_stops(waypoints, axes, scores, request, progress)
+        return replace(views, waypoint=rows[views.waypoint])
 
-    def _described(self, waypoints: Waypoints, rows: NDArray[np.int64], axes: Float, n: int) -> SelectedViews:
-        """Return the n best of views along axes (W, K, 3) at some of the waypoints."""
-        k = axes.shape[1]
-        views = self._reported(
-            waypoints, np.repeat(rows, k), np.tile(np.arange(1, k + 1), len(rows)), axes.reshape(-1, 3)
-        )
-        order = np.argsort(-views.score.reshape(-1, k), axis=1, kind="stable")[:, :n]
-        best = views[(np.arange(len(rows))[:, None] * k + order).ravel()]
-        return replace(best, rank=np.tile(np.arange(1, order.shape[1] + 1), len(rows)))
-
-    def _looks(
-        self,
-        waypoints: Waypoints,
-        rows: NDArray[np.int64],
-        axes: Float,
-        scores: Float,
-        n: int,
-        max_turn_deg: float | None,
-        progress: bool,
+    def _single_views(
+        self, waypoints: Waypoints, axes: Float, scores: Float, request: SelectionRequest
     ) -> SelectedViews:
-        """The best n looks together at some of the waypoints, (R,) rows, by scores (R, D) of axes (D, 3)."""
-        at = waypoints.points[rows]
-        pairs = tqdm(zip(at, scores, strict=True), total=len(at), desc="looks", unit="waypoint", disable=not progress)
-        sets = [best_views(self.scorer, place, axes, values, n, max_turn_deg) for place, values in pairs]
+        """Select the n best views at each waypoint by scores (W, D) of axes (D, 3), or the best sequence."""
+        if request.max_turn_deg is None:
+            chosen = np.argsort(-scores, axis=1, kind="stable")[:, : request.n + SPARE]
+        else:
+            chosen = best_sequence(scores, TurnLimit.of(axes, request.max_turn_deg)).direction_ids[:, None]
+        k = chosen.shape[1]
+        step = max(1, SIGHT_LINES // max(1, len(self.localization_map.landmarks)))
+        blocks = np.split(np.arange(len(waypoints)), range(step, len(waypoints), step))
+        reported = [self._reported(waypoints, np.repeat(block, k), axes[chosen[block].ravel()]) for block in blocks]
+        views = joined(reported)
+        order = np.argsort(-views.score.reshape(-1, k), axis=1, kind="stable")[:, : request.n]
+        best = views[(np.arange(len(waypoints))[:, None] * k + order).ravel()]
+        return replace(best, rank=np.tile(np.arange(1, order.shape[1] + 1), len(waypoints)))
+
+    def _view_sets(
+        self, waypoints: Waypoints, axes: Float, scores: Float, n: int, max_turn_deg: float | None, progress: bool
+    ) -> SelectedViews:
+        """Select the n views at each waypoint with the best joint score, by scores (W, D) of axes (D, 3)."""
+        pairs = zip(waypoints.points, tqdm(scores, desc="looks", unit="waypoint", disable=not progress), strict=True)
+        sets = [best_views(self.scorer, point, axes, values, n, max_turn_deg) for point, values in pairs]
         chosen = axes[[row for view_set in sets for row in view_set.rows]]
-        rank = np.tile(np.arange(1, n + 1), len(rows))
+        rank = np.tile(np.arange(1, n + 1), len(sets))
         set_scores = np.repeat([view_set.score for view_set in sets], n)
-        return self._reported(waypoints, np.repeat(rows, n), rank, chosen, set_scores)
+        return self._reported(waypoints, np.repeat(np.arange(len(sets)), n), chosen, rank, set_scores)
 
     def _sequence_with_stops(
-        self,
-        waypoints: Waypoints,
-        rows: NDArray[np.int64],
-        axes: Float,
-        scores: Float,
-        max_turn_deg: float,
-        stops: StopConfig,
-        progress: bool,
+        self, waypoints: Waypoints, axes: Float, scores: Float, request: SelectionRequest, progress: bool
     ) -> SelectedViews:
-        """The best sequence at some of the waypoints, (R,) rows, with further looks where it scores too little."""
-        at = waypoints.points[rows]
-        chosen = axes[best_sequence(scores, TurnLimit.of(axes, max_turn_deg)).direction_ids]
-        scores_of_path = self.scorer.score(poses_looking_along(at, chosen))
-        text = "stops" if progress else None
-        path_stops = stops_along(self.scorer, at, chosen, axes, stops, progress=text)
-        path = PlannedPath(at, chosen, scores_of_path, np.nan, stops=path_stops)
+        """Select the best sequence by scores (W, D) of axes (D, 3), with further looks where it scores too little."""
+        assert request.looks is not None and request.max_turn_deg is not None and request.least_score is not None
+        points = waypoints.points
+        chosen = axes[best_sequence(scores, TurnLimit.of(axes, request.max_turn_deg)).direction_ids]
+        config = StopConfig(request.looks, request.least_score)
+        stops = stops_along(self.scorer, points, chosen, axes, config, progress="stops" if progress else None)
+        path = PlannedPath(points, chosen, self.scorer.score(poses_looking_along(points, chosen)), np.nan, stops=stops)
         places, rank = path.looks
-        return self._reported(waypoints, rows[places], rank, path.all_axes, path.scores_with_stops[places])
+        return self._reported(waypoints, places, path.all_axes, rank, path.scores_with_stops[places])
 
     def _reported(
         self,
         waypoints: Waypoints,
         rows: NDArray[np.int64],
-        rank: NDArray[np.int64],
         axes: Float,
+        rank: NDArray[np.int64] | None = None,
         set_score: Float | None = None,
     ) -> SelectedViews:
         """Return the views along axes (V, 3) from the waypoints of rows (V,), with their scores."""
@@ -288,7 +250,7 @@ class WhereToLook:
         return SelectedViews(
             waypoint=rows,
             waypoint_id=tuple(waypoints.ids[row] for row in rows),
-            rank=rank,
+            rank=np.ones_like(rows) if rank is None else rank,
             cam_from_world=poses,
             score=report.score,
             expected_inliers=report.expected_inliers,
@@ -300,10 +262,10 @@ class WhereToLook:
         )
 
     def _candidate_scores(self, locations: Float, axes: Float, progress: bool) -> Float:
-        """Scores (L, D) of all directions (D, 3) at locations (L, 3)."""
+        """Score all directions (D, 3) at locations (L, 3), (L, D)."""
         kind = self.localization_map.device.partition(":")[0]
         scores = np.empty((len(locations), len(axes)))
-        step = max(1, VIEWS_AT_ONCE[kind] // len(axes))
+        step = max(1, VIEWS_PER_STEP[kind] // len(axes))
         with tqdm(total=len(locations), desc="score", unit="waypoint", disable=not progress) as bar:
             for begin in range(0, len(locations), step):
                 block = locations[begin : begin + step]
@@ -311,27 +273,13 @@ class WhereToLook:
                 bar.update(len(block))
         return scores
 
-    def _allowed(self, n: int, pitch_deg: tuple[float, float] | None) -> Float:
-        """The directions within the limit on pitch, (D, 3); a ConfigError if there are fewer than n."""
-        if pitch_deg is None:
-            return self._enough(self.directions, n)
-        low, high = pitch_deg
+    def _allowed(self, request: SelectionRequest) -> Float:
+        """Return the directions within the limit on pitch, (D, 3). Raises ConfigError if they are too few."""
+        low, high = request.pitch_deg or (-90.0, 90.0)
         pitch = np.degrees(pan_tilt_angles(self.directions)[1])
         axes = self.directions[(pitch >= low - 1e-9) & (pitch <= high + 1e-9)]
-        if len(axes) == 0:
-            fix = "Widen it, or look along more directions."
-            raise ConfigError("no direction is within the limit on pitch", value=(low, high), fix=fix)
-        return self._enough(axes, n)
-
-    @staticmethod
-    def _enough(axes: Float, n: int) -> Float:
-        if len(axes) < n:
-            fix = "Ask for fewer views, look along more directions, or widen the limit on pitch."
-            raise ConfigError(f"there are only {len(axes)} directions to choose from", value=n, fix=fix)
+        needed = request.looks or request.n
+        if len(axes) < needed:
+            fix = "Ask for fewer views, score more directions, or widen the limit on pitch."
+            raise ConfigError(f"there are only {len(axes)} directions to choose from", value=needed, fix=fix)
         return axes
-
-    def save(self, path: str | Path, format: str | None = None) -> None:
-        """Write the views of the last selection, see `SelectedViews.save`. Raises ConfigError if there are none."""
-        if self.views is None:
-            raise ConfigError("there are no views to save", path=path, fix="Ask for them first: best(points).")
-        self.views.save(path, format)

@@ -33,8 +33,7 @@ def views_at(selector: WhereToLook, points: Float, n: int, format: str) -> Itera
 
     Raises TableError for points outside the map or inside geometry.
     """
-    from wheretolook.select.surroundings import usable_waypoints
-    from wheretolook.select.waypoints import Waypoints
+    from wheretolook.select.waypoints import Waypoints, usable_waypoints
 
     usable_waypoints(selector.localization_map, Waypoints.of(points))
     n = 1 if FILES[format][0] in ("tum", "benchmark") else n

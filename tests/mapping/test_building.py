@@ -12,7 +12,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping import triangulation
-from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG, MapConfig, WalkConfig
+from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG, MapConfig
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.rendered_map import build_map
 from wheretolook.mapping.walk import plan_walk
@@ -20,7 +20,7 @@ from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.utils.errors import MapError
 
 CAMERA = PinholeCamera(320, 240, 160.0)
-CONFIG = MapConfig(n_images=14, walk=WalkConfig(image_spacing_m=0.35), keep_database=True, keep_images=True)
+CONFIG = MapConfig(n_images=14, keep_database=True, keep_images=True)
 SEED = 2**32 - 2  # beyond what COLMAP's own seed holds
 
 
@@ -60,7 +60,7 @@ def test_model_reopens_with_the_poses_of_the_walk(built, room, room_free_space):
     assert model.num_images() == CONFIG.n_images and model.num_points3D() == report.n_landmarks
     (camera,) = model.cameras.values()
     np.testing.assert_allclose(camera.calibration_matrix(), CAMERA.matrix)
-    walk = plan_walk(room_free_space, room.bounds, CONFIG.n_images, CONFIG.walk, SEED)
+    walk = plan_walk(room_free_space, room.bounds, CONFIG.n_images, SEED)
     expected = poses_looking_along(walk.positions, walk.directions)
     for index, pose in enumerate(expected):
         image = model.images[index + 1]

@@ -9,7 +9,6 @@ import pytest
 
 from mapping.conftest import BoxFreeSpace
 from wheretolook.mapping import walk
-from wheretolook.mapping.config import WalkConfig
 from wheretolook.mapping.walk import plan_walk
 from wheretolook.utils.errors import ConfigError, SceneError
 
@@ -55,9 +54,10 @@ def walked_distance_m(places: np.ndarray, path: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("coverage", [0.4, 0.7, 1.0])
-def test_walk_is_free_and_covers_what_was_asked(seed, coverage):
+def test_walk_is_free_and_covers_what_was_asked(seed, coverage, monkeypatch):
+    monkeypatch.setattr(walk, "COVERAGE", coverage)
     room = two_rooms(door_m=1.2)
-    route = plan_walk(room, BOUNDS, 150, WalkConfig(coverage=coverage), seed)
+    route = plan_walk(room, BOUNDS, 150, seed)
     assert room.segments_are_free(route.path[:-1], route.path[1:]).all()
     assert room.is_free(route.positions).all()
     # One more place to visit adds at most the floor within the radius of it, here at most a tenth of all.
@@ -70,8 +70,9 @@ def test_walk_is_free_and_covers_what_was_asked(seed, coverage):
 
 
 def test_poses_are_spaced_evenly_along_the_walk_and_look_ahead(monkeypatch):
-    monkeypatch.setattr(walk, "PITCH_VARIATION_DEG", 8.0)
-    route = plan_walk(two_rooms(door_m=1.2), BOUNDS, 120, WalkConfig(swing_deg=30, pitch_deg=-4), 3)
+    for name, value in (("PITCH_VARIATION_DEG", 8.0), ("SWING_DEG", 30.0), ("PITCH_DEG", -4.0)):
+        monkeypatch.setattr(walk, name, value)
+    route = plan_walk(two_rooms(door_m=1.2), BOUNDS, 120, 3)
     assert route.positions.shape == route.directions.shape == (120, 3)
     np.testing.assert_allclose(np.linalg.norm(route.directions, axis=1), 1, atol=1e-9)
     steps = np.linalg.norm(np.diff(route.positions[:, :2], axis=0), axis=1)
@@ -87,16 +88,18 @@ def test_poses_are_spaced_evenly_along_the_walk_and_look_ahead(monkeypatch):
     assert heights.min() >= 1.25 and heights.max() <= 1.65 and np.ptp(heights) > 0.2
 
 
-def test_only_the_largest_reachable_part_is_walked():
-    route = plan_walk(two_rooms(door_m=0.0), BOUNDS, 60, WalkConfig(coverage=1.0), 0)  # no door
+def test_only_the_largest_reachable_part_is_walked(monkeypatch):
+    monkeypatch.setattr(walk, "COVERAGE", 1.0)
+    route = plan_walk(two_rooms(door_m=0.0), BOUNDS, 60)  # no door
     assert (route.positions[:, 0] < 4).all() or (route.positions[:, 0] > 4).all()
 
 
 def test_walk_climbs_to_another_storey(monkeypatch):
     monkeypatch.setattr(walk, "EYE_HEIGHT_VARIATION_M", 0.1)
+    monkeypatch.setattr(walk, "COVERAGE", 0.95)
     scene = TwoStoreys(SIZE, 0.2)
     bounds = np.array([(0, 0, 0), (8, 6, 5.2)])
-    route = plan_walk(scene, bounds, 300, WalkConfig(coverage=0.95), 1)
+    route = plan_walk(scene, bounds, 300, 1)
     assert scene.segments_are_free(route.path[:-1], route.path[1:]).all()
     floor = scene.floor_below(route.positions)
     height = route.positions[:, 2] - floor
@@ -106,17 +109,15 @@ def test_walk_climbs_to_another_storey(monkeypatch):
     assert ((floor > 0.3) & (floor < 2.3)).any()
 
 
-def test_scenes_without_a_floor_and_bad_settings(monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "value", "clearance_m"), [("CELL_M", 0.3, 3.1), ("EYE_HEIGHT_M", 5.0, 0.2), ("CELL_M", 5.5, 0.2)]
+)
+def test_scenes_without_a_floor_are_rejected(name, value, clearance_m, monkeypatch):
+    monkeypatch.setattr(walk, name, value)
     with pytest.raises(SceneError):
-        plan_walk(two_rooms(door_m=1.2, clearance_m=3.1), BOUNDS, 10)
-    with pytest.raises(SceneError):
-        plan_walk(two_rooms(door_m=1.2), BOUNDS, 10, WalkConfig(eye_height_m=5.0))
+        plan_walk(two_rooms(door_m=1.2, clearance_m=clearance_m), BOUNDS, 10)
+
+
+def test_a_walk_needs_two_images():
     with pytest.raises(ConfigError):
         plan_walk(two_rooms(door_m=1.2), BOUNDS, 1)
-    monkeypatch.setattr(walk, "CELL_M", 5.5)
-    with pytest.raises(SceneError):
-        plan_walk(two_rooms(door_m=1.2), BOUNDS, 10)
-    bad = ({"coverage": 0.0}, {"coverage": 1.1}, {"pitch_deg": 85.0}, {"eye_height_m": 0.1})
-    for settings in bad:
-        with pytest.raises(ConfigError):
-            WalkConfig(**settings)

@@ -10,65 +10,40 @@ from typing import Any
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.validation import check_positive, check_range
 
-# Constants of the walk. The radius only starts there and grows until images are close enough together.
-VISIT_RADIUS_M = 1.0  # floor within this walking distance of the walk counts as visited
+# The walk of a person with a camera through a scene.
+COVERAGE = 0.7  # share of the reachable floor that is visited; the walk ends there
+IMAGE_SPACING_M = 0.6  # largest distance along the walk between two images; farther apart they overlap too little
+EYE_HEIGHT_M = 1.45  # mean height of the camera above the floor
+SWING_DEG = 40.0  # how far the camera swings to either side of the walk
+PITCH_DEG = -5.0  # mean pitch, negative is down
+VISIT_RADIUS_M = 1.0  # floor within this walking distance counts as visited; it grows until images are close enough
 EYE_HEIGHT_VARIATION_M = 0.2  # largest deviation of a hand-held camera's height
 CELL_M = 0.3  # grid spacing of the walk, well below a door's width
 MAX_STEP_HEIGHT_M = 0.4  # largest difference in floor height between neighbouring cells: two steps of stairs
 SWING_PERIOD = 12.0  # images in one swing from left to right and back, so that neighbours overlap
 PITCH_VARIATION_DEG = 10.0  # largest deviation of a hand-held camera's pitch
+_WALK_RECORD = {
+    "coverage": COVERAGE,
+    "image_spacing_m": IMAGE_SPACING_M,
+    "eye_height_m": EYE_HEIGHT_M,
+    "swing_deg": SWING_DEG,
+    "pitch_deg": PITCH_DEG,
+    "visit_radius_m": VISIT_RADIUS_M,
+    "eye_height_variation_m": EYE_HEIGHT_VARIATION_M,
+    "cell_m": CELL_M,
+    "max_step_height_m": MAX_STEP_HEIGHT_M,
+    "swing_period": SWING_PERIOD,
+    "pitch_variation_deg": PITCH_VARIATION_DEG,
+}
 
 PARTNERS = 10  # images that each image is matched with; time grows with their number
 MAX_EPIPOLAR_ERROR_PX = 2.0  # matches farther from the epipolar line are dropped; keypoints are accurate to a pixel
 MIN_TRIANGULATION_ANGLE_DEG = 1.5  # COLMAP's own limit
 EXHAUSTIVE_UP_TO = 60  # photographs of which all pairs are matched, in minutes; more are matched by their order
-SCALE_TOLERANCE_PERCENT = (
-    5.0  # of a marker's side, or of the extent of known positions; a wrong size or name is off by more
-)
-
-
-@dataclass(frozen=True)
-class WalkConfig:
-    """How a person with a camera walks through a scene.
-
-    Args:
-        coverage: share of the reachable floor that gets visited; the walk ends there.
-        image_spacing_m: largest distance along the walk between two images. Images farther apart overlap too little.
-        eye_height_m: mean height of the camera above the floor in metres.
-        swing_deg: how far the camera swings to either side of the walk.
-        pitch_deg: mean pitch, negative is down.
-    """
-
-    coverage: float = 0.7
-    image_spacing_m: float = 0.6
-    eye_height_m: float = 1.45
-    swing_deg: float = 40.0
-    pitch_deg: float = -5.0
-
-    def __post_init__(self) -> None:
-        if not 0 < self.coverage <= 1:
-            raise ConfigError("coverage must be in (0, 1]", value=self.coverage)
-        if not self.image_spacing_m > 0:
-            raise ConfigError("image_spacing_m must be positive", value=self.image_spacing_m)
-        if not self.eye_height_m > EYE_HEIGHT_VARIATION_M:
-            raise ConfigError(f"eye_height_m must be above {EYE_HEIGHT_VARIATION_M}", value=self.eye_height_m)
-        if not abs(self.pitch_deg) + PITCH_VARIATION_DEG < 90:
-            raise ConfigError(
-                f"pitch_deg must stay {PITCH_VARIATION_DEG:g} degrees from vertical", value=self.pitch_deg
-            )
-
-    def record(self) -> dict[str, Any]:
-        """Settings and constants, from which the keys of finished maps are made."""
-        return {
-            **asdict(self),
-            "visit_radius_m": VISIT_RADIUS_M,
-            "eye_height_variation_m": EYE_HEIGHT_VARIATION_M,
-            "cell_m": CELL_M,
-            "max_step_height_m": MAX_STEP_HEIGHT_M,
-            "swing_period": SWING_PERIOD,
-            "pitch_variation_deg": PITCH_VARIATION_DEG,
-        }
+# Of a marker's side, or of the extent of known positions; a wrong size or name is off by more.
+SCALE_TOLERANCE_PERCENT = 5.0
 
 
 @dataclass(frozen=True)
@@ -121,12 +96,10 @@ class ScaleConfig:
     positions: Path | None = None
 
     def __post_init__(self) -> None:
-        if not 0 <= self.marker_size_m < inf:
-            raise ConfigError("marker_size_m must not be negative", value=self.marker_size_m)
-        if self.marker_size_m > 0 and self.marker_table is not None:
-            raise ConfigError("give marker_size_m or marker_table, not both", value=str(self.marker_table))
-        if self.has_marker_sizes + (self.distance is not None) + (self.positions is not None) > 1:
-            raise ConfigError("give marker sizes, a distance or positions, not several of them", value=self.dictionary)
+        check_range("marker_size_m", self.marker_size_m, 0)
+        sources = (self.marker_size_m > 0, self.marker_table, self.distance, self.positions)
+        if sum(source not in (None, False) for source in sources) > 1:
+            raise ConfigError("give marker_size_m, marker_table, distance or positions, not several", value=sources)
 
     @property
     def has_marker_sizes(self) -> bool:
@@ -170,11 +143,9 @@ class PhotographsConfig:
     assume_metric: bool = False
 
     def __post_init__(self) -> None:
-        if self.max_side_px < 0 or self.overlap < 1:
-            value = (self.max_side_px, self.overlap)
-            raise ConfigError("max_side_px must not be negative, overlap at least 1", value=value)
-        if not self.max_reprojection_error_px > 0:
-            raise ConfigError("max_reprojection_error_px must be positive", value=self.max_reprojection_error_px)
+        check_range("max_side_px", self.max_side_px, 0)
+        check_range("overlap", self.overlap, 1)
+        check_positive("max_reprojection_error_px", self.max_reprojection_error_px)
         if self.up_in_camera is not None and not 0 < sum(abs(value) for value in self.up_in_camera) < inf:
             raise ConfigError("up_in_camera must be a direction", value=self.up_in_camera)
 
@@ -214,8 +185,7 @@ class ExistingModelConfig:
     max_reprojection_error_px: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.max_reprojection_error_px < inf:
-            raise ConfigError("max_reprojection_error_px must not be negative", value=self.max_reprojection_error_px)
+        check_range("max_reprojection_error_px", self.max_reprojection_error_px, 0)
 
     @property
     def scene_name(self) -> str:
@@ -234,7 +204,6 @@ class MapConfig:
 
     Args:
         n_images: images rendered along the walk.
-        walk: the walk and the camera's motion along it.
         extractor: keypoints and descriptors; queries must use the same.
         two_view_landmarks: whether two observations make a landmark. COLMAP's default is to ask for three, which gives
             a third as many landmarks, and fewer viewpoints that localize.
@@ -251,7 +220,6 @@ class MapConfig:
     """
 
     n_images: int = 100
-    walk: WalkConfig = field(default_factory=WalkConfig)
     extractor: ExtractorConfig = field(default_factory=ExtractorConfig)
     two_view_landmarks: bool = True
     max_reprojection_error_px: float = 0.5
@@ -263,18 +231,16 @@ class MapConfig:
     keep_database: bool = False
 
     def __post_init__(self) -> None:
-        if self.n_images < 2:
-            raise ConfigError("a map needs at least two images", value=self.n_images)
+        check_range("n_images", self.n_images, 2)
         if self.camera is not None and self.draw_camera:
             raise ConfigError("give camera or draw_camera, not both", value=self.camera)
-        if not self.max_reprojection_error_px > 0:
-            raise ConfigError("max_reprojection_error_px must be positive", value=self.max_reprojection_error_px)
+        check_positive("max_reprojection_error_px", self.max_reprojection_error_px)
 
     def record(self) -> dict[str, Any]:
         """Settings and constants, from which the keys of finished maps are made."""
         return {
             **asdict(self),
-            "walk": self.walk.record(),
+            "walk": _WALK_RECORD,
             "extractor": self.extractor.record(),
             "photographs": self.photographs.record(),
             "partners": PARTNERS,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping.colmap_model import (
     colmap_poses,
     describe_intrinsics,
@@ -21,23 +21,13 @@ from wheretolook.mapping.colmap_model import (
 from wheretolook.mapping.config import EXHAUSTIVE_UP_TO, PARTNERS, MapConfig
 from wheretolook.mapping.georeference import KnownScale, MapScale, Similarity, find_scale
 from wheretolook.mapping.gravity import estimate_gravity
-from wheretolook.mapping.map_folder import (
-    DATABASE_FILE,
-    MapDraft,
-    MapReport,
-    MapRun,
-    check_replaceable,
-    finish_map,
-    total_seconds,
-)
+from wheretolook.mapping.map_folder import DATABASE_FILE, MapDraft, MapReport, MapRun, finish_map, replacing_map
 from wheretolook.mapping.sanity import warn_of_frame
 from wheretolook.mapping.sfm import PhotographFeatures, photograph_features
 from wheretolook.mapping.triangulation import choose_pairs, triangulate_model
 from wheretolook.utils.confine import path_within
 from wheretolook.utils.errors import ConfigError, MapError
-from wheretolook.utils.files import atomic_folder
 from wheretolook.utils.images import image_size
-from wheretolook.utils.processes import WorkerPool
 
 _EITHER = "Leave --database out to triangulate again, or --images to keep the model's landmarks."
 _FIX = "Raise map.existing.max_reprojection_error_px, or check the model's poses and intrinsics."
@@ -82,25 +72,25 @@ def map_existing(
         raise ConfigError("no model was named", fix="Set map.existing.model.")
     if photographs.images is not None and settings.database is not None:
         raise ConfigError("images give new keypoints, which a database does not describe", fix=_EITHER)
-    check_replaceable(Path(out_dir))
     known = KnownScale.read(photographs.scale)
-    with atomic_folder(Path(out_dir)) as folder, WorkerPool(workers) as processes:
-        run = MapRun(config, processes, seed, device, progress)
-        clock = run.clock
-        with clock("read"):
+    with replacing_map(config, out_dir, seed, workers, device, progress) as (folder, run):
+        with run.clock("read"):
             model = reconstruction or read_model(settings.model)
             n_points = model.num_points3D()
         database = settings.database
         limit_px = settings.max_reprojection_error_px
         turned = True
         if photographs.images is not None:
-            with clock("extract"):
-                features, turned = _extract(model, photographs.images, Path(work), run)
+            turned = _are_turned(model, photographs.images)
             database = folder / DATABASE_FILE
-            model = _triangulate(model, features, database, run)
+            model = _triangulate(model, photographs.images, turned, Path(work), database, run)
             limit_px = limit_px or photographs.max_reprojection_error_px
-        with clock("frame"):
-            scale = _move_to_world(model, known, settings.level, photographs.images, turned, progress)
+        with run.clock("frame"):
+            rotation = estimate_gravity(colmap_poses("", model)).rotation if settings.level else np.eye(3)
+            upright = Similarity(1.0, rotation, np.zeros(3))
+            scale, to_world = find_scale(model, known, upright, photographs.images, turned, progress)
+            if scale.is_metric or settings.level:
+                to_world.transform_model(model)
         if limit_px and not all(point.has_error() for point in model.points3D.values()):
             model.update_point_3d_errors()
         draft = MapDraft(model, settings.model, limit_px, _FIX, database, search_device=device)
@@ -109,49 +99,28 @@ def map_existing(
         report = ExistingMapReport(
             n_images=len(poses),
             **fields,
-            seconds=total_seconds(clock),
+            seconds=run.clock.with_total(),
             n_points=n_points,
             triangulated_anew=photographs.images is not None,
             has_descriptors=landmarks.descriptors is not None,
             cameras=[describe_intrinsics(camera) for _, camera in sorted(model.cameras.items())],
-            scale=scale,
+            scale=scale if scale.is_metric else MapScale("model"),
         )
         report.save(folder)
     warn_of_frame(settings.model, landmarks.mapping_distance_m, poses)
     return report
 
 
-def _move_to_world(
-    model: Any, known: KnownScale, level: bool, images: Path | None, turned: bool, progress: bool
-) -> MapScale:
-    """Transform a model to the world frame by its scale and gravity, where they are asked for. Returns the scale."""
-    rotation: Float = np.eye(3)
-    if level:
-        rotation = estimate_gravity(colmap_poses("", model)).rotation
-    scale, to_world = find_scale(model, known, Similarity(1.0, rotation, np.zeros(3)), images, turned, progress)
-    if scale.is_metric or level:
-        to_world.transform_model(model)
-    return scale if scale.is_metric else MapScale("model")
-
-
-def _extract(model: Any, images: Path, work: Path, run: MapRun) -> tuple[PhotographFeatures, bool]:
-    """Extract keypoints of a model's images in a folder; also returns whether they are turned upright by EXIF."""
-    work.mkdir(parents=True, exist_ok=True)
-    names = list(registered_names(model).values())
-    for name in names:
-        path_within(images, name, "the name of an image of the model")
-    turned = _are_turned(model, images)
-    return photograph_features(images, work, run, names, turned), turned
-
-
-def _triangulate(source: Any, features: PhotographFeatures, database: Path, run: MapRun) -> Any:
+def _triangulate(source: Any, images: Path, turned: bool, work: Path, database: Path, run: MapRun) -> Any:
     """Triangulate new landmarks at the poses of a model, from keypoints of its images. Returns a new model."""
+    work.mkdir(parents=True, exist_ok=True)
+    with run.clock("extract"):
+        features = photograph_features(images, work, run, list(registered_names(source).values()), turned)
     with run.clock("pairs"):
         pairs = _pairs(source)
     model = triangulate_model(database, _posed_model(source, features), features.stored, features.colors, pairs, run)
     if not model.num_points3D():
         fix = "Check that these are the model's images, and that they overlap."
-        images = run.config.photographs.images
         raise MapError("the images give no landmark at the model's poses", path=images, fix=fix)
     return model
 
@@ -206,38 +175,31 @@ def _are_turned(model: Any, folder: Path) -> bool:
     COLMAP's versions differ in this. Raises MapError if a photograph is missing or unreadable, or fits its camera in
     neither way.
     """
-    misfits = []
+    names = registered_names(model)
+    stored = [_size(path_within(folder, name, "the name of an image of the model")) for name in names.values()]
+    misfits = {}
     for turned in (True, False):
-        misfit = next(
-            filter(None, (_misfit(model, number, folder, turned) for number in registered_names(model))), None
-        )
-        if misfit is None:
+        for (number, name), (width, height, sideways) in zip(names.items(), stored, strict=True):
+            size = (height, width) if turned and sideways else (width, height)
+            camera = model.cameras[model.images[number].camera_id]
+            if abs(size[0] * camera.height / (size[1] * camera.width) - 1) > _PROPORTION_TOLERANCE:
+                misfits[turned] = name, size, (camera.width, camera.height)
+                break
+        else:
             return turned
-        misfits.append(misfit)
-    name, size, expected = misfits[0]
+    name, size, expected = misfits[True]
     problem = f"the photograph's proportions differ from those of its camera in the model, {expected}"
     raise MapError(problem, path=folder / name, value=size, fix="Give the photographs that the model was made from.")
 
 
-def _misfit(model: Any, number: int, folder: Path, turned: bool) -> tuple[str, str, str] | None:
-    """Name, size and expected size of a model's image, if the photograph has other proportions than its camera."""
-    image = model.images[number]
-    camera = model.cameras[image.camera_id]
-    width, height = _size(folder / image.name, turned)
-    if abs(width * camera.height / (height * camera.width) - 1) <= _PROPORTION_TOLERANCE:
-        return None
-    return image.name, f"{width} x {height}", f"{camera.width} x {camera.height}"
-
-
-def _size(path: Path, turned: bool) -> tuple[int, int]:
-    """Width and height of a photograph, turned upright by its EXIF orientation, or as stored."""
+def _size(path: Path) -> tuple[int, int, bool]:
+    """Width and height of a photograph as stored, and whether its EXIF orientation swaps them."""
     from PIL import Image
 
     try:
         width, height = image_size(path)
         with Image.open(path) as photograph:
-            swapped = turned and photograph.getexif().get(_EXIF_ORIENTATION, 1) in _SIDEWAYS
+            return width, height, photograph.getexif().get(_EXIF_ORIENTATION, 1) in _SIDEWAYS
     except (OSError, ValueError) as error:
         fix = "Give the folder that the names of the model's images are relative to."
         raise MapError(f"cannot read an image of the model: {error}", path=path, fix=fix) from error
-    return (height, width) if swapped else (width, height)

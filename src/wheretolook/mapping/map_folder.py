@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -19,7 +19,7 @@ from wheretolook.mapping.feature_files import HDF5_SUFFIXES
 from wheretolook.mapping.georeference import REPORT_FILE
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.utils.errors import MapError
-from wheretolook.utils.files import copy_file, write_text
+from wheretolook.utils.files import atomic_folder, copy_file, write_text
 from wheretolook.utils.processes import WorkerPool
 
 LANDMARKS_FILE = "landmarks.npz"
@@ -38,6 +38,10 @@ class Clock:
         start = time.perf_counter()
         yield
         self.seconds[step] = round(time.perf_counter() - start, 3)
+
+    def with_total(self) -> dict[str, float]:
+        """Wall-clock time of each step and their sum."""
+        return {**self.seconds, "total": sum(self.seconds.values())}
 
 
 @dataclass(frozen=True)
@@ -61,9 +65,7 @@ class MapDraft:
     max_error_px: float  # points with a larger mean reprojection error are removed; 0 keeps all
     fix: str  # what to do if no point is left
     database: Path | None  # of keypoints and descriptors; one in the map's own folder is kept only on request
-    colors: Sequence[NDArray[np.uint8]] | None = (
-        None  # (N_i, 3) of the keypoints of image i + 1, if points lack colours
-    )
+    colors: Sequence[NDArray[np.uint8]] = ()  # (N_i, 3) of the keypoints of image i + 1, if points lack colours
     search_device: str = "cpu"  # that searches for similar descriptors
 
 
@@ -85,11 +87,26 @@ class MapReport:
         write_text(folder / REPORT_FILE, json.dumps(asdict(self), indent=2, default=str) + "\n")
 
 
-def check_replaceable(out_dir: Path) -> None:
-    """Raise MapError if a folder, or a file in its place, holds anything but a map of this project."""
+@contextmanager
+def replacing_map(  # the parts of a `MapRun`, and the folder
+    config: MapConfig,
+    out_dir: str | Path,
+    seed: int,
+    workers: int,
+    device: str,
+    progress: bool,
+    before_replace: Callable[[], None] = lambda: None,
+) -> Iterator[tuple[Path, MapRun]]:
+    """Yield a folder, which replaces the map in `out_dir` at the end of the block, and the resources for making it.
+
+    Raises MapError if `out_dir`, or a file in its place, holds anything but a map of this project.
+    """
+    out_dir = Path(out_dir)
     if out_dir.exists() and not (out_dir / REPORT_FILE).is_file() and (not out_dir.is_dir() or any(out_dir.iterdir())):
         fix = "Give another folder, or remove it."
         raise MapError("will not be replaced, because it is not a map of this project", path=out_dir, fix=fix)
+    with atomic_folder(out_dir, before_replace) as folder, WorkerPool(workers) as processes:
+        yield folder, MapRun(config, processes, seed, device, progress)
 
 
 def finish_map(draft: MapDraft, folder: Path, run: MapRun) -> tuple[Landmarks, dict[str, Any]]:
@@ -99,18 +116,21 @@ def finish_map(draft: MapDraft, folder: Path, run: MapRun) -> tuple[Landmarks, d
     leaves no point.
     """
     model = draft.model
-    n_removed = 0
     with run.clock("filter_and_write"):
-        if draft.max_error_px:
-            n_removed = remove_inaccurate(model, draft.max_error_px, draft.source, draft.fix)
-        if draft.colors is not None:
+        n_removed = _remove_inaccurate(draft) if draft.max_error_px else 0
+        if draft.colors:
             color_points(model, draft.colors)
         write_model(model, folder)
     with run.clock("landmarks"):
         landmarks = load_colmap_landmarks(draft.source, draft.database, None, draft.search_device, model, run.progress)
         landmarks.save(folder / LANDMARKS_FILE)
         save_mapping_poses(colmap_poses(draft.source, model), folder / CAMERAS_FILE)
-    _keep_database(draft.database, folder, run.config.keep_database)
+    database = draft.database
+    if database is not None and database.parent == folder and not run.config.keep_database:
+        database.unlink()
+    elif database is not None and database.parent != folder and run.config.keep_database:
+        is_hdf5 = database.suffix.lower() in HDF5_SUFFIXES
+        copy_file(database, folder / (database.name if is_hdf5 else DATABASE_FILE))
     return landmarks, {
         "n_landmarks": len(landmarks),
         "n_landmarks_removed": n_removed,
@@ -121,23 +141,15 @@ def finish_map(draft: MapDraft, folder: Path, run: MapRun) -> tuple[Landmarks, d
     }
 
 
-def total_seconds(clock: Clock) -> dict[str, float]:
-    """Wall-clock time of each step and their sum."""
-    return {**clock.seconds, "total": sum(clock.seconds.values())}
-
-
-def remove_inaccurate(model: Any, max_reprojection_error_px: float, source: Path, fix: str) -> int:
-    """Remove points of a reconstruction with a larger mean reprojection error, and return their number.
-
-    Raises MapError, which names `source`, if none is left.
-    """
-    errors = {number: point.error for number, point in model.points3D.items()}
-    removed = [number for number, error in errors.items() if not error <= max_reprojection_error_px]
-    if len(removed) == len(errors):
-        value = f"{len(errors)} triangulated, {len(removed)} removed"
-        raise MapError("the images give no landmark", path=source, value=value, fix=fix)
+def _remove_inaccurate(draft: MapDraft) -> int:
+    """Remove points with a larger mean reprojection error, and return their number. Raises MapError if none is left."""
+    points = draft.model.points3D
+    removed = [number for number, point in points.items() if not point.error <= draft.max_error_px]
+    if len(removed) == len(points):
+        value = f"{len(points)} triangulated, {len(removed)} removed"
+        raise MapError("the images give no landmark", path=draft.source, value=value, fix=draft.fix)
     for number in removed:
-        model.delete_point3D(number)
+        draft.model.delete_point3D(number)
     return len(removed)
 
 
@@ -146,15 +158,3 @@ def color_points(model: Any, colors: Sequence[NDArray[np.uint8]]) -> None:
     for point in model.points3D.values():
         observed = [colors[element.image_id - 1][element.point2D_idx] for element in point.track.elements]
         point.color = np.rint(np.mean(observed, axis=0)).astype(np.uint8)
-
-
-def _keep_database(database: Path | None, folder: Path, keep: bool) -> None:
-    """Leave the database in the map's folder, if wanted, under the name that later steps look for."""
-    if database is None:
-        return
-    if database.parent == folder:
-        if not keep:
-            database.unlink()
-    elif keep:
-        is_hdf5 = database.suffix.lower() in HDF5_SUFFIXES
-        copy_file(database, folder / (database.name if is_hdf5 else DATABASE_FILE))

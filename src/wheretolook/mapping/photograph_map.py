@@ -12,13 +12,11 @@ import numpy as np
 from wheretolook.mapping.colmap_model import colmap_poses, describe_intrinsics, registered_names
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.georeference import KnownScale, MapScale, Similarity, find_scale
-from wheretolook.mapping.gravity import Gravity, estimate_gravity
-from wheretolook.mapping.map_folder import MapDraft, MapReport, MapRun, check_replaceable, finish_map, total_seconds
+from wheretolook.mapping.gravity import estimate_gravity
+from wheretolook.mapping.map_folder import MapDraft, MapReport, finish_map, replacing_map
 from wheretolook.mapping.photographs import photograph_cameras
 from wheretolook.mapping.sfm import map_incrementally, photograph_features
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.files import atomic_folder
-from wheretolook.utils.processes import WorkerPool
 
 _FIX = "Raise map.photographs.max_reprojection_error_px, or take sharper photographs."
 
@@ -50,23 +48,17 @@ def map_photographs(
     """Map the photographs in `config.photographs.images`.
 
     Writes what `build_map` writes, z up, and in metres if the report's scale has a source. Unless positions are given,
-    the origin is the mean of the cameras' positions and the heading is arbitrary. Finished steps are cached in `work`,
-    so that another run, for instance with another source of scale, does not start over. Only `photographs`, `extractor`
-    and `keep_database` of `config` count. With one worker the same seed gives the same map; with more, COLMAP's bundle
-    adjustment sums large problems in another order each time.
-    Raises MapError if the photographs are missing, unreadable or do not overlap, do not give the requested scale, or
-    `out_dir` holds something else; ConfigError for damaged tables and unknown camera models or dictionaries.
+    the origin is the mean of the cameras' positions and the heading is arbitrary. Finished steps are cached in `work`.
+    With one worker the same seed gives the same map; with more, COLMAP's bundle adjustment sums in any order. Raises
+    MapError if photographs are unreadable, do not overlap or do not give the scale; ConfigError for invalid settings.
     """
     settings = config.photographs
-    out_dir = Path(out_dir)
     work = Path(work)
     if settings.images is None:
         raise ConfigError("no folder of photographs was named", fix="Set map.photographs.images.")
-    check_replaceable(out_dir)
     known = KnownScale.read(settings.scale)  # a damaged table is reported before the work
     work.mkdir(parents=True, exist_ok=True)
-    with atomic_folder(out_dir, before_replace) as folder, WorkerPool(workers) as processes:
-        run = MapRun(config, processes, seed, device, progress)
+    with replacing_map(config, out_dir, seed, workers, device, progress, before_replace) as (folder, run):
         with run.clock("extract"):
             features = photograph_features(settings.images, work, run)
         with run.clock("map"):
@@ -75,41 +67,33 @@ def map_photographs(
         model = mapped.model
         with run.clock("gravity"):
             gravity = estimate_gravity(colmap_poses(work, model), settings.up_in_camera)
-            upright = _upright(model, gravity)
+            centers = [model.images[number].projection_center() for number in registered_names(model)]
+            upright = Similarity(1.0, gravity.rotation, -gravity.rotation @ np.stack(centers).mean(0))
         with run.clock("scale"):
             scale, to_world = find_scale(model, known, upright, settings.images, progress=progress)
             to_world.transform_model(model)
             model.update_point_3d_errors()
-        draft = MapDraft(model, out_dir, settings.max_reprojection_error_px, _FIX, mapped.database, features.colors)
+        draft = MapDraft(
+            model, Path(out_dir), settings.max_reprojection_error_px, _FIX, mapped.database, features.colors
+        )
         fields = finish_map(draft, folder, run)[1]
         registered = set(registered_names(model).values())
         report = PhotographMapReport(
             n_images=len(features.names),
             **fields,
-            seconds=total_seconds(run.clock),
+            seconds=run.clock.with_total(),
             n_registered=len(registered),
             unregistered=[name for name in features.names if name not in registered],
             model_sizes=mapped.model_sizes,
             n_keypoints=sum(len(pixels) for pixels, _ in features.stored),
             cameras=[describe_intrinsics(camera) for _, camera in sorted(model.cameras.items())],
             n_known_focal=cameras.n_known_focal,
-            gravity=_gravity_record(gravity, bool(known.positions)),
+            gravity={
+                "method": "positions" if known.positions else gravity.method,
+                "median_deg": float(np.median(gravity.residual_deg)),
+                "max_deg": float(gravity.residual_deg.max()),
+            },
             scale=scale,
         )
         report.save(folder)
     return report
-
-
-def _upright(model: Any, gravity: Gravity) -> Similarity:
-    """The transformation that makes a model upright, with its origin at the mean of the cameras' positions."""
-    centers = [model.images[number].projection_center() for number in registered_names(model)]
-    return Similarity(1.0, gravity.rotation, -gravity.rotation @ np.stack(centers).mean(0))
-
-
-def _gravity_record(gravity: Gravity, from_positions: bool) -> dict[str, Any]:
-    """Source and residuals of the direction up, for the report."""
-    return {
-        "method": "positions" if from_positions else gravity.method,
-        "median_deg": float(np.median(gravity.residual_deg)),
-        "max_deg": float(gravity.residual_deg.max()),
-    }

@@ -13,23 +13,19 @@ from numpy.typing import NDArray
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
-from wheretolook.mapping import triangulation
 from wheretolook.mapping.config import PARTNERS, MapConfig
-from wheretolook.mapping.map_folder import (
-    DATABASE_FILE,
-    IMAGES_FOLDER,
-    Clock,
-    MapDraft,
-    MapReport,
-    MapRun,
-    check_replaceable,
-    finish_map,
-    total_seconds,
+from wheretolook.mapping.map_folder import DATABASE_FILE, IMAGES_FOLDER, MapDraft, MapReport, finish_map, replacing_map
+from wheretolook.mapping.triangulation import (
+    choose_pairs,
+    extract_with_colors,
+    image_name,
+    posed_model,
+    shrink_depth,
+    surface_overlap,
+    triangulate_model,
 )
-from wheretolook.mapping.triangulation import extract_with_colors, image_name, triangulate_known_poses
 from wheretolook.mapping.walk import FreeSpaceQueries, Walk, plan_walk
-from wheretolook.utils.files import atomic_folder, write_bytes
-from wheretolook.utils.processes import WorkerPool
+from wheretolook.utils.files import write_bytes
 
 if TYPE_CHECKING:
     from wheretolook.rendering.raycasting import MeshRaycaster
@@ -70,41 +66,41 @@ def build_map(  # a scene has four parts, and the output and its resources are t
 ) -> RenderedMapReport:
     """Map a scene in metres, z up: walk, render, extract, match, triangulate with known poses, filter.
 
-    With `poses` (M, 3, 4), images are rendered there instead of along a walk.
-    The result is a binary COLMAP model of the filtered points, with `landmarks.npz`, `cameras.npz` and `report.json`,
-    which is also returned. The folder appears when all is done and replaces an earlier map, right after
-    `before_replace`; a failed build leaves nothing behind. The same seed gives the same bytes.
-    `raycaster` measures the distance from landmarks to the mesh. Keypoints are extracted on `device`, "cpu" or a CUDA
-    device, and matched, by `workers` processes, which need `if __name__ == "__main__":` in the caller's script. Raises
-    MapError if the images give no landmark or `out_dir` holds something else, SceneError without floor to walk on.
+    With `poses` (M, 3, 4), images are rendered there instead of along a walk. The result is a binary COLMAP model of
+    the filtered points, with `landmarks.npz`, `cameras.npz` and `report.json`, which is also returned. It replaces an
+    earlier map when all is done, after `before_replace`; a failed build changes nothing. The same seed gives the same
+    bytes. Several workers need `if __name__ == "__main__":` in the caller's script. Raises MapError if the images give
+    no landmark or `out_dir` holds something else, SceneError without floor to walk on.
     """
     config = config or MapConfig()
-    out_dir = Path(out_dir)
-    check_replaceable(out_dir)
-    with atomic_folder(out_dir, before_replace) as folder, WorkerPool(workers) as processes:
-        run = MapRun(config, processes, seed, device, progress)
+    with replacing_map(config, out_dir, seed, workers, device, progress, before_replace) as (folder, run):
         clock = run.clock
         with clock("walk"):
-            walk, poses = _walk_and_poses(free_space, mesh, config, seed, poses)
+            if poses is None:
+                walk = plan_walk(free_space, mesh.bounds, config.n_images, seed)
+                poses = poses_looking_along(walk.positions, walk.directions)
+            else:
+                centers = np.asarray(camera_centers(poses), dtype=np.float64)
+                walk = Walk(centers, np.asarray(poses[:, 2, :3]), centers, 1.0, 0.0)
         with clock("render_and_extract"):
             depth: list[NDArray[np.float32]] = []
             images = _rendered(renderer, camera, poses, depth, folder / IMAGES_FOLDER if config.keep_images else None)
             extracted = extract_with_colors(images, len(poses), "map: render, extract", run)
-            keypoints, colors = zip(*extracted, strict=True)
+            stored, colors = zip(*extracted, strict=True)
         with clock("pairs"):
-            overlap = triangulation.surface_overlap(camera, poses, np.stack(depth))
-            pairs = triangulation.choose_pairs(overlap, PARTNERS)
+            pairs = choose_pairs(surface_overlap(camera, poses, np.stack(depth)), PARTNERS)
         database = folder / DATABASE_FILE
-        model = triangulate_known_poses(database, camera, poses, keypoints, colors, pairs, run)
-        draft = MapDraft(model, out_dir, config.max_reprojection_error_px, _FIX, database)
+        model = triangulate_model(database, posed_model(camera, poses), stored, colors, pairs, run)
+        draft = MapDraft(model, Path(out_dir), config.max_reprojection_error_px, _FIX, database)
         landmarks, fields = finish_map(draft, folder, run)
-        distance_cm = _distance_cm(landmarks.points, mesh, raycaster, clock)
+        with clock("accuracy"):
+            distance_cm = _distance_cm(landmarks.points, mesh, raycaster)
         report = RenderedMapReport(
             n_images=len(poses),
             **fields,
-            seconds=total_seconds(clock),
+            seconds=clock.with_total(),
             n_registered=sum(image.num_points3D > 0 for image in model.images.values()),
-            n_keypoints=sum(len(k) for k in keypoints),
+            n_keypoints=sum(len(pixels) for pixels, _ in stored),
             n_pairs=len(pairs),
             median_distance_to_mesh_cm=float(np.median(distance_cm)),
             p90_distance_to_mesh_cm=float(np.quantile(distance_cm, 0.9)),
@@ -116,29 +112,12 @@ def build_map(  # a scene has four parts, and the output and its resources are t
     return report
 
 
-def _distance_cm(points: Float, mesh: TexturedMesh, raycaster: MeshRaycaster | None, clock: Clock) -> Float:
+def _distance_cm(points: Float, mesh: TexturedMesh, raycaster: MeshRaycaster | None) -> Float:
     """Distances (N,) in centimetres from points (N, 3) to a mesh."""
     from wheretolook.rendering.raycasting import MeshRaycaster
 
-    with clock("accuracy"):
-        limit_m = float(np.linalg.norm(mesh.bounds[1] - mesh.bounds[0]))
-        caster = raycaster or MeshRaycaster(mesh)
-        return 100.0 * caster.distance_to_surface(points, limit_m).astype(np.float64)
-
-
-def _walk_and_poses(
-    free_space: FreeSpaceQueries,
-    mesh: TexturedMesh,
-    config: MapConfig,
-    seed: int,
-    poses: NDArray[np.floating[Any]] | None,
-) -> tuple[Walk, NDArray[np.floating[Any]]]:
-    """The walk and the poses (M, 3, 4) along it; of given poses, a walk through their centres."""
-    if poses is None:
-        walk = plan_walk(free_space, mesh.bounds, config.n_images, config.walk, seed)
-        return walk, poses_looking_along(walk.positions, walk.directions)
-    centers = np.asarray(camera_centers(poses), dtype=np.float64)
-    return Walk(centers, np.asarray(poses[:, 2, :3], dtype=np.float64), centers, 1.0, 0.0), poses
+    limit_m = float(np.linalg.norm(mesh.bounds[1] - mesh.bounds[0]))
+    return 100.0 * (raycaster or MeshRaycaster(mesh)).distance_to_surface(points, limit_m).astype(np.float64)
 
 
 def _rendered(
@@ -149,9 +128,9 @@ def _rendered(
 
     for start in range(0, len(poses), _RENDER_BATCH):
         rendering = renderer.render(camera, poses[start : start + _RENDER_BATCH])
-        depth.extend(triangulation.shrink_depth(rendering.depth_m))
-        for offset, rgb in enumerate(rendering.rgb):
+        for index, rgb in enumerate(rendering.rgb, start):
+            depth.append(shrink_depth(rendering.depth_m[index - start]))
             if keep_in is not None:
-                path = keep_in / image_name(start + offset)
+                path = keep_in / image_name(index)
                 write_bytes(path, cv2.imencode(path.suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1].tobytes())
             yield rgb

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,10 +24,11 @@ from wheretolook.mapping.photographs import (
     read_photograph,
     reduce_photograph,
 )
-from wheretolook.mapping.triangulation import extract_with_colors, fill_database, match_pairs, stored_keypoints
+from wheretolook.mapping.triangulation import extract_with_colors, fill_database, match_pairs, write_matches
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.colmap import quiet_colmap, storing_in_database
 from wheretolook.utils.errors import MapError
+from wheretolook.utils.files import temporary_folder
 
 _MIN_IMAGES = 3  # of a model: two photographs do not determine a camera
 _MANIFEST = "steps.json"
@@ -66,10 +66,10 @@ def photograph_features(
     be read, or the folder holds fewer than two.
     """
     names = list_photographs(folder) if names is None else names
-    max_side_px = run.config.photographs.max_side_px
-    files = [(name, (folder / name).stat().st_size, (folder / name).stat().st_mtime_ns) for name in names]
     extractor = run.config.extractor
-    key = cache_key(_VERSION, files, max_side_px, extractor.record(), turned)
+    stats = [(folder / name).stat() for name in names]
+    files = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in zip(names, stats, strict=True)]
+    key = cache_key(_VERSION, files, run.config.photographs.max_side_px, extractor.record(), turned)
     cache = ArtifactCache(work, key, "features", _MANIFEST)
     results = cache.load("features.npz")
     if results is None:
@@ -98,8 +98,8 @@ def map_incrementally(
     results = cache.load("matches.npz")
     if results is None:
         with storing_in_database(database):
-            found = list(match_pairs(features.stored, pairs, work, run.processes, run.progress, features.kind))
-        arrays = {"matches": np.concatenate(found), "counts": np.array([len(matches) for matches in found])}
+            matches = list(match_pairs(features.stored, pairs, work, run.processes, run.progress, features.kind))
+        arrays = {"matches": np.concatenate(matches), "counts": np.array([*map(len, matches)])}
         results = cache.store({"matches.npz": arrays})
     matches = np.split(results["matches.npz"]["matches"], np.cumsum(results["matches.npz"]["counts"])[:-1])
     intrinsics = [camera.todict() for camera in cameras.cameras]
@@ -111,47 +111,41 @@ def map_incrementally(
         cache.clear()
         database.unlink(missing_ok=True)
         shutil.rmtree(folder, ignore_errors=True)
-        _fill(database, features, cameras, pairs, matches)
-        model_sizes = _reconstruct(database, folder, len(features.names), cameras.given, seed, run)
+        with storing_in_database(database):
+            fill_database(database, _unposed_model(features, cameras), features.stored, features.kind)
+            write_matches(database, pairs, matches)
+            model_sizes = _reconstruct(database, folder, cameras, seed, run)
         results = cache.store({"sparse.json": {"model_sizes": model_sizes}})
     return MappedPhotographs(read_model(folder), database, results["sparse.json"]["model_sizes"])
 
 
 def _extract(folder: Path, names: list[str], turned: bool, run: MapRun) -> dict[str, NDArray[Any]]:
     """Sizes, keypoints, descriptors and colours of photographs, as the arrays of `features.npz`."""
-    full_sizes = []
     sizes = []
 
     def images() -> Iterator[NDArray[np.uint8]]:
         for name in names:
             rgb = read_photograph(folder / name, turned)
             reduced = reduce_photograph(rgb, run.config.photographs.max_side_px)
-            full_sizes.append(rgb.shape[1::-1])
-            sizes.append(reduced.shape[1::-1])
+            sizes.append((rgb.shape[1::-1], reduced.shape[1::-1]))
             yield reduced
 
-    kind = kind_of(run.config.extractor.method)
     extracted = extract_with_colors(images(), len(names), "map: extract", run, same_size=False)
-    stored = [(*stored_keypoints(keypoints, kind), color) for keypoints, color in extracted]
-    pixels, descriptors, colors = (np.concatenate(values) for values in zip(*stored, strict=True))
+    rows = [(len(color), pixels, descriptors, color) for (pixels, descriptors), color in extracted]
+    counts, pixels, descriptors, colors = zip(*rows, strict=True)
+    full_sizes, reduced_sizes = np.swapaxes(sizes, 0, 1)
     return {
-        "full_sizes": np.array(full_sizes),
-        "sizes": np.array(sizes),
-        "counts": np.array([len(color) for *_, color in stored]),
-        "pixels": pixels,
-        "descriptors": descriptors,
-        "colors": colors,
+        "full_sizes": full_sizes,
+        "sizes": reduced_sizes,
+        "counts": np.array(counts),
+        "pixels": np.concatenate(pixels),
+        "descriptors": np.concatenate(descriptors),
+        "colors": np.concatenate(colors),
     }
 
 
-def _fill(
-    database: Path,
-    features: PhotographFeatures,
-    cameras: PhotographCameras,
-    pairs: NDArray[np.int64],
-    matches: list[NDArray[np.uint32]],
-) -> None:
-    """Make a COLMAP database of photographs without poses, and write their matches into it."""
+def _unposed_model(features: PhotographFeatures, cameras: PhotographCameras) -> Any:
+    """Make a reconstruction of photographs and their cameras, without poses."""
     import pycolmap
 
     model = pycolmap.Reconstruction()
@@ -160,14 +154,10 @@ def _fill(
     for index, (name, row) in enumerate(zip(features.names, cameras.camera_of.tolist(), strict=True)):
         image = pycolmap.Image(name=name, camera_id=cameras.cameras[row].camera_id, image_id=index + 1)
         model.add_image_with_trivial_frame(image)
-    with storing_in_database(database):
-        fill_database(database, model, features.stored, features.kind)
-        with pycolmap.Database.open(str(database)) as db:
-            for (i, j), found in zip(pairs.tolist(), matches, strict=True):
-                db.write_matches(i + 1, j + 1, found)
+    return model
 
 
-def _reconstruct(database: Path, folder: Path, n_images: int, given: bool, seed: int, run: MapRun) -> list[int]:
+def _reconstruct(database: Path, folder: Path, cameras: PhotographCameras, seed: int, run: MapRun) -> list[int]:
     """Verify matches, map, and write the largest model. Returns the number of photographs in each, largest first."""
     import pycolmap
 
@@ -176,28 +166,21 @@ def _reconstruct(database: Path, folder: Path, n_images: int, given: bool, seed:
     verification.ransac.random_seed = seed
     options = pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=threads, extract_colors=False)
     options.min_model_size = _MIN_IMAGES
-    options.ba_refine_focal_length = options.ba_refine_extra_params = not given
-    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = not given
+    options.ba_refine_focal_length = options.ba_refine_extra_params = not cameras.given
+    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = not cameras.given
     options.triangulation.random_seed = options.mapper.random_seed = seed
     options.mapper.num_threads = threads
     pycolmap.set_random_seed(seed)
-    models = folder.with_name("models.partial")
-    shutil.rmtree(models, ignore_errors=True)
-    models.mkdir()
-    bar = tqdm(total=n_images, desc="map: register", disable=not run.progress, unit="image")
+    bar = tqdm(total=len(cameras.camera_of), desc="map: register", disable=not run.progress, unit="image")
     steps: Any = {"initial_image_pair_callback": lambda: bar.update(2), "next_image_callback": lambda: bar.update(1)}
-    with storing_in_database(database), quiet_colmap("ERROR"), bar:
+    with temporary_folder(".partial", parent=folder.parent) as models, quiet_colmap("ERROR"), bar:
         verifier = pycolmap.GeometricVerifierOptions(num_threads=threads)
         pycolmap.geometric_verification(str(database), verifier, two_view_geometry_options=verification)
-        found = pycolmap.incremental_mapping(str(database), str(models), str(models), options, **steps)
-    ordered = sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
-    shutil.rmtree(models)
+        mapped = pycolmap.incremental_mapping(str(database), str(models), str(models), options, **steps)
+    ordered = sorted(mapped.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     if not ordered:
-        fix = (
-            f"Give at least {_MIN_IMAGES} sharp photographs from different places, each of which overlaps most of the "
-        )
-        fix += "next; a focal length (map.photographs.camera_params) helps."
-        raise MapError("the photographs do not overlap enough for a map", value=f"{n_images} photographs", fix=fix)
-    write_model(ordered[0], models)
-    os.replace(models, folder)
+        fix = f"Give at least {_MIN_IMAGES} sharp photographs from different places, each of which overlaps the next;"
+        fix += " a focal length (map.photographs.camera_params) helps."
+        raise MapError("the photographs do not overlap enough for a map", path=database, fix=fix)
+    write_model(ordered[0], folder)
     return [model.num_reg_images() for model in ordered]

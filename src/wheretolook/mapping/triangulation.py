@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import closing
+from itertools import tee
 from pathlib import Path
 from typing import Any
 
@@ -43,43 +43,37 @@ def image_name(index: int) -> str:
 
 def extract_with_colors(
     images: Iterable[NDArray[np.uint8]], n_images: int, title: str, run: MapRun, same_size: bool = True
-) -> Iterator[tuple[Keypoints, NDArray[np.uint8]]]:
+) -> Iterator[tuple[Stored, NDArray[np.uint8]]]:
     """Extract keypoints of images (H, W, 3) uint8, in their order, and the colours (N, 3) uint8 at them.
 
     The images are made while others are processed. A GPU processes batches if all images are of the same size.
     """
     extractor = KeypointExtractor(run.config.extractor, run.device)
-    waiting: deque[NDArray[np.uint8]] = deque()
-
-    def remembered() -> Iterator[NDArray[np.uint8]]:
-        for rgb in images:
-            waiting.append(rgb)
-            yield rgb
-
-    if extractor.on_gpu and not same_size:
-        extracted: Generator[Keypoints, None, None] = (extractor.extract(rgb) for rgb in remembered())
-    else:
-        extracted = extractor.extract_many(remembered(), run.processes)
-    with closing(extracted):
-        for keypoints in tqdm(extracted, title, total=n_images, disable=not run.progress, unit="image"):
-            rgb = waiting.popleft()
-            column, row = keypoints.pixels.astype(np.int64).T
-            yield keypoints, rgb[np.clip(row, 0, rgb.shape[0] - 1), np.clip(column, 0, rgb.shape[1] - 1)]
-
-
-def triangulate_known_poses(
-    database: Path,
-    camera: PinholeCamera,
-    cam_from_world: NDArray[np.floating[Any]],
-    keypoints: Sequence[Keypoints],
-    colors: Sequence[NDArray[np.uint8]],
-    pairs: NDArray[np.int64],
-    run: MapRun,
-) -> Any:
-    """Triangulate landmarks from images (I) of one camera at known poses (I, 3, 4); see `triangulate_model`."""
     kind = kind_of(run.config.extractor.method)
-    stored = [stored_keypoints(extracted, kind) for extracted in keypoints]
-    return triangulate_model(database, _posed_model(camera, cam_from_world), stored, colors, pairs, run)
+    images, waiting = tee(images)
+    extracted: Generator[Keypoints, None, None]
+    if extractor.on_gpu and not same_size:
+        extracted = (extractor.extract(rgb) for rgb in images)
+    else:
+        extracted = extractor.extract_many(images, run.processes)
+    bar = tqdm(extracted, title, total=n_images, disable=not run.progress, unit="image")
+    with closing(extracted):
+        for keypoints, rgb in zip(bar, waiting, strict=True):
+            column, row = keypoints.pixels.astype(np.int64).T
+            color = rgb[np.clip(row, 0, rgb.shape[0] - 1), np.clip(column, 0, rgb.shape[1] - 1)]
+            yield (keypoints.pixels, kind.store(keypoints.descriptors)), color
+
+
+def posed_model(camera: PinholeCamera, cam_from_world: NDArray[np.floating[Any]]) -> Any:
+    """Make a reconstruction of images of one camera at poses (I, 3, 4), without keypoints; image i has the id i + 1."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, **camera.colmap.record()))
+    for index, pose in enumerate(np.asarray(cam_from_world, dtype=np.float64)):
+        image = pycolmap.Image(name=image_name(index), camera_id=1, image_id=index + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]))
+    return model
 
 
 def triangulate_model(
@@ -103,50 +97,47 @@ def triangulate_model(
     clock = run.clock
     folder = database.parent
     kind = kind_of(run.config.extractor.method)
-    to_local, back = _local_frame(model)
+    origin = local_origin([image.projection_center() for image in model.images.values()])
+    to_local = pycolmap.Sim3d(1.0, pycolmap.Rotation3d(np.eye(3)), -origin)
     model.transform(to_local)  # rays that meet far from the origin are ill-conditioned
     seed = run.seed % 2**31  # COLMAP keeps it in an int
     pycolmap.set_random_seed(seed)
-    with storing_in_database(database), clock("database"):
-        for index, (pixels, _) in enumerate(stored):
-            points = [pycolmap.Point2D(p) for p in pixels.astype(np.float64)]
-            model.images[index + 1].points2D = pycolmap.Point2DList(points)
-        fill_database(database, model, stored, kind)
-    with storing_in_database(database), clock("match"), pycolmap.Database.open(str(database)) as db:
-        matches = match_pairs(stored, pairs, folder, run.processes, run.progress, kind)
-        for (i, j), matched in zip(pairs.tolist(), matches, strict=True):
-            db.write_matches(i + 1, j + 1, matched)
-    with storing_in_database(database), clock("verify"):
-        verification = pycolmap.TwoViewGeometryOptions()
-        verification.ransac.max_error = MAX_EPIPOLAR_ERROR_PX
-        verification.ransac.random_seed = seed
-        with quiet_colmap():
+    with storing_in_database(database):
+        with clock("database"):
+            for index, (pixels, _) in enumerate(stored):
+                points = [pycolmap.Point2D(p) for p in pixels.astype(np.float64)]
+                model.images[index + 1].points2D = pycolmap.Point2DList(points)
+            fill_database(database, model, stored, kind)
+        with clock("match"):
+            write_matches(database, pairs, match_pairs(stored, pairs, folder, run.processes, run.progress, kind))
+        with clock("verify"), quiet_colmap():
+            verification = pycolmap.TwoViewGeometryOptions()
+            verification.ransac.max_error = MAX_EPIPOLAR_ERROR_PX
+            verification.ransac.random_seed = seed
             pycolmap.guided_geometric_verification(
                 model, str(database), two_view_geometry_options=verification, num_threads=run.processes.workers
             )
-    with clock("triangulate"):
+    with clock("triangulate"), quiet_colmap("ERROR"):  # it warns of every image it cannot read colours from
         options = pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=1, extract_colors=False)
         options.load_all_images = True
         options.triangulation.random_seed = options.mapper.random_seed = seed
         options.triangulation.ignore_two_view_tracks = not run.config.two_view_landmarks
         options.triangulation.min_angle = options.mapper.filter_min_tri_angle = MIN_TRIANGULATION_ANGLE_DEG
-        with quiet_colmap("ERROR"):  # it warns of every image it cannot read colours from
-            model = pycolmap.triangulate_points(model, str(database), str(folder), str(folder), options=options)
-        model.transform(back)
+        model = pycolmap.triangulate_points(model, str(database), str(folder), str(folder), options=options)
+        model.transform(to_local.inverse())
         model.update_point_3d_errors()
     with clock("color"):
         color_points(model, colors)
     return model
 
 
-def _local_frame(model: Any) -> tuple[Any, Any]:
-    """The `pycolmap.Sim3d` to a frame with its origin near a reconstruction's cameras, and its inverse."""
+def write_matches(database: Path, pairs: NDArray[np.int64], matches: Iterable[NDArray[np.uint32]]) -> None:
+    """Write matches (M, 2) of each pair (P, 2) of images into a COLMAP database; image i has the id i + 1."""
     import pycolmap
 
-    posed = [image.projection_center() for image in model.images.values() if image.has_pose]
-    origin = local_origin(posed)
-    straight = pycolmap.Rotation3d(np.eye(3))
-    return pycolmap.Sim3d(1.0, straight, -origin), pycolmap.Sim3d(1.0, straight, origin)
+    with pycolmap.Database.open(str(database)) as db:
+        for (i, j), matched in zip(pairs.tolist(), matches, strict=True):
+            db.write_matches(i + 1, j + 1, matched)
 
 
 def match_pairs(
@@ -163,10 +154,12 @@ def match_pairs(
     built without locks, so that two threads sometimes get the same buffer and wrong nearest neighbours. `folder` holds
     small temporary databases.
     """
-    chunks = [pairs[start : start + _PAIRS_AT_A_TIME] for start in range(0, len(pairs), _PAIRS_AT_A_TIME)]
     bar = tqdm(total=len(pairs), desc="map: match", disable=not progress, unit="pair")
     with bar, temporary_folder(".partial", parent=folder) as work:  # removes what a killed process leaves
-        jobs = (_match_job(chunk, stored, work, kind) for chunk in chunks)
+        jobs = (
+            _match_job(pairs[start : start + _PAIRS_AT_A_TIME], stored, work, kind)
+            for start in range(0, len(pairs), _PAIRS_AT_A_TIME)
+        )
         for matches in processes.map(_run_match_job, jobs):
             yield from matches
             bar.update(len(matches))
@@ -188,9 +181,9 @@ def _run_match_job(job: MatchJob) -> list[NDArray[np.uint32]]:
     matching = pycolmap.FeatureMatchingOptions(num_threads=1, skip_geometric_verification=True)
     with temporary_folder(parent=parent) as folder:
         database = folder / "database.db"
-        listed = Path(folder) / "pairs.txt"
+        listed = folder / "pairs.txt"
         # Any camera and poses do: only verification would use them.
-        fill_database(database, _posed_model(PinholeCamera(), np.tile(np.eye(3, 4), (len(stored), 1, 1))), stored)
+        fill_database(database, posed_model(PinholeCamera(), np.tile(np.eye(3, 4), (len(stored), 1, 1))), stored)
         listed.write_text("".join(f"{image_name(i)} {image_name(j)}\n" for i, j in pairs))
         pairing = pycolmap.ImportedPairingOptions(match_list_path=str(listed))
         with quiet_colmap():
@@ -206,29 +199,12 @@ def _match_by_similarity(
     from wheretolook.features.learned import one_thread
     from wheretolook.features.similarity import SimilarityMatcher
 
-    found = []
+    results = []
     with one_thread():
         for i, j in pairs.tolist():
-            ((first, second),) = SimilarityMatcher(stored[j][1]).match([stored[i][1]], kind.min_similarity)
-            found.append(np.column_stack([first, second]).astype(np.uint32))
-    return found
-
-
-def _posed_model(camera: PinholeCamera, cam_from_world: NDArray[np.floating[Any]]) -> Any:
-    """A reconstruction of images with poses, without keypoints."""
-    import pycolmap
-
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, **camera.colmap.record()))
-    for index, pose in enumerate(np.asarray(cam_from_world, dtype=np.float64)):
-        image = pycolmap.Image(name=image_name(index), camera_id=1, image_id=index + 1)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]))
-    return model
-
-
-def stored_keypoints(keypoints: Keypoints, kind: DescriptorKind = SIFT) -> Stored:
-    """Pixels (N, 2) and descriptors of keypoints as files hold them."""
-    return keypoints.pixels, kind.store(keypoints.descriptors)
+            matches = SimilarityMatcher(stored[j][1]).match([stored[i][1]], kind.min_similarity)
+            results.append(np.column_stack(matches[0]).astype(np.uint32))
+    return results
 
 
 def fill_database(database: Path, model: Any, stored: Iterable[Stored], kind: DescriptorKind = SIFT) -> None:
@@ -239,7 +215,6 @@ def fill_database(database: Path, model: Any, stored: Iterable[Stored], kind: De
     import pycolmap
 
     colmap_type = pycolmap.FeatureExtractorType(kind.colmap_type)
-
     with pycolmap.Database.open(str(database)) as db:
         for camera in model.cameras.values():
             db.write_camera(camera, use_camera_id=True)

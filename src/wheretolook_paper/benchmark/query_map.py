@@ -16,9 +16,10 @@ from wheretolook.mapping.map_folder import DATABASE_FILE, LANDMARKS_FILE, MapDra
 from wheretolook.mapping.triangulation import (
     choose_pairs,
     extract_with_colors,
+    posed_model,
     shrink_depth,
     surface_overlap,
-    triangulate_known_poses,
+    triangulate_model,
 )
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.images import read_image as read_file
@@ -61,9 +62,9 @@ def build_query_map(
     with WorkerPool(workers) as processes:
         images = _read(files, camera)
         run = MapRun(config, processes, device=device, progress=progress)
-        keypoints, colors = zip(*extract_with_colors(images, len(files), "map: extract", run), strict=True)
+        stored, colors = zip(*extract_with_colors(images, len(files), "map: extract", run), strict=True)
         database = folder / DATABASE_FILE
-        built = triangulate_known_poses(database, camera, poses, keypoints, colors, pairs, run)
+        built = triangulate_model(database, posed_model(camera, poses), stored, colors, pairs, run)
         finish_map(MapDraft(built, scene.images, config.max_reprojection_error_px, _FIX, database), folder, run)
     return folder / LANDMARKS_FILE
 

@@ -12,8 +12,7 @@ import pytest
 
 from mapping.conftest import ROOM_SIZE, BoxFreeSpace, box_room
 from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.mapping.config import WalkConfig
-from wheretolook.mapping.triangulation import _posed_model
+from wheretolook.mapping.triangulation import posed_model
 from wheretolook.mapping.walk import plan_walk
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh, save_glb
@@ -33,10 +32,10 @@ def make_scene(folder: Path) -> Path:
     mesh = replace(mesh, textures=tuple(textures), corner_uvs=mesh.corner_uvs * np.float32(0.5))
     save_glb(mesh, scene / "room.glb")
     mesh = load_mesh(scene / "room.glb")
-    walk = plan_walk(BoxFreeSpace(), mesh.bounds, 30, WalkConfig(), 0)
+    walk = plan_walk(BoxFreeSpace(), mesh.bounds, 30)
     poses = poses_looking_along(walk.positions, walk.directions)
     renderer = WarpRenderer(mesh)
-    posed = _posed_model(CAMERA, poses)
+    posed = posed_model(CAMERA, poses)
     for number, rgb in enumerate(renderer.render(DRAWN_CAMERA, poses).rgb, 1):
         image = posed.images[number]
         cv2.imwrite(str(images / image.name), rgb[:, :, ::-1])

@@ -29,7 +29,6 @@ import numpy as np
 from common import write_model
 
 from wheretolook.view.server import Viewer
-from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
 from wheretolook.view.viewed_map import open_map
 
@@ -155,11 +154,11 @@ def memory_mb() -> float:
 def print_turns(session: Any, n: int) -> None:
     """Print how long the score of a view turned by hand takes while the floor fills."""
     session.place.select(np.array([9.0, 9.0, 1.5]))
-    while session.place.location is None:
+    while session.location is None:
         time.sleep(0.02)
     time.sleep(2)
     times = []
-    for axis in session.place.location.directions[:: len(session.place.location.directions) // n][:n]:
+    for axis in session.location.directions[:: len(session.location.directions) // n][:n]:
         start = time.monotonic()
         session.controls.picture_caption.content = ""
         session.place.turn_to(axis)
@@ -207,7 +206,7 @@ def main() -> int:
         if options.map is None:
             write_model(model, options.landmarks)
         print_opening(model, options.repeat)
-        viewer = Viewer(Shared(open_map(model)), port=0, state=ViewState(occlusion=options.occlusion))
+        viewer = Viewer(open_map(model), port=0, state=ViewState(occlusion=options.occlusion))
         Client(viewer.port, 1e9, 0, clicks=False).start()
         while not viewer.sessions:
             time.sleep(0.01)

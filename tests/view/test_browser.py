@@ -17,7 +17,6 @@ from view.browser import Browser, chromium
 from wheretolook.geometry.poses import poses_looking_along, rotation_from_quaternion
 from wheretolook.view.paths import FORWARD, RecordedPath, looking_ahead
 from wheretolook.view.server import Viewer
-from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
 from wheretolook.view.viewed_map import open_map
 
@@ -31,8 +30,8 @@ def viewer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Viewer]:
     viewed = open_map(write_room(tmp_path_factory.mktemp("room") / "sparse"), weights=WEIGHTS)
     poses = poses_looking_along(POINTS, np.tile((-1.0, -0.5, 0.0), (4, 1)))
     localized = np.array([True, True, False, True])
-    paths = {FORWARD: RecordedPath(looking_ahead(POINTS)), "set": RecordedPath(poses, localized)}
-    made = Viewer(Shared(viewed, paths), port=0, state=ViewState(occlusion="none"))
+    viewed.paths = {FORWARD: RecordedPath(looking_ahead(POINTS)), "set": RecordedPath(poses, localized)}
+    made = Viewer(viewed, port=0, state=ViewState(occlusion="none"))
     yield made
     made.stop()
 
@@ -55,13 +54,13 @@ def test_a_location_is_clicked_a_path_plays_and_a_link_opens_the_same_view(
     viewer: Viewer, browser: Browser, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("wheretolook.view.player.STEP_S", 1.0)  # a page without a GPU may skip shorter steps
-    tab = browser.open(viewer.url)
+    tab = browser.open(f"http://{viewer.address}")
     tab.wait(lambda tab: "Click a place" in tab.text and " places" in tab.text)
     (session,) = viewer.sessions.values()
     at = np.array([1.6, 2.1, session.scenery.floor_m])
     tab.click(*pixel_of(session.client.camera, at))
     tab.wait(lambda tab: "landmarks in view" in tab.text)
-    location = session.place.location
+    location = session.location
     np.testing.assert_allclose(location.position[:2], at[:2], atol=0.1)
     assert f"{location.best.n_visible[0]:,} landmarks in view" in tab.text
     tab.press("Path")
@@ -71,7 +70,7 @@ def test_a_location_is_clicked_a_path_plays_and_a_link_opens_the_same_view(
     other = browser.open(session.state.link(f"localhost:{viewer.port}"))
     other.wait(lambda tab: "landmarks in view" in tab.text)
     joined = viewer.sessions[max(viewer.sessions)]
-    np.testing.assert_allclose(joined.place.location.position, location.position, atol=0.01)
+    np.testing.assert_allclose(joined.location.position, location.position, atol=0.01)
     assert tab.errors == other.errors == []
 
 
@@ -94,7 +93,7 @@ def test_views_and_an_image_are_saved_and_rings_turn_the_view(viewer: Viewer, br
     tab.press("Look")
     before = session.place.axis.copy()
     turn = poses_looking_along(at, before)[:, :3].T  # the rings have the camera's axes
-    radius = 3.0 * session.shared.marker_m * RING
+    radius = 3.0 * session.viewed.marker_m * RING
     yaw = [at + radius * turn @ (np.sin(angle), 0, np.cos(angle)) for angle in np.radians((45, 10))]
     start, end = (pixel_of(session.client.camera, point) for point in yaw)
     tab.drag(start, end)

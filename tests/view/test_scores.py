@@ -5,18 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from selection.room import POINTS, WEIGHTS, write_room
 from synthetic_dataset import CAMERA, make_dataset
-from wheretolook.dataset.viewpoint_table import pose_columns
-from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import TableError
 from wheretolook.view import drawing
-from wheretolook.view.scores import FLOOR_DIRECTIONS, floor_at, score_labels, score_location, visible_landmarks
-from wheretolook.view.viewed_map import ViewedMap, open_map, open_named_scene
+from wheretolook.view.scores import FIRST_CELLS, score_in_blocks, score_location
+from wheretolook.view.viewed_map import ViewedMap, open_map, open_scene
 
 
 @pytest.fixture(scope="module")
@@ -25,15 +23,14 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> ViewedMap:
 
 
 def test_a_floor_has_the_best_score_of_each_free_cell(room: ViewedMap) -> None:
-    selector = room.selector("visible", "none", FLOOR_DIRECTIONS)
-    floor = floor_at(room.space, selector.localization_map.occlusion, 1.5)
+    floor = room.floor("visible", "none", 1.5)
+    selector = floor.selector
     assert room.space.is_free(floor.points).all() and len({*floor.cells.tolist()}) == len(floor.cells)
     assert not np.isfinite(floor.raster()).any()
-    floor.score_next(selector, floor.n_first)  # spread over the floor, so that all of it has a colour
+    floor.score_next(FIRST_CELLS)  # spread over the floor, so that all of it has a colour
     assert np.isfinite(floor.raster()).sum() == len(floor.cells)
-    while floor.score_next(selector, 50):
+    while floor.score_next(50):
         pass
-    assert floor.done
     for k in (0, len(floor.cells) // 2):
         poses = poses_looking_along(np.tile(floor.points[k], (len(selector.directions), 1)), selector.directions)
         scores = selector.scorer.score(poses)
@@ -56,39 +53,32 @@ def test_the_best_views_of_a_location_are_those_of_select(room: ViewedMap) -> No
 def test_probabilities_of_visible_landmarks_sum_to_the_expected_inliers(room: ViewedMap) -> None:
     scorer = room.selector("set", "none").scorer
     pose = poses_looking_along(POINTS[0], (-1.0, -0.5, 0.0))
-    landmarks = visible_landmarks(scorer, pose)
+    landmarks = room.visible_landmarks("set", "none", pose)
     assert len(landmarks.points) == len(scorer.localization_map.landmarks_in_view(pose[None])[0]) > 20
     expected = scorer.report(pose[None]).expected_inliers[0]
     assert landmarks.probabilities.sum() == pytest.approx(expected, rel=1e-4)
-    counting = room.selector("visible", "none").scorer
-    assert np.isnan(visible_landmarks(counting, pose).probabilities).all()
-    np.testing.assert_array_equal(visible_landmarks(counting, pose, scorer).probabilities, landmarks.probabilities)
+    counted = room.visible_landmarks("visible", "none", pose)  # by the best weights, here of "set"
+    np.testing.assert_array_equal(counted.probabilities, landmarks.probabilities)
 
 
-def test_labels_are_compared_with_scores(room: ViewedMap) -> None:
+def test_labelled_views_are_scored_in_blocks(room: ViewedMap, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wheretolook.view.scores.BLOCK", 3)
     scorer = room.selector("set", "none").scorer
     axes = np.array([(-1.0, -0.5, 0.0), (1.0, 0.2, 0.0), (-1.0, 0.0, 0.0), (0.3, 1.0, 0.0)])
     poses = poses_looking_along(np.tile(POINTS[0], (4, 1)), axes)
-    errors = {"status": "localized", "error_m": [0.01, 0.2, 0.01, 9.0], "error_deg": 0.1}
-    scores = scorer.score(poses)
-    steps = score_labels(scorer, pd.DataFrame({**pose_columns(poses), **errors}), (0.05, 0.4), float(np.median(scores)))
+    steps = score_in_blocks(scorer, poses)
+    assert next(steps) is next(steps) is None
     with pytest.raises(StopIteration) as ended:
-        while True:
-            next(steps)
-    labels = ended.value.value
-    good = np.array([True, False, True, False])
-    np.testing.assert_array_equal(labels.good, good)
-    np.testing.assert_array_equal(labels.false_positive, (labels.scores >= labels.threshold) & ~good)
-    np.testing.assert_array_equal(labels.false_negative, (labels.scores < labels.threshold) & good)
-    np.testing.assert_allclose(labels.positions, camera_centers(poses), atol=1e-9)
+        next(steps)
+    np.testing.assert_allclose(ended.value.value, scorer.score(poses))
 
 
 def test_a_scene_of_a_dataset_has_its_labels(tmp_path: Path) -> None:
     dataset = make_dataset(tmp_path / "set", ("test",), n_locations=4, n_directions=5)
-    viewed = open_named_scene(tmp_path, dataset.scenes[0].name, "", None, WEIGHTS, "cpu")
+    viewed = open_scene(tmp_path, dataset.scenes[0].name, "", None, WEIGHTS, "cpu")
     assert viewed.labels is not None and len(viewed.labels) == 20 and viewed.camera == CAMERA
     assert viewed.mesh is None and viewed.photographs is None
-    assert len(floor_at(viewed.space, viewed.localization_map("none").occlusion, 1.5).cells)
+    assert len(viewed.floor("visible", "none", 1.5).cells)
 
 
 def test_colours_of_scores() -> None:

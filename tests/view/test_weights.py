@@ -21,7 +21,8 @@ from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.provenance import training_fingerprint
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import WeightsError
-from wheretolook.view.viewed_map import ViewedMap, open_map, open_named_scene
+from wheretolook.view.viewed_map import ViewedMap, open_map
+from wheretolook.view.viewed_map import open_scene as open_viewed
 
 
 def save_adapted(path: Path, landmarks: np.ndarray) -> None:
@@ -39,25 +40,25 @@ def dataset(tmp_path: Path) -> Dataset:
 
 
 def open_scene(dataset: Dataset, scene: str, weights: Path | None = None) -> ViewedMap:
-    return open_named_scene(dataset.root.parent, scene, "", None, weights, "cpu")
+    return open_viewed(dataset.root.parent, scene, "", None, weights, "cpu")
 
 
 def test_adapted_weights_score_in_their_scene_only(dataset: Dataset) -> None:
     path = dataset.root / "adapted" / "scene-1.safetensors"
     save_adapted(path, dataset.scene("scene-1").read_landmarks().points)
     viewed = open_scene(dataset, "scene-1")
-    assert viewed.methods[0] == "adapted" and "adapted" in viewed.weights.describe("adapted")
+    assert viewed.weights.methods[0] == "adapted" and "adapted" in viewed.weights.describe("adapted")
     at = np.array([[0.0, 0.0, 1.2]])
     adapted, base = (
         viewed.selector(name, "none", 30).scorer.score_around(at, np.eye(3)) for name in ("adapted", "set")
     )
     np.testing.assert_allclose(2 * np.log(adapted / (1 - adapted)), np.log(base / (1 - base)), atol=1e-6)
-    assert open_scene(dataset, "scene-0").methods[0] == "set"
-    assert open_scene(dataset, "scene-1", WEIGHTS / "set.safetensors").methods[0] == "set"
+    assert open_scene(dataset, "scene-0").weights.methods[0] == "set"
+    assert open_scene(dataset, "scene-1", WEIGHTS / "set.safetensors").weights.methods[0] == "set"
     shutil.copy(path, path.with_name("scene-0.safetensors"))  # of another scene
-    assert open_scene(dataset, "scene-0").methods[0] == "set"
+    assert open_scene(dataset, "scene-0").weights.methods[0] == "set"
     path.write_bytes(b"damaged")
-    assert open_scene(dataset, "scene-1").methods[0] == "set"
+    assert open_scene(dataset, "scene-1").weights.methods[0] == "set"
 
 
 def test_weights_trained_with_a_dataset_score_its_scenes(dataset: Dataset) -> None:
@@ -75,7 +76,7 @@ def test_weights_trained_with_a_dataset_score_its_scenes(dataset: Dataset) -> No
 def test_weights_adapted_to_a_map(tmp_path: Path) -> None:
     sparse = write_room(tmp_path / "house" / "sparse")
     save_adapted(tmp_path / "checks" / "house" / "adapted.safetensors", open_map(sparse).landmarks.points)
-    assert open_map(sparse, data=tmp_path).methods[0] == "adapted"
+    assert open_map(sparse, data=tmp_path).weights.methods[0] == "adapted"
     for name in ("bad.safetensors", "nowhere.safetensors"):
         (tmp_path / "bad.safetensors").write_bytes(b"damaged")
         with pytest.raises(WeightsError):
@@ -85,9 +86,8 @@ def test_weights_adapted_to_a_map(tmp_path: Path) -> None:
 def test_a_map_opens_before_torch_and_warp_are_loaded(tmp_path: Path) -> None:
     code = (
         "import sys; from pathlib import Path; from wheretolook.view.viewed_map import open_map; "
-        "from wheretolook.view.shared import Shared; from wheretolook.view.server import Viewer; "
-        "import wheretolook.view.session, wheretolook.view.saving, wheretolook.view.player; "
-        "Shared(open_map(Path(sys.argv[1]))); print({'torch', 'warp', 'pandas', 'pyarrow'} & {*sys.modules} or 'none')"
+        "import wheretolook.view.server, wheretolook.view.page; open_map(Path(sys.argv[1])); "
+        "print({'torch', 'warp', 'pandas', 'pyarrow'} & {*sys.modules} or 'none')"
     )
     command = [sys.executable, "-c", code, str(write_room(tmp_path / "sparse"))]
     environment = {**os.environ, "PYTHONPATH": str(Path(wheretolook.__file__).parents[1])}

@@ -14,7 +14,6 @@ from wheretolook.dataset.names import check_scene_name
 from wheretolook.utils.errors import ConfigError
 
 if TYPE_CHECKING:
-    from wheretolook.view.shared import Shared
     from wheretolook.view.state import ViewState
     from wheretolook.view.viewed_map import ViewedMap
 
@@ -102,38 +101,38 @@ class View(CameraOptions):
         start = time.monotonic()
         self._check_environment()
         from wheretolook.view.paths import read_paths
-        from wheretolook.view.shared import Shared
         from wheretolook.view.state import ViewState
 
         state = ViewState.parse(self.state)
         if self.method:
             state = replace(state, method=self.method)
-        paths = None if self.path is None else read_paths(self.path, self.pair)
+        paths = {} if self.path is None else read_paths(self.path, self.pair)
         viewed = self._open()
-        if state.method and state.method not in viewed.methods:
-            fix = f"Use {', '.join(viewed.methods)}."
+        viewed.paths = paths
+        if state.method and state.method not in viewed.weights.methods:
+            fix = f"Use {', '.join(viewed.weights.methods)}."
             raise ConfigError("there is no such method here, or no weights of it", value=state.method, fix=fix)
         summary = f"{viewed.name}: {len(viewed.landmarks):,} landmarks"
-        shared = Shared(viewed, paths)
         if self.record is not None:
             from wheretolook.view.recording import record
 
-            record(shared, self.record, state)
+            record(viewed, self.record, state)
             print(f"{summary}, in {time.monotonic() - start:.0f} s: {self.record}")
         elif self.film is not None:
-            n_frames = film_writer()(shared, self.film, state)
+            n_frames = film_writer()(viewed, self.film, state)
             print(f"{summary}, {n_frames} pictures in {time.monotonic() - start:.0f} s: {self.film}")
         else:
             print(f"{summary}, open after {time.monotonic() - start:.1f} s", flush=True)
-            self._serve(shared, state)
+            self._serve(viewed, state)
 
-    def _serve(self, shared: Shared, state: ViewState) -> None:
+    def _serve(self, viewed: ViewedMap, state: ViewState) -> None:
         from wheretolook.view.server import Viewer
 
-        viewer = Viewer(shared, self.host, self.port, state, self.dark)
-        viewed = shared.viewed
-        print(viewed.weights.describe(state.method or viewed.methods[0]) or "a method without weights", flush=True)
-        print(f"{viewer.url}    (Ctrl-C ends it)", flush=True)
+        viewer = Viewer(viewed, self.host, self.port, state, self.dark)
+        print(
+            viewed.weights.describe(state.method or viewed.weights.methods[0]) or "a method without weights", flush=True
+        )
+        print(f"http://{viewer.address}    (Ctrl-C ends it)", flush=True)
         try:
             viewer.wait()
         except KeyboardInterrupt:
@@ -157,19 +156,19 @@ class View(CameraOptions):
 
     def _open(self) -> ViewedMap:
         from wheretolook.utils.devices import usable_device
-        from wheretolook.view.viewed_map import open_map, open_named_scene
+        from wheretolook.view.viewed_map import open_map, open_scene
 
         device = usable_device(self.device)
         camera = self.named_camera()
         if self.map is not None:
             return open_map(self.map, self.mesh, camera, self.images, self.weights, device, self.data)
         assert self.scene is not None and not isinstance(camera, int)
-        return open_named_scene(self.data, self.scene, self.name, camera, self.weights, device)
+        return open_scene(self.data, self.scene, self.name, camera, self.weights, device)
 
 
-def film_writer() -> Callable[[Shared, Path, ViewState], int]:
+def film_writer() -> Callable[[ViewedMap, Path, ViewState], int]:
     """Return the installed writer of films, which returns the number of pictures. Raises ConfigError without one."""
     for entry in entry_points(group="wheretolook.view", name="film"):
-        writer: Callable[[Shared, Path, ViewState], int] = entry.load()
+        writer: Callable[[ViewedMap, Path, ViewState], int] = entry.load()
         return writer
     raise ConfigError("no package that writes films is installed", fix="Install wheretolook with its paper package.")

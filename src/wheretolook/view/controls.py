@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from wheretolook.dataset.thresholds import THRESHOLDS, threshold_key, threshold_label
+from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError
 from wheretolook.view.drawing import escape_markdown, legend
-from wheretolook.view.shared import STEP_M, Shared
 from wheretolook.view.state import MAX_VIEWS, ViewState
+from wheretolook.view.viewed_map import STEP_M, ViewedMap
 
 HINT = "Click a place on the coloured floor: the score of every direction there, and the best views."
 LIMITS = {threshold_label(threshold_key(limits)): limits for limits in THRESHOLDS}
-T = TypeVar("T")
 FILES = {
     "CSV": ("csv", ".csv"),
     "JSON": ("json", ".json"),
@@ -29,37 +29,32 @@ _BLANK = np.full((270, 360, 3), (38, 40, 46), np.uint8)
 class Controls:
     """Handles of all elements of the panel, which is made by a `viser.GuiApi`."""
 
-    def __init__(self, gui: Any, shared: Shared, state: ViewState) -> None:
+    def __init__(self, gui: Any, viewed: ViewedMap, state: ViewState) -> None:
         tabs = gui.add_tab_group()
         with tabs.add_tab("Look"):
-            self._add_map(gui, shared, state)
+            self._add_map(gui, viewed, state)
             with gui.add_folder("Place"):
                 self._add_location(gui, state)
             with gui.add_folder("Shown", expand_by_default=False):
-                self._add_layers(gui, shared, state)
-        self.step: Any = None
-        self.play: Any = None
-        self.path_captions: dict[str, Any] = {}
-        self.path_pictures: dict[str, Any] = {}
-        if shared.paths:
+                self._add_layers(gui, viewed, state)
+        if viewed.paths:
             with tabs.add_tab("Path"):
-                self._add_paths(gui, shared)
+                self._add_paths(gui, viewed)
         with tabs.add_tab("Waypoints"):
             self._add_waypoints(gui)
         with tabs.add_tab("Share"):
             self._add_share(gui, state)
 
-    def _add_map(self, gui: Any, shared: Shared, state: ViewState) -> None:
-        viewed = shared.viewed
+    def _add_map(self, gui: Any, viewed: ViewedMap, state: ViewState) -> None:
         warnings = "\n\n".join(f"⚠ {escape_markdown(text[0].upper() + text[1:])}." for text in viewed.warnings)
         self.warnings = gui.add_markdown(warnings, visible=bool(warnings))
         self.status = gui.add_markdown("")
-        self.legend = gui.add_html(legend(0, 1, "score"))
-        self.method = gui.add_dropdown("method", viewed.methods, initial_value=state.method)
+        self.legend = gui.add_html(legend(0, 1))
+        self.method = gui.add_dropdown("method", viewed.weights.methods, initial_value=state.method)
         self.weights = gui.add_markdown("")
         self.occlusion = gui.add_dropdown("hidden by", viewed.occlusions, initial_value=state.occlusion)
-        self.height = _height_slider(gui, "floor at, m", shared.low_m, shared.high_m, state.height)
-        threshold = _clamp(state.threshold, 0, 1)
+        self.height = _height_slider(gui, "floor at, m", viewed.bounds[:, 2], state.height)
+        threshold = min(max(state.threshold, 0.0), 1.0)
         hint = "Places and views below are paler."
         self.threshold = gui.add_slider("good from", 0.0, 1.0, 0.01, threshold, hint=hint)
 
@@ -74,11 +69,9 @@ class Controls:
         self.picture = gui.add_image(_BLANK, visible=False)
         self.picture_caption = gui.add_markdown("")
 
-    def _add_layers(self, gui: Any, shared: Shared, state: ViewState) -> None:
-        viewed = shared.viewed
+    def _add_layers(self, gui: Any, viewed: ViewedMap, state: ViewState) -> None:
         z = viewed.landmarks.points[:, 2] if viewed.mesh is None else viewed.mesh.bounds[:, 2]
-        low = float(z.min())
-        self.cut = _height_slider(gui, "cut above, m", low, max(float(z.max()), low + 2 * STEP_M), state.cut)
+        self.cut = _height_slider(gui, "cut above, m", z, state.cut)
         has_mesh = viewed.mesh is not None
         has_labels = viewed.labels is not None
         self.layers = {
@@ -91,10 +84,12 @@ class Controls:
         self.limits = gui.add_dropdown("labels within", tuple(LIMITS), visible=has_labels)
         self.label_summary = gui.add_markdown("", visible=has_labels)
 
-    def _add_paths(self, gui: Any, shared: Shared) -> None:
+    def _add_paths(self, gui: Any, viewed: ViewedMap) -> None:
         self.play = gui.add_button("Play")
-        self.step = gui.add_slider("step", 1, max(map(len, shared.paths.values())), 1, 1)
-        for name in shared.paths:
+        self.step = gui.add_slider("step", 1, max(map(len, viewed.paths.values())), 1, 1)
+        self.path_captions = {}
+        self.path_pictures = {}
+        for name in viewed.paths:
             self.path_captions[name] = gui.add_markdown(f"**{escape_markdown(name)}**")
             self.path_pictures[name] = gui.add_image(_BLANK)
 
@@ -113,35 +108,22 @@ class Controls:
         self.state = gui.add_text("state", state.text(), hint="For wheretolook view --state.")
 
 
-def _height_slider(gui: Any, label: str, low: float, high: float, value: float | None) -> Any:
-    low = round(np.floor(low / STEP_M) * STEP_M, 3)
-    high = round(max(np.ceil(high / STEP_M) * STEP_M, low + STEP_M), 3)
-    chosen = high if value is None else round(_clamp(value, low, high) / STEP_M) * STEP_M
-    return gui.add_slider(label, low, high, STEP_M, round(_clamp(chosen, low, high), 3))
+def _height_slider(gui: Any, label: str, heights: Float, value: float | None) -> Any:
+    """Add a slider over the multiples of STEP_M that span heights, at a value or at its upper end."""
+    first = np.floor(heights.min() / STEP_M)
+    last = max(np.ceil(heights.max() / STEP_M), first + 1)
+    step = last if value is None else np.clip(round(value / STEP_M), first, last)
+    return gui.add_slider(label, *(round(float(k) * STEP_M, 3) for k in (first, last)), STEP_M, round(step * STEP_M, 3))
 
 
-def _clamp(value: float, low: float, high: float) -> float:
-    return float(min(max(value, low), high))
-
-
-def check_value(handle: Any, previous: Any) -> None:
-    """Raise ConfigError and restore the previous value if a client has set a control to an invalid one."""
-    value = getattr(handle, "value", None)
-    if not _is_valid(handle, value):
-        handle.value = previous
-        raise ConfigError("this control has no such value", value=value, fix="Choose one that it offers.")
-
-
-def value_of(handle: Any, default: T) -> T:
-    """Return the value of a control, or a default while a client has set it to an invalid one.
+def value_of(handle: Any) -> Any:
+    """Return the value of a control. Raises ConfigError if a client has set one that it does not offer.
 
     Callbacks run in several threads: one can read a control before its own callback has restored it.
     """
     value = handle.value
-    return value if _is_valid(handle, value) else default
-
-
-def _is_valid(handle: Any, value: Any) -> bool:
-    options = getattr(handle, "options", None)
+    options = getattr(handle, "options", (value,))
     high = getattr(handle, "max", None)
-    return bool((options is None or value in options) and (high is None or handle.min <= value <= high))
+    if value not in options or not (high is None or handle.min <= value <= high):
+        raise ConfigError("this control has no such value", value=value, fix="Choose one that it offers.")
+    return value

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -28,6 +28,7 @@ CELL_PX = 6  # pixels of a floor's cell, so that its edges stay sharp
 MAX_FRUSTA = 1500
 DARK_BACKGROUND = np.full((2, 2, 3), (72, 74, 80), np.uint8)  # low scores are invisible on black
 PICTURE_PX = 360  # width of images in the panel
+DOT_PX = 1.6  # radius of landmarks on images
 MAX_TEXTURE_PX = 2048
 
 _PUNCTUATION = re.compile(r"([!-/:-@\[-`{-~])")  # ASCII punctuation, which CommonMark escapes by a backslash
@@ -39,20 +40,16 @@ def escape_markdown(text: str) -> str:
 
 
 @cache
-def _colors() -> Rgb:
-    """Return the 256 colours of Matplotlib's cividis."""
+def _colormap() -> Any:
     from matplotlib import colormaps
 
-    return (np.asarray(colormaps["cividis"](np.linspace(0, 1, 256)))[:, :3] * 255).round().astype(np.uint8)
+    return colormaps["cividis"].with_extremes(bad=f"#{bytes(UNKNOWN).hex()}")
 
 
 def score_colors(values: Float, low: float = 0.0, high: float = 1.0) -> Rgb:
     """Map values between low and high to colours (..., 3); NaN to `UNKNOWN`."""
-    known = np.isfinite(values)
-    share = np.clip((np.where(known, values, low) - low) / max(high - low, 1e-12), 0, 1)
-    colors = _colors()[(share * 255).round().astype(np.int64)]
-    colors[~known] = UNKNOWN
-    return colors
+    colors = _colormap()((values - low) / max(high - low, 1e-12), bytes=True)
+    return np.array(colors, dtype=np.uint8)[..., :3]
 
 
 def linear_light(colors: Any) -> Rgb:
@@ -60,12 +57,17 @@ def linear_light(colors: Any) -> Rgb:
     return (255 * (np.asarray(colors) / 255.0) ** 2.2).round().astype(np.uint8)
 
 
-def legend(low: float, high: float, unit: str) -> str:
-    """Return the colour scale as HTML."""
-    stops = ",".join("rgb({},{},{})".format(*_colors()[k]) for k in range(0, 256, 15))
+def line_ends(colors: Any) -> Rgb:
+    """Return the linear light of both ends of lines of the given colours (S, 3), (S, 2, 3)."""
+    return np.repeat(linear_light(colors)[:, None], 2, axis=1)
+
+
+def legend(low: float, high: float) -> str:
+    """Return the colour scale of scores as HTML."""
+    stops = ",".join("rgb({},{},{})".format(*color) for color in score_colors(np.linspace(0, 1, 18)))
     bar = f"height:10px;border-radius:3px;background:linear-gradient(to right,{stops})"
     row = "display:flex;justify-content:space-between;font-size:12px;opacity:.8"
-    ends = f"<span>{low:.3g}</span><span>{unit}</span><span>{high:.3g}</span>"
+    ends = f"<span>{low:.3g}</span><span>score</span><span>{high:.3g}</span>"
     return f'<div style="padding:4px 12px"><div style="{bar}"></div><div style="{row}">{ends}</div></div>'
 
 
@@ -74,14 +76,14 @@ def floor_image(raster: Float, low: float, high: float, threshold: float | None)
 
     Scores below the threshold are faded, NaN is transparent.
     """
+    known = np.isfinite(raster)
     colors = score_colors(raster, low, high).astype(np.float64)
     if threshold is not None:
-        below = np.isfinite(raster) & (raster < threshold)
+        below = known & (raster < threshold)
         grey = colors[below].mean(axis=1, keepdims=True) * 0.5 + 90
         colors[below] = FADE * grey + (1 - FADE) * colors[below]
-    alpha = np.where(np.isfinite(raster), 235, 0)[..., None]
-    image = np.concatenate([colors, alpha], axis=-1).astype(np.uint8)
-    return np.repeat(np.repeat(image, CELL_PX, axis=0), CELL_PX, axis=1)
+    image = np.dstack([colors, np.where(known, 235, 0)]).astype(np.uint8)
+    return image.repeat(CELL_PX, axis=0).repeat(CELL_PX, axis=1)
 
 
 def sphere_glb(directions: Float, scores: Float, low: float, high: float, radius_m: float) -> bytes:
@@ -112,12 +114,10 @@ def mesh_glb(mesh: TexturedMesh, cut_m: float | None) -> bytes:
     from wheretolook.scenes.cutting import cut_above
     from wheretolook.scenes.loading import glb_bytes
 
-    textures = []
-    for texture in mesh.textures:
-        scale = min(1.0, MAX_TEXTURE_PX / max(texture.shape[:2]))
-        size = (max(1, round(texture.shape[1] * scale)), max(1, round(texture.shape[0] * scale)))
-        textures.append(texture if scale == 1 else np.asarray(Image.fromarray(texture).resize(size)))
-    small = replace(mesh, textures=tuple(textures))
+    textures = [Image.fromarray(texture) for texture in mesh.textures]
+    for texture in textures:
+        texture.thumbnail((MAX_TEXTURE_PX, MAX_TEXTURE_PX))
+    small = replace(mesh, textures=tuple(map(np.asarray, textures)))
     return glb_bytes(small if cut_m is None else cut_above(small, cut_m), 80)
 
 
@@ -127,21 +127,30 @@ def frusta(camera: Camera, cam_from_world: Float, depth_m: float) -> Float:
 
     n = len(cam_from_world)
     rows = np.unique(np.linspace(0, n - 1, min(n, MAX_FRUSTA)).astype(int))
-    return frustum_segments(camera, np.asarray(cam_from_world, dtype=np.float64)[rows], depth_m).reshape(-1, 2, 3)
+    return frustum_segments(camera, cam_from_world[rows], depth_m).reshape(-1, 2, 3)
 
 
-def picture(rgb: Rgb | None, camera: Camera, pixels: Float, values: Float) -> Rgb:
-    """Draw landmarks at pixels (K, 2), coloured by values (K,), on an image or a plain ground; (H, PICTURE_PX, 3)."""
+@dataclass(frozen=True, eq=False)
+class VisibleLandmarks:
+    """The K landmarks visible in a view."""
+
+    points: Float  # (K, 3) m
+    pixels: Float  # (K, 2)
+    probabilities: Float  # (K,) of being detected; NaN if unknown
+
+
+def picture(rgb: Rgb | None, camera: Camera, visible: VisibleLandmarks) -> Rgb:
+    """Draw visible landmarks in the colours of their probabilities on an image or a plain ground; (H, PICTURE_PX, 3)."""
     from PIL import Image, ImageDraw
 
     scale = PICTURE_PX / camera.width
     size = (PICTURE_PX, max(1, round(camera.height * scale)))
     ground = Image.new("RGB", size, (38, 40, 46)) if rgb is None else Image.fromarray(rgb).resize(size)
     draw = ImageDraw.Draw(ground)
-    radius = 1.6
-    order = np.argsort(np.nan_to_num(values, nan=0.0), kind="stable")  # high values on top
-    for (x, y), color in zip(pixels[order] * scale, score_colors(values)[order], strict=True):
-        draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=tuple(color.tolist()))
+    order = np.argsort(np.nan_to_num(visible.probabilities), kind="stable")  # probable ones on top
+    colors = score_colors(visible.probabilities[order]).tolist()
+    for (x, y), color in zip(visible.pixels[order] * scale, colors, strict=True):
+        draw.ellipse((x - DOT_PX, y - DOT_PX, x + DOT_PX, y + DOT_PX), fill=tuple(color))
     return np.asarray(ground)
 
 
@@ -152,9 +161,3 @@ def small_camera(camera: Camera) -> Camera:
     scale = PICTURE_PX / camera.width
     center = (camera.cx * scale, camera.cy * scale)
     return PinholeCamera(PICTURE_PX, max(1, round(camera.height * scale)), camera.fx * scale, camera.fy * scale, center)
-
-
-def scene_size(points: Float) -> float:
-    """Return the diagonal of the bounding box of points (N, 3) m without outliers, metres."""
-    low, high = np.quantile(points, (0.02, 0.98), axis=0)
-    return float(np.linalg.norm(high - low))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,13 +14,9 @@ from wheretolook.geometry.poses import Float, poses_looking_along, quaternion_fr
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.view import drawing
 from wheretolook.view.controls import value_of
-from wheretolook.view.scenery import add_points
-from wheretolook.view.scores import ScoredLocation, score_location, visible_landmarks
-from wheretolook.view.state import ViewState
+from wheretolook.view.scores import ScoredLocation, score_location
+from wheretolook.view.session import Session
 from wheretolook.view.worker import NOW, SOON
-
-if TYPE_CHECKING:
-    from wheretolook.view.session import Session
 
 MARKERS = ("/sphere", "/view", "/views", "/turn", "/seen")  # hidden while the browser's camera is inside
 SETTLE_S = 0.3  # camera motion this soon after the program moved the camera is not by hand
@@ -31,41 +27,30 @@ class LocationView:
 
     def __init__(self, session: Session) -> None:
         self.session = session
-        self.location: ScoredLocation | None = None
         self.axis: Float | None = None
         self._rings: Any = None
         self._outside: Any = None  # camera pose before it moved inside
         self._camera_set = 0.0  # when the program last moved the browser's camera
         c = session.controls
-        session.on(c.view, lambda: self.show_best(int(c.view.value) - 1))
+        session.on(c.view, self._show_best)
         for slider in (c.yaw, c.pitch):
             session.on(slider, self._sliders_moved, by_hand=True)
         session.on(c.inside, self._move_inside)
 
-    @property
-    def angles(self) -> tuple[float, float]:
-        """Yaw and pitch of the view in degrees, as the sliders show them."""
-        c = self.session.controls
-        return float(value_of(c.yaw, 0.0)), float(value_of(c.pitch, 0.0))
-
-    @property
-    def fov(self) -> float:
-        """The vertical field of view in radians, without distortion."""
-        camera = self.session.viewed.camera
-        return 2 * float(np.arctan(camera.height / 2 / camera.mean_focal_px))
-
     def select(self, position: Float, angles: tuple[float, float] | None = None) -> None:
         """Score a location (3,) m, and show its best view or the one with angles (yaw, pitch) in degrees."""
-        self.session.submit("place", SOON, self._select(np.asarray(position, dtype=np.float64), angles))
+        self.session.submit("place", SOON, self._select(position, angles))
 
     def refresh(self) -> None:
         """Score the location again, such as by another method."""
-        if self.location is not None:
-            self.select(self.location.position, None if self.axis is None else self.angles)
+        if self.session.location is not None:
+            state = self.session.state
+            angles = None if state.yaw is None or state.pitch is None else (state.yaw, state.pitch)
+            self.select(self.session.location.position, angles)
 
     def _select(self, position: Float, angles: tuple[float, float] | None) -> Iterator[None]:
         session = self.session
-        if self.location is None:
+        if session.location is None:
             session.controls.summary.content = "Scoring all directions ..."
         selector = session.selector
         yield
@@ -74,31 +59,26 @@ class LocationView:
         except TableError as error:
             problem = "no camera can be there: it is outside the map or inside geometry"
             raise ConfigError(problem, value=tuple(np.round(position, 2).tolist())) from error
-        self.location = location
+        session.location = location
         session.update(place=tuple(position.tolist()))
         self._draw_location(location)
-        session.controls.summary.content = describe(location, session.state)
+        session.controls.summary.content = describe(location, session.state.threshold)
         self.turn_to(location.best.axes[0] if angles is None else axes_of_angles(angles))
         session.controls.view.max = max(2, len(location.best))
 
     def _draw_location(self, location: ScoredLocation) -> None:
         session = self.session
-        scene = session.scene
-        low, high = session.scenery.score_range
-        if low == high or not session.shared.is_probability(session.state.method):
-            low = float(location.scores.min())
-            high = float(location.scores.max())
-        size_m = session.shared.marker_m
+        viewed = session.viewed
+        low, high = viewed.score_range(session.state.method, location.scores)
+        sphere = drawing.sphere_glb(location.directions, location.scores, low, high, viewed.marker_m)
         position = location.position
-        sphere = drawing.sphere_glb(location.directions, location.scores, low, high, size_m)
-        scene.add_glb("/sphere", sphere, position=position, cast_shadow=False, receive_shadow=False)
-        edges = drawing.frusta(session.viewed.camera, location.best.cam_from_world, 2.2 * size_m)
-        colors = np.repeat(drawing.linear_light(drawing.score_colors(location.best.score, low, high)), 8, axis=0)
-        ends = np.repeat(colors[:, None], 2, axis=1)
-        scene.add_line_segments("/views", edges, ends, thickness=2.0, thickness_units="screen")
-        self._rings = scene.add_transform_controls(
+        session.scene.add_glb("/sphere", sphere, position=position, cast_shadow=False, receive_shadow=False)
+        edges = drawing.frusta(viewed.camera, location.best.cam_from_world, 2.2 * viewed.marker_m)
+        colors = np.repeat(drawing.score_colors(location.best.score, low, high), 8, axis=0)
+        session.add_lines("/views", edges, drawing.line_ends(colors), 2.0)
+        self._rings = session.scene.add_transform_controls(
             "/turn",
-            3.0 * size_m,
+            3.0 * viewed.marker_m,
             disable_axes=True,
             disable_sliders=True,
             position=position,
@@ -107,55 +87,54 @@ class LocationView:
         )
         self._rings.on_update(session.callback(lambda _: self._rings_dragged()))
 
-    def show_best(self, number: int) -> None:
-        """Show one of the best views."""
-        if self.location is not None and 0 <= number < len(self.location.best):
-            self.turn_to(self.location.best.axes[number])
+    def _show_best(self) -> None:
+        location = self.session.location
+        number = int(self.session.controls.view.value) - 1
+        if location is not None and number < len(location.best):
+            self.turn_to(location.best.axes[number])
 
     def _rings_dragged(self) -> None:
         self.turn_to(rotation_from_quaternion(self._rings.wxyz)[:, 2], move_rings=False)
 
     def _sliders_moved(self) -> None:
-        self.turn_to(axes_of_angles(self.angles), move_sliders=False)
+        controls = self.session.controls
+        self.turn_to(axes_of_angles((value_of(controls.yaw), value_of(controls.pitch))), move_sliders=False)
 
     def turn_to(self, axis: Float, move_rings: bool = True, move_sliders: bool = True) -> None:
         """Show the view along an axis (3,) at the location; the control that turned it is not moved."""
-        if self.location is None or not np.isfinite(axis).all() or np.linalg.norm(axis) < 1e-9:
+        location = self.session.location
+        if location is None or not np.isfinite(axis).all() or np.linalg.norm(axis) < 1e-9:
             return
-        self.axis = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
-        self.session.submit("view", NOW, self._show_view(self.location.position, self.axis, move_rings, move_sliders))
+        self.axis = axis / np.linalg.norm(axis)
+        self.session.submit("view", NOW, self._show_view(location.position, self.axis, move_rings, move_sliders))
 
     def _show_view(self, position: Float, axis: Float, move_rings: bool, move_sliders: bool) -> Iterator[None]:
+        """Report and draw a view: first its score, then its landmarks, then its image."""
         session = self.session
         c = session.controls
-        scorer = session.selector.scorer
+        state = session.state
         pose = poses_looking_along(position, axis)
-        report = scorer.report(pose[None])
+        report = session.selector.scorer.report(pose[None])
         caption = f"**score {float(report.score[0]):.3g}** · {report.n_visible[0]:,} landmarks in view"
         if np.isfinite(report.expected_inliers[0]):
             caption += f" · {report.expected_inliers[0]:,.0f} expected inliers"
         if not report.in_range[0]:
             caption += " · outside the training distribution"
         c.picture_caption.content = caption
-        wxyz = quaternion_from_rotation(pose[:, :3].T)
-        marker_visible = not c.inside.value
-        session.add_frustum("/view", wxyz, position, 3.0, drawing.FALSE_POSITIVE, thickness=4, visible=marker_visible)
+        outside = not c.inside.value
+        session.add_frustum("/view", pose, 3.0, drawing.FALSE_POSITIVE, thickness=4, visible=outside)
         session.client.flush()
         if move_rings and self._rings is not None:
-            self._rings.wxyz = wxyz
+            self._rings.wxyz = quaternion_from_rotation(pose[:, :3].T)
         yaw, pitch = (float(np.degrees(angle)) for angle in pan_tilt_angles(axis))
         if move_sliders:
             c.yaw.value = round(yaw * 2) / 2
             c.pitch.value = round(pitch * 2) / 2
         session.update(yaw=round(yaw, 1), pitch=round(pitch, 1))
         yield
-        landmarks = visible_landmarks(scorer, pose, session.shared.landmark_scorer(session.state.occlusion))
-        if len(landmarks.points):
-            colors = drawing.score_colors(landmarks.probabilities)
-            size_m = 0.0032 * session.shared.size_m
-            add_points(session.scene, "/seen", landmarks.points, colors, size_m, marker_visible)
-        else:
-            session.scene.remove_by_name("/seen")
+        landmarks = session.viewed.visible_landmarks(state.method, state.occlusion, pose)
+        colors = drawing.score_colors(landmarks.probabilities)
+        session.add_points("/seen", landmarks.points, colors, 0.0032 * session.viewed.size_m, outside)
         yield
         c.picture.image, c.picture.label = session.viewed.picture(pose, landmarks)
         c.picture.visible = True
@@ -166,16 +145,16 @@ class LocationView:
         session = self.session
         camera = session.client.camera
         inside = bool(session.controls.inside.value)
-        if self.location is None or self.axis is None:
+        if session.location is None or self.axis is None:
             session.controls.inside.value = False
             return
         self._camera_set = time.monotonic()
         with session.client.atomic():
             if inside:
                 self._outside = camera.position, camera.look_at, camera.fov
-                camera.fov = self.fov
-                camera.position = self.location.position
-                camera.look_at = self.location.position + 0.05 * self.axis
+                camera.fov = session.fov
+                camera.position = session.location.position
+                camera.look_at = session.location.position + 0.05 * self.axis
             elif self._outside is not None:
                 position, look_at, camera.fov = self._outside
                 camera.position = position
@@ -183,7 +162,6 @@ class LocationView:
         for name in MARKERS:
             if (handle := session.scene.get_handle_by_name(name)) is not None:
                 handle.visible = not inside
-        session.redraw()
 
     def camera_moved(self) -> None:
         """Turn the view with the browser's camera while that is inside."""
@@ -191,7 +169,7 @@ class LocationView:
             self.turn_to(rotation_from_quaternion(self.session.client.camera.wxyz)[:, 2])
 
 
-def describe(location: ScoredLocation, state: ViewState) -> str:
+def describe(location: ScoredLocation, threshold: float) -> str:
     """Summarize the scores of a location."""
     x, y, z = location.position
     median = float(np.median(location.scores))
@@ -199,4 +177,4 @@ def describe(location: ScoredLocation, state: ViewState) -> str:
     summary = f"At {x:.2f}, {y:.2f}, {z:.2f} m: best {location.best.score[0]:.3g}, median {median_text}"
     if location.scores.max() > 1:
         return f"{summary}."
-    return f"{summary}; {100 * np.mean(location.scores >= state.threshold):.0f} % of directions are good."
+    return f"{summary}; {100 * np.mean(location.scores >= threshold):.0f} % of directions are good."

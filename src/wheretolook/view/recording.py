@@ -16,10 +16,10 @@ from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.utils.errors import StorageError
 from wheretolook.utils.files import atomic_write
 from wheretolook.view import drawing
-from wheretolook.view.scenery import ABOVE_GROUND_M, CAMERA_COLOR, LANDMARK_COLOR
-from wheretolook.view.scores import score_location, visible_landmarks
-from wheretolook.view.shared import Shared
+from wheretolook.view.scenery import CAMERA_COLOR, LANDMARK_COLOR
+from wheretolook.view.scores import score_location
 from wheretolook.view.state import ViewState
+from wheretolook.view.viewed_map import ViewedMap
 
 
 class Recording:
@@ -82,48 +82,44 @@ def open_recording(path: Path) -> Iterator[Recording]:
         recording.stream.disconnect()
 
 
-def record(shared: Shared, path: Path, state: ViewState = ViewState()) -> None:
+def record(viewed: ViewedMap, path: Path, state: ViewState = ViewState()) -> None:
     """Record mesh, landmarks, mapping cameras, floor, the state's location with its best views, and paths.
 
     Paths are on the timeline "step". Raises StorageError if the file cannot be written, TableError if the state's
     location is outside the map.
     """
-    state = shared.complete(state)
+    state = viewed.complete(state)
     with open_recording(path) as recording:
-        _record_scene(recording, shared, state)
-        _record_floor(recording, shared, state)
+        _record_scene(recording, viewed, state)
+        _record_floor(recording, viewed, state)
         if state.place is not None:
-            _record_location(recording, shared, state, np.array(state.place))
-        for name, along in shared.paths.items():
-            _record_path(recording, shared, state, name, along.cam_from_world)
-    shared.worker.stop()
+            _record_location(recording, viewed, state, np.array(state.place))
+        for name, along in viewed.paths.items():
+            _record_path(recording, viewed, state, name, along.cam_from_world)
 
 
-def _record_scene(recording: Recording, shared: Shared, state: ViewState) -> None:
+def _record_scene(recording: Recording, viewed: ViewedMap, state: ViewState) -> None:
     rerun = recording.rerun
-    viewed = shared.viewed
-    if (mesh := shared.mesh(state.cut)) is not None:
+    if (mesh := viewed.mesh_glb(state.cut)) is not None:
         recording.log("world/mesh", rerun.Asset3D(contents=mesh, media_type="model/gltf-binary"))
-    recording.log_landmarks(viewed.landmarks.points, 0.001 * shared.size_m)
+    recording.log_landmarks(viewed.landmarks.points, 0.001 * viewed.size_m)
     if viewed.mapping_poses is not None:
-        edges = drawing.frusta(viewed.camera, viewed.mapping_poses, shared.marker_m)
+        edges = drawing.frusta(viewed.camera, viewed.mapping_poses, viewed.marker_m)
         recording.log("world/cameras", rerun.LineStrips3D(edges, colors=CAMERA_COLOR))
 
 
-def _record_floor(recording: Recording, shared: Shared, state: ViewState) -> None:
+def _record_floor(recording: Recording, viewed: ViewedMap, state: ViewState) -> None:
     assert state.height is not None
     rerun = recording.rerun
-    floor, selector = shared.floor(state.method, state.occlusion, state.height)
+    floor = viewed.floor(state.method, state.occlusion, state.height)
     with tqdm(total=len(floor.cells), desc="floor", unit="place") as bar:
-        while floor.score_next(selector, 8):
+        while floor.score_next(8):
             bar.update(floor.n_scored - bar.n)
     if not len(floor.cells):
         return
-    is_probability = shared.is_probability(state.method)
-    low, high = (0.0, 1.0) if is_probability else (float(floor.scores.min()), float(floor.scores.max()))
-    colors = drawing.score_colors(floor.scores, low, high)
+    colors = drawing.score_colors(floor.scores, *viewed.score_range(state.method, floor.scores))
     centers = floor.points
-    centers[:, 2] = floor.height_m if floor.ground_m is None else floor.ground_m + ABOVE_GROUND_M
+    centers[:, 2] = floor.drawn_m
     half_size = (floor.cell_m / 2, floor.cell_m / 2, 0.005)
     boxes = rerun.Boxes3D(centers=centers, half_sizes=[half_size], colors=colors, fill_mode="solid")
     recording.log("world/floor", boxes)
@@ -131,31 +127,29 @@ def _record_floor(recording: Recording, shared: Shared, state: ViewState) -> Non
     recording.log("world/best", arrows)
 
 
-def _record_location(recording: Recording, shared: Shared, state: ViewState, position: Float) -> None:
+def _record_location(recording: Recording, viewed: ViewedMap, state: ViewState, position: Float) -> None:
     rerun = recording.rerun
-    location = score_location(shared.viewed.selector(state.method, state.occlusion), position, state.n)
-    points = position + shared.marker_m * location.directions
+    location = score_location(viewed.selector(state.method, state.occlusion), position, state.n)
+    points = position + viewed.marker_m * location.directions
     colors = drawing.score_colors(location.scores)
-    recording.log("world/place/sphere", rerun.Points3D(points, colors=colors, radii=0.1 * shared.marker_m))
-    edges = drawing.frusta(shared.viewed.camera, location.best.cam_from_world, 2.2 * shared.marker_m)
+    recording.log("world/place/sphere", rerun.Points3D(points, colors=colors, radii=0.1 * viewed.marker_m))
+    edges = drawing.frusta(viewed.camera, location.best.cam_from_world, 2.2 * viewed.marker_m)
     colors = np.repeat(drawing.score_colors(location.best.score), 8, axis=0)
     recording.log("world/place/views", rerun.LineStrips3D(edges, colors=colors))
-    _record_view(recording, shared, state, "world/place/best", location.best.cam_from_world[0])
+    _record_view(recording, viewed, state, "world/place/best", location.best.cam_from_world[0])
 
 
-def _record_path(recording: Recording, shared: Shared, state: ViewState, name: str, poses: Float) -> None:
+def _record_path(recording: Recording, viewed: ViewedMap, state: ViewState, name: str, poses: Float) -> None:
     recording.log_line(f"world/path/{name}", camera_centers(poses))
-    scores = shared.viewed.selector(state.method, state.occlusion).scorer.score(poses)
+    scores = viewed.selector(state.method, state.occlusion).scorer.score(poses)
     for step, pose in enumerate(tqdm(poses, desc=name, unit="view")):
         recording.stream.set_time("step", sequence=step)
-        _record_view(recording, shared, state, f"world/path/{name}/camera", pose)
+        _record_view(recording, viewed, state, f"world/path/{name}/camera", pose)
         recording.log_score(f"score/{name}", float(scores[step]))
     recording.stream.reset_time()
 
 
-def _record_view(recording: Recording, shared: Shared, state: ViewState, entity: str, pose: Float) -> None:
+def _record_view(recording: Recording, viewed: ViewedMap, state: ViewState, entity: str, pose: Float) -> None:
     """Record a camera pose (3, 4) and its image with visible landmarks."""
-    scorer = shared.viewed.selector(state.method, state.occlusion).scorer
-    landmarks = visible_landmarks(scorer, pose, shared.landmark_scorer(state.occlusion))
-    image, _ = shared.viewed.picture(pose, landmarks)
-    recording.log_camera(entity, pose, drawing.small_camera(shared.viewed.camera), image)
+    image, _ = viewed.picture(pose, viewed.visible_landmarks(state.method, state.occlusion, pose))
+    recording.log_camera(entity, pose, drawing.small_camera(viewed.camera), image)

@@ -13,12 +13,13 @@ import numpy as np
 
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError
-from wheretolook.view.controls import FILES, check_value
-from wheretolook.view.scenery import add_points
+from wheretolook.view.controls import FILES, value_of
 from wheretolook.view.session import Session
 from wheretolook.view.worker import SOON
 
 if TYPE_CHECKING:
+    from viser import ClientHandle
+
     from wheretolook.select.views import SelectedViews
     from wheretolook.select.where_to_look import WhereToLook
 
@@ -59,23 +60,21 @@ class WaypointList:
     def __init__(self, session: Session) -> None:
         self.session = session
         self.points: list[Float] = []
-        controls = session.controls
-        session.on(controls.add, self._add_selected, "on_click")
-        session.on(controls.clear, self._clear, "on_click")
-        session.on(controls.save, self._save, "on_click")
+        session.on(session.controls.add, self._add_selected)
+        session.on(session.controls.clear, self._clear)
+        session.on(session.controls.save, self._save)
 
     def add(self, point: Float) -> None:
         """Add a waypoint (3,) m."""
         if len(self.points) >= MAX_WAYPOINTS:
             raise ConfigError("no more waypoints can be added", value=MAX_WAYPOINTS, fix="Save and remove them first.")
-        self.points.append(np.asarray(point, dtype=np.float64))
+        self.points.append(point)
         self._draw()
 
     def _add_selected(self) -> None:
-        location = self.session.place.location
-        if location is None:
+        if self.session.location is None:
             raise ConfigError("no place is selected", fix="Click one on the floor first.")
-        self.add(location.position)
+        self.add(self.session.location.position)
 
     def _clear(self) -> None:
         self.points.clear()
@@ -85,49 +84,35 @@ class WaypointList:
         session = self.session
         rows = [f"{k + 1}. {x:.2f}, {y:.2f}, {z:.2f}" for k, (x, y, z) in enumerate(self.points)]
         session.controls.waypoints.content = "\n".join(rows) or "No waypoints yet."
-        if self.points:
-            size_m = 0.35 * session.shared.marker_m
-            add_points(session.scene, "/waypoints", np.array(self.points), WAYPOINT_COLOR, size_m)
-        else:
-            session.scene.remove_by_name("/waypoints")
+        session.add_points("/waypoints", np.array(self.points), WAYPOINT_COLOR, 0.35 * session.viewed.marker_m)
 
     def _save(self) -> None:
         if not self.points:
-            fix = "Tick `clicks set waypoints` and click the floor, or add the place looked at."
+            fix = "Tick `clicks set waypoints` and click the floor, or add the selected place."
             raise ConfigError("there are no waypoints to save", fix=fix)
-        self.session.submit("save", SOON, self._save_views())
+        format = str(value_of(self.session.controls.format))
+        self.session.submit("save", SOON, self._save_views(np.array(self.points), format))
 
-    def _save_views(self) -> Iterator[None]:
+    def _save_views(self, points: Float, format: str) -> Iterator[None]:
         session = self.session
-        check_value(session.controls.format, next(iter(FILES)))
-        format = str(session.controls.format.value)
         views = []
-        for selected in views_at(session.selector, np.array(self.points), session.state.n, format):
+        for selected in views_at(session.selector, points, session.state.n, format):
             views.append(selected)
             yield  # to other jobs
         content = views_file(views, format)
         session.client.send_file_download(f"views{FILES[format][1]}", content, save_immediately=True)
 
 
-class PictureButton:
-    """Saves an image of the scene as the browser shows it."""
+def save_picture(client: ClientHandle) -> None:
+    """Download an image of the scene as the browser shows it. Raises ConfigError if the browser sends none."""
+    from PIL import Image
 
-    def __init__(self, session: Session) -> None:
-        self.session = session
-        session.on(session.controls.photo, self._save, "on_click")
-
-    def _save(self) -> None:
-        from PIL import Image
-
-        client = self.session.client
-        height = client.camera.image_height or 1080
-        width = client.camera.image_width or 1920
-        scale = min(1.0, MAX_IMAGE_PX / max(height, width))
-        try:
-            size = max(1, round(height * scale)), max(1, round(width * scale))
-            image = client.get_render(*size, transport_format="png", timeout=RENDER_TIMEOUT_S)
-        except (TimeoutError, RuntimeError) as error:
-            raise ConfigError(f"the browser sent no image: {error}", fix="Keep its window in front.") from error
-        file = io.BytesIO()
-        Image.fromarray(image).save(file, format="PNG")
-        client.send_file_download("wheretolook.png", file.getvalue(), save_immediately=True)
+    size = np.array([client.camera.image_height or 1080, client.camera.image_width or 1920])
+    height, width = np.maximum(1, np.round(size * min(1.0, MAX_IMAGE_PX / size.max()))).astype(int).tolist()
+    try:
+        image = client.get_render(height, width, transport_format="png", timeout=RENDER_TIMEOUT_S)
+    except (TimeoutError, RuntimeError) as error:
+        raise ConfigError(f"the browser sent no image: {error}", fix="Keep its window in front.") from error
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, format="PNG")
+    client.send_file_download("wheretolook.png", file.getvalue(), save_immediately=True)

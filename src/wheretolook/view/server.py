@@ -13,17 +13,19 @@ import time
 import warnings
 from collections.abc import Mapping
 from importlib.util import find_spec
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 import numpy as np
 
 from wheretolook.utils.errors import ConfigError, InUseError
-from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
+from wheretolook.view.viewed_map import ViewedMap
+from wheretolook.view.worker import Worker
 
-PORT = 8080
-HOST = "127.0.0.1"
+if TYPE_CHECKING:
+    from wheretolook.view.page import Page
+
 LOCAL = ("localhost", "127.0.0.1", "::1")  # names of this machine, unreachable from others
 HEADERS = ("Host", "Origin", "X-Forwarded-Host")
 EXTRAS = {"viser": "view", "rerun": "record"}
@@ -40,57 +42,45 @@ def require(package: str) -> None:
 
 def check_port(host: str, port: int) -> None:
     """Raise InUseError if a port is in use, ConfigError if this machine cannot serve at host and port."""
-    if not 0 <= port <= 65535:
-        raise ConfigError("a port is a number from 0 to 65535", value=port, fix="Such as --port 8081.")
     try:
-        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE:
-            raise _in_use(port) from error
-        fix = "Such as --host 0.0.0.0 --port 8081."
-        raise ConfigError(f"this address cannot be served: {error}", value=f"{host}:{port}", fix=fix) from error
-
-
-def _in_use(port: int) -> InUseError:
-    free = port + 1 if port < 65535 else PORT
-    return InUseError("this port is in use", value=port, fix=f"Use another: --port {free}.")
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        socket.create_server((host, port), family=family).close()
+    except (OSError, OverflowError) as error:
+        kind = InUseError if getattr(error, "errno", 0) == errno.EADDRINUSE else ConfigError
+        fix = "Use another, such as --host 0.0.0.0 --port 8081."
+        raise kind(f"this address cannot be served: {error}", value=f"{host}:{port}", fix=fix) from error
 
 
 class Viewer:
     """Serves a map until it is stopped. Raises as `check_port`, and ConfigError if viser is not installed."""
 
     def __init__(
-        self, shared: Shared, host: str = HOST, port: int = PORT, state: ViewState = ViewState(), dark: bool = False
+        self,
+        viewed: ViewedMap,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        state: ViewState = ViewState(),
+        dark: bool = False,
     ) -> None:
         require("viser")
         check_port(host, port)
-        self.shared = shared
+        self.viewed = viewed
         self.state = state
         self.dark = dark
         self.host = host
-        self.sessions: dict[int, Any] = {}
+        self.worker = Worker()
+        self.sessions: dict[int, Page] = {}
         self._lock = threading.Lock()
-        self.server = _start_server(host, port, f"wheretolook · {shared.viewed.name}")
+        self.server = _start_server(host, port, f"wheretolook · {viewed.name}")
         self.port = self.server.get_port()
         if port not in (0, self.port):  # taken since the check
             self.stop()
-            raise _in_use(port)
+            raise InUseError("this port is in use", value=port, fix=f"Use another: --port {self.port}.")
+        shown_host = "localhost" if host in ("0.0.0.0", "::", "127.0.0.1") else f"[{host}]" if ":" in host else host
+        self.address = f"{shown_host}:{self.port}"
         self._place_camera()
         self.server.on_client_connect(self._client_joined)
         self.server.on_client_disconnect(self._client_left)
-
-    @property
-    def url(self) -> str:
-        """Address of the page."""
-        return f"http://{self._address}"
-
-    @property
-    def _address(self) -> str:
-        host = "localhost" if self.host in ("0.0.0.0", "::", HOST) else self.host
-        return f"[{host}]:{self.port}" if ":" in host else f"{host}:{self.port}"
 
     def wait(self) -> None:
         """Serve until interrupted."""
@@ -100,18 +90,22 @@ class Viewer:
         """Stop serving."""
         for session in list(self.sessions.values()):
             session.close()
-        self.shared.worker.stop()
+        self.worker.stop()
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
     def _place_camera(self) -> None:
-        """Place the initial camera above one corner, so that it sees the whole floor."""
-        low, high = self.shared.bounding_box
+        """Place the initial camera above one corner, so that it sees the whole floor and most landmarks."""
+        viewed = self.viewed
+        space = viewed.bounds.copy()
+        space[:, 2] = viewed.usual_m
+        low = np.minimum(space[0], viewed.landmark_bounds[0])
+        high = np.maximum(space[1], viewed.landmark_bounds[1])
         size_m = float(np.linalg.norm(high - low))
         center = (low + high) / 2 + 0.07 * size_m * np.array([0.82, -0.57, 0.0])  # the panel covers the right
         camera = self.server.initial_camera
-        camera.far = max(1000.0, 20 * self.shared.size_m)
-        camera.near = min(0.01, self.shared.size_m / 1000)
+        camera.far = max(1000.0, 20 * viewed.size_m)
+        camera.near = min(0.01, viewed.size_m / 1000)
         camera.fov = np.radians(50)
         camera.look_at = self.state.target or tuple(center)
         camera.position = self.state.eye or tuple(center + size_m * np.array([-0.5, -0.72, 0.95]))
@@ -128,33 +122,20 @@ class Viewer:
             _log.exception("a client could not be served")
 
     def _start_session(self, client: Any, path: str, host: str) -> None:
-        from wheretolook.view.player import Player
-        from wheretolook.view.saving import PictureButton, WaypointList
-        from wheretolook.view.session import Session
+        from wheretolook.view.page import Page
 
         problem = None
+        state = self.state
         try:
-            state = ViewState.of_path(path) or self.state
+            state = ViewState.of_path(path) or state
         except ConfigError as error:
-            state = self.state
             problem = error
-        session = Session(
-            client, self.shared, state, host if re.fullmatch(r"[\w.:\[\]-]{1,255}", host) else self._address
-        )
+        address = host if re.fullmatch(r"[\w.:\[\]-]{1,255}", host) else self.address
+        page = Page(client, self.viewed, self.worker, state, address, self.dark)
         with self._lock:
-            self.sessions[client.client_id] = session
-        session.set_theme(self.dark)
-        session.controls.dark.value = self.dark
-        waypoints = WaypointList(session)
-        PictureButton(session)
-        if self.shared.paths:
-            Player(session)
-        if state.eye is not None and state.target is not None:
-            client.camera.position = np.array(state.eye)
-            client.camera.look_at = np.array(state.target)
-        client.scene.on_click()(session.callback(lambda event: self._clicked(session, waypoints, event)))
+            self.sessions[client.client_id] = page
         if problem is not None:
-            session.show_error(problem)
+            page.show_error(problem)
         if client.client_id not in self.server.get_clients():
             self._client_left(client)
 
@@ -182,28 +163,6 @@ class Viewer:
             session = self.sessions.pop(client.client_id, None)
         if session is not None:
             session.close()
-
-    def _clicked(self, session: Any, waypoints: Any, event: Any) -> None:
-        point = intersect_plane(event.ray_origin, event.ray_direction, session.scenery.floor_m)
-        low, high = np.asarray(self.shared.viewed.space.bounds)
-        if point is None or not ((point[:2] >= low[:2]) & (point[:2] <= high[:2])).all():
-            return
-        point[2] = session.state.height
-        if session.controls.placing.value:
-            waypoints.add(point)
-        else:
-            session.place.select(point)
-
-
-def intersect_plane(origin: Any, direction: Any, height_m: float) -> np.ndarray | None:
-    """Return where a ray meets the horizontal plane at a height, (3,) m; None if it does not."""
-    start = np.asarray(origin, dtype=np.float64)
-    axis = np.asarray(direction, dtype=np.float64)
-    if start.shape != (3,) or axis.shape != (3,) or not np.isfinite([start, axis]).all() or abs(axis[2]) < 1e-9:
-        return None
-    distance = (height_m - start[2]) / axis[2]
-    point = start + distance * axis
-    return point if distance > 0 and np.isfinite(point).all() else None
 
 
 def _request(server: Any, client_id: int) -> tuple[str, Mapping[str, str]]:

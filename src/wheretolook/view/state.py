@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from dataclasses import dataclass, fields
 from typing import Self
@@ -11,7 +10,9 @@ from urllib.parse import parse_qs, urlsplit
 from wheretolook.utils.errors import ConfigError
 
 MAX_VIEWS = 20
+MAX_NUMBER = 1e9
 _MAX_LENGTH = 2000  # characters
+_FIX = "Copy it from the field `state` of the viewer, such as n=3;height=1.4;place=1,2,1.5."
 
 
 @dataclass(frozen=True)
@@ -40,8 +41,8 @@ class ViewState:
         for item in fields(self):
             value = getattr(self, item.name)
             if value != item.default:
-                text = ",".join(map(_short, value)) if isinstance(value, tuple) else _short(value)
-                parts.append(f"{item.name}={text}")
+                values = value if isinstance(value, tuple) else (value,)
+                parts.append(f"{item.name}={','.join(map(_short, values))}")
         return ";".join(parts)
 
     @classmethod
@@ -53,8 +54,8 @@ class ViewState:
         for part in filter(None, text.split(";")):
             name, _, value = part.partition("=")
             try:
-                values[name] = _READERS[name](value)
-            except (KeyError, ValueError, TypeError) as error:
+                values[name] = _parse_value(name, value)
+            except ValueError as error:
                 raise ConfigError("invalid view state", value=part, fix=_FIX) from error
         state = cls(**values)  # type: ignore[arg-type]
         if state.eye is not None and state.eye == state.target:
@@ -75,40 +76,19 @@ class ViewState:
         return f"http://{host}/?websocket=ws://{host}/?view={self.text()}"
 
 
-_FIX = "Copy it from the field `state` of the viewer, such as n=3;height=1.4;place=1,2,1.5."
-
-
 def _short(value: object) -> str:
     """Format a value; numbers to the millimetre, however far a map is from its origin."""
     return f"{value:.3f}".rstrip("0").rstrip(".") if isinstance(value, float) else str(value)
 
 
-def _number(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value) or abs(value) > 1e9:
-        raise ValueError(text)
-    return value
-
-
-def _point(text: str) -> tuple[float, float, float]:
-    x, y, z = map(_number, text.split(","))
-    return x, y, z
-
-
-def _word(text: str) -> str:
-    if not re.fullmatch(r"[\w.+-]{1,60}", text):
-        raise ValueError(text)
-    return text
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if not 1 <= value <= MAX_VIEWS:
-        raise ValueError(text)
-    return value
-
-
-_READERS = {
-    "method": _word, "occlusion": _word, "n": _count, "threshold": _number, "height": _number, "cut": _number,
-    "place": _point, "yaw": _number, "pitch": _number, "eye": _point, "target": _point,
-}  # fmt: skip
+def _parse_value(name: str, text: str) -> object:
+    """Parse the value of a field. Raises ValueError if it is invalid."""
+    kind = {item.name: str(item.type) for item in fields(ViewState)}.get(name, "")
+    if kind == "str" and re.fullmatch(r"[\w.+-]{1,60}", text):
+        return text
+    if kind == "int" and 1 <= int(text) <= MAX_VIEWS:
+        return int(text)
+    numbers = tuple(map(float, text.split(",")))
+    if kind.count("float") == len(numbers) and all(abs(number) <= MAX_NUMBER for number in numbers):
+        return numbers if len(numbers) == 3 else numbers[0]
+    raise ValueError(text)

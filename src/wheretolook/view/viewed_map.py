@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import replace
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,77 +19,67 @@ from wheretolook.dataset.environment import (
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError
+from wheretolook.utils.errors import MapError, SceneError, TableError, WhereToLookError
 from wheretolook.view import drawing
+from wheretolook.view.paths import Paths
+from wheretolook.view.scores import FLOOR_DIRECTIONS, Floor, floor_at
+from wheretolook.view.state import ViewState
 from wheretolook.view.weights import AvailableWeights, given_weights, map_weights, scene_weights
 
 if TYPE_CHECKING:  # torch and Warp are imported when first needed: the page opens before them
     import pandas as pd
 
-    from wheretolook.dataset.layout import SceneFolder
-    from wheretolook.geometry.mesh import TexturedMesh
     from wheretolook.inputs.localization_map import LocalizationMap
-    from wheretolook.mapping.landmarks import Landmarks
+    from wheretolook.scorers.base import Scorer
     from wheretolook.select.where_to_look import WhereToLook
     from wheretolook.view.photographs import Photographs
-    from wheretolook.view.scores import VisibleLandmarks
 
 MAX_SCORERS = 8  # kept in memory; those of large maps take 100 MB each
+MAX_FLOORS = 64
+MAX_MESHES = 4
 DIRECTIONS = 500  # scored at a location, as by `wheretolook select`
 OCCLUSION_BYTES = 1 << 26  # memory for cached lines of sight
+STEP_M = 0.05  # heights of floors and cuts are multiples of it
 
 
-@dataclass(eq=False)
 class ViewedMap:
-    """An environment with everything else that the viewer shows. Methods are not thread-safe."""
+    """An environment with everything else that the viewer shows, computed once for all clients.
 
-    name: str
-    environment: Environment
-    weights: AvailableWeights
-    labels: pd.DataFrame | None = None  # labelled viewpoints
-    photographs: Photographs | None = None
-    _maps: dict[str, LocalizationMap] = field(default_factory=dict, init=False)
-    _selectors: dict[tuple[str, str, int], WhereToLook] = field(default_factory=dict, init=False)
+    Scorers, floors and landmarks in view are for one thread only.
+    """
 
-    @property
-    def landmarks(self) -> Landmarks:
-        """The map's landmarks."""
-        return self.environment.landmarks
-
-    @property
-    def camera(self) -> Camera:
-        """The camera whose views are shown."""
-        return self.environment.camera
-
-    @property
-    def mesh(self) -> TexturedMesh | None:
-        """The mesh; None without one."""
-        return self.environment.mesh if self.environment.has_mesh else None
-
-    @property
-    def mapping_poses(self) -> Float | None:
-        """Poses cam_from_world (M, 3, 4) of the mapping cameras; None if unknown."""
-        return self.environment.mapping_poses
-
-    @property
-    def mapping_centers(self) -> Float:
-        """Centres of the mapping cameras (M, 3), metres; empty if unknown."""
-        return camera_centers(np.empty((0, 3, 4)) if self.mapping_poses is None else self.mapping_poses)
-
-    @cached_property
-    def space(self) -> Any:
-        """Where a camera can be: `bounds` (2, 3) m and `is_free`."""
-        return self.environment.space if self.environment.has_mesh else self.environment.mapped_space
-
-    @property
-    def occlusions(self) -> tuple[str, ...]:
-        """Names of available occlusion models, the most accurate first."""
-        return tuple(name for name in self.environment.available_occlusion if name != "tsdf")  # slow to make
-
-    @cached_property
-    def methods(self) -> tuple[str, ...]:
-        """Names of the methods that can score here, that of the best weights first."""
-        return self.weights.methods
+    def __init__(
+        self,
+        name: str,
+        environment: Environment,
+        weights: AvailableWeights,
+        labels: pd.DataFrame | None = None,
+        photographs: Photographs | None = None,
+    ) -> None:
+        self.name = name
+        self.environment = environment
+        self.weights = weights
+        self.labels = labels  # labelled viewpoints
+        self.photographs = photographs
+        self.paths: Paths = {}  # to play
+        self.landmarks = environment.landmarks
+        self.camera = environment.camera
+        self.mapping_poses = environment.mapping_poses  # (M, 3, 4) cam_from_world
+        self.mesh = environment.mesh if environment.has_mesh else None
+        self.space = environment.space if environment.has_mesh else environment.mapped_space
+        self.occlusions = tuple(name for name in environment.available_occlusion if name != "tsdf")  # slow to make
+        self.bounds = np.array(self.space.bounds, dtype=np.float64)  # (2, 3) m, of free space
+        self.landmark_bounds = np.quantile(self.landmarks.points, (0.02, 0.98), axis=0)  # without outliers
+        self.size_m = float(np.linalg.norm(np.diff(self.landmark_bounds, axis=0)))
+        self.marker_m = min(0.3, 0.03 * self.size_m)  # size of drawn markers
+        low, high = self.bounds[:, 2]
+        self.usual_m = float((low + high) / 2)  # median height of the mapping cameras
+        if self.mapping_poses is not None and len(self.mapping_poses):
+            self.usual_m = float(np.clip(np.median(camera_centers(self.mapping_poses)[:, 2]), low, high))
+        self._map = cache(self._make_map)
+        self._selector = lru_cache(MAX_SCORERS)(self._make_selector)
+        self._floor = lru_cache(MAX_FLOORS)(self._make_floor)
+        self._mesh = lru_cache(MAX_MESHES)(self._make_mesh)
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
@@ -97,65 +87,107 @@ class ViewedMap:
         from wheretolook.mapping.sanity import frame_warnings, mesh_warning
 
         warnings: tuple[str, ...] = ()
-        if self.mapping_poses is not None and len(self.mapping_poses) > 0:
+        if self.mapping_poses is not None and len(self.mapping_poses):
             warnings = frame_warnings(self.landmarks.mapping_distance_m, self.mapping_poses)
         if self.mesh is not None and (doubt := mesh_warning(self.landmarks.points, self.environment.raycaster)):
             warnings = (*warnings, f"The mesh: {doubt}")
         return warnings
 
-    def picture(self, pose: Float, visible: VisibleLandmarks) -> tuple[drawing.Rgb, str]:
+    def complete(self, state: ViewState) -> ViewState:
+        """Fill in method, occlusion model and height where a state leaves them open or they are not available."""
+        return replace(
+            state,
+            method=state.method if state.method in self.weights.methods else self.weights.methods[0],
+            occlusion=state.occlusion if state.occlusion in self.occlusions else self.occlusions[0],
+            height=self.usual_m if state.height is None else state.height,
+        )
+
+    def is_probability(self, method: str) -> bool:
+        """Test whether a method's scores are probabilities, which a threshold applies to."""
+        from wheretolook.scorers.registry import check_method
+
+        return check_method(method).probability
+
+    def score_range(self, method: str, scores: Float) -> tuple[float, float]:
+        """Return the ends of the colour scale: 0 and 1 for probabilities, else those of the finite scores."""
+        return (0.0, 1.0) if self.is_probability(method) else (float(np.nanmin(scores)), float(np.nanmax(scores)))
+
+    def selector(self, method: str, occlusion: str, directions: int = DIRECTIONS) -> WhereToLook:
+        """Return the view selector of a method and an occlusion model.
+
+        Scorers cache what depends on the directions, so each number of directions has its own. Raises ConfigError for
+        an unknown method or occlusion model, WeightsError if the weights cannot be used.
+        """
+        return self._selector(method, occlusion, directions)
+
+    def _make_selector(self, method: str, occlusion: str, directions: int) -> WhereToLook:
+        from wheretolook.scorers.registry import check_method, make_scorer
+        from wheretolook.select.where_to_look import WhereToLook
+
+        weights = self.weights.files.get(check_method(method).weights)
+        scorer = make_scorer(method, self._map(occlusion), weights=weights)
+        return WhereToLook(scorer, direction_lattice(directions), self.space)
+
+    def _make_map(self, occlusion: str) -> LocalizationMap:
+        from wheretolook.inputs.localization_map import LocalizationMap
+
+        model = self.environment.occlusion_model(occlusion)
+        return LocalizationMap(self.landmarks, self.camera, model, self.environment.device, self.mapping_poses)
+
+    def floor(self, method: str, occlusion: str, height_m: float) -> Floor:
+        """Return the floor at a height, one object for all clients."""
+        return self._floor(method, occlusion, round(height_m / STEP_M) * STEP_M)
+
+    def _make_floor(self, method: str, occlusion: str, height_m: float) -> Floor:
+        return floor_at(self.selector(method, occlusion, FLOOR_DIRECTIONS), height_m)
+
+    def mesh_glb(self, cut_m: float | None) -> bytes | None:
+        """Return the mesh below a height as GLB; None without a mesh."""
+        return self._mesh(None if cut_m is None else round(cut_m / STEP_M) * STEP_M)
+
+    def _make_mesh(self, cut_m: float | None) -> bytes | None:
+        return None if self.mesh is None else drawing.mesh_glb(self.mesh, cut_m)
+
+    def visible_landmarks(self, method: str, occlusion: str, pose: Float) -> drawing.VisibleLandmarks:
+        """Return the landmarks visible in a view (3, 4) with detection probabilities.
+
+        Methods without landmark probabilities have those of the best weights, if these can score here.
+        """
+        scorer = self.selector(method, occlusion).scorer
+        estimated = scorer.landmark_probabilities(pose[None])
+        if estimated is None and (best := self._best_scorer(occlusion)) is not None:
+            estimated = best.landmark_probabilities(pose[None])
+        localization_map = scorer.localization_map
+        if estimated is None:
+            rows = localization_map.landmarks_in_view(pose[None])[0].astype(np.int64)
+            probabilities = np.full(len(rows), np.nan)
+        else:
+            rows = estimated.rows
+            probabilities = estimated.p_detect
+        points = localization_map.landmarks.points[rows]
+        pixels = localization_map.camera.project(points @ pose[:, :3].T + pose[:, 3])
+        return drawing.VisibleLandmarks(points, pixels, probabilities)
+
+    def _best_scorer(self, occlusion: str) -> Scorer | None:
+        try:
+            return self.selector(self.weights.methods[0], occlusion).scorer
+        except WhereToLookError:  # such as weights of another field of view
+            return None
+
+    def picture(self, pose: Float, visible: drawing.VisibleLandmarks) -> tuple[drawing.Rgb, str]:
         """Return an image (H, W, 3) of a view (3, 4) and its caption.
 
         The view is rendered; without a mesh it is the nearest photograph, or else the landmarks alone. Landmarks are
         drawn in the colours of their probabilities, except on photographs, which show another view.
         """
-        marks = (self.camera, visible.pixels, visible.probabilities)
-        if self.environment.has_mesh:
+        if self.mesh is not None:
             rgb = self.environment.renderer.render(drawing.small_camera(self.camera), pose[None]).rgb[0]
-            return drawing.picture(rgb, *marks), "rendered; landmarks by detection probability"
+            return drawing.picture(rgb, self.camera, visible), "rendered; landmarks by detection probability"
         if self.photographs is not None:
             number = self.photographs.nearest(pose)
             rgb = self.photographs.read(number, drawing.PICTURE_PX)
             return rgb, f"nearest photograph, {self.photographs.names[number]}"
-        return drawing.picture(None, *marks), "landmarks in view by detection probability"
-
-    def localization_map(self, occlusion: str) -> LocalizationMap:
-        """Return the map with an occlusion model. Raises ConfigError if the model is not available."""
-        from wheretolook.inputs.localization_map import LocalizationMap
-        from wheretolook.visibility.cached_occlusion import CachedOcclusion
-
-        if occlusion not in self.occlusions:
-            fix = f"Use {', '.join(self.occlusions)}."
-            raise ConfigError("this occlusion model is not available here", value=occlusion, fix=fix)
-        if occlusion not in self._maps:
-            environment = self.environment
-            model = environment.occlusion_model(occlusion)
-            if occlusion != "none":
-                model = CachedOcclusion(model, OCCLUSION_BYTES)
-            self._maps[occlusion] = LocalizationMap(
-                self.landmarks, self.camera, model, environment.device, self.mapping_poses
-            )
-        return self._maps[occlusion]
-
-    def selector(self, method: str = "", occlusion: str = "", directions: int = DIRECTIONS) -> WhereToLook:
-        """Return the view selector of a method (by default of the best weights) and an occlusion model.
-
-        Scorers cache what depends on the directions, so each number of directions has its own. Raises ConfigError for
-        an unknown method or occlusion model, WeightsError if the weights cannot be used.
-        """
-        from wheretolook.scorers.registry import check_method, make_scorer
-        from wheretolook.select.where_to_look import WhereToLook
-
-        key = (method or self.methods[0], occlusion or self.occlusions[0], directions)
-        selector = self._selectors.pop(key, None)
-        if selector is None:
-            weights = self.weights.files.get(check_method(key[0]).weights)
-            scorer = make_scorer(key[0], self.localization_map(key[1]), weights=weights)
-            selector = WhereToLook(scorer, direction_lattice(directions), self.space)
-            if len(self._selectors) >= MAX_SCORERS:
-                del self._selectors[next(iter(self._selectors))]  # the least recently used
-        self._selectors[key] = selector
-        return selector
+        return drawing.picture(None, self.camera, visible), "landmarks in view by detection probability"
 
 
 def open_map(
@@ -178,77 +210,60 @@ def open_map(
         WeightsError: the weights cannot be used.
     """
     from wheretolook.mapping.sanity import warn_of_mesh
-    from wheretolook.mapping.sources import find_photographs
-    from wheretolook.view.photographs import Photographs
 
-    environment = ColmapEnvironment(ColmapFiles(path, mesh), camera, device=device)
+    config = EnvironmentConfig(occlusion_cache_bytes=OCCLUSION_BYTES)
+    environment = ColmapEnvironment(ColmapFiles(path, mesh), camera, config=config, device=device)
     landmarks = environment.landmarks
     if len(landmarks) == 0:
         raise MapError("the map has no landmarks", path=path, fix="Map it again.")
-    if weights is None:
-        available = map_weights(path, data, landmarks.points, landmarks.features)
-    else:
-        available = given_weights(weights, landmarks.features)
     if mesh is not None:
         warn_of_mesh(mesh, landmarks.points, environment.raycaster)
-    folder = images or find_photographs(path)
-    photographs = None if folder is None else Photographs.of_model(path, folder)
+    available = given_weights(weights, landmarks.features) if weights else map_weights(path, data, landmarks)
     model = path.resolve()
     name = model.parent.name if model.name in ("0", "sparse", "map") else model.name
-    return ViewedMap(name, environment, available, photographs=photographs)
+    return ViewedMap(name, environment, available, photographs=_photographs(path, images))
 
 
 def open_scene(
-    files: SceneFolder, camera: Camera | None = None, weights: Path | None = None, device: str = "cpu"
-) -> ViewedMap:
-    """Open a mapped scene of a dataset, with its labels if there are any.
-
-    By default views are scored by the scene's own weights (`scene_weights`), or by bundled ones. Raises MapError or
-    TableError if the scene has not been mapped, WeightsError if the weights cannot be used.
-    """
-    from wheretolook.mapping.colmap_model import holds_model
-    from wheretolook.mapping.sources import find_photographs
-    from wheretolook.view.photographs import Photographs
-
-    if not files.landmarks.is_file():
-        raise MapError("this scene has no map yet", path=files.map, fix="Run `wheretolook map` for its dataset.")
-    number, own_camera = next(iter(files.cameras().items()))
-    environment = SceneEnvironment(files, camera or own_camera, EnvironmentConfig(assume_metric=True), device)
-    if not environment.has_mesh and environment.mapping_poses is None:
-        raise SceneError("neither a mesh nor the map's cameras are known", path=files.folder, fix="Map it again.")
-    landmarks = environment.landmarks
-    if weights is None:
-        available = scene_weights(files, landmarks.points, landmarks.features)
-    else:
-        available = given_weights(weights, landmarks.features)
-    folder = find_photographs(files.map)
-    photographs = None
-    if folder is not None and holds_model(files.map):
-        photographs = Photographs.of_model(files.map, folder)
-    labels = _labels(files, number) if camera is None else None
-    return ViewedMap(files.name, environment, available, labels, photographs)
-
-
-def _labels(files: SceneFolder, camera: int) -> pd.DataFrame | None:
-    """Read the labelled viewpoints of a camera; None without any."""
-    from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED
-
-    if not files.table.is_file():
-        return None
-    table = files.read_table()
-    if CAMERA_ID in table:
-        table = table[table[CAMERA_ID] == camera]
-    table = table[table["status"] != UNLABELLED].reset_index(drop=True)
-    return None if table.empty else table
-
-
-def open_named_scene(
     data: Path, name: str, dataset: str, camera: Camera | None, weights: Path | None, device: str
 ) -> ViewedMap:
-    """Open the scene of a name in a folder of datasets; raises as `dataset.layout.find_scene` and `open_scene`."""
+    """Open a mapped scene of a dataset in the folder `data`, with its labels if there are any.
+
+    By default views are scored by the scene's own weights (`scene_weights`), or by bundled ones. Raises as
+    `dataset.layout.find_scene`, MapError or TableError if the scene has not been mapped, WeightsError if the weights
+    cannot be used.
+    """
     from wheretolook.dataset.layout import find_scene
+    from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED
 
     if not data.is_dir():
         fix = "Make a scene first, such as by `wheretolook demo`, or name a model: --map SPARSE."
         raise TableError("there is no such folder of datasets", path=data, fix=fix)
-    return open_scene(find_scene(data, name, dataset), camera, weights, device)
+    files = find_scene(data, name, dataset)
+    if not files.landmarks.is_file():
+        raise MapError("this scene has no map yet", path=files.map, fix="Run `wheretolook map` for its dataset.")
+    number, own_camera = next(iter(files.cameras().items()))
+    config = EnvironmentConfig(assume_metric=True, occlusion_cache_bytes=OCCLUSION_BYTES)
+    environment = SceneEnvironment(files, camera or own_camera, config, device)
+    if not environment.has_mesh and environment.mapping_poses is None:
+        raise SceneError("neither a mesh nor the map's cameras are known", path=files.folder, fix="Map it again.")
+    landmarks = environment.landmarks
+    available = given_weights(weights, landmarks.features) if weights else scene_weights(files, landmarks)
+    labels = None
+    if camera is None and files.table.is_file():
+        table = files.read_table()
+        shown = table["status"] != UNLABELLED
+        if CAMERA_ID in table:
+            shown &= table[CAMERA_ID] == number
+        labels = table[shown].reset_index(drop=True) if shown.any() else None
+    return ViewedMap(files.name, environment, available, labels, _photographs(files.map))
+
+
+def _photographs(model: Path, folder: Path | None = None) -> Photographs | None:
+    """Find the photographs of a COLMAP model, in a folder or where it was mapped from."""
+    from wheretolook.mapping.colmap_model import holds_model
+    from wheretolook.mapping.sources import find_photographs
+    from wheretolook.view.photographs import Photographs
+
+    folder = folder or find_photographs(model)
+    return Photographs.of_model(model, folder) if folder is not None and holds_model(model) else None

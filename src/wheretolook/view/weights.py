@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,28 +9,26 @@ from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped
 
 if TYPE_CHECKING:
     from wheretolook.dataset.layout import SceneFolder
-    from wheretolook.geometry.poses import Float
+    from wheretolook.mapping.landmarks import Landmarks
 
 
-@dataclass(frozen=True)
 class AvailableWeights:
-    """Weights files and their origin, by the method that they belong to; the preferred method comes first."""
+    """Weights files and their origin, by the method that they belong to; the preferred method comes first.
 
-    files: dict[str, Path]
-    origins: dict[str, str]
+    Made from existing files or folders by origin, followed by the bundled weights, for a map with `features`. Raises
+    WeightsError if they cannot be used.
+    """
 
-    @classmethod
-    def of(cls, features: str, own: dict[str, Path | None]) -> AvailableWeights:
-        """Collect the weights of existing files or folders by origin, then bundled ones, for a map with `features`."""
+    def __init__(self, features: str, own: dict[str, Path | None]) -> None:
         from wheretolook.weights.resolve import weights_by_method
 
-        available = cls({}, {})
+        self.files: dict[str, Path] = {}
+        self.origins: dict[str, str] = {}
         for origin, place in {**own, "bundled with wheretolook": shipped(WEIGHTS)}.items():
             for method, path in weights_by_method(place, features).items() if place is not None else ():
-                if method not in available.files:
-                    available.files[method] = path
-                    available.origins[method] = origin
-        return available
+                if method not in self.files:
+                    self.files[method] = path
+                    self.origins[method] = origin
 
     def describe(self, method: str) -> str:
         """Describe the weights that a method scores with; empty for a method without weights."""
@@ -54,13 +51,13 @@ class AvailableWeights:
         return tuple(sorted(usable, key=lambda name: (scorers()[name].weights != first, name != first)))
 
 
-def given_weights(path: Path, features: str = "") -> AvailableWeights:
-    """Collect the weights in a file or folder, and bundled ones. Raises WeightsError if they cannot be used."""
-    return AvailableWeights.of(features, {"given": or_shipped(path)})
+def given_weights(path: Path, features: str) -> AvailableWeights:
+    """Collect the weights in a file or folder, and bundled ones."""
+    return AvailableWeights(features, {"given": or_shipped(path)})
 
 
-def scene_weights(files: SceneFolder, landmarks: Float, features: str = "") -> AvailableWeights:
-    """Collect weights adapted to a scene with landmarks (N, 3) m, trained with its dataset, and bundled ones."""
+def scene_weights(files: SceneFolder, landmarks: Landmarks) -> AvailableWeights:
+    """Collect weights adapted to a scene, trained with its dataset, and bundled ones."""
     root = files.folder.parent
     trained = None
     if any((root / "weights").glob("*.safetensors")):
@@ -71,19 +68,20 @@ def scene_weights(files: SceneFolder, landmarks: Float, features: str = "") -> A
         if trained is not None and not trained.is_relative_to(root):
             trained = None
     adapted = _if_adapted_to(root / "adapted" / f"{files.name}.safetensors", landmarks)
-    return AvailableWeights.of(features, {"adapted to this scene": adapted, "trained with this dataset": trained})
+    own = {"adapted to this scene": adapted, "trained with this dataset": trained}
+    return AvailableWeights(landmarks.features, own)
 
 
-def map_weights(model: Path, data: Path, landmarks: Float, features: str = "") -> AvailableWeights:
-    """Collect weights adapted to a COLMAP model with landmarks (N, 3) m by `wheretolook adapt --map`, and bundled ones."""
+def map_weights(model: Path, data: Path, landmarks: Landmarks) -> AvailableWeights:
+    """Collect weights adapted to a COLMAP model by `wheretolook adapt --map`, and bundled ones."""
     from wheretolook.mapping.config import ExistingModelConfig
 
     path = data / "checks" / ExistingModelConfig(model=model).scene_name / "adapted.safetensors"
-    return AvailableWeights.of(features, {"adapted to this scene": _if_adapted_to(path, landmarks)})
+    return AvailableWeights(landmarks.features, {"adapted to this scene": _if_adapted_to(path, landmarks)})
 
 
-def _if_adapted_to(path: Path, landmarks: Float) -> Path | None:
-    """Return the path if the file has weights adapted to a scene with these landmarks (N, 3) m."""
+def _if_adapted_to(path: Path, landmarks: Landmarks) -> Path | None:
+    """Return the path if the file has weights adapted to a scene with these landmarks."""
     if not path.is_file():
         return None
     from safetensors import SafetensorError, safe_open
@@ -95,4 +93,4 @@ def _if_adapted_to(path: Path, landmarks: Float) -> Path | None:
             place = file.get_tensor("place")
     except (SafetensorError, OSError):
         return None
-    return path if share_of_place(place, landmarks) >= LEAST_SAME else None
+    return path if share_of_place(place, landmarks.points) >= LEAST_SAME else None

@@ -6,7 +6,6 @@ import logging
 import math
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass
 
@@ -27,8 +26,8 @@ _log = logging.getLogger(__name__)
 
 @dataclass(eq=False)
 class _Job:
+    key: tuple[Hashable, Hashable]  # owner and kind
     urgency: int
-    key: tuple[Hashable, Hashable]
     steps: Iterator[object]
     on_error: Callable[[Exception], None]
 
@@ -41,9 +40,8 @@ class Worker:
     """
 
     def __init__(self, name: str = "scores") -> None:
-        self._jobs: dict[tuple[Hashable, Hashable], _Job] = {}
-        self._queues: dict[int, deque[_Job]] = {NOW: deque(), SOON: deque(), LATER: deque()}
-        self._last_run = dict.fromkeys(self._queues, -math.inf)
+        self._jobs: dict[tuple[Hashable, Hashable], _Job] = {}  # the next of each urgency first
+        self._last_run = [-math.inf] * 3  # by urgency
         self._changed = threading.Condition()
         self._stopped = False
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -58,10 +56,10 @@ class Worker:
         on_error: Callable[[Exception], None],
     ) -> None:
         """Queue a job of an owner. It replaces the pending job of the same owner and kind."""
-        job = _Job(urgency, (owner, kind), steps, on_error)
+        job = _Job((owner, kind), urgency, steps, on_error)
         with self._changed:
+            self._jobs.pop(job.key, None)
             self._jobs[job.key] = job
-            self._queues[urgency].append(job)
             self._changed.notify()
 
     def forget(self, owner: Hashable) -> None:
@@ -84,43 +82,42 @@ class Worker:
                     self._changed.wait()
                 if self._stopped:
                     return
-                queue = self._next_queue()
+                job = self._next_job()
                 start = min(self._last_run[NOW] + QUIET_S, self._last_run[LATER] + PATIENCE_S)
                 pause_s = start - time.monotonic()
-                if queue is self._queues[LATER] and pause_s > 0:
+                if job.urgency == LATER and pause_s > 0:
                     self._changed.wait(pause_s)
                     continue
-                job = queue.popleft()
-            self._step(job)
+            finished = self._step(job)
             self._last_run[job.urgency] = time.monotonic()
+            with self._changed:
+                if self._jobs.get(job.key) is job:
+                    del self._jobs[job.key]
+                    if not finished:
+                        self._jobs[job.key] = job  # behind the others
 
-    def _next_queue(self) -> deque[_Job]:
-        """Return the queue to serve: of the most urgent jobs, or of less urgent ones that have waited too long."""
-        for queue in self._queues.values():
-            while queue and self._jobs.get(queue[0].key) is not queue[0]:
-                queue.popleft()  # replaced or forgotten
+    def _next_job(self) -> _Job:
+        """Return the first of the most urgent jobs, or of less urgent ones that have waited too long."""
         now = time.monotonic()
-        for urgency, patience_s in ((SOON, CLICK_PATIENCE_S), (LATER, PATIENCE_S)):
-            if self._queues[urgency] and now - self._last_run[urgency] > patience_s:
-                return self._queues[urgency]
-        return next(queue for queue in self._queues.values() if queue)
+        patience_s = (math.inf, CLICK_PATIENCE_S, PATIENCE_S)
 
-    def _step(self, job: _Job) -> None:
+        def order(job: _Job) -> tuple[bool, int]:
+            overdue = now - self._last_run[job.urgency] > patience_s[job.urgency]
+            return not overdue, job.urgency
+
+        return min(self._jobs.values(), key=order)
+
+    def _step(self, job: _Job) -> bool:
+        """Run a step of a job; return whether the job has ended."""
         try:
             next(job.steps)
-            finished = False
+            return False
         except StopIteration:
-            finished = True
+            return True
         except Exception as error:  # must not end the thread
-            finished = True
             _log.debug("a job failed: %s", job.key, exc_info=error)
             try:
                 job.on_error(error)
             except Exception:
                 _log.exception("an error could not be reported")
-        with self._changed:
-            if self._jobs.get(job.key) is job:
-                if finished:
-                    del self._jobs[job.key]
-                else:
-                    self._queues[job.urgency].append(job)
+            return True

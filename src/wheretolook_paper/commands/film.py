@@ -19,10 +19,10 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.utils.errors import ConfigError
 from wheretolook.view import drawing
+from wheretolook.view.drawing import VisibleLandmarks
 from wheretolook.view.paths import FORWARD, RecordedPath
-from wheretolook.view.scores import VisibleLandmarks, visible_landmarks
-from wheretolook.view.shared import Shared
 from wheretolook.view.state import ViewState
+from wheretolook.view.viewed_map import ViewedMap
 
 SIZE_IN = (7.6, 4.3)
 DPI = 100
@@ -45,29 +45,24 @@ class _FilmedPath:
         return VERMILION if self.name == FORWARD else BLUE
 
 
-def film(shared: Shared, path: Path, state: ViewState = ViewState()) -> int:
+def film(viewed: ViewedMap, path: Path, state: ViewState = ViewState()) -> int:
     """Write a film (.webp or .gif) of the first and the last of the paths; return its number of frames.
 
     A view is good if it localized, or, for paths that were not localized, if its score reaches the threshold. Raises
     ConfigError without a mesh or with fewer than two paths.
     """
-    try:
-        viewed = shared.viewed
-        if viewed.mesh is None or len(shared.paths) < 2:
-            fix = "Give --path of a scene with a mesh."
-            raise ConfigError("a film needs a mesh, and two paths to compare", path=path, fix=fix)
-        frames = list(_frames(shared, shared.complete(state)))
-    finally:
-        shared.worker.stop()
+    if viewed.mesh is None or len(viewed.paths) < 2:
+        fix = "Give --path of a scene with a mesh."
+        raise ConfigError("a film needs a mesh, and two paths to compare", path=path, fix=fix)
+    frames = list(_frames(viewed, viewed.complete(state)))
     save_moving(frames, [FRAME_MS] * (len(frames) - 1) + [LAST_MS], path)
     return len(frames)
 
 
-def _frames(shared: Shared, state: ViewState) -> Iterator[drawing.Rgb]:
-    viewed = shared.viewed
+def _frames(viewed: ViewedMap, state: ViewState) -> Iterator[drawing.Rgb]:
     assert viewed.mesh is not None
     scorer = viewed.selector(state.method, state.occlusion).scorer
-    named = list(shared.paths.items())
+    named = list(viewed.paths.items())
     paths = []
     for name, path in (named[0], named[-1]):
         scores = scorer.score(path.cam_from_world)
@@ -86,8 +81,8 @@ def _frames(shared: Shared, state: ViewState) -> Iterator[drawing.Rgb]:
             for row, filmed in enumerate(paths):
                 at = round(share * (len(filmed.path) - 1))
                 pose = filmed.path.cam_from_world[at]
-                _draw_path(above, house, filmed, at, viewed.camera, shared.marker_m)
-                visible = visible_landmarks(scorer, pose, shared.landmark_scorer(state.occlusion))
+                _draw_path(above, house, filmed, at, viewed.camera, viewed.marker_m)
+                visible = viewed.visible_landmarks(state.method, state.occlusion, pose)
                 likely = np.nan_to_num(visible.probabilities) >= MIN_PROBABILITY
                 shown = (visible.points[likely], visible.pixels[likely], visible.probabilities[likely])
                 image, _ = viewed.picture(pose, VisibleLandmarks(*shown))

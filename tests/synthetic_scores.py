@@ -67,10 +67,3 @@ def make_scores(
                 row |= {"ece": 0.0712 if learned else np.nan, "ece_scaled": 0.0234 if learned else np.nan}
                 rows.append({**row, "temperature": 1.375 if learned else np.nan})
     return pd.DataFrame(rows)
-
-
-def older(scores: pd.DataFrame) -> pd.DataFrame:
-    """The columns that tables had before regrets, differences and calibration."""
-    new = ("good_", "released_", "regret_", "difference_", "p_", "candidates", "ece", "temperature", "reference",
-           "any_low_", "any_high_")  # fmt: skip
-    return scores[[name for name in scores.columns if not name.startswith(new)]]

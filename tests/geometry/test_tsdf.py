@@ -43,11 +43,14 @@ def test_a_depth_camera_may_have_two_focal_lengths_and_its_own_centre() -> None:
         DepthImage(depth, ColmapCamera("RADIAL", 320, 240, (200.0, 160.0, 120.0, 0.1, 0.0)), pose)
 
 
-def test_voxels_that_exceed_the_memory_limit_are_refused(images: list[DepthImage], volume: TsdfVolume) -> None:
+def test_voxels_that_do_not_fit_into_memory_are_refused(
+    images: list[DepthImage], volume: TsdfVolume, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert 1 <= estimate_blocks(images, volume.config) / len(volume) < 2
+    monkeypatch.setattr("wheretolook.geometry.tsdf.fitting", lambda bytes_each: (5 << 20) // bytes_each)
     with pytest.raises(ConfigError):
-        TsdfVolume.from_images(images, TsdfConfig(memory_limit_bytes=50 << 20), progress=False)
-    small = TsdfVolume(TsdfConfig(memory_limit_bytes=5 << 20))
+        TsdfVolume.from_images(images, progress=False)
+    small = TsdfVolume()
     with pytest.raises(ConfigError):
         for image in images:
             small.integrate(image)
@@ -55,13 +58,7 @@ def test_voxels_that_exceed_the_memory_limit_are_refused(images: list[DepthImage
 
 @pytest.mark.parametrize(
     "options",
-    [
-        {"voxel_size_m": 0.0},
-        {"voxel_size_m": float("nan")},
-        {"truncation_voxels": 0.5},
-        {"max_depth_m": -1.0},
-        {"memory_limit_bytes": 0},
-    ],
+    [{"voxel_size_m": 0.0}, {"voxel_size_m": float("nan")}, {"truncation_voxels": 0.5}, {"max_depth_m": -1.0}],
 )
 def test_invalid_options(options: dict[str, float]) -> None:
     with pytest.raises(ConfigError):

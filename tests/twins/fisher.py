@@ -5,11 +5,25 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.pose_information import N_NUMBERS, bearing_numbers, information_matrices
+from wheretolook.geometry import pose_information
+from wheretolook.geometry.pose_information import N_NUMBERS, bearing_numbers
 from wheretolook.geometry.poses import Float
 from wheretolook.visibility.frustum import offsets_from
 from wheretolook_paper.fisher.field_sums import NEAREST_M
 from wheretolook_paper.fisher.soft_visibility import SoftVisibility
+
+
+def information_matrices(numbers: ArrayLike, pivots: ArrayLike | None = None) -> Float:
+    """`pose_information.information_matrices` (..., 6, 6) of a pose that is rotated about pivots.
+
+    These are offsets (..., 3) m from the camera centre; None for the centre itself.
+    """
+    matrices = pose_information.information_matrices(numbers)
+    if pivots is None:
+        return matrices
+    turn = np.broadcast_to(np.eye(6), matrices.shape).copy()  # the centre moves by theta x (centre - pivot)
+    turn[..., :3, 3:] = np.cross(np.eye(3), np.asarray(pivots, dtype=np.float64)[..., None, :])
+    return np.asarray(np.swapaxes(turn, -1, -2) @ matrices @ turn)
 
 
 def field_sums_plain(

@@ -64,15 +64,14 @@ def compare_log_odds(
         seed: of the bootstrap.
         blocks: (B,) block of each held-out photograph, resampled as a whole, -1 for rendered views; None for none.
     """
-    ids, first, row, n_views = np.unique(location, return_index=True, return_inverse=True, return_counts=True)
+    _, first, row, n_views = np.unique(location, return_index=True, return_inverse=True, return_counts=True)
     row = row.reshape(-1)
     clusters = np.unique(np.floor(centers[first, :2] / SQUARE_M), axis=0, return_inverse=True)[1].reshape(-1)
     if blocks is not None:
         clusters = np.where(blocks[first] >= 0, clusters.max() + 1 + blocks[first], clusters)
     bootstrap = ClusterBootstrap(clusters, RESAMPLES, seed)
     has_choice = (n_views > 1).astype(np.float64)
-    localizes_somewhere = np.zeros(len(ids), dtype=bool)
-    np.logical_or.at(localizes_somewhere, row, good)
+    localizes_somewhere = np.bincount(row, weights=good) > 0
 
     def mean_with_interval(values: Float, counts: Float) -> Interval:
         low, high = bootstrap.ratio_interval(values[:, None], counts[:, None])
@@ -108,15 +107,10 @@ def compare_log_odds(
 def gain_markdown(gain: Gain) -> str:
     """Format a gain as a Markdown table and a sentence."""
     names = {"regret": "regret", "auc": "AUC", "calibration_error": "calibration error", "log_loss": "log loss"}
-    rows = []
-    for key, text in names.items():
-        digits = ".1f" if key == "regret" else ".3f"
-        rows.append([text, format(gain.before[key], digits), format(gain.after[key], digits)])
-    loss, low, high = gain.log_loss_less
-    summary = f"Log loss decreases by {loss:.3f} [{low:.3f}, {high:.3f}]"
-    regret, low, high = gain.regret_less
-    if np.isnan(low):
+    rows = [[text, f"{gain.before[key]:.3f}", f"{gain.after[key]:.3f}"] for key, text in names.items()]
+    summary = "Log loss decreases by {:.3f} [{:.3f}, {:.3f}]".format(*gain.log_loss_less)
+    if np.isnan(gain.regret_less[1]):
         summary += "; regret is unknown, as no location has several views."
     else:
-        summary += f", regret by {regret:+.1f} points [{low:+.1f}, {high:+.1f}]."
+        summary += ", regret by {:+.1f} points [{:+.1f}, {:+.1f}].".format(*gain.regret_less)
     return f"{markdown_table(('', 'before', 'adapted'), rows)}\n\n{summary}\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -68,28 +69,20 @@ class ClusterBootstrap:
 
         NaN where the denominator's sum is not positive.
         """
-        return divide(self._weighted(numerator), self._weighted(denominator))
-
-    def _weighted(self, values: Float) -> Float:
-        """Sums (1 + R, ...) of values (L, ...) over the data and over each resample."""
-        return np.tensordot(self.times, self.sums(values), axes=1)
+        top, bottom = (np.tensordot(self.times, self.sums(values), axes=1) for values in (numerator, denominator))
+        return divide(top, bottom)
 
     def interval(self, values: Float) -> tuple[Float, Float]:
         """95 % percentile interval of statistics (1 + R, ...), of the data and of the resamples, without NaN.
 
         Returns lower and upper ends, (...) each; NaN where all are NaN, or where no stratum has two clusters.
         """
-        ends = np.full((2, *values.shape[1:]), np.nan)
         if not self._has_intervals:
-            return ends[0], ends[1]
-        resampled = values[1:]
-        known = np.isfinite(resampled)
-        complete = known.all(0)
-        ends[:, complete] = np.percentile(resampled[:, complete], _PERCENTILES, axis=0)
-        for column in np.argwhere(known.any(0) & ~complete):
-            at = (slice(None), *column)
-            ends[at] = np.percentile(resampled[at][known[at]], _PERCENTILES)
-        return ends[0], ends[1]
+            values = np.full_like(values, np.nan)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # of columns that are all NaN
+            low, high = np.nanpercentile(values[1:], _PERCENTILES, axis=0)
+        return low, high
 
     def ratio_interval(self, numerator: Float, denominator: Float) -> tuple[Float, Float]:
         """95 % interval of the ratio of sums over observations of values (L, ...) that broadcast; see `interval`."""

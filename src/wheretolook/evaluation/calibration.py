@@ -65,13 +65,11 @@ def fit_temperature(probability: Float, good: Labels) -> float:
     if not len(good) or good.all() or not good.any():
         return float("nan")
     logits = finite_log_odds(probability, MARGIN)
-    lowest, highest = np.log(TEMPERATURES)
-    best = minimize_scalar(
-        lambda log_t: _mean_loss(logits / np.exp(log_t), good),
-        bounds=(lowest, highest),
-        method="bounded",
-        options={"xatol": 1e-6},
-    )
+
+    def loss(log_t: float) -> float:
+        return _mean_loss(logits / np.exp(log_t), good)
+
+    best = minimize_scalar(loss, bounds=np.log(TEMPERATURES), method="bounded", options={"xatol": 1e-6})
     return float(np.exp(best.x))
 
 

@@ -9,10 +9,11 @@ from typing import Literal
 
 import numpy as np
 
-from wheretolook.dataset.thresholds import THRESHOLDS, threshold_key
+from wheretolook.dataset.thresholds import THRESHOLDS
 from wheretolook.scorers.registry import methods_named, scorers
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.shipped import or_shipped
+from wheretolook.utils.validation import check_choice, check_positive, check_range
 from wheretolook.visibility.config import check_occlusion_names
 
 
@@ -37,16 +38,16 @@ class EvaluateConfig:
         occlusions: occlusion models to see the landmarks by, each scored apart. "mesh", "tsdf", "hidden-points",
             "none"; empty for the one that the viewpoints were sampled with, which is stored.
         candidates: sets of views to choose from, each tabulated apart. 0 is for all labelled directions of a location,
-            as a planner meets them, K > 0 for those among the K that see most landmarks (of all directions, labelled or
+            as a planner uses them, K > 0 for those among the K that see most landmarks (of all directions, labelled or
             not), as in the paper.
         block_m: side of the squares of floor whose locations are resampled together, in metres. For intervals and
             tests, as neighbours see the same landmarks; 0 takes each location for independent.
         heading: heading of the method "forward": one direction, or the waypoints of a path. In the world; the direction
             of travel nearest to a location is the heading there. Empty for a horizontal heading drawn for each
             location.
-        photographs: whether photographs that were left out of the scenes' maps are views, too, as by
+        photographs: whether photographs that were held out of the scenes' maps are views, too, as by
             `wheretolook check`; in rows of their own, with "photographs" in the column `candidates`.
-        anywhere: let weights that are adapted to one place score in others, too.
+        anywhere: allow weights adapted to another scene.
         reference: method that every other is compared with, by its name, such as "bins" or "mlp-2d+z". Empty for
             "set", or else "mlp-2d+3d", or else the first learned one.
     """
@@ -69,25 +70,18 @@ class EvaluateConfig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "weights", tuple(map(or_shipped, self.weights)))
         methods_named(self.methods, scorers())
-        if self.split not in ("train", "val", "test"):
-            raise ConfigError("unknown split", value=self.split, fix="Use train, val or test.")
-        if not self.top_n or min(self.top_n) < 1 or len(set(self.top_n)) < len(self.top_n):
-            raise ConfigError("top_n needs different numbers of at least 1", value=self.top_n)
-        limits = [limit for pair in self.thresholds for limit in pair]
-        if not limits or not all(0 < limit < float("inf") for limit in limits):
-            raise ConfigError("thresholds needs pairs of positive limits", value=self.thresholds)
-        if len(set(map(threshold_key, self.thresholds))) < len(self.thresholds):
-            raise ConfigError("thresholds needs different pairs", value=self.thresholds)
-        if self.seed < 0:
-            raise ConfigError("seed must not be negative", value=self.seed)
-        if not 0 <= self.block_m < float("inf"):
-            raise ConfigError("block_m must not be negative", value=self.block_m)
+        check_choice("evaluate.split", self.split, ("train", "val", "test"))
+        for name, least in (("seed", 0), ("block_m", 0), ("resamples", 1)):
+            check_range(f"evaluate.{name}", getattr(self, name), least)
+        for limit in (limit for pair in self.thresholds for limit in pair):
+            check_positive("a limit of evaluate.thresholds", limit)
+        check_range("the smallest of evaluate.top_n", min(self.top_n, default=0), 1)
+        check_range("the smallest of evaluate.candidates", min(self.candidates, default=-1), 0)
+        for name in ("thresholds", "top_n", "candidates"):
+            values = getattr(self, name)
+            if not values or len(set(values)) < len(values):
+                raise ConfigError(f"evaluate.{name} must differ, and there must be one", value=values)
         check_heading(self.heading)
-        if self.resamples < 1:
-            raise ConfigError("resamples must be at least 1", value=self.resamples)
-        if not self.candidates or min(self.candidates) < 0 or len(set(self.candidates)) < len(self.candidates):
-            fix = "0 is for all directions, 100 for the 100 that see most landmarks."
-            raise ConfigError("candidates needs different numbers of at least 0", value=self.candidates, fix=fix)
         check_occlusion_names(self.occlusions)
 
 
@@ -96,9 +90,8 @@ def check_heading(heading: Sequence[Sequence[float]]) -> None:
     values = np.asarray(heading, dtype=np.float64).reshape(-1, 3)
     steps = np.diff(values, axis=0) if len(values) > 1 else values
     if not np.isfinite(values).all() or (np.abs(steps).sum(1) == 0).any():
-        given = tuple(map(tuple, values.tolist()))
         fix = "Give a direction such as [[1, 0, 0]], or waypoints such as [[0, 0, 1], [2, 0, 1], [2, 3, 1]]."
-        raise ConfigError("a heading is one direction, or waypoints that differ", value=given, fix=fix)
+        raise ConfigError("a heading is one direction, or waypoints that differ", value=heading, fix=fix)
 
 
 def candidates_label(best: int) -> str:

@@ -11,17 +11,15 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.layout import SceneFolder
-from wheretolook.dataset.viewpoint_table import LOCALIZED
+from wheretolook.dataset.viewpoint_table import is_good
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.ranking import SceneViews, join_scenes
-from wheretolook.evaluation.scores import PHOTOGRAPHS, reference_method
-from wheretolook.evaluation.scoring import Weights, scorers_of
+from wheretolook.evaluation.scores import PHOTOGRAPHS
+from wheretolook.evaluation.scoring import Weights, join_scores, score_batches, scorers_of
 from wheretolook.evaluation.views import CandidateSet
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.utils.errors import TableError
-
-_SHARES_OF_THE_MAP = ("expected-inliers", "visible")  # methods whose score is a share of the map's landmarks
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,40 +62,21 @@ def photographs_set(photographs: Sequence[HeldOutPhotographs], config: EvaluateC
 
 def _scene_views(views: pd.DataFrame, config: EvaluateConfig) -> SceneViews:
     ids, first, rows = np.unique(views["place"].to_numpy(np.int64), return_index=True, return_inverse=True)
-    localized = views["status"].to_numpy() == LOCALIZED
-    error_m = views["error_m"].to_numpy()
-    error_deg = views["error_deg"].to_numpy()
-    good = [localized & (error_m < metres) & (error_deg < degrees) for metres, degrees in config.thresholds]
+    good = np.stack([is_good(views, *limits) for limits in config.thresholds], axis=-1)
     names = views["photograph"].to_numpy(np.int64)
-    return SceneViews(rows.reshape(-1), names, np.stack(good, axis=-1), ids, views["block"].to_numpy(np.int64)[first])
+    return SceneViews(rows.reshape(-1), names, good, ids, views["block"].to_numpy(np.int64)[first])
 
 
 def score_photographs(
     photographs: Sequence[HeldOutPhotographs], config: EvaluateConfig, weights: Weights, progress: bool
 ) -> dict[str, Float]:
     """Score (B,) the photographs of scenes by each method; raises as `wheretolook.evaluation.scoring.score_scenes`."""
-    parts: dict[str, list[Float]] = {}
+    parts = []
     n_views = sum(len(one.views) for one in photographs)
     with tqdm(total=n_views, desc="score photographs", unit="view", disable=not progress) as bar:
         for one in photographs:
             # the map with most landmarks decides whether weights adapted to another scene are rejected
             largest = max((remaining for _, remaining in one.maps), key=lambda remaining: len(remaining.landmarks))
             scorers_of(largest, config, weights)
-            of_scene: dict[str, Float] = {}
-            for rows, remaining in one.maps:
-                scorers = scorers_of(remaining, config, weights, anywhere=True)
-                reference_method(scorers, config.reference)
-                poses = one.poses[rows]
-                binned = remaining.bin_views(poses)
-                for method, scorer in scorers.items():
-                    values = scorer.score_binned(poses, binned) * score_scale(scorer.name, remaining)
-                    of_scene.setdefault(method, np.empty(len(one.views)))[rows] = values
-                bar.update(len(rows))
-            for method, values in of_scene.items():
-                parts.setdefault(method, []).append(values)
-    return {method: np.concatenate(values) for method, values in parts.items()}
-
-
-def score_scale(method: str, localization_map: LocalizationMap) -> int:
-    """Return the factor that makes a method's scores comparable between maps of different sizes."""
-    return len(localization_map.landmarks) if method in _SHARES_OF_THE_MAP else 1
+            parts.append(score_batches(one.scene, one.poses, one.maps, config, weights, bar, held_out=True))
+    return join_scores(parts)

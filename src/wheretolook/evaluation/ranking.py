@@ -61,14 +61,11 @@ def join_scenes(parts: Sequence[SceneViews]) -> tuple[CandidateViews, Ids]:
     """Join views of scenes, numbered in this order; also returns the location_id (L,) of each location."""
     sizes = [len(part.location_id) for part in parts]
     starts = np.cumsum([0, *sizes])
-    views = CandidateViews(
-        location=np.concatenate([part.location + start for part, start in zip(parts, starts, strict=False)]),
-        viewpoint_id=np.concatenate([part.viewpoint_id for part in parts]),
-        good=np.concatenate([part.good for part in parts]),
-        location_scene=np.repeat(np.arange(len(parts)), sizes),
-        location_block=np.concatenate([part.location_block for part in parts]),
-    )
-    return views, np.concatenate([part.location_id for part in parts])
+    locations, names, good, ids, blocks = zip(*parts, strict=True)
+    location = np.concatenate([rows + start for rows, start in zip(locations, starts, strict=False)])
+    scene = np.repeat(np.arange(len(parts)), sizes)
+    views = CandidateViews(location, np.concatenate(names), np.concatenate(good), scene, np.concatenate(blocks))
+    return views, np.concatenate(ids)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,13 +93,15 @@ def rank_views(views: CandidateViews, scores: Float) -> Ids:
 
 def choose_best(views: CandidateViews, ranks: Ids, n: int) -> TopN:
     """Choose the n views of every location that rank first (`rank_views`), or all where there are fewer."""
-    good = _sum_by_location(views, views.good & (ranks < n)[:, None])
-    return TopN(np.minimum(_n_views(views), n), good, (good > 0).astype(np.float64))
+    return _top(views, _sum_by_location(views, views.good & (ranks < n)[:, None]), n)
 
 
 def choose_oracle(views: CandidateViews, n: int) -> TopN:
     """Choose up to n good views of every location for each threshold: the oracle."""
-    good = np.minimum(_sum_by_location(views, views.good), n)
+    return _top(views, np.minimum(_sum_by_location(views, views.good), n), n)
+
+
+def _top(views: CandidateViews, good: Float, n: int) -> TopN:
     return TopN(np.minimum(_n_views(views), n), good, (good > 0).astype(np.float64))
 
 

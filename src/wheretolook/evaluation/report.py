@@ -25,12 +25,9 @@ def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> s
     """Format a score table (`wheretolook.evaluation.scores.score_table`) as Markdown.
 
     The rows are of the first occlusion model and set of candidates: the first N with all columns; other N; the share of
-    locations with a good view; by scene; held-out photographs; calibration; probes. Missing columns are left out.
+    locations with a good view; by scene; held-out photographs; calibration; probes.
     """
     main = main_rows(scores)
-    photographs = scores.iloc[:0]
-    if "candidates" in scores and (main["candidates"] != PHOTOGRAPHS).all():
-        photographs = scores[scores["candidates"] == PHOTOGRAPHS]
     is_probe = main["method"].map(method_group) == "probes"
     methods = main[~is_probe]
     pooled = methods[methods["scene"] == ALL]
@@ -41,17 +38,15 @@ def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> s
     for n in counts:
         rows = pooled[pooled["top_n"] == n]
         columns = _all_columns(first, keys) if n == counts[0] else _score_columns(keys, 1)
-        parts += [
-            f"## {best_views(n)} of each location ({rows['n_views'].iloc[0]:,} in all)",
-            method_table(rows, columns),
-        ]
+        header = f"## {best_views(n)} of each location ({rows['n_views'].iloc[0]:,} in all)"
+        parts += [header, method_table(rows, columns)]
     parts += _any_table(pooled, keys[0], counts)
     parts += _scene_tables(methods, keys[0], counts[0])
+    photographs = scores[(scores["candidates"] == PHOTOGRAPHS) & (main["candidates"].iloc[0] != PHOTOGRAPHS)]
     if len(photographs):
-        first_photographs = photographs[(photographs["scene"] == ALL) & (photographs["top_n"] == counts[0])]
+        rows = photographs[(photographs["scene"] == ALL) & (photographs["top_n"] == counts[0])]
         parts += ["## Photographs", f"{_about(photographs)} {best_views(counts[0])} of each."]
-        parts += [method_table(first_photographs, _all_columns(first_photographs, keys))]
-        parts += _scene_tables(photographs, keys[0], counts[0])
+        parts += [method_table(rows, _all_columns(rows, keys)), *_scene_tables(photographs, keys[0], counts[0])]
     parts += _calibration(first)
     probes = main[is_probe & (main["scene"] == ALL) & (main["top_n"] == counts[0])]
     if len(probes):
@@ -65,7 +60,7 @@ def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> s
 
 
 def best_in_words(scores: pd.DataFrame) -> str:
-    """Describe in two sentences which method chose good views most often, and whether the difference is significant.
+    """Name the methods that chose good views most often, and state whether the first two differ significantly.
 
     Uses the first N, threshold, occlusion model and set of candidates of a score table.
     """
@@ -76,21 +71,14 @@ def best_in_words(scores: pd.DataFrame) -> str:
     methods = [name for name in rows if name != ORACLE and method_group(name) != "probes"]
     ranked = [name for name in methods if not is_random(name)]
     ranked.sort(key=lambda name: -rows[name][f"raw_{key}"])
-    n_views, n_locations, n = (int(rows[ORACLE][name]) for name in ("n_views", "n_locations", "top_n"))
+    n_views, n_locations = (int(rows[ORACLE][name]) for name in ("n_views", "n_locations"))
 
     def times(name: str) -> str:
-        count = f"{rows[name][f'raw_{key}'] * n_views:.1f}".removesuffix(".0")
-        return f"at {count}" if n == 1 else count
+        return f"{method_style(name).label} {rows[name][f'raw_{key}'] * n_views:.1f}".removesuffix(".0")
 
-    total = f"of {n_locations} locations"
-    if n > 1:
-        total = f"of {n_views} times ({n} views at each of {n_locations} locations)"
-    others = [*ranked[1:2], *(name for name in methods if is_random(name))]
-    best = method_style(ranked[0]).label
-    text = f"{best[:1].upper()}{best[1:]} chose a view that localizes within {threshold_label(key)} "
-    text += f"{times(ranked[0])} {total}; "
-    text += "".join(f"{method_style(name).label} {times(name)}, " for name in others)
-    text += f"and the oracle, which knows, {times(ORACLE)}."
+    others = [*ranked[1:2], *(name for name in methods if is_random(name)), ORACLE]
+    text = f"Views that localize within {threshold_label(key)}, among {n_views} chosen at {n_locations} locations: "
+    text += f"{'; '.join(map(times, [ranked[0], *others]))}."
     return f"{text} {_significance_sentence(rows[ranked[0]], rows[ranked[1]], key)}" if len(ranked) > 1 else text
 
 
@@ -100,22 +88,17 @@ def _significance_sentence(first: Row, second: Row, key: str) -> str:
     Decided by the interval of their difference where one is the reference, else by whether their intervals overlap.
     """
     names = (first["method"], second["method"])
-    if first.get("reference", "") in names:
+    if first["reference"] in names:
         row, sign = (second, -1) if first["reference"] == names[0] else (first, 1)
         low, high = sorted(sign * row[f"difference_{end}_{key}"] for end in ("low", "high"))
-        if low == high == 0:
-            return "The first two chose equally well everywhere."
         why = f"the 95 % interval of their difference is {_signed(low)} to {_signed(high)} points"
-        significant = low > 0
     else:
-        low = first[f"raw_low_{key}"]
-        high = second[f"raw_high_{key}"]
-        significant = low > high
-        ends = " and ".join(_ends(row, "raw", key).strip() for row in (first, second))
-        why = f"the 95 % intervals of their shares {'do not overlap' if significant else 'overlap'}, {ends}"
+        low = first[f"raw_low_{key}"] - second[f"raw_high_{key}"]
+        high = low
+        why = f"their 95 % intervals {'do not overlap' if low > 0 else 'overlap'}"
     if pd.isna(low) or pd.isna(high):
         why = "there are too few for an interval"
-    if significant:
+    if low > 0:
         return f"The first is significantly better than the second: {why}."
     return f"By {first['n_locations']} locations the first two do not differ significantly: {why}."
 
@@ -123,7 +106,7 @@ def _significance_sentence(first: Row, second: Row, key: str) -> str:
 def _about(main: pd.DataFrame) -> str:
     n_locations = main.loc[main["scene"] == ALL, "n_locations"].iloc[0]
     text = f"Scenes: {', '.join(_scenes(main))}; {n_locations:,} locations"
-    candidates = main["candidates"].iloc[0] if "candidates" in main else ALL
+    candidates = main["candidates"].iloc[0]
     if candidates == PHOTOGRAPHS:
         text += (
             "; views are photographs, held out of their maps in blocks and scored on the map without their block; a "
@@ -141,13 +124,10 @@ def _explained(first: pd.DataFrame, key: str) -> str:
     lines = [
         "score: share in % of the chosen viewpoints that localize within both limits, divided by the oracle's share "
         "[95 % bootstrap interval over locations, neighbours resampled together] (undivided). Random is an exact "
-        "expectation, its AP and AUC are one draw."
+        "expectation, its AP and AUC are one draw.",
+        f"regret: the oracle's undivided share within {limits} less the method's, in percentage points [interval]; "
+        "lower is better.",
     ]
-    if f"regret_{key}" in first:
-        lines.append(
-            f"regret: the oracle's undivided share within {limits} less the method's, in percentage points [interval]; "
-            "lower is better."
-        )
     if reference:
         lines.append(
             f"difference: the method's undivided share within {limits} less that of {method_style(reference).label}, "
@@ -180,8 +160,8 @@ _RANKING: list[Column] = [
 
 
 def method_table(rows: pd.DataFrame, columns: Sequence[Column], first: str = "method") -> str:
-    """Format a row for each method, without columns that are missing or NaN throughout."""
-    shown = [(header, text) for header, needs, text in columns if needs in rows and rows[needs].notna().any()]
+    """Format a row for each method, without columns that are NaN throughout."""
+    shown = [(header, text) for header, needs, text in columns if rows[needs].notna().any()]
     lines = [[method_style(row["method"]).label, *(text(row) for _, text in shown)] for row in rows.to_dict("records")]
     return markdown_table([first, *(header for header, _ in shown)], lines)
 
@@ -230,20 +210,17 @@ def _scenes(rows: pd.DataFrame) -> list[str]:
 
 
 def _calibration(first: pd.DataFrame) -> list[str]:
-    if "ece" not in first or not first["ece"].notna().any():
-        return []
     lines = []
     for row in first[first["ece"].notna()].to_dict("records"):
         text = f"- {method_style(row['method']).label}: {number_text(row['ece'])}"
         if pd.notna(row["temperature"]):
             text += f" → {number_text(row['ece_scaled'])} with T = {row['temperature']:.2f}"
         lines.append(text)
-    return [
-        "## Calibration",
+    about = (
         "Expected calibration error of the predicted probabilities, before → after their logits are divided by a "
-        "temperature T, which keeps their order.",
-        "\n".join(lines),
-    ]
+        "temperature T, which keeps their order."
+    )
+    return ["## Calibration", about, "\n".join(lines)] if lines else []
 
 
 def best_views(n: int) -> str:
@@ -254,7 +231,7 @@ def best_views(n: int) -> str:
 def score_text(row: Row, key: str, interval: bool) -> str:
     """Format the share divided by the oracle's, in %, and the undivided share."""
     text = share_text(row, "normalized", key) if interval else _percent(row[f"normalized_{key}"])
-    return f"{text} ({_percent(row[f'raw_{key}'])})" if f"raw_{key}" in row else text
+    return f"{text} ({_percent(row[f'raw_{key}'])})"
 
 
 def share_text(row: Row, name: str, key: str) -> str:
@@ -268,14 +245,14 @@ def _difference_text(row: Row, key: str, reference: str) -> str:
     if pd.isna(row[f"difference_{key}"]):
         return "–"
     text = f"{_signed(row[f'difference_{key}'])}{_ends(row, 'difference', key)}"
-    p = row.get(f"p_{key}", float("nan"))
+    p = row[f"p_{key}"]
     return text if pd.isna(p) else f"{text}, p {'< 0.001' if p < 0.001 else f'{p:.3f}'}"
 
 
 def _counted_text(row: Row, key: str) -> str:
     """Score of a scene with the numbers behind it; an expected number has a decimal place."""
     text = share_text(row, "normalized", key)
-    if f"raw_{key}" not in row or pd.isna(row[f"raw_{key}"]):
+    if pd.isna(row[f"raw_{key}"]):
         return text
     good = row[f"raw_{key}"] * row["n_views"]
     digits = 0 if abs(good - round(good)) < 1e-6 else 1
@@ -284,7 +261,7 @@ def _counted_text(row: Row, key: str) -> str:
 
 def _ends(row: Row, name: str, key: str) -> str:
     """Interval of a share with a leading space; "" where it is unknown or has no width."""
-    low, high = (row.get(f"{name}_{end}_{key}", float("nan")) for end in ("low", "high"))
+    low, high = (row.get(f"{name}_{end}_{key}") for end in ("low", "high"))  # the paper's shares have none
     as_text = _signed if name == "difference" else _percent
     return f" [{as_text(low)}, {as_text(high)}]" if pd.notna(low) and low < high else ""
 

@@ -37,7 +37,7 @@ from wheretolook.tracking.runs import (
     newest_run,
     start_run,
 )
-from wheretolook.utils.files import atomic_write, fingerprint, temporary_folder
+from wheretolook.utils.files import fingerprint, temporary_folder
 from wheretolook.visibility.config import OcclusionConfig
 
 SCORES_CSV = "scores.csv"
@@ -66,7 +66,6 @@ _OF_FIRST_THRESHOLD = ("regret_low", "regret_high", "difference", "difference_lo
 class ScoredSet:
     """Scores, choices and score table of one candidate set by one occlusion model."""
 
-    occlusion: str
     candidates: CandidateSet
     scores: Mapping[str, Float]  # (B,) by method
     choices: Choices
@@ -115,7 +114,7 @@ def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[Nes
         own = dict(zip(_RUN_KEY, map(str, key), strict=True))
         pooled = rows[rows["scene"] == ALL]
         metrics = first_metrics(pooled)
-        metrics |= {name: float(pooled[name].iloc[0]) for name in _OF_ALL_VIEWS if name in pooled}
+        metrics |= {name: float(pooled[name].iloc[0]) for name in _OF_ALL_VIEWS}
         metrics |= _metrics_by_n(pooled, of_pooled) | _metrics_by_n(rows[rows["scene"] != ALL], [f"regret_{keys[0]}"])
         candidates = own["candidates"] if own["candidates"] != ALL else ""
         yield NestedRun(joined(own["method"], own["occlusion"], candidates), {**params, **own}, metrics)
@@ -125,16 +124,16 @@ def _metrics_by_n(rows: pd.DataFrame, columns: Iterable[str]) -> dict[str, float
     metrics: dict[str, float] = {}
     for row in rows.to_dict("records"):
         prefix = f"top-{row['top_n']}" + ("" if row["scene"] == ALL else f"/{row['scene']}")
-        metrics |= {f"{prefix}/{name}": float(row[name]) for name in columns if name in row}
+        metrics |= {f"{prefix}/{name}": float(row[name]) for name in columns}
     return metrics
 
 
 def first_metrics(rows: pd.DataFrame) -> dict[str, float]:
     """Return the metrics to sort runs by: of one method's first choice over all scenes, at the first threshold."""
     strictest = threshold_keys(rows)[0]
+    first = rows[(rows["scene"] == ALL) & (rows["top_n"] == rows["top_n"].min())].iloc[0]
     columns = {REGRET: f"regret_{strictest}", SHARE: f"raw_{strictest}", AUC: "roc_auc"}
-    first = rows[(rows["scene"] == ALL) & (rows["top_n"] == rows["top_n"].min())]
-    return {name: float(first[column].iloc[0]) for name, column in columns.items() if column in first}
+    return {name: float(first[column]) for name, column in columns.items()}
 
 
 def best_of(table: pd.DataFrame) -> tuple[dict[str, str], dict[str, float]]:
@@ -147,7 +146,7 @@ def best_of(table: pd.DataFrame) -> tuple[dict[str, str], dict[str, float]]:
     metrics = {name: first_metrics(main[main["method"] == name]) for name in methods}
     if not metrics:
         return {}, {}
-    best = min(metrics, key=lambda name: metrics[name].get(REGRET, -metrics[name][SHARE]))
+    best = min(metrics, key=lambda name: metrics[name][REGRET])
     return {BEST_TAG: best}, metrics[best]
 
 
@@ -158,8 +157,7 @@ def _runs_with_locations(
     for one in scored:
         for nested in runs_of_rows(one.table, params):
             tables = [location_table(one, nested.params["method"], n, config) for n in config.top_n]
-            with atomic_write(file) as partial:
-                pd.concat(tables).to_parquet(partial, index=False)
+            pd.concat(tables).to_parquet(file, index=False)
             yield replace(nested, files=(file,))
 
 
@@ -173,14 +171,15 @@ def location_table(scored: ScoredSet, method: str, n: int, config: EvaluateConfi
     views = scored.candidates.views
     top = scored.choices[method, n]
     names = [scored.scenes[number].name for number in views.location_scene]
-    columns: dict[str, Any] = {"scene": names, "location_id": scored.candidates.location_id, "top_n": n}
-    columns |= {"chosen": top.chosen.astype(np.int64)}
+    table = pd.DataFrame({"scene": names, "location_id": scored.candidates.location_id, "top_n": n})
+    table["chosen"] = top.chosen.astype(np.int64)
     for index, key in enumerate(map(threshold_key, config.thresholds)):
-        columns |= {f"good_{key}": top.good[:, index], f"any_{key}": top.any_good[:, index]}
+        table[f"good_{key}"] = top.good[:, index]
+        table[f"any_{key}"] = top.any_good[:, index]
     best = np.full(views.n_locations, np.nan)
     if method in scored.scores and not is_random(method):
         np.fmax.at(best, views.location, scored.scores[method])
-    return pd.DataFrame({**columns, "best_score": best})
+    return table.assign(best_score=best)
 
 
 def log_evaluation(
@@ -199,9 +198,7 @@ def log_evaluation(
     views = evaluation.views
     params = evaluation_params(dataset, evaluation.scenes, evaluation.weights)
     params |= {name: value for name, value in asdict(config).items() if name not in ("weights", "methods")}
-    for name in ("anywhere", "photographs"):  # logged only where set
-        if not params[name]:
-            del params[name]
+    params = {name: value for name, value in params.items() if value or name not in ("anywhere", "photographs")}
     if config.occlusions:
         params |= {f"occlusion_{name}": value for name, value in asdict(occlusion).items() if name != "model"}
     if len(dataset.cameras) == 1:
@@ -211,17 +208,15 @@ def log_evaluation(
     if logged_last(tracking, "evaluate", dataset.name, mark, SCORES_CSV) is not None:
         return
     best, metrics = best_of(evaluation.table)
-    metrics |= {"n_locations": views.n_locations, "n_views": len(views.good)}
-    metrics["positives"] = float(views.good[:, 0].mean())
+    metrics |= {"n_locations": views.n_locations, "n_views": len(views.good), "positives": views.good[:, 0].mean()}
     tags = {"dataset": dataset.name, FINGERPRINT_TAG: mark, **best}
-    run_context = start_run(tracking, ALL_METHODS, "evaluate", params, tags=tags)
-    with temporary_folder() as folder, run_context as (client, run):
+    with temporary_folder() as folder, start_run(tracking, ALL_METHODS, "evaluate", params, tags=tags) as (client, run):
         log(client, run, metrics=metrics)
         for file in results.iterdir():
             if file.is_file() and file.suffix != ".partial":  # left by a killed process
                 client.log_artifact(run, str(file))
-        file = folder / LOCATIONS_PARQUET
-        log_nested(tracking, run, "evaluate", _runs_with_locations(evaluation.scored, params, config, file))
+        nested = _runs_with_locations(evaluation.scored, params, config, folder / LOCATIONS_PARQUET)
+        log_nested(tracking, run, "evaluate", nested)
 
 
 def latest_scores(tracking: TrackingConfig, dataset: str | None = None) -> pd.DataFrame | None:

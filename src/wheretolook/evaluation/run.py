@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,17 +27,6 @@ from wheretolook.utils.errors import TableError
 from wheretolook.visibility.config import OcclusionConfig
 
 
-@dataclass(frozen=True, eq=False)
-class _ScoredViews:
-    """All labelled views (B,) of scenes, with the scores by one occlusion model."""
-
-    occlusion: str
-    scenes: Sequence[SceneFolder]
-    views: CandidateViews
-    scores: Mapping[str, Float]  # (B,) by method
-    sets: Sequence[CandidateSet]
-
-
 def compare_methods(
     dataset: Dataset,
     config: EvaluateConfig,
@@ -59,37 +48,42 @@ def compare_methods(
     temperatures, n_val = _fit_temperatures(dataset, config, weights, device, progress, occlusions[0])
     photographed = {one.scene.name for one in photographs}
     rendered = [scene for scene in scenes if scene.name not in photographed or has_labels(scene)]
-    scored: list[_ScoredViews] = []
+    parts: list[ScoredSet] = []
+    scored: list[tuple[CandidateViews, Mapping[str, Float]]] = []  # of each occlusion model
     if rendered:
         tables = [scene.read_table() for scene in rendered]
         views, location_id = views_of(rendered, tables, config)
         sets = candidate_sets(views, location_id, rendered, tables, config)
         for model in occlusions:
-            scores, used = score_scenes(dataset, rendered, tables, config, weights, device, progress, model)
-            scored.append(_ScoredViews(used, rendered, views, scores, sets))
+            scores, used = score_scenes(rendered, tables, config, weights, device, progress, model)
+            scored.append((views, scores))
+            parts += [_compare(candidates, scores, rendered, used, config, temperatures) for candidates in sets]
     if photographs:
         held_out = photographs_set(photographs, config)
         scores = score_photographs(photographs, config, weights, progress)
+        scored.append((held_out.views, scores))
         used = " ".join(sorted({one.occlusion for one in photographs}))
-        scored.append(_ScoredViews(used, [one.scene for one in photographs], held_out.views, scores, [held_out]))
-    first = scored[0]
-    calibration = _calibration(first.scores, first.views.good[:, 0], temperatures, n_val)
-    parts = [_compare(one, candidates, config, temperatures) for one in scored for candidates in one.sets]
+        parts.append(_compare(held_out, scores, [one.scene for one in photographs], used, config, temperatures))
+    views, scores = scored[0]
     table = pd.concat([part.table for part in parts], ignore_index=True)
-    return Evaluation(scenes, weights, first.views, parts, table, calibration)
+    return Evaluation(scenes, weights, views, parts, table, _calibration(scores, views.good[:, 0], temperatures, n_val))
 
 
 def _compare(
-    scored: _ScoredViews, candidates: CandidateSet, config: EvaluateConfig, temperatures: Mapping[str, float]
+    candidates: CandidateSet,
+    scores: Mapping[str, Float],
+    scenes: Sequence[SceneFolder],
+    occlusion: str,
+    config: EvaluateConfig,
+    temperatures: Mapping[str, float],
 ) -> ScoredSet:
     """Choose among one set of candidates by each method, and tabulate the results."""
-    scores = {method: values[candidates.mask] for method, values in scored.scores.items()}
+    scores = {method: values[candidates.mask] for method, values in scores.items()}
     choices = choose(candidates.views, scores, config.top_n)
-    names = [scene.name for scene in scored.scenes]
-    table = score_table(candidates.views, scores, names, config, temperatures, choices)
-    table.insert(1, "occlusion", scored.occlusion)
+    table = score_table(candidates.views, scores, [scene.name for scene in scenes], config, temperatures, choices)
+    table.insert(1, "occlusion", occlusion)
     table.insert(2, "candidates", candidates.name)
-    return ScoredSet(scored.occlusion, candidates, scores, choices, table, scored.scenes)
+    return ScoredSet(candidates, scores, choices, table, scenes)
 
 
 def has_labels(scene: SceneFolder) -> bool:
@@ -111,11 +105,10 @@ def _fit_temperatures(
     scenes = [scene for scene in dataset.split("val") if has_labels(scene)]
     if not scenes:
         return {}, 0
-    tables = [scene.read_table() for scene in scenes]
-    tables = [table[table["status"] != UNLABELLED] for table in tables]
+    tables = [table[table["status"] != UNLABELLED] for table in (scene.read_table() for scene in scenes)]
     chosen = methods_named(config.methods, scorers())
     config = replace(config, methods=tuple(method.name for method in chosen if method.probability), reference="")
-    scores, _ = score_scenes(dataset, scenes, tables, config, weights, device, progress, occlusion)
+    scores, _ = score_scenes(scenes, tables, config, weights, device, progress, occlusion)
     good = np.concatenate([is_good(table, *config.thresholds[0]) for table in tables])
     return {method: fit_temperature(values, good) for method, values in scores.items()}, len(good)
 
@@ -130,10 +123,11 @@ def _calibration(
     parts = []
     for name, values in scores.items():
         if is_probability(name):
-            temperature = temperatures.get(name, float("nan"))
+            temperature = temperatures.get(name, np.nan)
             curves = calibration_rows(values, good, temperature)
-            curves.insert(0, "method", name)
-            curves.insert(1, "temperature", temperature)
-            curves.insert(2, "n_val", n_val)
+            for place, (column, value) in enumerate(
+                {"method": name, "temperature": temperature, "n_val": n_val}.items()
+            ):
+                curves.insert(place, column, value)
             parts.append(curves)
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()

@@ -24,7 +24,7 @@ from wheretolook.evaluation.ranking import (
 from wheretolook.geometry.poses import Float
 from wheretolook.scorers.registry import find
 from wheretolook.scorers.styles import ORACLE
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.validation import check_choice
 
 PHOTOGRAPHS = "photographs"  # value of the column `candidates` in rows of held-out photographs
 
@@ -32,22 +32,19 @@ RELEASED_DIVISOR = 0.527
 """Divisor of every share in the paper's released code, whatever the threshold, the scenes and N."""
 
 _PAIRED = ("difference", "difference_low", "difference_high", "p")
-_CALIBRATION = ("ece", "ece_scaled", "temperature")
+_CALIBRATION = {"ece": np.nan, "ece_scaled": np.nan, "temperature": np.nan}  # columns where they are unknown
 
 Choices = Mapping[tuple[str, int], TopN]  # by method, the oracle included, and N
 
 
 def read_scores(path: Path) -> pd.DataFrame:
     """Read a score table (`score_table`) from its CSV file."""
-    table = pd.read_csv(path, keep_default_na=False, na_values=[""])
-    return table.assign(reference=table["reference"].fillna("")) if "reference" in table else table
+    return pd.read_csv(path, keep_default_na=False, na_values=[""]).fillna({"reference": ""})
 
 
 def threshold_keys(scores: pd.DataFrame) -> list[str]:
     """Return the thresholds of a score table, as in its column names."""
-    intervals = ("normalized_low_", "normalized_high_")
-    shares = [name for name in scores.columns if name.startswith("normalized_") and not name.startswith(intervals)]
-    return [name.removeprefix("normalized_") for name in shares]
+    return [name.removeprefix("released_") for name in scores.columns if name.startswith("released_")]
 
 
 def main_rows(scores: pd.DataFrame, columns: Sequence[str] = ("occlusion", "candidates")) -> pd.DataFrame:
@@ -65,20 +62,18 @@ def methods_of(scores: pd.DataFrame) -> list[str]:
 
 def reference_of(scores: pd.DataFrame) -> str:
     """Return the method that a score table compares the others with; "" if there is none."""
-    name = scores["reference"].iloc[0] if "reference" in scores else ""
-    return str(name) if name in methods_of(scores) else ""
+    name = str(scores["reference"].iloc[0])
+    return name if name in methods_of(scores) else ""
 
 
 def is_random(method: str) -> bool:
     """Whether a method chooses at random, so that its rows hold exact expectations."""
-    known = find(method)
-    return known is not None and known.is_random_baseline
+    return bool(getattr(find(method), "is_random_baseline", False))
 
 
 def is_probability(method: str) -> bool:
     """Whether a method's score is the probability that a view localizes."""
-    known = find(method)
-    return known is not None and known.probability
+    return bool(getattr(find(method), "probability", False))
 
 
 def choose(views: CandidateViews, scores: Mapping[str, Float], top_n: Sequence[int]) -> Choices:
@@ -98,12 +93,11 @@ def reference_method(methods: Iterable[str], name: str) -> str:
 
     Raises a ConfigError if no method has that name.
     """
-    methods = list(methods)
-    if name and name not in methods:
-        known = f"Use one of {', '.join(methods)}."
-        raise ConfigError("the reference is none of the methods evaluated", value=name, fix=known)
+    if name:
+        check_choice("reference among the methods evaluated", name, methods)
+        return name
     learned = {method: record for method in methods if (record := find(method)) is not None and record.probability}
-    return name or max(learned, key=lambda method: learned[method].reference, default="")
+    return max(learned, key=lambda method: learned[method].reference, default="")
 
 
 def score_table(
@@ -161,7 +155,7 @@ def score_table(
         blocks = views.location_block[locations]
         bootstrap = ClusterBootstrap(blocks, config.resamples, config.seed, strata=views.location_scene[locations])
         good = views.good[inside, 0]
-        metrics = {ORACLE: {"average_precision": 1.0, "roc_auc": 1.0, **dict.fromkeys(_CALIBRATION, float("nan"))}}
+        metrics = {ORACLE: {"average_precision": 1.0, "roc_auc": 1.0, **_CALIBRATION}}
         for method, values in scores.items():
             temperature = (temperatures or {}).get(method, float("nan"))
             metrics[method] = _ranking_metrics(good, values[inside])
@@ -215,14 +209,16 @@ def _share_columns(
 def _ranking_metrics(good: NDArray[np.bool_], scores: Float) -> dict[str, float]:
     from sklearn.metrics import average_precision_score, roc_auc_score  # takes a second; reading a table needs none
 
-    measures = {"average_precision": average_precision_score, "roc_auc": roc_auc_score}
     if good.all() or not good.any():
-        return dict.fromkeys(measures, float("nan"))
-    return {name: float(measure(good, scores)) for name, measure in measures.items()}
+        return {"average_precision": np.nan, "roc_auc": np.nan}
+    return {
+        "average_precision": float(average_precision_score(good, scores)),
+        "roc_auc": float(roc_auc_score(good, scores)),
+    }
 
 
 def _calibration_metrics(method: str, good: NDArray[np.bool_], scores: Float, temperature: float) -> dict[str, float]:
-    metrics = dict.fromkeys(_CALIBRATION, float("nan"))
+    metrics = dict(_CALIBRATION)
     if is_probability(method):
         metrics["ece"] = expected_calibration_error(scores, good)
         if np.isfinite(temperature):

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.environment import EnvironmentConfig, SceneEnvironment
@@ -24,12 +26,13 @@ from wheretolook.training.provenance import TrainedModel, was_trained_on, weight
 from wheretolook.training.weights import method_of_weights, read_training
 from wheretolook.utils.errors import TableError, WeightsError
 from wheretolook.utils.files import fingerprint
-from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped
+from wheretolook.utils.shipped import WEIGHTS, shipped
 from wheretolook.visibility.config import OcclusionConfig
 
 BATCH = 4096  # views binned and scored at a time
 BUNDLED = "that ships"  # follows the method's name in rows of bundled weights that are compared with others
 Weights = Mapping[Path, str]  # files of weights, and the method that each serves
+_SHARES_OF_THE_MAP = ("expected-inliers", "visible")  # methods whose score is a share of the map's landmarks
 
 
 def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[TrainedModel | Path] | None) -> Weights:
@@ -44,7 +47,7 @@ def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[Tr
     if models is not None:
         paths = [model if isinstance(model, Path) else model.path for model in models]
     else:
-        paths = [or_shipped(path) for path in config.weights] or own_weights(dataset)
+        paths = list(config.weights) or own_weights(dataset)
     weights = {path: method_of_weights(path) for path in paths}
     available = set(weights.values())
     missing = [name for name, of_name in kinds.items() if "" not in of_name and not of_name & available]
@@ -62,9 +65,7 @@ def own_weights(dataset: Dataset) -> list[Path]:
         # methods that learn from matches cannot be compared where compact tables hold none
         if path.stem in scorers() and not was_trained_on(dataset, read_training(path)):
             fix = "Run the train stage again, remove the file, or name weights in evaluate.weights."
-            raise WeightsError(
-                "these weights were trained on other data than the dataset now holds", path=path, fix=fix
-            )
+            raise WeightsError("the dataset has changed since these weights were trained", path=path, fix=fix)
     return paths
 
 
@@ -74,13 +75,12 @@ def check_unseen(scenes: Sequence[SceneFolder], weights: Weights) -> None:
     for path in weights:
         for trained in read_training(path).get("landmarks", {}).values():
             if trained in tested:
-                problem = "these weights were trained on a scene of the test split"
                 fix = "Train again without that scene, or evaluate on others."
+                problem = "these weights were trained on a scene of the test split"
                 raise WeightsError(problem, path=path, value=tested[trained], fix=fix)
 
 
 def score_scenes(
-    dataset: Dataset,
     scenes: Sequence[SceneFolder],
     tables: Sequence[pd.DataFrame],
     config: EvaluateConfig,
@@ -99,16 +99,17 @@ def score_scenes(
         MapError, SceneError: a scene has no landmarks, or no mesh where one is needed.
         ConfigError: the reference is none of the methods.
     """
-    scores: dict[str, list[Float]] = {}
+    parts: list[dict[str, Float]] = []
     used: set[str] = set()
     text = f"score {scenes[0].split} views" + ("" if occlusion is None else f", {occlusion.model}")
     with tqdm(total=sum(map(len, tables)), desc=text, unit="view", disable=not progress) as bar:
         for scene, table in zip(scenes, tables, strict=True):
             localization_map = _open_map(scene, occlusion, device, progress)
             used.add(localization_map.occlusion.name)
-            for method, values in _score_scene(scene, table, localization_map, config, weights, bar).items():
-                scores.setdefault(method, []).append(values)
-    return {method: np.concatenate(parts) for method, parts in scores.items()}, " ".join(sorted(used))
+            of_camera = cache(localization_map.of_camera)
+            batches = ((rows, of_camera(camera)) for camera, rows in views_by_camera(scene, table, BATCH))
+            parts.append(score_batches(scene, poses(table), batches, config, weights, bar))
+    return join_scores(parts), " ".join(sorted(used))
 
 
 def _open_map(scene: SceneFolder, occlusion: OcclusionConfig | None, device: str, progress: bool) -> LocalizationMap:
@@ -120,35 +121,48 @@ def _open_map(scene: SceneFolder, occlusion: OcclusionConfig | None, device: str
     return replace(localization_map, occlusion=environment.occlusion)
 
 
-def _score_scene(
+def score_batches(
     scene: SceneFolder,
-    table: pd.DataFrame,
-    localization_map: LocalizationMap,
+    cam_from_world: Float,
+    batches: Iterable[tuple[NDArray[np.int64], LocalizationMap]],
     config: EvaluateConfig,
     weights: Weights,
     bar: tqdm[NoReturn],
+    held_out: bool = False,
 ) -> dict[str, Float]:
-    """Score (B,) the views of one scene by each method; each batch is binned once for all methods."""
-    cam_from_world = poses(table)
+    """Score (B,) poses (B, 3, 4) by each method, from batches of their rows and the map that these are scored on.
+
+    Each batch is binned once for all methods. Photographs that are `held_out` are scored on maps of different sizes
+    (`score_scale`), on which weights adapted to the whole map are allowed.
+    """
     scores: dict[str, Float] = {}
     current = None
-    for camera, rows in views_by_camera(scene, table, BATCH):
-        if camera != current:
-            current = camera
-            of_camera = localization_map.of_camera(camera)
-            scorers_by_row = scorers_of(of_camera, config, weights)
+    for rows, localization_map in batches:
+        if localization_map is not current:
+            current = localization_map
+            scorers_by_row = scorers_of(localization_map, config, weights, anywhere=held_out)
             reference_method(scorers_by_row, config.reference)  # fails before the work
         batch = cam_from_world[rows]
-        binned = of_camera.bin_views(batch)
+        binned = localization_map.bin_views(batch)
         for method, scorer in scorers_by_row.items():
             values = scorer.score_binned(batch, binned)
             if not np.isfinite(values).all():
-                problem = "a method gives scores that are not finite"
                 fix = "Check the scene's landmarks and poses, and the weights; or leave the method out."
-                raise TableError(problem, path=scene.folder, value=method, fix=fix)
-            scores.setdefault(method, np.empty(len(table)))[rows] = values
+                raise TableError("scores of a method are not finite", path=scene.folder, value=method, fix=fix)
+            scale = score_scale(scorer.name, localization_map) if held_out else 1
+            scores.setdefault(method, np.empty(len(cam_from_world)))[rows] = values * scale
         bar.update(len(batch))
     return scores
+
+
+def score_scale(method: str, localization_map: LocalizationMap) -> int:
+    """Return the factor that makes a method's scores comparable between maps of different sizes."""
+    return len(localization_map.landmarks) if method in _SHARES_OF_THE_MAP else 1
+
+
+def join_scores(parts: Sequence[Mapping[str, Float]]) -> dict[str, Float]:
+    """Concatenate the scores of scenes by method."""
+    return {method: np.concatenate([part[method] for part in parts]) for method in parts[0]}
 
 
 def scorers_of(

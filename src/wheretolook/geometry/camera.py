@@ -15,17 +15,30 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError, MapError, TableError
 from wheretolook.utils.files import write_text
+from wheretolook.utils.validation import check_choice
 
 if TYPE_CHECKING:
     import pycolmap
 
-MAX_SIDE_PX = 10**6  # of an image; COLMAP's numbers end not far beyond
+MAX_SIDE_PX = 10**6  # of an image; COLMAP's limit is not much higher
 MAX_PX = 1e12  # of a focal length or a principal point, whose products stay finite; and no integers without end
 MAX_RAY_ERROR = 1e-4  # largest distance between a point's direction and its pixel's ray (chord, about radians)
 
 
+class _Image:
+    """The image of a camera."""
+
+    width: int
+    height: int
+
+    def in_image(self, pixels: ArrayLike) -> NDArray[np.bool_]:
+        """Whether pixels (..., 2) are in the image: 0 <= x < width and 0 <= y < height. NaN is outside."""
+        x, y = np.moveaxis(np.asarray(pixels), -1, 0)
+        return (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+
+
 @dataclass(frozen=True)
-class PinholeCamera:
+class PinholeCamera(_Image):
     """Ideal pinhole camera.
 
     Args:
@@ -46,19 +59,17 @@ class PinholeCamera:
     center_px: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        check_size(self.width, self.height)
-        if self.focal_y_px == self.focal_px:  # one way to say it, so that equal cameras are equal
+        if self.focal_y_px == self.focal_px:  # one form, so that equal cameras are equal
             object.__setattr__(self, "focal_y_px", None)
         if self.center_px is not None and tuple(self.center_px) == (self.width / 2, self.height / 2):
             object.__setattr__(self, "center_px", None)
-        check_focal_lengths((self.fx, self.fy), self.width, self.height)
+        _check_intrinsics(self.width, self.height, (self.fx, self.fy))
         if not all(abs(value) <= MAX_PX for value in (self.cx, self.cy)):
             raise ConfigError("a camera's principal point must be finite", value=self.center_px)
 
     @classmethod
     def of_field_of_view(cls, across_deg: float, width: int, height: int) -> PinholeCamera:
         """With square pixels, from the angle between the image's left and right side. Raises ConfigError."""
-        check_size(width, height)
         if not 0 < across_deg < 180:
             fix = "Give the angle between the image's left and right side; a fisheye needs a COLMAP model."
             raise ConfigError("a pinhole's field of view must be between 0 and 180 degrees", value=across_deg, fix=fix)
@@ -107,7 +118,7 @@ class PinholeCamera:
         return ColmapCamera("PINHOLE", self.width, self.height, (self.fx, self.fy, self.cx, self.cy))
 
     def record(self) -> dict[str, Any]:
-        """What `camera_of_record` makes the camera of, for JSON files."""
+        """The camera as plain values for JSON files, see `camera_of_record`."""
         if self.focal_y_px is None and self.center_px is None:
             return {"width": self.width, "height": self.height, "focal_px": self.focal_px}
         return self.colmap.record()
@@ -124,46 +135,25 @@ class PinholeCamera:
         rays = np.concatenate([at, np.ones_like(at[..., :1])], axis=-1)
         return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
-    def in_image(self, pixels: ArrayLike) -> NDArray[np.bool_]:
-        """Whether pixels (..., 2) lie in the image: 0 <= x < width and 0 <= y < height. NaN is outside."""
-        return in_image(pixels, self.width, self.height)
 
-
-def check_size(width: int, height: int) -> None:
-    """Raise ConfigError if no image has that size in pixels."""
-    fix = "Give the image's width and height in pixels."
-    if not (width >= 1 and height >= 1):  # nor NaN
-        raise ConfigError("a camera needs a positive image size", value=(width, height), fix=fix)
-    if not (isinstance(width, Integral) and isinstance(height, Integral)):
-        raise ConfigError("an image's size is whole pixels", value=(width, height), fix=fix)
-    if max(width, height) > MAX_SIDE_PX:
-        raise ConfigError(f"no image has more than {MAX_SIDE_PX:,} pixels a side", value=(width, height), fix=fix)
-
-
-def check_focal_lengths(focal_px: tuple[float, ...], width: int, height: int) -> None:
-    """Raise ConfigError unless focal lengths are positive, and no less than a hundredth of the image's longer side.
+def _check_intrinsics(width: int, height: int, focal_px: tuple[float, ...]) -> None:
+    """Raise ConfigError unless sizes are whole pixels, and focal lengths at least 1 % of the image's longer side.
 
     A pinhole of that focal length would see 179 degrees; a smaller number is a focal length in metres or millimetres.
     """
-    if not all(0 < focal <= MAX_PX for focal in focal_px):
-        raise ConfigError("a camera needs a positive, finite focal length in pixels", value=focal_px)
-    if min(focal_px, default=np.inf) < max(width, height) / 100:
-        fix = f"Give it in pixels: half the width ({width / 2:g}) divided by the tangent of half the angle across."
-        raise ConfigError("a focal length in pixels was expected, this looks like metres", value=focal_px, fix=fix)
-
-
-def in_image(pixels: ArrayLike, width: int, height: int) -> NDArray[np.bool_]:
-    """Whether pixels (..., 2) lie in an image: 0 <= x < width and 0 <= y < height. NaN is outside."""
-    x, y = np.moveaxis(np.asarray(pixels), -1, 0)
-    return (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    if not all(isinstance(side, Integral) and 1 <= side <= MAX_SIDE_PX for side in (width, height)):
+        raise ConfigError("an image's sides must be 1 to a million whole pixels", value=(width, height))
+    if not all(max(width, height) / 100 <= focal <= MAX_PX for focal in focal_px):
+        fix = f"Half the width ({width / 2:g}) divided by the tangent of half the angle across."
+        raise ConfigError("a focal length must be in pixels, not metres or millimetres", value=focal_px, fix=fix)
 
 
 @dataclass(frozen=True)
-class ColmapCamera:
+class ColmapCamera(_Image):
     """A camera of any COLMAP model.
 
     Beyond the field of view that they were fitted to, distortion polynomials turn back and map points far outside of it
-    into the image. So a point counts as seen only if the ray of its pixel, by COLMAP's own inverse, leads back to it.
+    into the image. So a point counts as visible only if the ray of its pixel, by COLMAP's own inverse, leads back to it.
     COLMAP's fisheye models see nothing at 90 degrees from the axis and beyond. Raises ConfigError if COLMAP has no such
     model, or the model takes other parameters.
     """
@@ -177,21 +167,13 @@ class ColmapCamera:
         import pycolmap
 
         names = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
-        if self.model not in names:
-            fix = f"Use one of {', '.join(names)}."
-            raise ConfigError("COLMAP has no such camera model", value=self.model, fix=fix)
-        expected = pycolmap.Camera.create_from_model_name(1, self.model, 1.0, 1, 1).params_info
-        check_size(self.width, self.height)
-        if len(self.params) != len(expected.split(",")) or not np.isfinite(self.params).all():
-            problem = f"camera model {self.model} needs the finite parameters {expected}"
+        check_choice("camera model", self.model, names)
+        expected = pycolmap.Camera.create_from_model_name(1, self.model, 1.0, 1, 1)
+        if len(self.params) != len(expected.params) or not np.isfinite(self.params).all():
+            problem = f"camera model {self.model} needs the finite parameters {expected.params_info}"
             raise ConfigError(problem, value=self.params)
-        focal_px = tuple(self.params[i] for i in self._camera.focal_length_idxs())
-        check_focal_lengths(focal_px, self.width, self.height)  # panoramas have none
-
-    @classmethod
-    def of(cls, camera: pycolmap.Camera) -> ColmapCamera:
-        """From a camera of pycolmap."""
-        return cls(camera.model_name, camera.width, camera.height, tuple(float(value) for value in camera.params))
+        focal_px = tuple(self.params[i] for i in expected.focal_length_idxs())  # panoramas have none
+        _check_intrinsics(self.width, self.height, focal_px)
 
     @cached_property
     def _camera(self) -> pycolmap.Camera:
@@ -216,13 +198,8 @@ class ColmapCamera:
         """The camera itself."""
         return self
 
-    @property
-    def pycolmap(self) -> pycolmap.Camera:
-        """The camera for functions of pycolmap."""
-        return self._camera
-
     def record(self) -> dict[str, Any]:
-        """What `camera_of_record` makes the camera of, for JSON files."""
+        """The camera as plain values for JSON files, see `camera_of_record`."""
         return {"model": self.model, "width": self.width, "height": self.height, "params": list(self.params)}
 
     @property
@@ -256,12 +233,8 @@ class ColmapCamera:
             rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
         return rays.reshape(*at.shape[:-1], 3)
 
-    def in_image(self, pixels: ArrayLike) -> NDArray[np.bool_]:
-        """Whether pixels (..., 2) lie in the image: 0 <= x < width and 0 <= y < height. NaN is outside."""
-        return in_image(pixels, self.width, self.height)
-
     def sees(self, points_cam: ArrayLike) -> NDArray[np.bool_]:
-        """Whether points (..., 3) of the camera frame fall into the image."""
+        """Whether points (..., 3) of the camera frame project into the image."""
         return self.in_image(self.project(points_cam))
 
 
@@ -288,15 +261,8 @@ def mean_focal_px(camera: pycolmap.Camera) -> float:
 
 
 def camera_of_record(record: Mapping[str, Any]) -> Camera:
-    """The camera of a `record` read from a file. Raises ConfigError, KeyError, TypeError, ValueError if it is none."""
-    if "model" in record:
-        try:
-            width = int(record["width"])
-            height = int(record["height"])
-        except OverflowError as error:
-            raise ValueError(f"no size of an image: {error}") from error
-        return camera_of(str(record["model"]), width, height, record["params"])
-    return PinholeCamera(**record)
+    """The camera of a `record` read from a file. Raises ConfigError, TypeError or ValueError if it is none."""
+    return camera_of(**record) if "model" in record else PinholeCamera(**record)
 
 
 def parse_camera(text: str) -> Camera:
@@ -304,18 +270,12 @@ def parse_camera(text: str) -> Camera:
 
     Raises ConfigError if the text describes no camera.
     """
-    model, *numbers = text.replace(",", " ").split() or [""]
-    fix = "Write MODEL,width,height,parameters as COLMAP orders them, such as PINHOLE,640,480,320,320,320,240; sizes in pixels."
     try:
-        width, height, *params = (float(number) for number in numbers)
+        model, width, height, *params = text.replace(",", " ").split()
+        return camera_of(model.upper(), int(width), int(height), map(float, params))
     except ValueError as error:
+        fix = "Write MODEL,width,height,parameters as COLMAP orders them, such as PINHOLE,640,480,320,320,320,240."
         raise ConfigError("this is no camera", value=text, fix=fix) from error
-    if not width.is_integer() or not height.is_integer():
-        raise ConfigError("an image's size is whole pixels", value=text, fix=fix)
-    try:
-        return camera_of(model.upper(), int(width), int(height), params)
-    except ConfigError as error:
-        raise ConfigError(error.problem, value=text, fix=error.fix or fix) from error
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -336,11 +296,10 @@ def read_cameras(path: Path) -> dict[int, Camera]:
     for line in path.read_text(errors="replace").splitlines():
         if line.strip() and not line.startswith("#"):
             try:
-                number, model, width, height, *params = line.split()
-                cameras[int(number)] = camera_of(model, int(width), int(height), [float(value) for value in params])
+                number, text = line.split(maxsplit=1)
+                cameras[int(number)] = parse_camera(text)
             except (ValueError, ConfigError) as error:
-                fix = "A line is: camera_id model width height parameters."
-                raise TableError(f"no camera in this line: {error}", path=path, value=line[:200], fix=fix) from error
+                raise TableError(f"no camera in this line: {error}", path=path, value=line[:200]) from error
     return cameras
 
 
@@ -348,23 +307,20 @@ def write_cameras(cameras: Mapping[int, Camera], path: Path) -> None:
     """Write what `read_cameras` reads."""
     lines = ["# Camera list: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     for number, camera in cameras.items():
-        record = camera.colmap.record()
-        values = [number, record["model"], record["width"], record["height"], *record["params"]]
-        lines.append(" ".join(map(str, values)))
+        model, width, height, params = camera.colmap.record().values()
+        lines.append(" ".join(map(str, (number, model, width, height, *params))))
     write_text(path, "\n".join(lines) + "\n")
 
 
 def cameras_by_id(cameras: Any, path: Path) -> dict[int, Camera]:
-    """Cameras of the pycolmap model in a folder by their camera_id; MapError, naming the file, if one is no camera."""
-    files = [path / f"cameras{suffix}" for suffix in (".bin", ".txt")]
-    path = next((file for file in files if file.is_file()), path)
-    found: dict[int, Camera] = {}
+    """Cameras of the pycolmap model in a folder by their camera_id; MapError if one is no camera."""
+    by_id: dict[int, Camera] = {}
     for number, camera in sorted(cameras.items()):
         try:
-            found[number] = camera_of(camera.model_name, camera.width, camera.height, camera.params)
+            by_id[number] = camera_of(camera.model_name, camera.width, camera.height, camera.params)
         except ConfigError as error:
             raise MapError(f"camera {number}: {error.problem}", path=path, value=error.value, fix=error.fix) from error
-    return found
+    return by_id
 
 
 def only_camera(cameras: Mapping[int, Camera], path: Path) -> Camera:
@@ -374,7 +330,7 @@ def only_camera(cameras: Mapping[int, Camera], path: Path) -> Camera:
         return different[0]
     listed = "; ".join(f"{number}: {describe_camera(camera)}" for number, camera in list(cameras.items())[:10])
     one = min(cameras)
-    fix = f"Say which will look: --camera-id {one}, in Python camera={one}; or describe another: --camera."
+    fix = f"Name one of them (--camera-id {one}, in Python camera={one}), or describe another by --camera."
     raise MapError(f"the map has {len(different)} cameras, not one ({listed})", path=path, fix=fix)
 
 
@@ -397,24 +353,21 @@ def field_of_view_deg(camera: Camera) -> tuple[float, float]:
     return float(angles[0] + angles[1]), float(angles[2] + angles[3])
 
 
-ACROSS_DEG = (40.0, 120.0)
-WIDTHS_PX = (320, 1280)
-PROPORTIONS = ((4, 3), (3, 2), (16, 9), (1, 1), (3, 4), (2, 3), (9, 16))
-OFF_CENTER = 0.05
+PROPORTIONS = ((4, 3), (3, 2), (16, 9), (1, 1), (3, 4), (2, 3), (9, 16))  # of drawn cameras
 
 
 def draw_camera(rng: np.random.Generator) -> PinholeCamera:
-    """A pinhole as somebody may have one: 40 to 120 degrees along the longer side, 320 to 1,280 px wide or high.
+    """Draw a common pinhole: 40 to 120 degrees along the longer side, 320 to 1,280 px wide or high.
 
     Sides are 4:3, 3:2, 16:9 or 1:1, also upright; the principal point is off the centre by up to 5 % of a side.
     """
-    longer = np.exp(rng.uniform(*np.log(WIDTHS_PX)))
-    (a, b) = PROPORTIONS[rng.integers(len(PROPORTIONS))]
+    longer = np.exp(rng.uniform(*np.log((320, 1280))))
+    a, b = PROPORTIONS[rng.integers(len(PROPORTIONS))]
     width, height = (2 * round(longer * side / max(a, b) / 2) for side in (a, b))
-    across = rng.uniform(*ACROSS_DEG)
+    across = rng.uniform(40.0, 120.0)
     focal_px = round(max(width, height) / 2 / np.tan(np.radians(across) / 2), 2)
-    x, y = rng.uniform(-OFF_CENTER, OFF_CENTER, 2)
-    center = (round(width * (0.5 + x), 2), round(height * (0.5 + y), 2))
+    x, y = 0.5 + rng.uniform(-0.05, 0.05, 2)
+    center = (round(width * x, 2), round(height * y, 2))
     return PinholeCamera(width, height, focal_px, center_px=center)
 
 
@@ -442,10 +395,9 @@ class CameraConfig:
     params: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        given = [value is not None for value in (self.focal_px, self.fov_deg)] + [bool(self.model)]
-        if sum(given) > 1 or (self.params and not self.model):
-            fix = "Give focal_px, or fov_deg, or model and params."
-            raise ConfigError("a camera is described in several ways", value=self, fix=fix)
+        n_descriptions = (self.focal_px is not None) + (self.fov_deg is not None) + bool(self.model)
+        if n_descriptions > 1 or (self.params and not self.model):
+            raise ConfigError("a camera is described by focal_px, or fov_deg, or model and params", value=self)
         if not self.model:  # COLMAP's models are looked up when they are used: that takes a second
             _ = self.camera
 

@@ -13,10 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.memory import fitting
+from wheretolook.utils.validation import check_choice
 
 GOLDEN_ANGLE = np.pi * (1 + np.sqrt(5))  # radians between neighbours of the spiral: the paper's i * pi * (1 + sqrt 5)
 BYTES_PER_VOXEL = 160  # while the locations of a grid are computed, and which of them are free
-BYTES_PER_DIRECTION = 500  # while rotations are made of it, and it is looked along
+BYTES_PER_DIRECTION = 500  # while rotations and views are made of it
 MOST_VOXELS = 2**31 - 1  # tables hold ids of locations in 32 bits
 Lattice = Literal["fibonacci", "azimuth-elevation", "released", "yaw-pitch"]
 
@@ -35,9 +36,7 @@ class VoxelGrid:
     def __post_init__(self) -> None:
         if min(self.shape) < 1:
             raise ConfigError("a grid needs at least one voxel along every axis", value=self.shape)
-        lower = np.asarray(self.lower, dtype=np.float64)
-        upper = np.asarray(self.upper, dtype=np.float64)
-        if not (np.isfinite(lower).all() and np.isfinite(upper).all() and (lower < upper).all()):
+        if not (self.voxel_m > 0).all() or not np.isfinite([self.lower, self.upper]).all():
             raise ConfigError("grid bounds must be finite and lower < upper", value=(self.lower, self.upper))
 
     @classmethod
@@ -71,18 +70,15 @@ class VoxelGrid:
 
 
 def check_voxels(shape: tuple[int, int, int]) -> None:
-    """Raise ConfigError, which names a grid that would fit, if memory does not hold the locations of this one."""
+    """Raise ConfigError if memory does not hold the locations of a grid."""
+    if min(shape) < 1:
+        raise ConfigError("a grid needs at least one voxel along every axis", value=shape)
     voxels = math.prod(shape)
     most = min(fitting(BYTES_PER_VOXEL), MOST_VOXELS)
     if voxels <= most:
         return
-    fits = list(shape)
-    shrunk = sorted(range(3), key=lambda axis: shape[axis])
-    for left, axis in zip((3, 2, 1), shrunk, strict=True):  # short sides stay as they are
-        others = math.prod(fits[other] for other in shrunk[: 3 - left])
-        fits[axis] = max(1, min(fits[axis], math.floor((most / others) ** (1 / left))))
-    problem = f"a grid of {voxels:,} voxels is too large: there is room for {most:,}"
-    raise ConfigError(problem, value=shape, fix=f"{fits} would fit.")
+    fix = f"There is room for {most:,} voxels."
+    raise ConfigError(f"a grid of {voxels:,} voxels is too large", value=shape, fix=fix)
 
 
 @dataclass(frozen=True)
@@ -105,12 +101,9 @@ class ViewLattice:
     lattice: Lattice = "fibonacci"
 
     def __post_init__(self) -> None:
-        if min(self.grid) < 1:
-            raise ConfigError("grid needs at least one voxel along every axis", value=self.grid)
         check_voxels(self.grid)
         _positive(self.directions)
-        if self.lattice not in LATTICES:
-            raise ConfigError("unknown lattice", value=self.lattice, fix=f"Use one of {', '.join(LATTICES)}.")
+        check_choice("lattice", self.lattice, LATTICES)
 
     def voxels(self, bounds: ArrayLike) -> VoxelGrid:
         """The grid over a scene's bounds (2, 3): lowest and highest corner in metres."""
@@ -178,8 +171,7 @@ def axes_of_angles(yaw_pitch_deg: ArrayLike) -> Float:
 
 def direction_lattice(n: int, lattice: Lattice = "fibonacci") -> Float:
     """Directions (m, 3) of the named lattice; m = n but for "azimuth-elevation" (near n) and "yaw-pitch" (108)."""
-    if lattice not in LATTICES:
-        raise ConfigError("unknown lattice", value=lattice, fix=f"Use one of {', '.join(LATTICES)}.")
+    check_choice("lattice", lattice, LATTICES)
     return LATTICES[lattice](n)
 
 
@@ -196,5 +188,5 @@ def _positive(n: int) -> int:
         raise ConfigError("a lattice needs at least one direction", value=n)
     if n > (most := fitting(BYTES_PER_DIRECTION)):
         fix = f"There is room for {most:,}."
-        raise ConfigError("so many directions are more than there is memory for", value=n, fix=fix)
+        raise ConfigError("so many directions do not fit into memory", value=n, fix=fix)
     return n

@@ -39,6 +39,9 @@ class TexturedMesh:
 
     def only(self, keep: NDArray[np.bool_]) -> TexturedMesh:
         """The mesh with only some of its triangles, (T,) bool, and all of its vertices."""
-        names = ("triangles", "corner_uvs", "triangle_texture")
-        kept: dict[str, Any] = {name: getattr(self, name)[keep] for name in names}
-        return replace(self, **kept)
+        return replace(
+            self,
+            triangles=self.triangles[keep],
+            corner_uvs=self.corner_uvs[keep],
+            triangle_texture=self.triangle_texture[keep],
+        )

@@ -16,7 +16,7 @@ P (xx, xy, xz, yy, yz, zz).
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from wheretolook.geometry.poses import Float
 
@@ -62,25 +62,6 @@ def bearing_numbers(offsets: ArrayLike) -> Float:
     return np.concatenate([numbers / distance**2, bearing / distance, numbers], axis=-1)
 
 
-def information_matrices(numbers: ArrayLike, pivots: ArrayLike | None = None) -> Float:
-    """Information matrices (..., 6, 6) of sums kept as numbers (..., 15); translation first, rotation second.
-
-    Pivots (..., 3) are offsets in metres from the camera centre to the points that the pose is rotated about: minus the
-    camera centre rotates it about the world's origin, as the released code of the Fisher Information Field does. None
-    for the camera centre. The determinant does not depend on it.
-    """
-    numbers = np.asarray(numbers, dtype=np.float64)
-    matrices = numbers[..., PLACES] * SIGNS
-    if pivots is not None:  # the centre moves by theta x (centre - pivot)
-        turn = np.broadcast_to(np.eye(6), matrices.shape).copy()
-        turn[..., :3, 3:] = _cross(np.broadcast_to(np.asarray(pivots, dtype=np.float64), (*matrices.shape[:-2], 3)))
-        matrices = np.swapaxes(turn, -1, -2) @ matrices @ turn
-    return matrices
-
-
-def _cross(vectors: NDArray[np.float64]) -> Float:
-    """Matrices (..., 3, 3) that multiply as the cross product with vectors (..., 3)."""
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+def information_matrices(numbers: ArrayLike) -> Float:
+    """Information matrices (..., 6, 6) of sums kept as numbers (..., 15); translation first, rotation second."""
+    return np.asarray(numbers, dtype=np.float64)[..., PLACES] * SIGNS

@@ -52,9 +52,7 @@ def rotation_looking_along(directions: ArrayLike) -> Float:
     usable = (length > 0) & np.isfinite(length)
     if not usable.all():
         value = forward[~usable[..., 0]].reshape(-1, 3)[0].tolist()
-        raise PoseError(
-            "a camera cannot look along this direction", value=value, fix="Give three numbers, not all zero."
-        )
+        raise PoseError("a direction must be three finite numbers, not all zero", value=value)
     forward = forward / length
     right = np.stack([forward[..., 1], -forward[..., 0], np.zeros_like(forward[..., 0])], axis=-1)
     length = np.linalg.norm(right, axis=-1, keepdims=True)
@@ -115,22 +113,17 @@ def check_poses(cam_from_world: ArrayLike) -> NDArray[np.float64]:
     """The poses as float64 (B, 3, 4). Raises PoseError, a ValueError, on another shape or entries not finite."""
     poses = np.asarray(cam_from_world, dtype=np.float64)
     if poses.ndim != 3 or poses.shape[1:] != (3, 4):
-        raise PoseError(f"cam_from_world must have shape (B, 3, 4), got {poses.shape}")
-    finite = np.isfinite(poses)
-    if not finite.all():
-        row = int(np.flatnonzero(~finite.all(axis=(1, 2)))[0])
-        fix = "Leave such poses out."
-        raise PoseError(
-            f"cam_from_world has NaN or infinite entries, first in pose {row}", value=poses[row].tolist(), fix=fix
-        )
+        raise PoseError("cam_from_world must have shape (B, 3, 4)", value=poses.shape)
+    invalid = np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2)))
+    if len(invalid):
+        raise PoseError(f"pose {invalid[0]} has NaN or infinite entries", value=poses[invalid[0]].tolist())
     return poses
 
 
 def check_locations(locations: ArrayLike) -> NDArray[np.float64]:
     """The locations as float64 (..., 3). Raises PoseError, a ValueError, on entries that are not finite."""
     at = np.asarray(locations, dtype=np.float64)
-    finite = np.isfinite(at)
+    finite = np.isfinite(at).all(axis=-1)
     if not finite.all():
-        value = at[~finite.all(axis=-1)].reshape(-1, 3)[0].tolist()
-        raise PoseError("a camera's location is NaN or infinite", value=value, fix="Leave such locations out.")
+        raise PoseError("a camera's location is NaN or infinite", value=at[~finite].reshape(-1, 3)[0].tolist())
     return at

@@ -17,9 +17,10 @@ from tqdm.auto import tqdm
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.local_origin import local_origin, poses_from
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.memory import fitting
+from wheretolook.utils.validation import check_positive, check_range
 
 BLOCK_VOXELS = 8  # voxels along the side of a block
 BYTES_PER_BLOCK = 24 * 1024  # peak memory for each block, from fusion to ray casting: 19 to 23 KiB on three scenes
@@ -44,23 +45,16 @@ class TsdfConfig:
         truncation_voxels: how far behind a surface space counts as inside it, in voxels. The two faces of a wall
             thinner than twice this blur each other, so it should be small; below about 1.5, gaps open.
         max_depth_m: farther readings are left out, as those of most depth cameras are too noisy there.
-        memory_limit_bytes: memory the fusion and its result may take; None takes 80 % of what is available.
     """
 
     voxel_size_m: float = 0.02
     truncation_voxels: float = 2.0
     max_depth_m: float = 10.0
-    memory_limit_bytes: int | None = None
 
     def __post_init__(self) -> None:
-        for name in ("voxel_size_m", "max_depth_m"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise ConfigError(f"tsdf.{name} must be a positive length in metres", value=getattr(self, name))
-        if not 1 <= self.truncation_voxels < np.inf:
-            value = self.truncation_voxels
-            raise ConfigError("tsdf.truncation_voxels must be at least 1", value=value, fix="The default is 2.")
-        if self.memory_limit_bytes is not None and self.memory_limit_bytes <= 0:
-            raise ConfigError("tsdf.memory_limit_bytes must be positive", value=self.memory_limit_bytes)
+        check_positive("tsdf.voxel_size_m", self.voxel_size_m)
+        check_positive("tsdf.max_depth_m", self.max_depth_m)
+        check_range("tsdf.truncation_voxels", self.truncation_voxels, 1)
 
     @property
     def block_m(self) -> float:
@@ -83,25 +77,17 @@ class DepthImage:
 
     def __post_init__(self) -> None:
         _ = self.camera.matrix  # raises if the camera has distortion
-        height = self.camera.height
-        width = self.camera.width
-        if np.shape(self.depth_m) != (height, width):
-            problem = f"the camera has {height} x {width} pixels (height x width), the depth image another size"
-            fix = "Give the camera of the depth image, or scale one of them."
-            raise ConfigError(problem, value=np.shape(self.depth_m), fix=fix)
-        if self.rgb is not None and np.shape(self.rgb) != (height, width, 3):
-            fix = "Give colours of the same camera, or none."
-            raise ConfigError("the colours of a depth image have another size", value=np.shape(self.rgb), fix=fix)
+        size = (self.camera.height, self.camera.width)
+        if np.shape(self.depth_m) != size or (self.rgb is not None and np.shape(self.rgb) != (*size, 3)):
+            problem = f"a depth image and its colours must have the size of its camera, {size} (height, width)"
+            raise ConfigError(problem, value=np.shape(self.depth_m))
         dtype = np.asarray(self.depth_m).dtype
         if not np.issubdtype(dtype, np.floating):
             fix = "Divide a 16-bit image by its depth scale, mostly 1000 a metre."
             raise ConfigError("a depth image must hold floats, in metres", value=str(dtype), fix=fix)
-        pose = np.asarray(self.cam_from_world, dtype=np.float64)
-        rigid = pose.shape == (3, 4) and bool(np.isfinite(pose).all()) and np.linalg.det(pose[:, :3]) > 0
-        if not rigid or not np.allclose(pose[:, :3] @ pose[:, :3].T, np.eye(3), atol=1e-3):
-            problem = "cam_from_world of a depth image must be a rigid transform (3, 4)"
-            fix = "Give finite poses with a rotation in the first three columns."
-            raise ConfigError(problem, value=pose.tolist(), fix=fix)
+        rotation = check_poses([self.cam_from_world])[0, :, :3]
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+            raise ConfigError("cam_from_world of a depth image must hold a rotation", value=rotation.tolist())
 
     def readings(self, max_depth_m: float, stride: int = 1) -> NDArray[np.float32]:
         """Every stride-th pixel in both directions, float32, 0 where there is no reading up to `max_depth_m`."""
@@ -131,29 +117,27 @@ class TsdfVolume:
 
     def __init__(
         self,
-        config: TsdfConfig | None = None,
+        config: TsdfConfig = TsdfConfig(),
         expected_blocks: int = 1 << 13,
         origin: ArrayLike = (0.0, 0.0, 0.0),
         colored: bool = False,
     ) -> None:
         import open3d as o3d
 
-        self.config = config or TsdfConfig()
+        self.config = config
         self.origin = np.asarray(origin, dtype=np.float64)
         self.colored = colored
-        self._limit = self.config.memory_limit_bytes or fitting(1)
-        names = ("tsdf", "weight", "color")
-        sizes = (1, 1, 3)
-        n = 3 if colored else 2
-        layout = names[:n], (o3d.core.float32,) * n, [o3d.core.SizeVector([size]) for size in sizes[:n]]
-        size_m = self.config.voxel_size_m
-        self._grid: Any = o3d.t.geometry.VoxelBlockGrid(*layout, size_m, BLOCK_VOXELS, expected_blocks)
+        self._max_blocks = _max_blocks(colored)
+        sizes = {"tsdf": 1, "weight": 1} | ({"color": 3} if colored else {})
+        shapes = [o3d.core.SizeVector([size]) for size in sizes.values()]
+        layout = tuple(sizes), (o3d.core.float32,) * len(sizes), shapes
+        self._grid: Any = o3d.t.geometry.VoxelBlockGrid(*layout, config.voxel_size_m, BLOCK_VOXELS, expected_blocks)
 
     @classmethod
     def from_images(
         cls,
         images: Sequence[DepthImage],
-        config: TsdfConfig | None = None,
+        config: TsdfConfig = TsdfConfig(),
         progress: bool = True,
         colored: bool = False,
     ) -> TsdfVolume:
@@ -162,9 +146,8 @@ class TsdfVolume:
         Raises a ConfigError if the voxels would not fit the memory (found before the fusion, from a sample of the
         images), a SceneError if there is no image, or none of the sampled ones has a reading.
         """
-        config = config or TsdfConfig()
         n_blocks = estimate_blocks(images, config)
-        _check_memory(n_blocks, config, config.memory_limit_bytes or fitting(1), colored)
+        _check_memory(n_blocks, config, _max_blocks(colored))
         volume = cls(config, n_blocks, _origin_of(images), colored)
         for i in tqdm(range(len(images)), desc="fuse depth", unit="image", disable=not progress):
             volume.integrate(images[i])
@@ -186,23 +169,20 @@ class TsdfVolume:
         pose = np.vstack([poses_from(image.cam_from_world, self.origin), (0, 0, 0, 1)])
         tensor: Any = core.Tensor
         limits = 1.0, float(self.config.max_depth_m), float(self.config.truncation_voxels)
-        shown = Image(tensor(np.ascontiguousarray(depth)))
-        from_where = (tensor(image.camera.matrix), tensor(pose))
-        blocks = self._grid.compute_unique_block_coordinates(shown, *from_where, *limits)
+        view = (tensor(image.camera.matrix), tensor(pose))
+        shown = [Image(tensor(np.ascontiguousarray(depth)))]
+        blocks = self._grid.compute_unique_block_coordinates(*shown, *view, *limits)
         if self.colored:
-            assert image.rgb is not None
-            color = Image(tensor(np.asarray(image.rgb, dtype=np.float32) / np.float32(255)))
-            self._grid.integrate(blocks, shown, color, *from_where, *limits)
-        else:
-            self._grid.integrate(blocks, shown, *from_where, *limits)
-        _check_memory(len(self), self.config, self._limit, self.colored)
+            shown.append(Image(tensor(np.asarray(image.rgb, dtype=np.float32) / np.float32(255))))
+        self._grid.integrate(blocks, *shown, *view, *limits)
+        _check_memory(len(self), self.config, self._max_blocks)
 
-    def surface(self, least_weight: float = 0.5) -> TexturedMesh:
+    def surface(self, min_readings: float = 0.5) -> TexturedMesh:
         """The zero crossing as triangles, whose fronts face the cameras that saw them; with colours if it has them.
 
-        Only voxels with at least `least_weight` readings count.
+        Only voxels with at least `min_readings` count.
 
-        Several threads find the triangles, so their order may differ from run to run; the triangles do not. Raises
+        Several threads extract the triangles, so their order may differ from run to run; the triangles do not. Raises
         SceneError if there is none.
         """
         fix = "Check the poses, that depths are in metres, and that voxel_size_m is below the scene's size."
@@ -214,7 +194,7 @@ class TsdfVolume:
         values = self._grid.attribute("tsdf").numpy()  # shares its memory
         values -= shift
         try:
-            mesh = self._grid.extract_triangle_mesh(least_weight, -1)
+            mesh = self._grid.extract_triangle_mesh(min_readings, -1)
         except RuntimeError:  # Open3D cannot colour a mesh without vertices
             raise nothing from None
         finally:
@@ -235,12 +215,11 @@ def estimate_blocks(images: Sequence[DepthImage], config: TsdfConfig) -> int:
     """Blocks of voxels that the images' surfaces will touch, from some pixels of up to 100; SceneError without any."""
     cell_m = max(config.block_m, _SURVEY_CELL_M)
     cells = np.empty(0, dtype=np.int64)
-    origin = _origin_of(images) if len(images) else np.zeros(3)
     number = np.array([1, 1 << 21, 1 << 42])  # one number a cell sorts faster than three
-    for i in np.unique(np.linspace(0, len(images) - 1, _SURVEY_IMAGES).astype(int)) if len(images) else ():
-        image = images[i]
+    sampled = {int(i) for i in np.linspace(0, len(images) - 1, _SURVEY_IMAGES)} if len(images) else ()
+    for image in (images[i] for i in sampled):
         stride = max(1, int(np.sqrt(np.size(image.depth_m) / _SURVEY_PIXELS)))
-        points = image.points(config.max_depth_m, stride) - origin
+        points = image.points(config.max_depth_m, stride) - _origin_of(images)
         cells = np.union1d(cells, np.floor(points / cell_m).astype(np.int64) @ number)
     if len(cells) == 0:
         problem = f"no depth image has a reading up to {config.max_depth_m:g} m"
@@ -251,19 +230,19 @@ def estimate_blocks(images: Sequence[DepthImage], config: TsdfConfig) -> int:
 
 
 def _origin_of(images: Sequence[DepthImage]) -> Float:
-    """The local origin (3,) m of images of one scene, by the place of the first."""
+    """The local origin (3,) m of images of one scene, by the location of the first."""
     return local_origin(camera_centers(images[0].cam_from_world))
 
 
-def _check_memory(n_blocks: int, config: TsdfConfig, limit_bytes: int, colored: bool = False) -> None:
-    block_bytes = BYTES_PER_BLOCK + colored * _COLOR_BYTES_PER_BLOCK
-    fits = min(limit_bytes // block_bytes, MAX_BLOCKS)
-    if n_blocks <= fits:
-        return
-    enough = config.voxel_size_m * np.sqrt(n_blocks / max(fits, 1))
-    step = 10.0 ** (np.floor(np.log10(enough)) - 1)
-    needed, available = (n * block_bytes / 2**30 for n in (n_blocks, fits))
-    need = f"about {needed:.2f} GiB ({n_blocks * block_bytes:,} bytes) for what the depth images show"
-    problem = f"voxels of this size need {need}, {available:.2f} GiB ({fits * block_bytes:,} bytes) can be used"
-    fix = f"A voxel_size_m of {np.ceil(enough / step) * step:.2g} would fit."
-    raise ConfigError(problem, value=f"voxel_size_m={config.voxel_size_m:g}", fix=fix)
+def _max_blocks(colored: bool) -> int:
+    """Number of blocks that fit into 80 % of the available memory."""
+    return min(fitting(BYTES_PER_BLOCK + colored * _COLOR_BYTES_PER_BLOCK), MAX_BLOCKS)
+
+
+def _check_memory(n_blocks: int, config: TsdfConfig, max_blocks: int) -> None:
+    """Raise ConfigError if there are more blocks than fit."""
+    if n_blocks > max_blocks:
+        enough = config.voxel_size_m * np.sqrt(n_blocks / max(max_blocks, 1))
+        problem = f"the depth images need {n_blocks:,} blocks of voxels, {max_blocks:,} fit into memory"
+        fix = f"A voxel_size_m of {1.1 * enough:.2g} would fit."
+        raise ConfigError(problem, value=f"voxel_size_m={config.voxel_size_m:g}", fix=fix)

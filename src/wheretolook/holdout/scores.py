@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.evaluation.photographs import score_scale
+from wheretolook.evaluation.scoring import score_scale
 from wheretolook.geometry.poses import Float
 from wheretolook.holdout.holdout import HoldoutResult
 from wheretolook.holdout.photo_map import PhotographedMap

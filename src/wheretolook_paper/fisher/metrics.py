@@ -23,7 +23,7 @@ ROWS_AT_ONCE = 4096  # matrices that a thread of a CPU takes at a time: a few mi
 
 
 def metric_of(numbers: ArrayLike, metric: str, pivots: ArrayLike | None = None, device: str = "cpu") -> Float:
-    """Return a metric (B,) of information matrices (B, 15), about pivots (B, 3) as in `information_matrices`.
+    """Return a metric (B,) of information matrices (B, 15), rotated about pivots (B, 3).
 
     More is better. The metric is "trace"; "logdet", the logarithm of one plus the determinant (log(1 + d), and
     -log(1 - d) where an approximation makes d negative), so that it is finite without landmarks and keeps the

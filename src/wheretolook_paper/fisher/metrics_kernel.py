@@ -29,7 +29,7 @@ def symmetric(numbers: wp.array2d[wp.float64], row: wp.int32, first: wp.int32) -
 
 @wp.func
 def information_matrix(numbers: wp.array2d[wp.float64], row: wp.int32, pivot: wp.vec3d) -> mat66d:
-    """As `wheretolook.geometry.pose_information.information_matrices`."""
+    """As `wheretolook.geometry.pose_information.information_matrices`, of a pose that rotates about a pivot."""
     shift = symmetric(numbers, row, 0)
     cross = wp.skew(wp.vec3d(numbers[row, 6], numbers[row, 7], numbers[row, 8]))
     arm = wp.skew(pivot)

@@ -48,7 +48,7 @@ def scored(root: Path, split: Split, methods: tuple[str, ...], weights: list[Pat
     tables = [scene.read_table() for scene in scenes]
     served = {path: method_of_weights(path) for path in weights}
     config = EvaluateConfig(methods=methods, reference="")
-    scores, _ = score_scenes(dataset, scenes, tables, config, served, "cpu", True, None)
+    scores, _ = score_scenes(scenes, tables, config, served, "cpu", True, None)
     parts = []
     for scene, table in zip(scenes, tables, strict=True):
         cameras = scene.cameras()

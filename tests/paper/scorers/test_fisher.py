@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from synthetic_dataset import make_landmarks
+from twins.fisher import information_matrices
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
-from wheretolook.geometry.pose_information import information_matrices
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks

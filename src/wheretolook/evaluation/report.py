@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from wheretolook.dataset.thresholds import ALL, threshold_label
@@ -261,7 +262,7 @@ def _counted_text(row: Row, key: str) -> str:
 
 def _ends(row: Row, name: str, key: str) -> str:
     """Interval of a share with a leading space; "" where it is unknown or has no width."""
-    low, high = (row.get(f"{name}_{end}_{key}") for end in ("low", "high"))  # the paper's shares have none
+    low, high = (row.get(f"{name}_{end}_{key}", np.nan) for end in ("low", "high"))  # the paper's shares have none
     as_text = _signed if name == "difference" else _percent
     return f" [{as_text(low)}, {as_text(high)}]" if pd.notna(low) and low < high else ""
 

@@ -64,9 +64,10 @@ def compare_methods(
         scored.append((held_out.views, scores))
         used = " ".join(sorted({one.occlusion for one in photographs}))
         parts.append(_compare(held_out, scores, [one.scene for one in photographs], used, config, temperatures))
-    views, scores = scored[0]
+    first_views, first_scores = scored[0]
     table = pd.concat([part.table for part in parts], ignore_index=True)
-    return Evaluation(scenes, weights, views, parts, table, _calibration(scores, views.good[:, 0], temperatures, n_val))
+    calibration = _calibration(first_scores, first_views.good[:, 0], temperatures, n_val)
+    return Evaluation(scenes, weights, first_views, parts, table, calibration)
 
 
 def _compare(
@@ -125,9 +126,8 @@ def _calibration(
         if is_probability(name):
             temperature = temperatures.get(name, np.nan)
             curves = calibration_rows(values, good, temperature)
-            for place, (column, value) in enumerate(
-                {"method": name, "temperature": temperature, "n_val": n_val}.items()
-            ):
-                curves.insert(place, column, value)
+            curves.insert(0, "method", name)
+            curves.insert(1, "temperature", temperature)
+            curves.insert(2, "n_val", n_val)
             parts.append(curves)
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()

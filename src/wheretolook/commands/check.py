@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +15,7 @@ from wheretolook.features.config import ExtractorConfig
 from wheretolook.mapping.config import ExistingModelConfig
 from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.locks import hold
+from wheretolook.utils.validation import check_range, reject
 
 if TYPE_CHECKING:
     from wheretolook.dataset.layout import SceneFolder
@@ -82,26 +83,26 @@ class Check(OcclusionOptions, ScorerOptions):
     device: str = "auto"
 
     def __post_init__(self) -> None:
-        if (self.map is None) == (self.scene is None):
-            raise ConfigError("what is checked is given by --map or by --scene", fix="Give one of them.")
-        if self.database is not None and self.images is not None:
-            fix = "Leave --images out to use the map's own features, --database to extract them again."
-            raise ConfigError("features come from a database or from images", value=str(self.images), fix=fix)
-        if self.views < 1 or self.workers < 0:
-            fix = "Give --views of at least 1, --workers of at least 0."
-            raise ConfigError("a number is out of range", value=(self.views, self.workers), fix=fix)
-        ExtractorConfig(self.extractor or "opencv", weights=self.extractor_weights)
-        if (self.extractor is not None or self.extractor_weights) and self.images is None:
-            fix = "Give --images, the folder of the photographs, or leave --extractor out."
-            raise ConfigError("an extractor needs images", value=self.extractor, fix=fix)
+        check_range("views", self.views, 1)
+        check_range("workers", self.workers, 0)
+        extracting = self.extractor is not None or bool(self.extractor_weights)
+        reject(
+            ((self.map is None) == (self.scene is None), "what is checked is given by either --map or --scene", None),
+            (bool(self.database and self.images), "features come from either --database or --images", None),
+            (extracting and self.images is None, "an extractor needs --images, the photographs", self.extractor),
+        )
+        self._extractor()
+
+    def _extractor(self) -> ExtractorConfig:
+        return ExtractorConfig(self.extractor or "opencv", weights=self.extractor_weights)
 
     def run(self) -> None:
         """Check the map, write the report to `out`, and print a summary."""
         self._check_names()
         from wheretolook.dataset.layout import find_scene
         from wheretolook.figures.style import save_figure
-        from wheretolook.holdout import photo_map as sources
         from wheretolook.holdout.figure import check_figure
+        from wheretolook.holdout.photo_map import WORK, folder_of_check
         from wheretolook.holdout.report import check_map
         from wheretolook.holdout.scores import Scoring
         from wheretolook.training.weights import read_training
@@ -112,12 +113,20 @@ class Check(OcclusionOptions, ScorerOptions):
         workers = self.workers or len(os.sched_getaffinity(0))
         scoring = Scoring(self.method, self.weights, self.also, self.anywhere)
         scoring.check()
-        out = self.out or sources.folder_of_check(self.data, self._result_name())
-        scene = None if self.scene is None else find_scene(self.data, self.scene, self.name)
+        if self.scene is None:
+            scene = None
+            name = ExistingModelConfig(model=self.map).scene_name
+        else:
+            scene = find_scene(self.data, self.scene, self.name)
+            name = "-".join(filter(None, (self.name, self.scene)))
+        out = self.out or folder_of_check(self.data, name)
         try:
-            with _reading(scene), hold(out / ".lock", "check"):
-                source, occlusion = self._open(scene, out, device, workers)
-                report = check_map(source, out / sources.WORK, scoring, occlusion, self.views, workers, device)
+            with ExitStack() as locks:
+                if scene is not None:  # no command may change it meanwhile
+                    locks.enter_context(hold(scene.folder.parent / LOCK, "check", shared=True))
+                locks.enter_context(hold(out / ".lock", "check"))
+                photographs, occlusion = self._open(scene, out / WORK, device, workers)
+                report = check_map(photographs, out / WORK, scoring, occlusion, self.views, workers, device)
                 report.save(out)
                 save_figure(check_figure(report), out / "check.png")
         finally:
@@ -138,54 +147,37 @@ class Check(OcclusionOptions, ScorerOptions):
 
         if self.scene is not None:
             check_scene_name(self.data, self.scene, self.name)
-        for name in (*([self.method] if self.method else []), *self.also):
+        for name in filter(None, (self.method, *self.also)):
             check_method(name)
         if self.map is not None and self.mesh is None:  # with a mesh, missing metres are the first error
             model_suffix(self.map)
 
-    def _result_name(self) -> str:
-        """Return the name of the results' folder: that of the model, or of the scene after its dataset's if given."""
-        if self.scene is None:
-            return ExistingModelConfig(model=self.map).scene_name
-        return "-".join(filter(None, (self.name, self.scene)))
-
     def _open(
-        self, scene: SceneFolder | None, out: Path, device: str, workers: int
+        self, scene: SceneFolder | None, work: Path, device: str, workers: int
     ) -> tuple[PhotographedMap, OcclusionModel]:
-        """Open the map with its photographs' features, and the occlusion model; results go to `out`."""
+        """Open the map with its photographs' features, and the occlusion model; results go to `work`."""
         from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
-        from wheretolook.holdout import photo_map as source
+        from wheretolook.holdout.photo_map import features_of, open_map, says_metric
         from wheretolook.mapping.sources import find_features, find_photographs
 
         mesh = self.mesh
-        metric = self.metres
-        name = self.scene
-        if scene is not None:
-            model = scene.map
-            metric = metric or not scene.is_photographed or source.says_metric(model)
-            if mesh is None and scene.mesh.is_file():
-                mesh = scene.mesh
-        else:
-            assert self.map is not None
-            model = self.map
-            name = ExistingModelConfig(model=model).scene_name
-            metric = metric or source.says_metric(model)
+        model = self.map if scene is None else scene.map
+        assert model is not None
+        metric = self.metres or says_metric(model) or not (scene is None or scene.is_photographed)
+        rendered = scene is not None and scene.mesh.is_file()
+        if mesh is None and scene is not None and rendered:
+            mesh = scene.mesh
         if mesh is not None and not metric:
             fix = "Say --metres if it is, or leave --mesh out."
             raise ConfigError("a mesh is of use only for a map in metres", value=str(mesh), fix=fix)
-        files = ColmapFiles(model, mesh=mesh)
-        occlusion = ColmapEnvironment(files, occlusion=self.occlusion or "", device=device).occlusion
-        given = self.images or self.database or find_features(model) or find_photographs(model)
-        if given is None and scene is not None and scene.mesh.is_file():  # its images were rendered, and are gone
+        occlusion = ColmapEnvironment(
+            ColmapFiles(model, mesh=mesh), occlusion=self.occlusion or "", device=device
+        ).occlusion
+        if rendered and not any((self.images, self.database, find_features(model), find_photographs(model))):
             problem = "neither the features nor the photographs of this map are known"
             fix = "Map the scene again with `wheretolook map --map.keep_database true`, which keeps the features."
             raise MapError(problem, path=model, fix=fix)
-        extractor = ExtractorConfig(self.extractor or "opencv", weights=self.extractor_weights)
-        where = (out / source.WORK, workers, device, extractor)
-        model, features = source.features_of(model, self.images, self.database, *where)
-        return source.open_map(model, features, metric, name, keep_frame=mesh is not None), occlusion
-
-
-def _reading(scene: SceneFolder | None) -> AbstractContextManager[None]:
-    """Hold the dataset of a scene, so that no command changes it."""
-    return nullcontext() if scene is None else hold(scene.folder.parent / LOCK, "check", shared=True)
+        given = (self.images, self.database)
+        folder, features = features_of(model, *given, work, workers, device, self._extractor())
+        name = self.scene or ExistingModelConfig(model=model).scene_name
+        return open_map(folder, features, metric, name, keep_frame=mesh is not None), occlusion

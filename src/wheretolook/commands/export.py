@@ -4,16 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from wheretolook.commands.options import CameraOptions
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.shipped import WEIGHTS, or_shipped
 from wheretolook.utils.validation import check_positive
-
-if TYPE_CHECKING:
-    from wheretolook.geometry.poses import Float
-    from wheretolook.space.free_space import FreeSpace
 
 MAX_LOCATIONS = 20_000
 
@@ -57,40 +52,24 @@ class Export(CameraOptions):
         """Write the robot's folder."""
         from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
         from wheretolook.robot.export import export_robot, pinhole_of
+        from wheretolook.select.waypoints import grid_waypoints
 
         files = ColmapFiles(self.map, mesh=self.mesh, database=self.database)
         occlusion = "none" if self.mesh is None else "mesh"
         environment = ColmapEnvironment(files, self.named_camera(), occlusion=occlusion)
-        locations = None if self.mesh is None else _free_locations(environment.mesh_space, self.spacing)
         source = environment.localization_map
+        locations = None
+        if self.mesh is not None:
+            locations = grid_waypoints(source, environment.mesh_space, self.spacing).points
+            if len(locations) > MAX_LOCATIONS:
+                problem = f"the grid has {len(locations):,} free locations, more than {MAX_LOCATIONS:,}"
+                raise ConfigError(problem, value=self.spacing, fix="Give a larger --spacing.")
         camera = pinhole_of(source.camera)
         if camera != source.camera:
-            print(
-                "the map's camera has distortion, the robot's is the pinhole of its rectified images; or use --camera"
-            )
+            print("the map's camera has distortion, the robot's is the pinhole of its rectified images")
         export_robot(source.of_camera(camera), or_shipped(self.weights), self.out, locations)
         print(f"{len(source.landmarks):,} landmarks, a camera of {camera.width} x {camera.height} px: {self.out}")
         if locations is None:
             print("without --mesh the robot sees landmarks through walls")
         else:
             print(f"visible landmarks are stored for {len(locations):,} free locations, {self.spacing:g} m apart")
-
-
-def _free_locations(space: FreeSpace, spacing_m: float) -> Float:
-    """Return free locations (L, 3) m on a grid over the mesh. Raises ConfigError if there are none, or too many."""
-    import numpy as np
-
-    low, high = space.bounds
-    counts = np.maximum(1, np.ceil((high - low) / spacing_m)).astype(np.int64)
-    if counts.prod() > 100 * MAX_LOCATIONS:
-        raise ConfigError("the grid is too fine for this mesh", value=spacing_m, fix="Give a larger --spacing.")
-    # centred between both bounds
-    axes = [(a + b) / 2 + (np.arange(n) - (n - 1) / 2) * spacing_m for a, b, n in zip(low, high, counts, strict=True)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    free = grid[space.is_free(grid)]
-    if len(free) == 0:
-        fix = "Give a smaller --spacing, or a mesh with free space above a floor (metres, z up)."
-        raise ConfigError("no location of the grid is free", value=spacing_m, fix=fix)
-    if len(free) > MAX_LOCATIONS:
-        raise ConfigError(f"the grid has {len(free):,} free locations", value=spacing_m, fix="Give a larger --spacing.")
-    return free

@@ -6,7 +6,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from wheretolook.commands.options import CameraOptions, OcclusionOptions, ScorerOptions
 from wheretolook.select.request import SelectionRequest
@@ -85,24 +85,21 @@ class Select(SelectionRequest, CameraOptions, OcclusionOptions, ScorerOptions):
         super().__post_init__()
         check_format(self.out, self.format, max(self.n, self.looks or 1))
         if bool(self.at) == (self.grid is not None):
-            raise ConfigError("waypoints are given by --at or by --grid", fix="Give one of them.")
+            raise ConfigError("waypoints are given by either --at or --grid")
         self.named_camera()
 
     def named_camera(self) -> Camera | int | None:
         """Return the camera asked for: one, a camera_id of the map, or None for the map's own."""
         from wheretolook.geometry.camera import PinholeCamera, parse_size
 
+        described = super().named_camera()
         if self.fov is None:
             if self.size is not None:
-                raise ConfigError("an image size belongs to a field of view", value=self.size, fix="Give --fov too.")
-            return super().named_camera()
-        if self.camera is not None or self.camera_id is not None:
+                raise ConfigError("an image size belongs to a field of view, --fov", value=self.size)
+            return described
+        if described is not None:
             raise ConfigError("the camera is described in several ways", value=self.fov, fix="Give one of them.")
         return PinholeCamera.of_field_of_view(self.fov, *parse_size(self.size or "640x480"))
-
-    def request(self) -> dict[str, Any]:
-        """Return the fields of `SelectionRequest`."""
-        return {field.name: getattr(self, field.name) for field in fields(SelectionRequest)}
 
     def run(self) -> SelectedViews:
         """Select the views, write them to `out` and print a summary."""
@@ -139,9 +136,10 @@ class Select(SelectionRequest, CameraOptions, OcclusionOptions, ScorerOptions):
         if waypoints is None:
             assert self.grid is not None
             waypoints = selector.grid(self.grid)
-        views = selector.best(waypoints, progress=True, **self.request())
+        request = {field.name: getattr(self, field.name) for field in fields(SelectionRequest)}
+        views = selector.best(waypoints, progress=True, **request)
         views.save(self.out, self.format)
-        _print_summary(selector, views, len(waypoints), stopping=self.least_score is not None)
+        _print_summary(selector, views, len(waypoints))
         print(f"{len(views)} views in {time.monotonic() - start:.1f} s: {self.out}")
         return views
 
@@ -149,15 +147,12 @@ class Select(SelectionRequest, CameraOptions, OcclusionOptions, ScorerOptions):
         """Return the waypoints, None for a grid."""
         from wheretolook.select.waypoints import parse_points, read_waypoints
 
-        if not self.at:
-            return None
-        texts = [text.strip() for text in self.at]
-        if len(texts) == 1 and (Path(texts[0]).exists() or texts[0].count(",") != 2):
-            return read_waypoints(texts[0])
-        return parse_points(texts)
+        if len(self.at) == 1 and (Path(self.at[0].strip()).exists() or self.at[0].count(",") != 2):
+            return read_waypoints(self.at[0].strip())
+        return parse_points(self.at) if self.at else None
 
 
-def _print_summary(selector: WhereToLook, views: SelectedViews, n_waypoints: int, stopping: bool) -> None:
+def _print_summary(selector: WhereToLook, views: SelectedViews, n_waypoints: int) -> None:
     localization_map = selector.localization_map
     n_used = len({*views.waypoint.tolist()})
     skipped = f", {n_waypoints - n_used} left out" if n_used < n_waypoints else ""
@@ -166,9 +161,10 @@ def _print_summary(selector: WhereToLook, views: SelectedViews, n_waypoints: int
     best = views.rank == 1
     scores = views.score[best]
     print(f"{n_used} waypoints{skipped}; best scores {scores.min():.3g} to {scores.max():.3g}")
-    if stopping and (n_further := int((~best).sum())):
-        print(f"{len({*views.waypoint[~best].tolist()})} waypoints are stops, with {n_further} further looks")
-    if n_blind := int((views.n_visible[best] == 0).sum()):
-        print(f"{n_blind} of the best views see no landmark")
-    if n_outside := int((~views.in_range[best]).sum()):
-        print(f"{n_outside} of the best views are outside the training distribution (column in_range)")
+    counts = {
+        "best views see no landmark": views.n_visible[best] == 0,
+        "best views are outside the training distribution (column in_range)": ~views.in_range[best],
+    }
+    for what, rows in counts.items():
+        if rows.any():
+            print(f"{rows.sum()} of the {what}")

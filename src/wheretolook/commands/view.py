@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from wheretolook.commands.options import CameraOptions
 from wheretolook.dataset.names import check_scene_name
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.validation import reject
 
 if TYPE_CHECKING:
     from wheretolook.view.state import ViewState
@@ -79,21 +80,18 @@ class View(CameraOptions):
     device: str = "auto"
 
     def __post_init__(self) -> None:
-        if (self.map is None) == (self.scene is None):
-            raise ConfigError("what is viewed is given by --scene or by --map", fix="Give one of them.")
-        if self.scene is not None and (self.mesh is not None or self.images is not None):
-            fix = "Leave them out: a scene has its own."
-            raise ConfigError("--mesh and --images belong to --map", value=str(self.mesh or self.images), fix=fix)
-        if self.scene is not None and self.camera_id is not None:
-            raise ConfigError("--camera-id belongs to --map", value=self.camera_id, fix="Describe it by --camera.")
-        if self.record is not None and self.film is not None:
-            raise ConfigError("a recording and a film are made one at a time", value=str(self.film), fix="Give one.")
-        if self.record is not None and self.record.suffix != ".rrd":
-            raise ConfigError("a Rerun recording is a .rrd", path=self.record, fix="Name it so.")
-        if self.film is not None and self.film.suffix not in (".webp", ".gif"):
-            raise ConfigError("this film is a .webp or a .gif", path=self.film, fix="Name it so.")
-        if self.film is not None and (self.path is None or (self.map is not None and self.mesh is None)):
-            raise ConfigError("a film needs a path, and a mesh to render", path=self.film, fix="Give --path.")
+        of_map = self.mesh is not None or self.images is not None or self.camera_id is not None
+        record = self.record
+        film = self.film
+        can_film = film is None or (self.path is not None and (self.map is None or self.mesh is not None))
+        reject(
+            ((self.map is None) == (self.scene is None), "what is viewed is given by either --scene or --map", None),
+            (self.scene is not None and of_map, "--mesh, --images and --camera-id belong to --map", self.scene),
+            (record is not None and film is not None, "give either --record or --film", None),
+            (record is not None and record.suffix != ".rrd", "a Rerun recording is a .rrd", str(record)),
+            (film is not None and film.suffix not in (".webp", ".gif"), "a film is a .webp or a .gif", str(film)),
+            (not can_film, "a film needs --path, and of a map --mesh", str(film)),
+        )
         self.named_camera()
 
     def run(self) -> None:

@@ -7,6 +7,7 @@ from numbers import Integral
 
 from wheretolook.looks.selection import MAX_VIEWS
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.validation import check_range, reject
 
 
 @dataclass(frozen=True)
@@ -34,35 +35,26 @@ class SelectionRequest:
     skip: bool = False
 
     def __post_init__(self) -> None:
-        if not isinstance(self.n, Integral) or self.n < 1:
-            raise ConfigError("n must be a whole number of at least 1", value=self.n)
-        if self.looks is not None and not (isinstance(self.looks, Integral) and 1 <= self.looks <= MAX_VIEWS):
-            raise ConfigError(f"looks must be a whole number of 1 to {MAX_VIEWS}", value=self.looks)
-        if self.pitch_deg is not None and not -90 <= self.pitch_deg[0] <= self.pitch_deg[1] <= 90:
-            fix = "Give the lowest and the highest pitch in degrees, such as -30 and 30."
-            raise ConfigError("limits on pitch must be within -90 and 90", value=tuple(self.pitch_deg), fix=fix)
-        for name in ("max_turn_deg", "max_total_turn_deg"):
-            value = getattr(self, name)
-            if value is not None and not 0 <= value < float("inf"):
-                raise ConfigError(f"{name} must be at least 0 degrees", value=value)
-        self._check_combination()
-
-    def _check_combination(self) -> None:
-        """Raise ConfigError for options that exclude or need each other."""
+        low, high = self.pitch_deg or (-90.0, 90.0)
+        joint = self.looks is not None
+        in_order = self.max_turn_deg is not None
         stopping = self.least_score is not None
-        if stopping and (self.looks is None or self.max_turn_deg is None):
-            fix = "Give looks, the most of a waypoint, and max_turn_deg, the limit between waypoints."
-            raise ConfigError("least_score is for further looks along a path", value=self.least_score, fix=fix)
-        if stopping and not 0 < (self.least_score or 0) <= 1:
-            raise ConfigError("least_score must be a probability above 0", value=self.least_score)
-        if stopping and self.max_total_turn_deg is not None:
-            raise ConfigError("max_total_turn_deg and least_score exclude each other", value=self.max_total_turn_deg)
-        if self.looks is not None and self.n > 1:
-            raise ConfigError("n and looks exclude each other", value=(self.n, self.looks))
-        if self.looks is not None and self.max_turn_deg is not None and not stopping:
-            fix = "Give least_score, below which a waypoint gets further looks; or leave max_turn_deg out."
-            raise ConfigError("looks are chosen at each waypoint by itself", value=self.looks, fix=fix)
-        if self.looks is None and self.max_total_turn_deg is not None:
-            raise ConfigError("max_total_turn_deg needs looks", value=self.max_total_turn_deg)
-        if self.max_turn_deg is not None and self.n > 1:
-            raise ConfigError("max_turn_deg is for one view of each waypoint", value=self.n, fix="Leave n out.")
+        for name in ("max_turn_deg", "max_total_turn_deg"):
+            check_range(name, getattr(self, name) or 0, 0)
+        reject(
+            (not isinstance(self.n, Integral) or self.n < 1, "n must be a whole number of at least 1", self.n),
+            (joint and self.looks not in range(1, MAX_VIEWS + 1), f"looks must be 1 to {MAX_VIEWS}", self.looks),
+            (
+                not -90 <= low <= high <= 90,
+                "pitch_deg must be a lowest and a highest pitch, such as -30 30",
+                (low, high),
+            ),
+            (stopping and not (joint and in_order), "least_score needs looks and max_turn_deg", self.least_score),
+            (stopping and not 0 < (self.least_score or 0) <= 1, "least_score must be above 0, to 1", self.least_score),
+            (joint and self.n > 1, "n and looks exclude each other", (self.n, self.looks)),
+            (in_order and self.n > 1, "max_turn_deg is for one view of each waypoint: leave n out", self.n),
+            (joint and in_order and not stopping, "looks with max_turn_deg need least_score", self.looks),
+        )
+        if self.max_total_turn_deg is not None and (stopping or not joint):
+            problem = "max_total_turn_deg needs looks, and excludes least_score"
+            raise ConfigError(problem, value=self.max_total_turn_deg)

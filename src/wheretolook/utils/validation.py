@@ -26,3 +26,10 @@ def check_choice(name: str, value: object, choices: Iterable[object]) -> None:
     known = [*choices]
     if value not in known:
         raise ConfigError(f"unknown {name}", value=value, fix=f"Use one of {', '.join(map(str, known))}.")
+
+
+def reject(*cases: tuple[bool, str, object]) -> None:
+    """Raise ConfigError with the problem and the value of the first case that holds."""
+    for holds, problem, value in cases:
+        if holds:
+            raise ConfigError(problem, value=value)

@@ -29,6 +29,14 @@ def invert_poses(poses: ArrayLike) -> Float:
     return np.concatenate([rotation, -rotation @ poses[..., 3:]], axis=-1)
 
 
+def compose_poses(b_to_c: ArrayLike, a_to_b: ArrayLike) -> Float:
+    """Compose rigid transforms (..., 3, 4) to that from frame a to frame c."""
+    second = np.asarray(b_to_c, dtype=np.float64)
+    first = np.asarray(a_to_b, dtype=np.float64)
+    rotation = second[..., :3]
+    return np.concatenate([rotation @ first[..., :3], rotation @ first[..., 3:] + second[..., 3:]], axis=-1)
+
+
 def camera_centers(cam_from_world: ArrayLike) -> Float:
     """Camera centres in the world, (..., 3) metres, of poses (..., 3, 4)."""
     return invert_poses(cam_from_world)[..., 3]

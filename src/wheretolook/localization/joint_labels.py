@@ -20,7 +20,7 @@ from wheretolook.localization.confidence import ConfidenceModel
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator
 from wheretolook.localization.rig import Look, rig_of
-from wheretolook.localization.rig_localization import JointLocalization, JointLocalizer, SingleViewPoses
+from wheretolook.localization.rig_localization import JointLocalizer, SingleViewPoses
 from wheretolook.utils.errors import TableError
 
 SET_COLUMNS = (
@@ -52,7 +52,6 @@ def label_sets(
     config: LocalizerConfig | None = None,
     turn_noise_deg: float = 0.0,
     seed: int = 0,
-    confidence: ConfidenceModel | None = None,
     progress: str | None = None,
     rigs: Sequence[Float] | None = None,
 ) -> pd.DataFrame:
@@ -72,19 +71,18 @@ def label_sets(
         fix = "Label with `--label.store_pixels true`, and read the table with `pixels=True`."
         raise TableError("the table has no pixels of matches", value=missing, fix=fix)
     localizer = JointLocalizer(PoseEstimator(points, config), turn_noise_deg)
-    model = confidence or ConfidenceModel.bundled()
     rng = np.random.default_rng(seed)
     true_poses = poses(table)
     single_view: dict[int, SingleViewPoses] = {}
     known: dict[tuple[int, ...], tuple[object, ...]] = {}  # repeated sets, if nothing is drawn for each
     rows: list[tuple[object, ...]] = []
     for number, members in enumerate(tqdm(sets, desc=progress, unit="set", disable=progress is None)):
-        chosen = np.asarray(members, dtype=np.int64)
-        if len(chosen) == 0 or chosen.min() < 0 or chosen.max() >= len(table):
-            raise TableError(f"a set of views has none or wrong rows of {len(table)}", value=chosen.tolist())
-        key = tuple(chosen.tolist())
+        key = tuple(map(int, members))
+        if not key or max(key) >= len(table):
+            raise TableError(f"a set of views has none or wrong rows of {len(table)}", value=key)
         if key not in known or turn_noise_deg or rigs is not None:
-            rig = _noisy(rig_of(true_poses[chosen]), turn_noise_deg, rng) if rigs is None else rigs[number]
+            true = true_poses[list(key)]
+            rig = _noisy(rig_of(true), turn_noise_deg, rng) if rigs is None else rigs[number]
             looks = [_look(table, row, pose, cameras, len(points)) for row, pose in zip(key, rig, strict=True)]
             start = time.perf_counter()
             for row, look in zip(key, looks, strict=True):
@@ -92,45 +90,40 @@ def label_sets(
                     single_view[row] = localizer.single_view_poses(look)
             result = localizer.localize(looks, [single_view[row] for row in key])
             seconds = time.perf_counter() - start
-            error = _worst_error(result, true_poses[chosen] if rigs is None else true_poses[chosen[:1]])
-            location = int(table["location_id"].iloc[chosen[0]])
-            known[key] = (*_values(len(chosen), location, result, error), model.of(result), seconds)
+            error_m = error_deg = np.nan
+            if result.cams_from_world is not None:
+                n = len(true) if rigs is None else 1
+                error_m, error_deg = (error.max() for error in pose_error(result.cams_from_world[:n], true[:n]))
+            known[key] = (
+                len(key),
+                int(table["location_id"].iat[key[0]]),
+                result.status,
+                error_m,
+                error_deg,
+                result.n_matches,
+                result.n_inliers,
+                result.support,
+                result.rival_support,
+                *result.unique_support,
+                *result.deviation,
+                ConfidenceModel.bundled().of(result),
+                seconds,
+            )
         rows.append(known[key])
     return pd.DataFrame(rows, columns=list(SET_COLUMNS))
-
-
-def _worst_error(result: JointLocalization, true_poses: Float) -> tuple[float, float]:
-    """Largest errors (m, degrees) of the first poses; NaN if there is no pose."""
-    if result.cams_from_world is None:
-        return np.nan, np.nan
-    error_m, error_deg = pose_error(result.cams_from_world[: len(true_poses)], true_poses)
-    return error_m.max(), error_deg.max()
-
-
-def _values(
-    n_views: int, location_id: int, result: JointLocalization, error: tuple[float, float]
-) -> tuple[object, ...]:
-    counts = (result.n_matches, result.n_inliers, result.support, result.rival_support)
-    return (n_views, location_id, result.status, *error, *counts, *result.unique_support, *result.deviation)
 
 
 def _look(
     table: pd.DataFrame, row: int, cam_from_rig: Float, cameras: Camera | Mapping[int, Camera], n_points: int
 ) -> Look:
     if isinstance(cameras, Mapping):
-        camera = cameras[int(table[CAMERA_ID].iat[row])] if CAMERA_ID in table else next(iter(cameras.values()))
-    else:
-        camera = cameras
+        cameras = cameras[int(table[CAMERA_ID].iat[row])] if CAMERA_ID in table else next(iter(cameras.values()))
     landmarks = np.asarray(table["matched_rows"].iat[row], dtype=np.int64)
-    pixels = np.asarray(table[PIXELS].iat[row], dtype=np.float64)
-    fix = "Label the scene again with its present map."
-    if len(pixels) != 2 * len(landmarks) or not np.isfinite(pixels).all():
-        raise TableError("a view's pixels do not match its landmarks", value=(len(pixels), len(landmarks)), fix=fix)
-    if len(landmarks) and (landmarks.min() < 0 or landmarks.max() >= n_points):
-        raise TableError(
-            f"a view matched a landmark that the map of {n_points} lacks", value=int(landmarks.max()), fix=fix
-        )
-    return Look(cam_from_rig, pixels.reshape(-1, 2), landmarks, camera)
+    pixels = np.asarray(table[PIXELS].iat[row], dtype=np.float64).reshape(-1, 2)
+    if landmarks.max(initial=0) >= n_points:
+        problem = f"a view matched a landmark that the map of {n_points} lacks"
+        raise TableError(problem, value=int(landmarks.max()), fix="Label the scene again with its present map.")
+    return Look(cam_from_rig, pixels, landmarks, cameras)
 
 
 def _noisy(cam_from_rig: Float, turn_noise_deg: float, rng: np.random.Generator) -> Float:

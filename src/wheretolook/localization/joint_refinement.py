@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, compose_poses, transform
 from wheretolook.localization.rig import Look
 
 MAX_STEPS = 20
@@ -30,28 +30,23 @@ def refine_rotations(
     """
     from scipy.spatial.transform import Rotation
 
-    cam_from_rig = np.stack([np.asarray(look.cam_from_rig, dtype=np.float64) for look in looks])
-    rig = np.array(rig_from_world)
-    turns = np.stack([cams_from_world[k, :, :3] @ rig[:, :3].T @ pose[:, :3].T for k, pose in enumerate(cam_from_rig)])
+    cam_from_rig = np.stack([look.cam_from_rig for look in looks])
+    rig = rig_from_world
+    turns = cams_from_world[:, :, :3] @ rig[:, :3].T @ cam_from_rig[:, :, :3].swapaxes(1, 2)
     for _ in range(MAX_STEPS):
-        step = _solve(looks, points, inliers, cam_from_rig, rig, turns, noise_rad)
+        step = _solve(looks, points, inliers, rig, turns, noise_rad)
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
-        rig = np.concatenate([turn @ rig[:, :3], (turn @ rig[:, 3] + step[3:6])[:, None]], axis=1)
+        rig = compose_poses(np.column_stack([turn, step[3:6]]), rig)
         turns = Rotation.from_rotvec(step[6:].reshape(-1, 3)).as_matrix() @ turns
         if np.abs(step).max() < MIN_STEP:
             break
-    cams = [
-        np.concatenate([turn @ pose[:, :3] @ rig[:, :3], (turn @ (pose[:, :3] @ rig[:, 3] + pose[:, 3]))[:, None]], 1)
-        for turn, pose in zip(turns, cam_from_rig, strict=True)
-    ]
-    return rig, np.stack(cams)
+    return rig, turns @ compose_poses(cam_from_rig, rig)
 
 
 def _solve(
     looks: Sequence[Look],
     points: Sequence[Float],
     inliers: Sequence[NDArray[np.bool_]],
-    cam_from_rig: Float,
     rig: Float,
     turns: Float,
     noise_rad: float,
@@ -67,12 +62,14 @@ def _solve(
         right[columns_of_turn] -= Rotation.from_matrix(turns[k]).as_rotvec() / noise_rad**2
         if not inliers[k].any():
             continue
-        in_rig = points[k][inliers[k]] @ rig[:, :3].T + rig[:, 3]
-        in_camera = (in_rig @ cam_from_rig[k][:, :3].T + cam_from_rig[k][:, 3]) @ turns[k].T
+        in_rig = transform(rig, points[k][inliers[k]])
+        in_camera = transform(look.cam_from_rig, in_rig) @ turns[k].T
         error = look.camera.project(in_camera) - look.pixels[inliers[k]]
         by_point = _projection_jacobian(look, in_camera)
-        by_rig = by_point @ turns[k] @ cam_from_rig[k][:, :3]
-        jacobian = np.concatenate([by_rig @ -_skew(in_rig), by_rig, by_point @ -_skew(in_camera)], axis=2)
+        by_rig = by_point @ turns[k] @ look.cam_from_rig[:, :3]
+        # the derivative of a rotated point is the cross product with it
+        by_rotations = np.cross(in_rig[:, None], by_rig), np.cross(in_camera[:, None], by_point)
+        jacobian = np.concatenate([by_rotations[0], by_rig, by_rotations[1]], axis=2)
         weight = 1 / (1 + (error**2).sum(1))
         columns = np.r_[0:6, columns_of_turn]
         normal[np.ix_(columns, columns)] += np.einsum("m,mij,mik->jk", weight, jacobian, jacobian)
@@ -89,9 +86,3 @@ def _projection_jacobian(look: Look, points_cam: Float) -> Float:
         behind = look.camera.project(points_cam - size * axis)
         columns.append((ahead - behind) / (2 * size))
     return np.stack(columns, axis=2)
-
-
-def _skew(vectors: Float) -> Float:
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([np.stack([zero, -z, y], 1), np.stack([z, zero, -x], 1), np.stack([-y, x, zero], 1)], 1)

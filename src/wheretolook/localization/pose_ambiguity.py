@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, compose_poses, invert_poses, transform
 
 COUNTERPART_DISTANCE_M = 0.4
 """A landmark this close to a moved one is its counterpart. On validation scenes 0.25 to 0.6 m work equally: different
@@ -44,8 +44,7 @@ class PoseAmbiguity:
 
         Both poses (3, 4) are from the world into the same frame of camera or rig.
         """
-        in_camera = self.points[rows] @ pose[:, :3].T + pose[:, 3]
-        moved = (in_camera - other[:, 3]) @ other[:, :3]
+        moved = transform(compose_poses(invert_poses(other), pose), self.points[rows])
         distance, _ = self._tree.query(moved, distance_upper_bound=COUNTERPART_DISTANCE_M)
         return self.count_voxels(rows[~np.isfinite(distance)])
 
@@ -62,17 +61,17 @@ def log_ratio(unique: ArrayLike, rival_unique: ArrayLike) -> Float:
     )
 
 
-def preference(unique: tuple[int, int], support: tuple[float, float]) -> float:
-    """Log odds for the first of two poses, from the unique support and the support of both."""
-    return float(log_ratio(*unique) + SUPPORT_POWER * np.log((support[0] + 1) / (support[1] + 1)))
+def _preferences(unique: NDArray[np.int64], support: ArrayLike) -> Float:
+    """Log odds (K, K) for each pose against each other, from unique support (K, K) and support (K,)."""
+    smoothed = np.asarray(support, dtype=np.float64) + 1
+    return log_ratio(unique, unique.T) + SUPPORT_POWER * np.log(smoothed[:, None] / smoothed)
 
 
-def strongest_rival(
-    unique: NDArray[np.int64], support: Sequence[float], k: int, among: Sequence[int] | None = None
-) -> int:
+def strongest_rival(unique: NDArray[np.int64], support: Sequence[float], k: int) -> int:
     """Index of the pose that is the strongest evidence against pose `k`; `unique` (K, K) as by `unique_support`."""
-    others = [n for n in (range(len(support)) if among is None else among) if n != k]
-    return min(others, key=lambda n: _preference_over(unique, support, k, n))
+    preference = _preferences(unique, support)[k]
+    preference[k] = np.inf
+    return int(np.argmin(preference))
 
 
 def most_likely(unique: NDArray[np.int64], support: Sequence[float]) -> int:
@@ -80,13 +79,7 @@ def most_likely(unique: NDArray[np.int64], support: Sequence[float]) -> int:
 
     Pairwise preferences may be cyclic, so poses are not eliminated one after the other.
     """
-    candidates = [k for k, value in enumerate(support) if value > MIN_SUPPORT_RATIO * support[0]]
-    if len(candidates) < 2:
-        return 0
-    return max(
-        candidates, key=lambda k: _preference_over(unique, support, k, strongest_rival(unique, support, k, candidates))
-    )
-
-
-def _preference_over(unique: NDArray[np.int64], support: Sequence[float], k: int, n: int) -> float:
-    return preference((int(unique[k, n]), int(unique[n, k])), (support[k], support[n]))
+    candidates = np.flatnonzero(np.asarray(support) >= MIN_SUPPORT_RATIO * support[0])
+    preference = _preferences(unique, support)[np.ix_(candidates, candidates)]
+    np.fill_diagonal(preference, np.inf)
+    return int(candidates[np.argmax(preference.min(axis=1))])

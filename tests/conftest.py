@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, poses_looking_along
-from wheretolook.localization import local_engine
+from wheretolook.localization import labeller
 from wheretolook.localization.shard import LabelledShard, Shard, ShardWorker
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.store import client
@@ -83,7 +83,7 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         for shard in shards:
             yield shard, worker.label(shard.job, shard.rows)
 
-    monkeypatch.setattr(local_engine, "run_local", run)
+    monkeypatch.setattr(labeller, "run_local", run)
     yield
     torch.set_num_threads(threads[0])
     cv2.setNumThreads(threads[1])

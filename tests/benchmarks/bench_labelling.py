@@ -27,7 +27,7 @@ from wheretolook.dataset.layout import SceneFolder
 from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.features import aliked_batch
 from wheretolook.localization import labeller
-from wheretolook.localization.config import LabelConfig
+from wheretolook.localization.config import LabelConfig, LocalizerConfig
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.shard import SceneJob
 from wheretolook.mapping.landmarks import Landmarks
@@ -68,7 +68,7 @@ def time_steps(folder: SceneFolder, views: np.ndarray, batch: int, device: str) 
     """Label views (B, 3, 4) in one process, step by step, and print milliseconds per view."""
     camera = next(iter(folder.cameras().values()))
     renderer = WarpRenderer(load_mesh(folder.mesh), device)
-    localizer = Localizer(Landmarks.load(folder.landmarks), camera, None, extractor_of(folder), device)
+    localizer = Localizer(Landmarks.load(folder.landmarks), camera, LocalizerConfig(), extractor_of(folder), device)
     network = getattr(localizer.extractor._extraction, "_network", None)
     for warm_up in (True, False):
         watch = Stopwatch(device)
@@ -80,7 +80,7 @@ def time_steps(folder: SceneFolder, views: np.ndarray, batch: int, device: str) 
             with watch("render"):
                 rgb = renderer.render(camera, views[start : start + batch]).rgb
             with watch("extract"):
-                keypoints = localizer.extract(rgb)
+                keypoints = localizer.extractor.extract_batch(rgb)
             with watch("match"):
                 matches = localizer.match(keypoints)
             with watch("pose"):

@@ -17,9 +17,8 @@ import pytest
 from localization.rooms import Deadly, MappedRoom, is_running, label, times, workers_of
 from waiting import wait_until
 from wheretolook.dataset.viewpoint_table import read_table, write_table
-from wheretolook.localization import local_engine
-from wheretolook.localization.local_engine import run_local
-from wheretolook.localization.shard import Shard
+from wheretolook.localization import labeller
+from wheretolook.localization.shard import Shard, run_local
 from wheretolook.scenes.loading import load_mesh, save_glb
 from wheretolook.utils.errors import WorkerError
 
@@ -46,7 +45,7 @@ def test_killed_workers_are_replaced(
         wait_until(lambda: len(workers_of(os.getpid())) == 2)
         kill_one()
 
-    monkeypatch.setattr(local_engine, "run_local", watched)
+    monkeypatch.setattr(labeller, "run_local", watched)
     killer = threading.Thread(target=kill_at_start)
     killer.start()
     assert label(views, room, tmp_path / "shards", workers=2, shard_size=6) == expected

@@ -237,7 +237,7 @@ def _localize(job: _Job, landmarks: Landmarks, observed: Sequence[NDArray[np.int
                 error_m=error_m,
                 error_deg=error_deg,
                 limit_m=limit_m,
-                n_matches=estimate.n_matches,
+                n_matches=len(estimate.matched_rows),
                 n_inliers=len(estimate.inlier_rows),
                 n_observed=len(observed[number]),
                 n_kept=int(np.isin(observed[number], landmarks.ids).sum()),

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import sha256
+from wheretolook.utils.validation import check_choice, check_positive, check_range
 
 
 @dataclass(frozen=True)
@@ -46,16 +47,12 @@ class LocalizerConfig:
     max_trials: int = field(default=10_000, init=False)
 
     def __post_init__(self) -> None:
-        if not 0 < self.max_ratio <= 1:
-            raise ConfigError("max_ratio must be in (0, 1]", value=self.max_ratio)
-        if self.min_similarity is not None and not -1 <= self.min_similarity <= 1:
-            raise ConfigError("min_similarity is a cosine, -1 to 1", value=self.min_similarity)
-        if self.lightglue_images < 1:
-            raise ConfigError("lightglue_images must be at least 1", value=self.lightglue_images)
-        if self.min_inliers < 4 or self.max_error_px <= 0:
-            raise ConfigError(
-                "the localizer needs min_inliers >= 4 and max_error_px > 0", value=(self.min_inliers, self.max_error_px)
-            )
+        check_range("max_ratio", self.max_ratio, 1e-9, 1)
+        if self.min_similarity is not None:
+            check_range("min_similarity", self.min_similarity, -1, 1)
+        check_range("lightglue_images", self.lightglue_images, 1)
+        check_range("min_inliers", self.min_inliers, 4)
+        check_positive("max_error_px", self.max_error_px)
 
     def record(self) -> dict[str, Any]:
         """Settings that decide the labels, as JSON values."""
@@ -97,10 +94,9 @@ class LabelConfig:
     store_pixels: bool = False
 
     def __post_init__(self) -> None:
-        if self.engine not in ("local", "ray"):
-            raise ConfigError("unknown label.engine", value=self.engine, fix="Use local or ray.")
+        check_choice("label.engine", self.engine, ("local", "ray"))
         if self.engine == "ray" and self.localizer.lightglue:
             fix = "Use label.engine local, or leave label.localizer.lightglue out."
             raise ConfigError("LightGlue reads the map's database, which does not travel to Ray's machines", fix=fix)
-        if self.workers < 0 or self.shard_size < 1:
-            raise ConfigError("workers must be >= 0 and shard_size >= 1", value=(self.workers, self.shard_size))
+        check_range("workers", self.workers, 0)
+        check_range("shard_size", self.shard_size, 1)

@@ -24,8 +24,8 @@ class PoseEstimator:
     It computes in metres from `origin`, so that coordinates of a national grid lose no precision.
     """
 
-    def __init__(self, points: Float, config: LocalizerConfig | None = None) -> None:
-        self.config = config or LocalizerConfig()
+    def __init__(self, points: Float, config: LocalizerConfig = LocalizerConfig()) -> None:
+        self.config = config
         self.origin = local_origin(points)
         self.points = np.asarray(points, dtype=np.float64) - self.origin
         self.ransac = {

@@ -49,7 +49,7 @@ def label_sets(
     sets: Sequence[Sequence[int] | NDArray[np.integer]],
     points: Float,
     cameras: Camera | Mapping[int, Camera],
-    config: LocalizerConfig | None = None,
+    config: LocalizerConfig = LocalizerConfig(),
     turn_noise_deg: float = 0.0,
     seed: int = 0,
     progress: str | None = None,

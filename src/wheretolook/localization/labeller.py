@@ -19,9 +19,8 @@ from tqdm.auto import tqdm
 
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, SCHEMA, read_table, write_table
 from wheretolook.localization.config import LabelConfig
-from wheretolook.localization.shard import LabelledShard, SceneJob, Shard
-from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.utils.errors import MapError, SceneError, StorageError, TableError
+from wheretolook.localization.shard import LabelledShard, SceneJob, Shard, run_local
+from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import fingerprint, sha256, write_json
 from wheretolook.utils.version import VERSION
 
@@ -116,7 +115,7 @@ class _SceneInProgress:
     """A scene whose shards are being labelled; `missing` are those without a file yet."""
 
     task: LabelTask
-    settings: dict[str, Any]
+    manifest: dict[str, Any]
     shards: list[Shard]
     missing: list[Shard]
     seconds: dict[str, float] = field(default_factory=dict)
@@ -127,11 +126,6 @@ class _SceneInProgress:
         table = task.table
         if table.empty:
             raise TableError("no viewpoints to label", value=task.name, fix="Run the sample stage with other settings.")
-        if not job.mesh.is_file():
-            raise SceneError("there is no such mesh", path=job.mesh, fix="Run the scenes stage first.")
-        if Landmarks.load(job.landmarks).descriptors is None:
-            fix = "Build the map again."
-            raise MapError("landmarks without descriptors cannot be matched", path=job.landmarks, fix=fix)
         settings: dict[str, Any] = {
             "versions": versions(),
             "localizer": job.localizer.record(),
@@ -143,10 +137,8 @@ class _SceneInProgress:
         }
         if job.cameras:
             settings["cameras"] = {number: camera.record() for number, camera in job.cameras}
-        if job.store_matches:  # only then: the record decides the names of shards
-            settings["store_matches"] = True
-        if job.store_pixels:
-            settings["store_pixels"] = True
+        # only options that are set: the record decides the names of shards
+        settings |= {name: True for name in ("store_matches", "store_pixels") if getattr(job, name)}
         text = json.dumps(settings, sort_keys=True).encode()
         inputs = [name for name in (*SCHEMA.names, CAMERA_ID) if name not in LABELS and name in table]
         shards = []
@@ -157,25 +149,15 @@ class _SceneInProgress:
             content = pd.util.hash_pandas_object(rows[inputs], index=False).to_numpy()
             digest = hashlib.sha256(text + content.tobytes()).hexdigest()[:16]
             shards.append(Shard(job, task.shards / f"{begin:08d}-{digest}.parquet", rows))
-        scene = cls(task, settings, shards, [shard for shard in shards if _finished(shard) is None])
-        write_json(task.shards / MANIFEST, scene.manifest())
-        return scene
-
-    def manifest(self) -> dict[str, Any]:
-        shards = {shard.path.name: len(shard.rows) for shard in self.shards}
-        return {**self.settings, "n_viewpoints": len(self.task.table), "shards": shards}
+        names = {shard.path.name: len(shard.rows) for shard in shards}
+        manifest = {**settings, "n_viewpoints": len(table), "shards": names}
+        write_json(task.shards / MANIFEST, manifest)
+        return cls(task, manifest, shards, [shard for shard in shards if not _is_finished(shard)])
 
     def result(self) -> LabelledScene:
-        parts = []
-        for shard in self.shards:
-            rows = _finished(shard)
-            if rows is None:
-                fix = "Run again: it is labelled again."
-                raise StorageError("a finished shard was damaged or removed", path=shard.path, fix=fix)
-            parts.append(rows)
+        table = pd.concat([_read(shard) for shard in self.shards], ignore_index=True)
         contents = {shard.path.name: {"n": len(shard.rows), "sha256": sha256(shard.path)} for shard in self.shards}
-        manifest = {**self.manifest(), "shards": contents}
-        return LabelledScene(self.task, pd.concat(parts, ignore_index=True), manifest, self.seconds)
+        return LabelledScene(self.task, table, {**self.manifest, "shards": contents}, self.seconds)
 
 
 def _renderer_name(device: str) -> str:
@@ -192,18 +174,17 @@ def _run(shards: Sequence[Shard], config: LabelConfig) -> Generator[tuple[Shard,
 
         yield from run_ray(shards, config.ray_address)
     elif shards:
-        from wheretolook.localization.local_engine import run_local
-
         yield from run_local(shards, config.workers or len(os.sched_getaffinity(0)))
 
 
-def _finished(shard: Shard) -> pd.DataFrame | None:
-    """Read a shard's labelled rows; None if the file is missing, damaged (then it is removed) or of other viewpoints."""
-    if not shard.path.exists():
-        return None
+def _read(shard: Shard) -> pd.DataFrame:
+    return read_table(shard.path, shard.job.store_matches, shard.job.store_pixels)
+
+
+def _is_finished(shard: Shard) -> bool:
+    """Whether a shard's file has the labels of its viewpoints; an unreadable one is removed."""
     try:
-        done = read_table(shard.path, shard.job.store_matches, shard.job.store_pixels)
+        return np.array_equal(_read(shard)["viewpoint_id"], shard.rows["viewpoint_id"])
     except TableError:
-        shard.path.unlink()
-        return None
-    return done if np.array_equal(done["viewpoint_id"], shard.rows["viewpoint_id"]) else None
+        shard.path.unlink(missing_ok=True)
+        return False

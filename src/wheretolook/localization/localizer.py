@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,6 @@ class Localization:
         status: "localized", "too_few_matches" or "no_pose".
         cam_from_world: (3, 4) estimated pose, None if RANSAC found none. A pose with too few inliers is kept, but its
             status is "no_pose".
-        n_matches: number of 2D-3D matches.
         inlier_rows: (I,) rows of the landmarks that were matched and agree with the pose.
         matched_rows: (M,) rows of all matched landmarks.
         matched_pixels: (M, 2) float32, their pixels in the image.
@@ -45,10 +44,9 @@ class Localization:
 
     status: str
     cam_from_world: Float | None
-    n_matches: int
-    inlier_rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    matched_rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    matched_pixels: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), dtype=np.float32))
+    inlier_rows: NDArray[np.int64]
+    matched_rows: NDArray[np.int64]
+    matched_pixels: NDArray[np.float32]
 
 
 class Localizer:
@@ -64,7 +62,7 @@ class Localizer:
         self,
         landmarks: Landmarks,
         camera: Camera,
-        config: LocalizerConfig | None = None,
+        config: LocalizerConfig = LocalizerConfig(),
         extractor: ExtractorConfig | None = None,
         device: str = "cpu",
         map_dir: Path | None = None,
@@ -72,47 +70,47 @@ class Localizer:
         if landmarks.descriptors is None:
             raise MapError("landmarks without descriptors cannot be matched", fix="Build the map with its database.")
         self.landmarks = landmarks
-        self.config = config or LocalizerConfig()
+        self.config = config
         self.kind = all_kinds()[landmarks.features]
+        self._extractor = extractor or ExtractorConfig()
         if extractor is not None:
-            self._check_kind(extractor)
-        self._extract_with = extractor
+            self._check_extractor()
         self._device = device
         matcher = DescriptorMatcher if self.kind.in_bytes else SimilarityMatcher
         self._matcher = matcher(landmarks.descriptors, device)
         self._guided: LightGlueMatcher | None = None
-        if self.config.lightglue:
+        if config.lightglue:
             from wheretolook.localization.lightglue import LightGlueMatcher
 
-            self._guided = LightGlueMatcher(landmarks, map_dir, self.config.lightglue, device)
+            self._guided = LightGlueMatcher(landmarks, map_dir, config.lightglue, device)
         self._camera = camera
-        self.estimator = PoseEstimator(landmarks.points, self.config)
+        self.estimator = PoseEstimator(landmarks.points, config)
 
     @cached_property
     def extractor(self) -> KeypointExtractor:
         """Extractor for queries, built when first used."""
-        config = self._extract_with or ExtractorConfig()
-        self._check_kind(config)
-        return KeypointExtractor(config, self._device)
+        self._check_extractor()
+        return KeypointExtractor(self._extractor, self._device)
 
-    def _check_kind(self, extractor: ExtractorConfig) -> None:
-        if kind_of(extractor.method) != self.kind:
+    def _check_extractor(self) -> None:
+        if kind_of(self._extractor.method) != self.kind:
             problem = f"the map has {self.kind.name} descriptors"
             fix = "Use this extractor for queries, or map again with --map.extractor.method."
-            raise MapError(problem, value=extractor.method, fix=fix)
+            raise MapError(problem, value=self._extractor.method, fix=fix)
 
     def localize(self, rgb: NDArray[np.uint8]) -> Localization:
         """Localize one image (H, W, 3) uint8."""
         keypoints = self.extractor.extract(rgb)
         return self.estimate(keypoints, *self.match([keypoints])[0])
 
-    def extract(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
-        """Step 1: extract keypoints from images, each (H, W, 3) uint8 and all of one size."""
-        return self.extractor.extract_batch(images)
-
     def match(self, keypoints: Sequence[Keypoints], camera: Camera | None = None) -> list[Matches]:
-        """Step 2: match keypoints of several images with landmarks. The result for an image does not depend on the others."""
-        matches = self._match(keypoints)
+        """Match keypoints of several images with landmarks. The result for an image does not depend on the others."""
+        descriptors = [self.kind.store(of_image.descriptors) for of_image in keypoints]
+        if isinstance(self._matcher, SimilarityMatcher):
+            limit = self.config.min_similarity
+            matches = self._matcher.match(descriptors, self.kind.min_similarity if limit is None else limit)
+        else:
+            matches = match(self._matcher, descriptors, self.config.max_ratio)
         if self._guided is None:
             return matches
         camera = camera or self._camera
@@ -122,13 +120,6 @@ class Localizer:
             for query, (_, rows) in zip(keypoints, matches, strict=True)
         ]
 
-    def _match(self, keypoints: Sequence[Keypoints]) -> list[Matches]:
-        descriptors = [self.kind.store(of_image.descriptors) for of_image in keypoints]
-        if isinstance(self._matcher, SimilarityMatcher):
-            limit = self.config.min_similarity
-            return self._matcher.match(descriptors, self.kind.min_similarity if limit is None else limit)
-        return match(self._matcher, descriptors, self.config.max_ratio)
-
     def estimate(
         self,
         keypoints: Keypoints,
@@ -136,15 +127,17 @@ class Localizer:
         landmark_rows: NDArray[np.int64],
         camera: Camera | None = None,
     ) -> Localization:
-        """Step 3: estimate the pose of an image from its matches, rows (M,) of keypoints and rows (M,) of landmarks."""
-        n_matches = len(keypoint_rows)
-        matched_pixels = keypoints.pixels[keypoint_rows]
-        matched: dict[str, Any] = {"matched_rows": landmark_rows, "matched_pixels": matched_pixels}
-        if n_matches < self.config.min_matches:
-            return Localization(TOO_FEW_MATCHES, None, n_matches, **matched)
-        result = self.estimator.estimate(matched_pixels, landmark_rows, camera or self._camera)
+        """Estimate the pose of an image from its matches, rows (M,) of keypoints and rows (M,) of landmarks."""
+        pixels = keypoints.pixels[keypoint_rows]
+        status = NO_POSE
+        result = None
+        if len(landmark_rows) < self.config.min_matches:
+            status = TOO_FEW_MATCHES
+        else:
+            result = self.estimator.estimate(pixels, landmark_rows, camera or self._camera)
         if result is None:
-            return Localization(NO_POSE, None, n_matches, **matched)
-        cam_from_world, inliers = result
-        status = LOCALIZED if inliers.sum() >= self.config.min_inliers else NO_POSE
-        return Localization(status, cam_from_world, n_matches, landmark_rows[inliers], **matched)
+            return Localization(status, None, landmark_rows[:0], landmark_rows, pixels)
+        pose, inliers = result
+        if inliers.sum() >= self.config.min_inliers:
+            status = LOCALIZED
+        return Localization(status, pose, landmark_rows[inliers], landmark_rows, pixels)

@@ -1,8 +1,8 @@
-"""Labels the viewpoints of one shard, in any engine's worker."""
+"""Labels the viewpoints of one shard, in a worker of any engine; the local engine, in processes of this machine."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,14 +11,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.dataset.viewpoint_table import CAMERA_ID, MATCH_FIELDS, PIXEL_FIELD, PIXELS, poses
+from wheretolook.dataset.viewpoint_table import CAMERA_ID, MATCH_FIELDS, PIXELS, poses
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.pipeline import Step, run_pipeline
 from wheretolook.utils.errors import WhereToLookError, WorkerError
-from wheretolook.utils.processes import use_one_core
+from wheretolook.utils.processes import WorkerPool, use_one_core, worker_number
 
 if TYPE_CHECKING:
     from wheretolook.features.keypoints import Keypoints
@@ -118,6 +118,24 @@ class ShardWorker:
         return self._scene[1:]
 
 
+_worker: ShardWorker | None = None
+
+
+def run_local(shards: Sequence[Shard], workers: int) -> Iterator[tuple[Shard, LabelledShard]]:
+    """Label shards in worker processes, begun in this order, and yield them as they are finished.
+
+    Raises what a worker raises, and WorkerError if workers are killed repeatedly.
+    """
+    with WorkerPool(min(workers, len(shards))) as pool:
+        yield from pool.map_unordered(_label_shard, shards)
+
+
+def _label_shard(shard: Shard) -> LabelledShard:
+    global _worker
+    _worker = _worker or ShardWorker(worker_number())
+    return _worker.label(shard.job, shard.rows)
+
+
 def label_rows(
     table: pd.DataFrame,
     renderer: Renderer,
@@ -148,15 +166,25 @@ def label_rows(
 
     steps = [  # the camera of a batch goes with it from step to step
         Step("render", lambda batch: (batch[0], renderer.render(batch[0], true_poses[batch[1]]).rgb)),
-        Step("extract", lambda batch: (batch[0], localizer.extract(batch[1]))),
+        Step("extract", lambda batch: (batch[0], localizer.extractor.extract_batch(batch[1]))),
         Step("match", lambda batch: (batch[0], list(zip(batch[1], localizer.match(batch[1], batch[0]), strict=True)))),
         Step("pose", estimate),
     ]
     localizations = [result for batch in run_pipeline(batches, steps, seconds) for result in batch]
     order = np.argsort(np.concatenate([rows for _, rows in groups]))
     results = [localizations[row] for row in order]
-    labelled = _with_errors(table, true_poses, results)
-    return _with_matches(labelled, results, store_pixels) if store_matches or store_pixels else labelled
+    no_pose: Float = np.full((3, 4), np.nan)
+    estimates = np.stack([no_pose if result.cam_from_world is None else result.cam_from_world for result in results])
+    error_m, error_deg = pose_error(estimates, true_poses)
+    columns: dict[str, Any] = {
+        "status": [result.status for result in results],
+        "error_m": error_m.astype(np.float32),
+        "error_deg": error_deg.astype(np.float32),
+        "n_inliers": np.array([len(result.inlier_rows) for result in results], dtype=np.int32),
+    }
+    if store_matches or store_pixels:
+        columns |= _matches(results, store_pixels)
+    return table.drop(columns=[*MATCH_FIELDS.names, PIXELS], errors="ignore").assign(**columns)
 
 
 def _batches(camera: Camera, rows: NDArray[np.int64], batch_size: int) -> list[NDArray[np.int64]]:
@@ -165,27 +193,13 @@ def _batches(camera: Camera, rows: NDArray[np.int64], batch_size: int) -> list[N
     return [rows[i : i + size] for i in range(0, len(rows), size)]
 
 
-def _with_errors(table: pd.DataFrame, true_poses: Float, results: Sequence[Localization]) -> pd.DataFrame:
-    no_pose: Float = np.full((3, 4), np.nan)
-    estimates = np.stack([no_pose if result.cam_from_world is None else result.cam_from_world for result in results])
-    error_m, error_deg = pose_error(estimates, true_poses)
-    return table.drop(columns=[*MATCH_FIELDS.names, *PIXEL_FIELD.names], errors="ignore").assign(
-        status=[result.status for result in results],
-        error_m=error_m.astype(np.float32),
-        error_deg=error_deg.astype(np.float32),
-        n_inliers=np.array([len(result.inlier_rows) for result in results], dtype=np.int32),
-    )
-
-
-def _with_matches(table: pd.DataFrame, results: Sequence[Localization], store_pixels: bool) -> pd.DataFrame:
-    """Add matched landmarks and inliers, in ascending order of the landmarks, and optionally pixels."""
-    orders = [np.argsort(result.matched_rows, kind="stable") for result in results]
+def _matches(results: Sequence[Localization], store_pixels: bool) -> dict[str, Any]:
+    """Columns of matched landmarks and inliers, in ascending order of the landmarks, and optionally of pixels."""
+    orders = [(result, np.argsort(result.matched_rows, kind="stable")) for result in results]
     columns: dict[str, Any] = {
-        "matched_rows": [
-            result.matched_rows[order].astype(np.int32) for result, order in zip(results, orders, strict=True)
-        ],
+        "matched_rows": [result.matched_rows[order].astype(np.int32) for result, order in orders],
         "inlier_rows": [np.sort(result.inlier_rows).astype(np.int32) for result in results],
     }
     if store_pixels:
-        columns[PIXELS] = [result.matched_pixels[order].ravel() for result, order in zip(results, orders, strict=True)]
-    return table.assign(**columns)
+        columns[PIXELS] = [result.matched_pixels[order].ravel() for result, order in orders]
+    return columns

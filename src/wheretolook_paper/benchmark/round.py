@@ -233,7 +233,7 @@ class SceneRound:
                 problem = "a rendered image is unreadable"
                 raise SceneError(problem, path=_image_file(folder, name), fix="Remove it and run again.")
             images.append(image)
-        keypoints = self._localizer.extract(images)
+        keypoints = self._localizer.extractor.extract_batch(images)
         matches = self._localizer.match(keypoints)
         return [
             self._localizer.estimate(of_image, *matched).cam_from_world

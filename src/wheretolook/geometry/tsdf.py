@@ -6,9 +6,8 @@ blocks of voxels of Dong, Park, Yang and Kaess, "ASH", T-PAMI 2022 (Open3D's `Vo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -106,6 +105,14 @@ class DepthImage:
         return (in_camera - pose[:, 3]) @ pose[:, :3]
 
 
+class DepthImages(Protocol):
+    """Depth images by index; each may be read from disk or rendered when it is asked for."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int, /) -> DepthImage: ...
+
+
 class TsdfVolume:
     """A truncated signed distance field in hashed blocks of voxels, on the CPU.
 
@@ -136,7 +143,7 @@ class TsdfVolume:
     @classmethod
     def from_images(
         cls,
-        images: Sequence[DepthImage],
+        images: DepthImages,
         config: TsdfConfig = TsdfConfig(),
         progress: bool = True,
         colored: bool = False,
@@ -211,7 +218,7 @@ class TsdfVolume:
         return TexturedMesh(mesh.vertex.positions.numpy(), triangles, uvs, texture, white, colors, self.origin)
 
 
-def estimate_blocks(images: Sequence[DepthImage], config: TsdfConfig) -> int:
+def estimate_blocks(images: DepthImages, config: TsdfConfig) -> int:
     """Blocks of voxels that the images' surfaces will touch, from some pixels of up to 100; SceneError without any."""
     cell_m = max(config.block_m, _SURVEY_CELL_M)
     cells = np.empty(0, dtype=np.int64)
@@ -229,7 +236,7 @@ def estimate_blocks(images: Sequence[DepthImage], config: TsdfConfig) -> int:
     return int(np.ceil(_BLOCKS_PER_CELL * len(cells) * (cell_m / config.block_m) ** 2))
 
 
-def _origin_of(images: Sequence[DepthImage]) -> Float:
+def _origin_of(images: DepthImages) -> Float:
     """The local origin (3,) m of images of one scene, by the location of the first."""
     return local_origin(camera_centers(images[0].cam_from_world))
 

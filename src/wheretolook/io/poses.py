@@ -19,6 +19,7 @@ from wheretolook.utils.reading import read_text
 QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
 TRANSLATION_COLUMNS = ("tx", "ty", "tz")
 POSE_COLUMNS = (*QUATERNION_COLUMNS, *TRANSLATION_COLUMNS)
+MAX_ROWS = 500_000  # of a text table
 FAR_M = 1000.0  # of a camera from the origin, from where on its quaternion needs more decimals
 
 
@@ -43,8 +44,8 @@ def read_rows(path: Path) -> list[tuple[int, list[str]]]:
     try:
         lines = enumerate(map(str.strip, read_text(path).removeprefix("\ufeff").splitlines()), 1)
         rows = [(number, line) for number, line in lines if line and not line.startswith("#")]
-        if not rows:
-            raise ValueError("it has no rows")
+        if not 0 < len(rows) <= MAX_ROWS:
+            raise ValueError(f"it has {len(rows):,} rows, not 1 to {MAX_ROWS:,}")
         separator = next((mark for mark in ",;" if mark in rows[0][1]), None)
         if separator is None:
             return [(number, line.split()) for number, line in rows]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, camera_centers, invert_poses
-from wheretolook.scans.frames import SURVEY_STRIDE, RgbdFrames
+from wheretolook.scans.frames import SURVEY_STRIDE, RgbdFrames, evenly
 from wheretolook.utils.errors import SceneError
 
 DEPTH_M = (0.2, 20.0)
@@ -22,7 +22,6 @@ _FACING = np.cos(np.radians(40.0))  # largest angle between the optical axes of 
 _STEPS = 83
 _FACTORS = np.geomspace(1 / 12, 12, _STEPS)  # candidate factors of depth, in steps of 6 %
 _FACTORS = np.concatenate([_FACTORS, *(power * np.geomspace(0.8, 1.25, 7) for power in (0.001, 0.01, 100, 1000))])
-_ONE = 41  # index of the factor 1
 _MIN_AGREEMENT = 0.2  # share of the readings below which poses and depths do not belong together
 _CLEARLY = 0.15  # share of the readings by which another factor must agree better
 _UNIT_OFF = 1.25  # smallest factor that is attributed to the unit
@@ -36,19 +35,16 @@ def check_depth_unit(frames: RgbdFrames) -> None:
     readings only if depths and poses are in one unit. With a model, depths are compared with its landmarks.
     """
     scale = frames.depth_scale
-    if frames.model is not None:
-        factor = landmark_factor(landmark_readings(frames, frames.model))
-        if factor is not None and not 1 / _LANDMARK_OFF < factor < _LANDMARK_OFF:
-            problem = f"the model's landmarks are {factor:.3g} times as far as the depth images show"
-            fix = f"Give the model metres (`wheretolook map --model`), or {_option(scale / factor)} if its unit is one."
-            raise SceneError(problem, path=frames.folder, value=f"{scale:g} units a metre", fix=fix)
+    off = 1.0 if frames.model is None else landmark_factor(landmark_readings(frames, frames.model))
     factor = pose_factor(frames.survey_m, frames.camera, frames.cam_from_world)
-    if factor is not None and np.isnan(factor):
+    median_m = float(np.median(frames.survey_m[frames.survey_m > 0]))
+    if not 1 / _LANDMARK_OFF < off < _LANDMARK_OFF:
+        problem = f"the model's landmarks are {off:.3g} times as far as the depth images show"
+        fix = f"Give the model metres (`wheretolook map --model`), or {_option(scale / off)} if its unit is one."
+    elif np.isnan(factor):
         problem = "neighbouring frames do not show the same surfaces at their poses, whatever the unit of depth"
         fix = "Give poses world_from_cam (not cam_from_world), x right, y down, z forward, of the same frames."
-        raise SceneError(problem, path=frames.folder, fix=fix)
-    median_m = float(np.median(frames.survey_m[frames.survey_m > 0]))
-    if factor is not None and not 1 / _UNIT_OFF < factor < _UNIT_OFF:
+    elif not 1 / _UNIT_OFF < factor < _UNIT_OFF:
         problem = f"depths seem to be {factor:.2g} times as large in the unit of the poses"
         fix = f"Give {_option(scale / factor)}, or poses in metres."
     elif not DEPTH_M[0] <= median_m <= DEPTH_M[1]:
@@ -74,19 +70,18 @@ def landmark_readings(frames: RgbdFrames, model: Any) -> Float:
     return np.concatenate(found)
 
 
-def landmark_factor(readings: Float) -> float | None:
-    """Median ratio of the depth of landmarks to the readings there, of (N, 2); None for fewer than 20."""
-    return float(np.median(readings[:, 0] / readings[:, 1])) if len(readings) >= 20 else None
+def landmark_factor(readings: Float) -> float:
+    """Median ratio of the depth of landmarks to the readings there, of (N, 2); 1 for fewer than 20."""
+    return float(np.median(readings[:, 0] / readings[:, 1])) if len(readings) >= 20 else 1.0
 
 
-def pose_factor(survey_m: NDArray[np.float32], camera: PinholeCamera, cam_from_world: Float) -> float | None:
+def pose_factor(survey_m: NDArray[np.float32], camera: PinholeCamera, cam_from_world: Float) -> float:
     """Factor of depths (F, h, w) at which neighbouring frames agree; 1 unless another is clearly better.
 
-    NaN if hardly any readings agree at any factor, None if the camera moved too little.
+    NaN if hardly any readings agree at any factor; 1 if the camera moved too little.
     """
-    pairs = _pairs(cam_from_world)
     agreements = []
-    for i, j in pairs:
+    for i, j in _pairs(cam_from_world):
         row, column = np.nonzero(survey_m[i])
         pixels = np.column_stack([column, row]) * SURVEY_STRIDE + SURVEY_STRIDE // 2 + 0.5
         rays = camera.unproject(pixels)
@@ -100,13 +95,13 @@ def pose_factor(survey_m: NDArray[np.float32], camera: PinholeCamera, cam_from_w
             shares.append(agree.mean() if len(both) >= _MIN_SHARED else 0.0)
         agreements.append(shares)
     if len(agreements) < _MIN_PAIRS:
-        return None
+        return 1.0
     agreement = np.mean(agreements, axis=0)
     best = int(agreement.argmax())
     near_one = agreement[np.abs(np.log(_FACTORS)) < np.log(_UNIT_OFF)].max()
     if agreement[best] < _MIN_AGREEMENT:
         return float("nan")
-    return _peak(agreement, best) if agreement[best] > near_one + _CLEARLY else float(_FACTORS[_ONE])
+    return _peak(agreement, best) if agreement[best] > near_one + _CLEARLY else 1.0
 
 
 def _peak(agreement: Float, best: int) -> float:
@@ -123,7 +118,7 @@ def _pairs(cam_from_world: Float) -> list[tuple[int, int]]:
     """Pairs of frames with similar directions and typical distances."""
     centers = camera_centers(cam_from_world)
     axes = cam_from_world[:, 2, :3]
-    first = np.unique(np.linspace(0, len(centers) - 1, _PAIRS).round().astype(int))
+    first = evenly(len(centers), _PAIRS)
     apart = np.linalg.norm(centers[first][:, None] - centers, axis=-1)
     facing = axes[first] @ axes.T > _FACING
     if not (apart[facing] > 0).any():

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 from typing import Literal
 
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.validation import check_positive, check_range
 
 UP_AXES = {"x": (1, 0, 0), "-x": (-1, 0, 0), "y": (0, 1, 0), "-y": (0, -1, 0), "z": (0, 0, 1), "-z": (0, 0, -1)}
 
@@ -53,19 +54,14 @@ class RgbdConfig:
     max_frames: int = 1000
     appearance: Literal["texture", "colors"] = "texture"
 
-    # Voxels behind a surface that count as inside it: 4 cm cover the noise of depth and poses.
-    truncation_voxels: float = field(default=4.0, init=False)
-
     def __post_init__(self) -> None:
         for name, length in (("camera", 4), ("depth_camera", 4), ("color_from_depth_m", 3)):
             values = getattr(self, name)
             if len(values) not in (0, length) or not all(-inf < value < inf for value in values):
                 raise ConfigError(f"scenes.rgbd.{name} are {length} numbers", value=values)
-        if not 0 <= self.depth_scale < inf:
-            raise ConfigError("scenes.rgbd.depth_scale must not be negative", value=self.depth_scale)
+        check_range("scenes.rgbd.depth_scale", self.depth_scale, 0)
         for name in ("voxel_m", "max_depth_m", "max_frames"):
-            if not 0 < getattr(self, name) < inf:
-                raise ConfigError(f"scenes.rgbd.{name} must be positive", value=getattr(self, name))
+            check_positive(f"scenes.rgbd.{name}", getattr(self, name))
         _ = self.up_direction
 
     @property

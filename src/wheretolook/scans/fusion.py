@@ -3,31 +3,29 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float
-from wheretolook.geometry.tsdf import DepthImage, TsdfConfig, TsdfVolume
+from wheretolook.geometry.tsdf import TsdfConfig, TsdfVolume
 from wheretolook.mapping.colmap_model import write_model
 from wheretolook.mapping.georeference import Similarity
 from wheretolook.mapping.gravity import estimate_gravity, rotation_to_z
 from wheretolook.scans.checks import check_depth_unit, landmark_readings
 from wheretolook.scans.config import RgbdConfig
-from wheretolook.scans.depth_correction import DepthCorrection, fit_depth_correction
-from wheretolook.scans.frames import Frames, RgbdFrames
+from wheretolook.scans.depth_correction import fit_depth_correction
+from wheretolook.scans.frames import RgbdFrames
 from wheretolook.scans.textures import textured
 from wheretolook.scans.upright import find_up
 from wheretolook.utils.errors import MapWarning, SceneError
 
+TRUNCATION_VOXELS = 4.0  # behind a surface that count as inside it: 4 cm cover the noise of depth and poses
 _MIN_READINGS = 3.0  # of a voxel that is part of the surface
 _MIN_PIECE_M2 = 0.01  # smaller disconnected pieces are noise
 _DISAGREE_DEG = 30.0  # between the given and the estimated direction up
@@ -44,15 +42,15 @@ class Scan:
 
     def describe(self) -> list[str]:
         """Sentences about frames used and skipped, the unit of depth, and up."""
-        skipped = self.frames.skipped.describe()
-        used = f"{len(self.frames)} frames of a recording of {self.frames.layout.name}'s layout"
-        up = " ".join(f"{value:.2f}" for value in np.round(self.up, 2) + 0.0)
+        frames = self.frames
+        skipped = ", ".join(f"{number} {reason}" for reason, number in frames.skipped.items())
+        used = f"{len(frames)} frames of a recording of {frames.layout.name}'s layout"
         lines = [
-            f"{used}{f'; not used: {skipped}' if skipped else ''}",
-            f"{self.frames.depth_scale:g} units of depth a metre; up is ({up}) in the recording's world, z here",
+            f"{used}; not used: {skipped}" if skipped else used,
+            f"{frames.depth_scale:g} units of depth a metre; up is ({_rounded(self.up)}) in the recording's world, z here",
         ]
-        if self.frames.depth_correction != DepthCorrection():
-            lines.append(f"depths corrected by the model's landmarks: {self.frames.depth_correction.describe()}")
+        if frames.model is not None:
+            lines.append(f"depths corrected by the model's landmarks: {frames.depth_correction.describe()}")
         return lines
 
     def report(self) -> dict[str, Any]:
@@ -61,7 +59,7 @@ class Scan:
         return {
             "layout": frames.layout.name,
             "n_frames": len(frames),
-            "skipped": frames.skipped.reasons,
+            "skipped": dict(frames.skipped),
             "depth_scale": frames.depth_scale,
             "depth_correction": asdict(frames.depth_correction),
             "up": self.up.tolist(),
@@ -104,29 +102,16 @@ def make_scan(config: RgbdConfig, device: str = "cpu", progress: bool = True) ->
         correction = fit_depth_correction(*landmark_readings(frames, frames.model).T)
         if correction is not None:
             frames.correct_depths(correction)
-    mesh = fuse(frames, frames.camera, frames.cam_from_world, config, device, progress)
+    tsdf = TsdfConfig(config.voxel_m, TRUNCATION_VOXELS, config.max_depth_m)
+    volume = TsdfVolume.from_images(frames, tsdf, progress, colored=True)
+    mesh = _without_small_pieces(volume.surface(min(_MIN_READINGS, len(frames))))
+    del volume
+    if config.appearance == "texture":
+        mesh = textured(mesh, frames, device, progress)
     up = _up(config, frames, mesh)
     rotation = rotation_to_z(up)
     turned = replace(mesh, vertices=(mesh.vertices @ rotation.T).astype(np.float32), origin=rotation @ mesh.origin)
     return Scan(turned, frames, up, rotation)
-
-
-def fuse(
-    frames: Frames,
-    camera: PinholeCamera,
-    cam_from_world: Float,
-    config: RgbdConfig,
-    device: str = "cpu",
-    progress: bool = True,
-) -> TexturedMesh:
-    """Fuse frames (F) of one camera at poses (F, 3, 4) to a mesh in their world. Raises SceneError if it is empty."""
-    tsdf = TsdfConfig(config.voxel_m, config.truncation_voxels, config.max_depth_m)
-    volume = TsdfVolume.from_images(_DepthImages(frames, camera, cam_from_world), tsdf, progress, colored=True)
-    mesh = _without_small_pieces(volume.surface(min(_MIN_READINGS, len(frames))))
-    del volume
-    if config.appearance == "texture":
-        return textured(mesh, frames, camera, cam_from_world, device, progress)
-    return mesh
 
 
 def _up(config: RgbdConfig, frames: RgbdFrames, mesh: TexturedMesh) -> Float:
@@ -137,11 +122,14 @@ def _up(config: RgbdConfig, frames: RgbdFrames, mesh: TexturedMesh) -> Float:
     held = estimate_gravity(frames.cam_from_world).up
     off_deg = float(np.degrees(np.arccos(np.clip(up @ held, -1, 1))))
     if off_deg > _DISAGREE_DEG:
-        seems = " ".join(f"{value:.2f}" for value in np.round(held, 2) + 0.0)
-        text = f"{frames.folder}: up is given as {config.up}, but as the camera was held it is ({seems}), "
+        text = f"{frames.folder}: up is given as {config.up}, but as the camera was held it is ({_rounded(held)}), "
         text += f"{off_deg:.0f} degrees from it. --scenes.rgbd.up auto estimates it"
         warnings.warn(text, MapWarning, stacklevel=3)
     return up
+
+
+def _rounded(direction: Float) -> str:
+    return " ".join(f"{value:.2f}" for value in np.round(direction, 2) + 0.0)
 
 
 def _without_small_pieces(mesh: TexturedMesh) -> TexturedMesh:
@@ -157,28 +145,6 @@ def _without_small_pieces(mesh: TexturedMesh) -> TexturedMesh:
         fix = "Check the poses, and that depths are in metres."
         raise SceneError("the depth images show no connected surface", value=f"{area_m2.max():.2g} m2", fix=fix)
     used, triangles = np.unique(mesh.triangles[keep], return_inverse=True)
+    triangles = triangles.reshape(-1, 3).astype(np.int32)
     colors = None if mesh.vertex_colors is None else mesh.vertex_colors[used]
-    rest: dict[str, Any] = {"vertices": mesh.vertices[used], "vertex_colors": colors}
-    return replace(mesh.only(keep), triangles=triangles.reshape(-1, 3).astype(np.int32), **rest)
-
-
-class _DepthImages(Sequence[DepthImage]):
-    """Frames as depth images for the fusion, read on access."""
-
-    def __init__(self, frames: Frames, camera: PinholeCamera, poses: NDArray[Any]) -> None:
-        self.frames = frames
-        self.camera = camera
-        self.poses = poses
-
-    def __len__(self) -> int:
-        return len(self.poses)
-
-    @overload
-    def __getitem__(self, index: int) -> DepthImage: ...
-    @overload
-    def __getitem__(self, index: slice) -> _DepthImages: ...
-    def __getitem__(self, index: int | slice) -> DepthImage | _DepthImages:
-        if isinstance(index, slice):
-            raise TypeError("frames are read one by one")
-        frame = self.frames[int(index)]
-        return DepthImage(frame.depth_m, self.camera, self.poses[index], frame.rgb)
+    return replace(mesh.only(keep), triangles=triangles, vertices=mesh.vertices[used], vertex_colors=colors)

@@ -20,7 +20,7 @@ from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, transform
 from wheretolook.rendering.registry import make_renderer
 from wheretolook.rendering.types import Renderer
-from wheretolook.scans.frames import Frames
+from wheretolook.scans.frames import RgbdFrames, evenly
 
 MAX_PHOTOGRAPHS = 100  # larger sets are subsampled evenly
 _BEHIND_M = 0.03  # tolerance of the visibility of a corner: voxels and rounding
@@ -30,17 +30,11 @@ _GAINS = (0.5, 2.0)  # range of exposure correction
 _MIN_AREA_SHARE = 0.5  # of the largest area in pixels of a triangle in any photograph
 
 
-def textured(
-    mesh: TexturedMesh,
-    frames: Frames,
-    camera: PinholeCamera,
-    cam_from_world: Float,
-    device: str = "cpu",
-    progress: bool = True,
-) -> TexturedMesh:
-    """Texture a mesh with photographs (F) at poses (F, 3, 4); triangles that none shows get their vertex colours."""
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MAX_PHOTOGRAPHS)).round().astype(int))
-    poses = cam_from_world[chosen]
+def textured(mesh: TexturedMesh, frames: RgbdFrames, device: str = "cpu", progress: bool = True) -> TexturedMesh:
+    """Texture a mesh with the photographs of frames; triangles that none shows get their vertex colours."""
+    camera = frames.camera
+    chosen = evenly(len(frames), MAX_PHOTOGRAPHS)
+    poses = frames.cam_from_world[chosen]
     areas = np.zeros((len(chosen), len(mesh.triangles)), dtype=np.float16)
     renderer = make_renderer(mesh, device)
     for row, pose in enumerate(tqdm(poses, desc="find textures", unit="photograph", disable=not progress)):
@@ -51,14 +45,11 @@ def textured(
     number = np.zeros(len(mesh.triangles), dtype=np.int32)
     for row in np.unique(photograph[photograph >= 0]).tolist():
         shown = np.flatnonzero(photograph == row)
-        rgb = frames[int(chosen[row])].rgb
-        pixels = camera.project(
-            transform(poses_from(poses[row], mesh.origin), mesh.vertices[mesh.triangles[shown]].reshape(-1, 3))
-        )
-        pixels = pixels.reshape(-1, 3, 2)
+        corners = mesh.vertices[mesh.triangles[shown]].reshape(-1, 3)
+        pixels = camera.project(transform(poses_from(poses[row], mesh.origin), corners)).reshape(-1, 3, 2)
         uvs[shown] = pixels / (camera.width, camera.height)
         number[shown] = len(textures)
-        textures.append(_as_exposed(rgb, pixels.mean(1), mesh, shown))
+        textures.append(_as_exposed(frames.rgb(chosen[row]), pixels.mean(1), mesh, shown))
     rest = np.flatnonzero(photograph < 0)
     if len(rest):
         texture, uvs[rest] = _flat_colors(mesh, rest)
@@ -81,8 +72,8 @@ def _areas_px(mesh: TexturedMesh, renderer: Renderer, camera: PinholeCamera, pos
     seen[seen] = z[seen] < nearest[row, column] + _BEHIND_M
     whole = np.flatnonzero(seen[mesh.triangles].all(1))
     a, b, c = np.moveaxis(pixels[mesh.triangles[whole]], 1, 0)
-    (ux, uy) = (b - a).T
-    (vx, vy) = (c - a).T
+    ux, uy = (b - a).T
+    vx, vy = (c - a).T
     areas = np.zeros(len(mesh.triangles), dtype=np.float16)
     areas[whole] = np.clip((uy * vx - ux * vy) / 2, 0, 60_000)  # fronts are clockwise where y points down
     return areas
@@ -110,8 +101,7 @@ def _as_exposed(
 
     Cameras adjust exposure and white balance for every photograph, which would leave edges at seams.
     """
-    if mesh.vertex_colors is None:
-        return rgb
+    assert mesh.vertex_colors is not None
     column, row = pixels.astype(np.int64).T
     here = rgb[row, column].mean(0)
     wanted = mesh.vertex_colors[mesh.triangles[triangles]].mean((0, 1))
@@ -123,8 +113,8 @@ def _flat_colors(mesh: TexturedMesh, rows: NDArray[np.int64]) -> tuple[NDArray[n
     """A texture of one texel per triangle, in the mean colour of its corners, and the texture coordinates."""
     side = int(np.ceil(np.sqrt(len(rows))))
     texels = np.full((side * side, 3), 255, dtype=np.uint8)
-    if mesh.vertex_colors is not None:
-        texels[: len(rows)] = mesh.vertex_colors[mesh.triangles[rows]].mean(1).round()
+    assert mesh.vertex_colors is not None
+    texels[: len(rows)] = mesh.vertex_colors[mesh.triangles[rows]].mean(1).round()
     index = np.arange(len(rows))
     uv = (np.column_stack([index % side, index // side]) + 0.5) / side
     return texels.reshape(side, side, 3), np.repeat(uv[:, None], 3, axis=1).astype(np.float32)

@@ -15,8 +15,9 @@ _IS_Z_DEG = 3.0  # a world this close to upright counts as upright
 def find_up(cam_from_world: Float, mesh: TexturedMesh) -> Float:
     """Estimate the unit direction up (3,) in the frame of poses (F, 3, 4) and of a mesh of the recording.
 
-    Starts from `estimate_gravity`, then refines it by the mesh: floors and walls are perpendicular or parallel to up (Gupta, Arbelaez and Malik, "Perceptual Organization and Recognition of Indoor Scenes from RGB-D Images",
-    CVPR 2013), weighted by area. z itself if it is that to within 3 degrees.
+    Starts from `estimate_gravity`, then refines it by the mesh: floors and walls are perpendicular or parallel to up
+    (Gupta, Arbelaez and Malik, "Perceptual Organization and Recognition of Indoor Scenes from RGB-D Images", CVPR
+    2013), weighted by area. z itself if it is that to within 3 degrees.
     """
     up = estimate_gravity(cam_from_world).up
     normals = mesh.normals

@@ -14,7 +14,7 @@ from wheretolook.dataset.layout import SceneFolder
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.rendering import raycasting
 from wheretolook.scenes.loading import save_glb
-from wheretolook.utils.errors import ConfigError, MapError, SceneError
+from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.files import write_json
 from wheretolook.visibility.cached_occlusion import CachedOcclusion
 from wheretolook.visibility.config import OcclusionConfig
@@ -43,7 +43,7 @@ def test_parts_of_a_scene_share_one_ray_caster(files: SceneFolder, monkeypatch: 
 
 def test_without_a_mesh_landmarks_hide_one_another_and_metres_are_needed(files: SceneFolder) -> None:
     files.mesh.unlink()
-    with pytest.raises(SceneError):
+    with pytest.raises(ConfigError):
         _ = SceneEnvironment(files, CAMERA).occlusion
     write_json(files.map / "report.json", {"scale": {"source": "unknown"}})
     scene = SceneEnvironment(files, CAMERA)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wheretolook.commands.options import OcclusionOptions, ScorerOptions
-from wheretolook.dataset.names import LOCK, check_scene_name
+from wheretolook.dataset.names import LOCK
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.mapping.config import ExistingModelConfig
 from wheretolook.utils.errors import ConfigError, MapError
@@ -145,8 +145,6 @@ class Check(OcclusionOptions, ScorerOptions):
         from wheretolook.mapping.colmap_model import model_suffix
         from wheretolook.scorers.registry import check_method
 
-        if self.scene is not None:
-            check_scene_name(self.data, self.scene, self.name)
         for name in filter(None, (self.method, *self.also)):
             check_method(name)
         if self.map is not None and self.mesh is None:  # with a mesh, missing metres are the first error

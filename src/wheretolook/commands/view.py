@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wheretolook.commands.options import CameraOptions
-from wheretolook.dataset.names import check_scene_name
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.validation import reject
 
@@ -144,8 +143,6 @@ class View(CameraOptions):
 
         if self.images is not None and not self.images.is_dir():
             raise ConfigError("there is no such folder of photographs", path=self.images, fix="Correct the path.")
-        if self.scene is not None and self.data.is_dir():
-            check_scene_name(self.data, self.scene, self.name)
         if self.record is not None:
             require("rerun")
         elif self.film is None:

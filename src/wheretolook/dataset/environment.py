@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +18,14 @@ from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.mapping.georeference import read_scale
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.utils.devices import usable_device
-from wheretolook.utils.errors import ConfigError, MapError, SceneError
+from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.validation import check_positive
 from wheretolook.visibility.config import OCCLUSION_MODELS, OcclusionConfig, check_occlusion_names
 
 if TYPE_CHECKING:  # pandas and Warp are imported when first needed
     from wheretolook.dataset.layout import SceneFolder
     from wheretolook.geometry.mesh import TexturedMesh
-    from wheretolook.geometry.tsdf import DepthImage, TsdfVolume
+    from wheretolook.geometry.tsdf import DepthImage, DepthImages, TsdfVolume
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.mapping.colmap_source import ColmapSource
     from wheretolook.mapping.landmarks import Landmarks
@@ -94,7 +94,7 @@ class Environment(ABC):
 
     @property
     @abstractmethod
-    def depth_images(self) -> Sequence[DepthImage]:
+    def depth_images(self) -> DepthImages:
         """Depth images of the mapping images."""
 
     @property
@@ -103,9 +103,9 @@ class Environment(ABC):
         """Whether `mesh` is available."""
 
     @property
-    @abstractmethod
     def has_depth(self) -> bool:
-        """Whether `depth_images` are available."""
+        """Whether `depth_images` are available: by default, rendered from the mesh."""
+        return self.has_mesh
 
     @property
     @abstractmethod
@@ -168,8 +168,8 @@ class Environment(ABC):
         """Raise ConfigError if an occlusion model is unknown or cannot be made here."""
         check_occlusion_names((name,))
         if name not in self.available_occlusion:
-            fix = f"Give them, or use {' or '.join(self.available_occlusion)}."
-            raise ConfigError(f"this occlusion model needs a {OCCLUSION_MODELS[name].needs}", value=name, fix=fix)
+            problem = f"{self.name} lacks what this occlusion model needs: {OCCLUSION_MODELS[name].needs}"
+            raise ConfigError(problem, value=name, fix=f"Use {' or '.join(self.available_occlusion)}.")
 
     @property
     def occlusion_config(self) -> OcclusionConfig:
@@ -245,11 +245,6 @@ class SceneEnvironment(Environment):
         """Whether there is a mesh."""
         return "mesh" in vars(self) or self.files.mesh.is_file()
 
-    @property
-    def has_depth(self) -> bool:
-        """Whether depth images can be rendered."""
-        return self.has_mesh
-
     @cached_property
     def landmarks(self) -> Landmarks:  # type: ignore[override]
         """The map's landmarks."""
@@ -261,7 +256,7 @@ class SceneEnvironment(Environment):
         return self.files.mapping_poses()
 
     @cached_property
-    def depth_images(self) -> Sequence[DepthImage]:  # type: ignore[override]
+    def depth_images(self) -> DepthImages:  # type: ignore[override]
         """Depth images rendered where the map's images were taken."""
         from wheretolook.mapping.colmap_model import colmap_poses, read_model
 
@@ -273,9 +268,6 @@ class SceneEnvironment(Environment):
     def mapped_space(self) -> MappedSpace:
         """Where a camera can be according to the photographs."""
         self.require_metres()
-        if self.mapping_poses is None:
-            fix = "Run the map stage again."
-            raise MapError("the poses of the map's photographs are missing", path=self.files.map, fix=fix)
         return super().mapped_space
 
     @cached_property
@@ -328,12 +320,6 @@ class SceneEnvironment(Environment):
         replaced = OCCLUSION_MODELS[config.model].needs and self.is_photographed
         return replace(config, model="hidden-points") if replaced else config
 
-    def check_occlusion(self, name: str) -> None:
-        """Raise SceneError if the mesh is missing that an occlusion model needs."""
-        if name not in self.available_occlusion:
-            fix = "Run the scenes stage, or use hidden-points or none."
-            raise SceneError(f"occlusion by {name} needs the scene's mesh", path=self.files.mesh, fix=fix)
-
 
 @dataclass(frozen=True)
 class ColmapFiles:
@@ -370,13 +356,9 @@ class ColmapEnvironment(Environment):
         self.name = files.model.resolve().name
         self._camera = camera
         if files.mesh is not None and files.depth is not None:
-            problem = "occlusion uses a mesh or depth images"
-            raise ConfigError(problem, value=str(files.depth), fix="Give one of them.")
-        limit_px = files.max_reprojection_error_px
-        if limit_px is not None and not limit_px > 0:
-            raise ConfigError(
-                "the largest reprojection error must be positive", value=limit_px, fix="Such as 2 pixels."
-            )
+            raise ConfigError("give a mesh or depth images, not both", value=str(files.depth))
+        if files.max_reprojection_error_px is not None:
+            check_positive("the largest reprojection error", files.max_reprojection_error_px)
         name = occlusion or self.available_occlusion[0]
         self.check_occlusion(name)
         self.config = replace(config, occlusion=replace(config.occlusion, model=name))
@@ -423,7 +405,7 @@ class ColmapEnvironment(Environment):
         return load_mesh(self.files.mesh, colored=False)
 
     @cached_property
-    def depth_images(self) -> Sequence[DepthImage]:  # type: ignore[override]
+    def depth_images(self) -> DepthImages:  # type: ignore[override]
         """Depth images of the model's images."""
         from wheretolook.scans.depth_images import read_depth_images
 
@@ -448,7 +430,7 @@ class ColmapEnvironment(Environment):
         return result
 
 
-class RenderedDepth(Sequence["DepthImage"]):
+class RenderedDepth:
     """Depth images of poses (B, 3, 4), each rendered when it is accessed."""
 
     def __init__(self, renderer: Renderer, camera: Camera, cam_from_world: Float) -> None:
@@ -459,13 +441,7 @@ class RenderedDepth(Sequence["DepthImage"]):
     def __len__(self) -> int:
         return len(self.cam_from_world)
 
-    @overload
-    def __getitem__(self, index: int) -> DepthImage: ...
-    @overload
-    def __getitem__(self, index: slice) -> RenderedDepth: ...
-    def __getitem__(self, index: int | slice) -> DepthImage | RenderedDepth:
-        if isinstance(index, slice):
-            return RenderedDepth(self.renderer, self.camera, self.cam_from_world[index])
+    def __getitem__(self, index: int) -> DepthImage:
         from wheretolook.geometry.tsdf import DepthImage
 
         pose = self.cam_from_world[index]

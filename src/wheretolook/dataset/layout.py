@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.dataset.names import NO_DATASET, check_scene_name, no_such_scene
 from wheretolook.dataset.sampling_config import Split
 from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of_record, read_cameras
 from wheretolook.geometry.poses import Float
@@ -19,9 +18,10 @@ from wheretolook.mapping.colmap_model import CAMERAS_FILE, holds_model, load_map
 from wheretolook.mapping.georeference import read_scale
 from wheretolook.utils.artifact_cache import ArtifactCache
 from wheretolook.utils.confine import safe_child
-from wheretolook.utils.errors import ConfigError, SceneError, TableError
+from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.files import fingerprint, write_json
 from wheretolook.utils.reading import read_json_object
+from wheretolook.utils.validation import check_choice
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -126,15 +126,10 @@ class SceneFolder:
         return ArtifactCache(self.folder, key, stage, "stages.json", STAGES)
 
     def mapped_floor(self) -> MappedFloor:
-        """The floor that `save_mapped_floor` wrote. Raises SceneError if its file is damaged."""
+        """The floor that `save_mapped_floor` wrote."""
         if not self._description.is_file():
             return ()
-        try:
-            rectangles = read_json_object(self._description)["mapped_floor"]
-            return tuple((float(x0), float(y0), float(x1), float(y1)) for x0, y0, x1, y1 in rectangles)
-        except (ValueError, KeyError, TypeError) as error:
-            fix = "Remove it and the mesh, and run the scenes stage again."
-            raise SceneError("damaged description of a scene", path=self._description, fix=fix) from error
+        return tuple((x0, y0, x1, y1) for x0, y0, x1, y1 in read_json_object(self._description)["mapped_floor"])
 
     def save_mapped_floor(self, floor: MappedFloor) -> None:
         """Write the floor that the map is to be made from to `scene.json`, unless it is all."""
@@ -252,11 +247,8 @@ class Dataset:
         """16 hexadecimal digits that change with any scene's table, landmarks or occlusion."""
         digest = hashlib.sha256()
         for scene in self.scenes:
-            parts = [
-                fingerprint(path)
-                for path in (scene.table, scene.landmarks, scene.occlusion, scene.cameras_file)
-                if path.is_file()
-            ]
+            files = (scene.table, scene.landmarks, scene.occlusion, scene.cameras_file)
+            parts = [fingerprint(path) for path in files if path.is_file()]
             digest.update("".join([scene.name, scene.split, *parts]).encode())
         return digest.hexdigest()[:16]
 
@@ -276,27 +268,21 @@ class Dataset:
 
     @classmethod
     def load(cls, root: Path) -> Dataset:
-        """Read a dataset folder.
-
-        Raises TableError if there is no valid `dataset.json`.
-        """
+        """Read a dataset folder. Raises TableError if there is no valid `dataset.json`."""
         path = root / "dataset.json"
+        fix = "Run the scenes stage, or for a map of your own `wheretolook map --model SPARSE`."
         try:
             content = read_json_object(path)
             scenes = []
             for entry in content["scenes"]:
+                check_choice("split", entry["split"], get_args(Split))
                 camera = camera_of_record(entry["camera"] if "camera" in entry else content["camera"])
-                own = bool(entry.get("own_camera", False))
                 folder = safe_child(root, entry["name"], "a scene's name")
-                if entry["split"] not in get_args(Split):
-                    raise ValueError(f"a scene's split is {', '.join(get_args(Split))}, not {entry['split']!r}")
-                scenes.append(SceneFolder(folder, entry["split"], camera, own))
+                scenes.append(SceneFolder(folder, entry["split"], camera, bool(entry.get("own_camera", False))))
         except FileNotFoundError as error:
-            raise TableError("not a folder of a dataset", path=path, fix=NO_DATASET) from error
+            raise TableError("not a folder of a dataset", path=path, fix=fix) from error
         except (OSError, ConfigError, ValueError, KeyError, TypeError, AttributeError) as error:
-            problem = f"damaged dataset description: {error}"
-            fix = "Run the scenes stage again."
-            raise TableError(problem, path=path, fix=fix) from error
+            raise TableError(f"damaged dataset description: {error}", path=path, fix=fix) from error
         return cls(root, tuple(scenes))
 
 
@@ -305,19 +291,18 @@ def find_scene(data: Path, name: str, dataset: str = "") -> SceneFolder:
 
     Raises ConfigError if there is none, or several datasets have it; TableError if the dataset is damaged.
     """
-    check_scene_name(data, name, dataset)
     if dataset:
-        return Dataset.load(data / dataset).scene(name)
+        return Dataset.load(safe_child(data, dataset, "a dataset's name")).scene(name)
     roots = [path.parent for path in sorted(data.glob("*/dataset.json"))]
     # datasets without such a folder are not read, so that damaged ones are not in the way
-    having = [
-        one
-        for one in map(Dataset.load, (root for root in roots if (root / name).is_dir()))
-        if name in {scene.name for scene in one.scenes}
-    ]
+    possible = [Dataset.load(root) for root in roots if safe_child(root, name, "a scene's name").is_dir()]
+    having = [one for one in possible if name in {scene.name for scene in one.scenes}]
     if len(having) == 1:
         return having[0].scene(name)
     if having:
         names = ", ".join(one.name for one in having)
         raise ConfigError("several datasets have such a scene", value=name, fix=f"Give --name: {names}.")
-    no_such_scene(data, name, roots)
+    fix = (
+        f"Name a scene of {', '.join(root.name for root in roots)}, or make one with `wheretolook map --model SPARSE`."
+    )
+    raise ConfigError("there is no such scene", path=data, value=name, fix=fix)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -65,15 +65,20 @@ def sample_viewpoints(
     ids = np.sort(_subset(np.asarray(location_ids, dtype=np.int64), config.max_locations, rng))
     locations = grid.centers()[ids]
     directions = config.axes()
-    options = SurveyOptions(
-        keep=config.keep, device=device, memory_bytes=round(config.memory_gb * 1e9), progress=progress
-    )
+    memory_bytes = round(config.memory_gb * 1e9)
+    options = SurveyOptions(keep=config.keep, device=device, memory_bytes=memory_bytes, progress=progress)
+    rotations = rotation_looking_along(directions)
     several = cameras if isinstance(cameras, Mapping) else {0: cameras}
     numbers = np.array(list(several))[np.arange(len(ids)) % len(several)]
     if len(several) > 1:
         rng.shuffle(numbers)
-    inputs = (rotation_looking_along(directions), locations, landmarks.points, occlusion)
-    seen = _survey_by_camera(several, numbers, *inputs, options)
+    groups = [np.flatnonzero(numbers == number) for number in several]
+    parts = [
+        survey(camera, rotations, locations[rows], landmarks.points, occlusion, options)
+        for camera, rows in zip(several.values(), groups, strict=True)
+        if len(rows)
+    ]
+    seen = _joined(parts, np.concatenate(groups), locations)
     kept = []
     for row, best in enumerate(seen.best):
         visible = best[seen.counts[row, best] >= config.min_visible]
@@ -111,30 +116,15 @@ def _check_number(n_viewpoints: int, n_locations: int, max_count: int, n_landmar
         raise ConfigError("the table has more viewpoints than there is memory for", value=n_viewpoints, fix=fix)
 
 
-def _survey_by_camera(
-    cameras: Mapping[int, Camera],
-    numbers: NDArray[np.integer[Any]],
-    rotations: Float,
-    locations: Float,
-    points: Float,
-    occlusion: OcclusionModel,
-    options: SurveyOptions,
-) -> Survey:
-    """`survey` of locations (L, 3), each looked from with the camera of its number (L,)."""
-    if len(cameras) == 1:
-        return survey(next(iter(cameras.values())), rotations, locations, points, occlusion, options)
-    groups = [np.flatnonzero(numbers == number) for number in cameras]
-    parts = [
-        survey(camera, rotations, locations[rows], points, occlusion, options)
-        for camera, rows in zip(cameras.values(), groups, strict=True)
-        if len(rows)
-    ]
-    order = np.argsort(np.concatenate(groups))
+def _joined(parts: Sequence[Survey], rows: NDArray[np.int64], locations: Float) -> Survey:
+    """Join surveys that together hold `rows` of locations (L, 3), in that order."""
+    if len(parts) == 1:
+        return parts[0]
+    order = np.argsort(rows)
     stored = [part.occlusion for part in parts if part.occlusion is not None]
     packed = np.concatenate([part.packed for part in stored])[order]
-    joined = StoredOcclusion(locations, packed, stored[0].n_landmarks, stored[0].name)
     counts, best = (np.concatenate([getattr(part, name) for part in parts])[order] for name in ("counts", "best"))
-    return Survey(counts, best, joined)
+    return Survey(counts, best, StoredOcclusion(locations, packed, stored[0].n_landmarks, stored[0].name))
 
 
 def _subset(values: NDArray[np.int64], at_most: int, rng: np.random.Generator) -> NDArray[np.int64]:

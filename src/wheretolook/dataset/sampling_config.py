@@ -7,6 +7,7 @@ from typing import Literal, get_args
 
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.validation import check_range
 
 Split = Literal["train", "val", "test"]  # what a scene is for: to learn from, to choose by, to report on
 
@@ -43,13 +44,11 @@ class SampleConfig(ViewLattice):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("keep", "min_visible", "max_locations", "cameras"):
-            if getattr(self, name) < 0:
-                raise ConfigError(f"sample.{name} must not be negative", value=getattr(self, name))
+            check_range(f"sample.{name}", getattr(self, name), 0)
         if isinstance(self.max_directions, dict) and set(self.max_directions) != set(get_args(Split)):
             fix = "Give one number, or one for each of train, val and test."
             raise ConfigError("sample.max_directions lacks or misnames a split", value=self.max_directions, fix=fix)
-        if min(map(self.directions_of, get_args(Split))) < 0:
-            raise ConfigError("sample.max_directions must not be negative", value=self.max_directions)
+        check_range("sample.max_directions", min(map(self.directions_of, get_args(Split))), 0)
 
     def directions_of(self, split: Split) -> int:
         """`max_directions` for a split."""

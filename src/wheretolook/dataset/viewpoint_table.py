@@ -6,7 +6,6 @@ matched can be stored too, see `MATCH_FIELDS`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -100,25 +99,20 @@ def instructive_location(table: pd.DataFrame) -> int:
     return int(ids[np.argmin(np.abs(shares - 0.5))])
 
 
-def outcome_in_words(label: pd.Series) -> str:
-    """The result of localizing a row of a table, in words; empty if it was not tried."""
+def outcome_in_words(label: pd.Series, brief: bool = False) -> str:
+    """The result of localizing a row of a table, in words; `brief` gives only the pose's error, if one was found.
+
+    Empty if it was not tried.
+    """
     status = str(label["status"])
     if status == UNLABELLED:
         return ""
     if status != LOCALIZED:
         return status.replace("_", " ")
-    if label["error_m"] < 1:
-        return f"pose found, {100 * label['error_m']:.1f} cm and {label['error_deg']:.2f}° off"
-    return f"wrong pose found, {label['error_m']:.1f} m and {label['error_deg']:.0f}° off"
-
-
-def outcome_in_brief(label: pd.Series) -> str:
-    """As `outcome_in_words`, for narrow pictures: only the error of the pose, if one was found."""
-    if str(label["status"]) != LOCALIZED:
-        return outcome_in_words(label)
-    if label["error_m"] < 1:
-        return f"{100 * label['error_m']:.1f} cm, {label['error_deg']:.2f}° off"
-    return f"{label['error_m']:.1f} m, {label['error_deg']:.0f}° off"
+    right = label["error_m"] < 1
+    error = f"{100 * label['error_m']:.1f} cm, " if right else f"{label['error_m']:.1f} m, "
+    error += f"{label['error_deg']:.2f}° off" if right else f"{label['error_deg']:.0f}° off"
+    return error if brief else f"{'pose' if right else 'wrong pose'} found, {error}"
 
 
 def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
@@ -130,11 +124,11 @@ def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
     if compact:
         table = table.assign(**dict(zip(CENTER_COLUMNS, _shared_centers(table).T, strict=True)))
     optional = [CAMERA_FIELD] if compact else [CAMERA_FIELD, MATCH_FIELDS, PIXEL_FIELD]
-    extra = [name for part in optional if set(part.names) <= set(table.columns) for name in part.names]
-    schema = _schema(compact, extra)
-    options = _COMPACT_FORMAT if compact else {}
+    extra = [field for part in optional if {*part.names} <= {*table} for field in part]
+    schema = pa.schema([*(COMPACT_SCHEMA if compact else SCHEMA), *extra])
     content = pa.Table.from_pandas(table, schema=schema, preserve_index=False)
     content = content.replace_schema_metadata(None)  # it describes the data frame, not the rows
+    options = _COMPACT_FORMAT if compact else {}
     with atomic_write(path) as partial:
         pq.write_table(content, partial, compression="zstd", write_page_checksum=True, **options)
 
@@ -166,45 +160,29 @@ def read_table(path: Path, matches: bool = False, pixels: bool = False) -> pd.Da
     """
     if not path.is_file():
         raise TableError("there is no table of viewpoints", path=path, fix="Run the sample stage first.")
-    requested = (MATCH_FIELDS.names if matches or pixels else []) + (PIXEL_FIELD.names if pixels else [])
+    requested = [*(MATCH_FIELDS if matches or pixels else ()), *(PIXEL_FIELD if pixels else ())]
+    fix = "Run the stage that writes it again."
     try:
         with open_parquet(path, page_checksum_verification=True) as file:
-            names = file.schema_arrow.names
-            compact = any(name in names for name in CENTER_COLUMNS)
-            extra = [*(name for name in CAMERA_FIELD.names if name in names), *requested]
-            schema = _schema(compact, extra)
-            _check_columns(path, [name for name in schema.names if name not in names], requested)
+            stored = {*file.schema_arrow.names}
+            compact = not stored.isdisjoint(CENTER_COLUMNS)
+            extra = [*(CAMERA_FIELD if CAMERA_ID in stored else ()), *requested]
+            schema = pa.schema([*(COMPACT_SCHEMA if compact else SCHEMA), *extra])
+            if missing := [name for name in schema.names if name not in stored]:
+                if requested:
+                    fix = f"Label again with `--label.store_{'pixels' if pixels else 'matches'} true`; "
+                    fix += "compact tables never hold them."
+                raise TableError("columns are missing", path=path, value=missing, fix=fix)
             frame: pd.DataFrame = read_columns(file, path, schema.names).cast(schema).to_pandas()
     except ValueError as error:
-        fix = "It may be truncated or of another program: run the stage that writes it again."
         raise TableError(f"not a readable table of viewpoints: {error}", path=path, fix=fix) from error
-    _check_poses(path, frame, CENTER_COLUMNS if compact else TRANSLATION_COLUMNS)
-    if compact:
-        rotation = rotation_from_quaternion(frame[list(QUATERNION_COLUMNS)].to_numpy())
-        translation = -(rotation @ frame[list(CENTER_COLUMNS)].to_numpy()[..., None])[..., 0]
-        frame = frame.assign(**dict(zip(TRANSLATION_COLUMNS, translation.T, strict=True)))
-    return frame[[*SCHEMA.names, *extra]]
-
-
-def _schema(compact: bool, extra: Iterable[str]) -> pa.Schema:
-    """The columns of a table with the named ones of `CAMERA_FIELD`, `MATCH_FIELDS` and `PIXEL_FIELD`."""
-    optional = pa.unify_schemas([CAMERA_FIELD, MATCH_FIELDS, PIXEL_FIELD])
-    return pa.schema([*(COMPACT_SCHEMA if compact else SCHEMA), *(optional.field(name) for name in extra)])
-
-
-def _check_columns(path: Path, missing: list[str], requested: list[str]) -> None:
-    if set(missing) & set(requested):
-        option = "pixels" if PIXELS in missing else "matches"
-        fix = f"Label again with `--label.store_{option} true`; compact tables never hold them."
-        raise TableError("the matched landmarks are not stored", path=path, value=missing, fix=fix)
-    if missing:
-        raise TableError("columns are missing", path=path, value=missing, fix="Run the sample stage again.")
-
-
-def _check_poses(path: Path, frame: pd.DataFrame, position: tuple[str, ...]) -> None:
-    length = np.linalg.norm(frame[list(QUATERNION_COLUMNS)].to_numpy(), axis=1)
-    bad = ~(np.abs(length - 1) < 1e-6) | ~np.isfinite(frame[list(position)].to_numpy()).all(1)
+    length = np.linalg.norm(frame[[*QUATERNION_COLUMNS]], axis=1)
+    position = frame[[*(CENTER_COLUMNS if compact else TRANSLATION_COLUMNS)]].to_numpy()
+    bad = ~(np.abs(length - 1) < 1e-6) | ~np.isfinite(position).all(1)
     if bad.any():
-        first = [float(value) for value in frame[[*QUATERNION_COLUMNS, *position]].iloc[int(np.argmax(bad))]]
-        fix = "The file is damaged: run the sample stage again."
-        raise TableError("a pose is no rigid transform", path=path, value=first, fix=fix)
+        raise TableError("a pose is no rigid transform", path=path, value=f"row {np.argmax(bad)}", fix=fix)
+    if compact:
+        rotation = rotation_from_quaternion(frame[[*QUATERNION_COLUMNS]])
+        translation = -(rotation @ position[..., None])[..., 0]
+        frame = frame.assign(**dict(zip(TRANSLATION_COLUMNS, translation.T, strict=True)))
+    return frame[[*SCHEMA.names, *(field.name for field in extra)]]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +11,7 @@ from tqdm.auto import tqdm
 
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float
-from wheretolook.geometry.tsdf import DepthImage, TsdfVolume
+from wheretolook.geometry.tsdf import DepthImages, TsdfVolume
 from wheretolook.space.config import FreeSpaceConfig
 from wheretolook.space.free_space import FreeSpace
 
@@ -37,7 +36,7 @@ class TsdfSpace(FreeSpace):
     def __init__(
         self,
         volume: TsdfVolume,
-        images: Sequence[DepthImage],
+        images: DepthImages,
         config: FreeSpaceConfig | None = None,
         device: str = "cpu",
         progress: bool = True,
@@ -88,9 +87,7 @@ class TsdfSpace(FreeSpace):
         return np.asarray(inside & (distance >= self.config.clearance_m + size.max() / 2))
 
 
-def seen_through(
-    points: Float, images: Sequence[DepthImage], max_depth_m: float, progress: bool = True
-) -> NDArray[np.bool_]:
+def seen_through(points: Float, images: DepthImages, max_depth_m: float, progress: bool = True) -> NDArray[np.bool_]:
     """Whether a depth image saw something behind points (N, 3) m, but for readings beyond `max_depth_m`; (N,)."""
     seen = np.zeros(len(points), dtype=bool)
     for index in tqdm(range(len(images)), desc="seen space", unit="image", disable=not progress):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, outcome_in_brief, outcome_in_words, poses
+from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, outcome_in_words, poses
 from wheretolook.figures.overview import View, rendered_views
 from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
 from wheretolook.inputs.channels import CHANNELS
@@ -131,7 +132,7 @@ def learning_of(showcase: Showcase, scorer: BinnedNetworkScorer, location_id: in
     spec = scorer.network.spec
     found = activations(scorer.network, showcase.localization_map.bin_views(pose, spec.bins))
     image = binned_image_of(showcase, pose[0], spec.bins)
-    return Learning(image, tuple(found), spec.channels, outcome_in_brief(candidates.iloc[row]))
+    return Learning(image, tuple(found), spec.channels, outcome_in_words(candidates.iloc[row], brief=True))
 
 
 def mistaken_location(showcase: Showcase, scorer: Scorer, height_m: float = EYE_M) -> int:
@@ -159,7 +160,7 @@ def peaks_of(showcase: Showcase, scorer: Scorer, location_id: int, n: int = 3, a
 
     def views(highest: bool) -> tuple[View, ...]:
         found = spread_extrema(axes, scores, n, apart_deg, highest)
-        return rendered_views(showcase, rows.iloc[found], scores[found], outcome_in_brief)
+        return rendered_views(showcase, rows.iloc[found], scores[found], partial(outcome_in_words, brief=True))
 
     known = (rows["status"] != UNLABELLED).to_numpy()
     center = np.broadcast_to(showcase.center(location_id), showcase.directions.shape)

@@ -12,14 +12,7 @@ from synthetic_dataset import make_landmarks, make_mapping_poses
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.sampling import free_locations, sample_viewpoints
 from wheretolook.dataset.sampling_config import SampleConfig
-from wheretolook.dataset.viewpoint_table import (
-    LOCALIZED,
-    NO_POSE,
-    outcome_in_brief,
-    outcome_in_words,
-    poses,
-    write_table,
-)
+from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, outcome_in_words, poses, write_table
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
@@ -151,7 +144,7 @@ def test_peaks_are_labelled_views_with_what_came_of_them(showcase: Showcase) -> 
     assert found.peaks[0].score == scores.max() and found.pits[0].score == scores.min()
     for view in (*found.peaks, *found.pits):
         row = int(np.argmin(np.linalg.norm(axes - view.direction, axis=1)))
-        assert view.score == scores[row] and view.outcome == outcome_in_brief(rows.iloc[row])
+        assert view.score == scores[row] and view.outcome == outcome_in_words(rows.iloc[row], brief=True)
     np.testing.assert_allclose(found.scores, scorer.score(_poses_at(showcase, location)))
     np.testing.assert_array_equal(found.tried[1], (rows["error_m"] < 0.05).to_numpy())
 
@@ -167,7 +160,7 @@ def test_learning_follows_the_best_and_the_worst_view(showcase: Showcase) -> Non
         learning = learning_of(showcase, scorer, location, best)
         assert learning.activations[-1] == pytest.approx(score)
         assert learning.channels == ("u", "v") and learning.image.counts.shape == (6, 6)
-        assert learning.outcome == outcome_in_brief(rows.iloc[int(np.argmin(np.abs(scores - score)))])
+        assert learning.outcome == outcome_in_words(rows.iloc[int(np.argmin(np.abs(scores - score)))], brief=True)
 
 
 def _poses_at(showcase: Showcase, location: int) -> Float:

@@ -142,11 +142,7 @@ class TsdfVolume:
 
     @classmethod
     def from_images(
-        cls,
-        images: DepthImages,
-        config: TsdfConfig = TsdfConfig(),
-        progress: bool = True,
-        colored: bool = False,
+        cls, images: DepthImages, config: TsdfConfig = TsdfConfig(), progress: bool = True, colored: bool = False
     ) -> TsdfVolume:
         """Fuse depth images, in any order. A sequence that reads each from disk when asked for it keeps memory low.
 

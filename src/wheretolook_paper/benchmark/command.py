@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
@@ -25,7 +24,13 @@ class Benchmark(Command):
     wheretolook benchmark SCENE_DIR [SCENE_DIR ...] [--out FOLDER] [options]
     wheretolook benchmark --errors pose_errors.txt --poses selected_gt_poses.txt [--out FOLDER]
 
-    docs/benchmark.md describes scene folders, results, and the differences to the benchmark's own scripts. Results in
+    SCENE_DIR, such as 00010-DBjEcHFg4oq, contains
+      scene_reconstruction/    COLMAP model (cameras, images, points3D; binary or text) in metres, z up
+        images/                images of the map
+      waypoints.txt            "id x y z"; or sampled_waypoints.txt, or name another: --waypoints
+      DBjEcHFg4oq.glb          mesh in the frame of the map; or the only .glb of the folder, or name another: --mesh
+
+    docs/benchmark.md describes results, and the differences to the benchmark's own scripts. Results in
     --out are summary.csv, summary.md, views.csv, and for each scene and method the files of the benchmark's scripts,
     which can continue from any of them. Run again, the same command does only what is missing.
 
@@ -74,16 +79,13 @@ class Benchmark(Command):
     poses: Path | None = None
 
     def __post_init__(self) -> None:
-        if (self.errors is None) != (self.poses is None):
-            raise ConfigError("errors and poses belong together", fix="Give both --errors and --poses.")
-        if bool(self.scenes) == (self.errors is not None):
-            fix = "Give SCENE_DIR, or --errors and --poses."
-            raise ConfigError("the benchmark needs scene folders, or files to score", fix=fix)
+        if (self.errors is None) != (self.poses is None) or bool(self.scenes) == (self.errors is not None):
+            raise ConfigError("the benchmark needs scene folders, or --errors and --poses")
         if len(self.scenes) > 1 and (self.mesh is not None or self.waypoints is not None):
-            raise ConfigError("a mesh and waypoints are of one scene", value=len(self.scenes), fix="Give one scene.")
+            raise ConfigError("--mesh and --waypoints are of one scene", value=len(self.scenes))
         names = [path.resolve().name for path in self.scenes]
         if len({*names}) < len(names):
-            raise ConfigError("two scene folders have the same name", value=names, fix="Give each once.")
+            raise ConfigError("two scene folders have the same name", value=names)
         check_range("directions", self.directions, 1)
         check_range("workers", self.workers, 0)
         if self.max_turn is not None:
@@ -91,59 +93,49 @@ class Benchmark(Command):
 
     def run(self) -> None:
         """Run the benchmark, or score files, and write the report to `out`."""
-        start = time.monotonic()
-        results, lines = (_of_files(self), []) if self.errors is not None else _of_scenes(self)
-        for line in lines:
-            print(line)
+        from wheretolook_paper.benchmark.files import read_errors, read_poses
+        from wheretolook_paper.benchmark.report import NOTES, SUMMARY_CSV, VIEWS_CSV, Result, write_report
+        from wheretolook_paper.benchmark.scores import Scores
+
+        if self.errors is not None and self.poses is not None:
+            scores = Scores.of(read_poses(self.poses), read_errors(self.errors))
+            results = [Result(self.errors.resolve().parent.name, self.errors.name, scores)]
+        else:
+            results = self._run_scenes()
         if not results:
             print("Nothing to score yet. docs/benchmark.md explains how the benchmark's own script continues.")
             return
-        from wheretolook_paper.benchmark.report import NOTES, SUMMARY_CSV, VIEWS_CSV, write_report
-
         print(f"\n{write_report(results, self.out)}\n\n{NOTES}\n")
-        print(f"done in {time.monotonic() - start:.0f} s: {self.out / SUMMARY_CSV}, {self.out / VIEWS_CSV}")
+        print(f"done: {self.out / SUMMARY_CSV}, {self.out / VIEWS_CSV}")
 
+    def _run_scenes(self) -> list[Result]:
+        from wheretolook.scorers.registry import check_method
+        from wheretolook.utils.devices import usable_device
+        from wheretolook_paper.benchmark.actloc_baseline import ACTLOC
+        from wheretolook_paper.benchmark.folder import BenchmarkScene
+        from wheretolook_paper.benchmark.report import Result
+        from wheretolook_paper.benchmark.round import BEST, RoundConfig, SceneRound
 
-def _of_files(options: Benchmark) -> list[Result]:
-    from wheretolook_paper.benchmark.files import read_errors, read_poses
-    from wheretolook_paper.benchmark.report import Result
-    from wheretolook_paper.benchmark.scores import Scores
-
-    assert options.poses is not None and options.errors is not None
-    scores = Scores.of(read_poses(options.poses), read_errors(options.errors))
-    return [Result(options.errors.resolve().parent.name, options.errors.name, scores)]
-
-
-def _of_scenes(options: Benchmark) -> tuple[list[Result], list[str]]:
-    from wheretolook.scorers.registry import check_method
-    from wheretolook.utils.devices import usable_device
-    from wheretolook_paper.benchmark.actloc_baseline import ACTLOC
-    from wheretolook_paper.benchmark.folder import BenchmarkScene
-    from wheretolook_paper.benchmark.report import Result
-    from wheretolook_paper.benchmark.round import BEST, RoundConfig, SceneRound
-
-    methods = list(dict.fromkeys(options.methods))
-    for method in methods:
-        if method not in (BEST, ACTLOC):
-            check_method(method)
-    scenes = [BenchmarkScene.of(folder, options.mesh, options.waypoints) for folder in options.scenes]
-    config = RoundConfig(
-        options.weights,
-        options.directions,
-        options.lattice,
-        options.max_turn,
-        localize=options.localizer == "sift",
-        workers=options.workers or len(os.sched_getaffinity(0)),
-        device=usable_device(options.device),
-    )
-    rounds = [SceneRound(scene, options.out / scene.name, config) for scene in scenes]
-    results: list[Result] = []
-    messages: list[str] = []
-    while rounds:
-        one = rounds.pop(0)  # so that its mesh goes when it is done
+        methods = dict.fromkeys(self.methods)
         for method in methods:
-            scores = one.run(method)
-            if scores is not None:
-                results.append(Result(one.scene.name, one.folder_name(method), scores))
-        messages += [f"{one.scene.name}: {line}" for line in one.messages]
-    return results, messages
+            if method not in (BEST, ACTLOC):
+                check_method(method)
+        scenes = [BenchmarkScene.of(folder, self.mesh, self.waypoints) for folder in self.scenes]
+        config = RoundConfig(
+            self.weights,
+            self.directions,
+            self.lattice,
+            self.max_turn,
+            localize=self.localizer == "sift",
+            workers=self.workers or len(os.sched_getaffinity(0)),
+            device=usable_device(self.device),
+        )
+        rounds = [SceneRound(scene, self.out / scene.name, config) for scene in scenes]
+        results: list[Result] = []
+        while rounds:
+            one = rounds.pop(0)  # so that its mesh goes when it is done
+            scores_of = {one.folder_name(method): one.run(method) for method in methods}
+            results += [Result(one.scene.name, name, scores) for name, scores in scores_of.items() if scores]
+            for line in one.messages:
+                print(f"{one.scene.name}: {line}")
+        return results

@@ -25,9 +25,6 @@ class PoseFile:
     quaternions: Float  # (N, 4) wxyz, cam_from_world, as in the file
     translations: Float  # (N, 3) metres, cam_from_world
 
-    def __len__(self) -> int:
-        return len(self.ids)
-
     @property
     def cam_from_world(self) -> Float:
         """(N, 3, 4)."""
@@ -42,9 +39,6 @@ class ErrorFile:
     metres: Float  # (N,) distance between camera centres; NaN without a pose
     degrees: Float  # (N,) angle between orientations
 
-    def __len__(self) -> int:
-        return len(self.ids)
-
 
 def write_poses(path: Path, ids: Sequence[str], cam_from_world: ArrayLike) -> None:
     """Write poses (N, 3, 4) atomically, creating the folder if missing."""
@@ -56,15 +50,13 @@ def write_poses(path: Path, ids: Sequence[str], cam_from_world: ArrayLike) -> No
 
 def read_poses(path: Path) -> PoseFile:
     """Read a file of poses. Raises a TableError if it is missing, a line is not a pose, or ids repeat."""
-    ids, values = _read(path, 8, "a pose is id qw qx qy qz tx ty tz")
-    table = np.array(values, dtype=np.float64).reshape(-1, 7)
-    is_unit = np.abs(np.linalg.norm(table[:, :4], axis=1) - 1) <= _UNIT_TOLERANCE
-    invalid = np.flatnonzero(~(is_unit & np.isfinite(table).all(axis=1)))
+    ids, values = _read(path, "id qw qx qy qz tx ty tz")
+    is_unit = np.abs(np.linalg.norm(values[:, :4], axis=1) - 1) <= _UNIT_TOLERANCE
+    invalid = np.flatnonzero(~(is_unit & np.isfinite(values).all(axis=1)))
     if len(invalid):
-        fix = "Write finite numbers and quaternions qw qx qy qz of length 1, or omit the pose."
-        value = f"{ids[invalid[0]]}: {table[invalid[0]]}"
-        raise TableError("this is not a pose", path=path, value=value, fix=fix)
-    return PoseFile(ids, table[:, :4], table[:, 4:])
+        fix = "Write finite numbers and quaternions of length 1, or omit the pose."
+        raise TableError("this is not a pose", path=path, value=ids[invalid[0]], fix=fix)
+    return PoseFile(ids, values[:, :4], values[:, 4:])
 
 
 def write_errors(path: Path, ids: Sequence[str], metres: ArrayLike, degrees: ArrayLike) -> None:
@@ -79,31 +71,18 @@ def read_errors(path: Path) -> ErrorFile:
 
     Raises a TableError if it is missing or empty, a line is not an error, or ids repeat.
     """
-    ids, values = _read(path, 3, "an error is id, metres and degrees")
-    table = np.array(values, dtype=np.float64).reshape(-1, 2)
-    return ErrorFile(ids, table[:, 0], table[:, 1])
+    ids, values = _read(path, "id metres degrees")
+    return ErrorFile(ids, values[:, 0], values[:, 1])
 
 
-def _read(path: Path, n_cells: int, what: str) -> tuple[tuple[str, ...], list[list[float]]]:
-    if not path.is_file():
-        raise TableError("there is no such file", path=path, fix=f"In this file, {what}.")
-    ids: list[str] = []
-    values: list[list[float]] = []
-    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
-        cells = line.split()
-        if not cells or line.startswith("#"):
-            continue
-        try:
-            numbers = [float(cell) for cell in cells[1:]]
-        except ValueError:
-            numbers = []
-        if len(cells) != n_cells or len(numbers) != n_cells - 1:
-            raise TableError(what, path=path, value=f"line {number}: {line[:80]}", fix="Correct the line.")
-        ids.append(cells[0].removesuffix(IMAGE_ENDING))
-        values.append(numbers)
-    if not ids:
-        raise TableError("the file is empty", path=path, fix=f"In this file, {what}.")
-    if len({*ids}) < len(ids):
-        twice = next(name for row, name in enumerate(ids) if name in ids[:row])
-        raise TableError("an id appears twice", path=path, value=twice, fix="Keep one line per id.")
-    return tuple(ids), values
+def _read(path: Path, columns: str) -> tuple[tuple[str, ...], Float]:
+    """Read the ids (N,) and numbers (N, C) of a file whose lines have the named columns."""
+    try:
+        lines = [line.split() for line in path.read_text().splitlines() if line.strip() and line[0] != "#"]
+        ids = tuple(cells[0].removesuffix(IMAGE_ENDING) for cells in lines)
+        values = np.array([cells[1:] for cells in lines], dtype=np.float64)
+    except (OSError, ValueError) as error:
+        raise TableError(f"its lines are not {columns!r}: {error}", path=path) from error
+    if values.shape != (len(ids), len(columns.split()) - 1) or not 0 < len(ids) == len({*ids}):
+        raise TableError(f"its lines are not {columns!r}, each id once", path=path)
+    return ids, values

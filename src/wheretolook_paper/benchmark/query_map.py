@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from wheretolook.geometry.camera import PinholeCamera, cameras_by_id
 from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.config import PARTNERS, MapConfig
-from wheretolook.mapping.map_folder import DATABASE_FILE, LANDMARKS_FILE, MapDraft, MapRun, finish_map
+from wheretolook.mapping.map_folder import DATABASE_FILE, MapDraft, MapRun, finish_map
 from wheretolook.mapping.triangulation import (
     choose_pairs,
     extract_with_colors,
@@ -22,7 +21,7 @@ from wheretolook.mapping.triangulation import (
     triangulate_model,
 )
 from wheretolook.utils.errors import MapError
-from wheretolook.utils.images import read_image as read_file
+from wheretolook.utils.images import read_image
 from wheretolook.utils.processes import WorkerPool
 from wheretolook_paper.benchmark.folder import DRAWN_CAMERA, BenchmarkScene
 
@@ -33,10 +32,8 @@ _FIX = "Localize with the benchmark's own script instead: --localizer none."
 _RENDER_BATCH = 16
 
 
-def build_query_map(
-    scene: BenchmarkScene, renderer: Renderer, folder: Path, workers: int, device: str, progress: bool
-) -> Path:
-    """Triangulate SIFT landmarks and save them with descriptors in an existing folder; return their file.
+def build_query_map(scene: BenchmarkScene, renderer: Renderer, folder: Path, workers: int, device: str) -> None:
+    """Triangulate SIFT landmarks and save them with descriptors in an existing folder.
 
     The released maps have SuperPoint keypoints, whose descriptors need SuperPoint's network; here SIFT is extracted
     from the same images, and the poses are kept. Image pairs are chosen by the overlap of their surface in the mesh.
@@ -46,12 +43,9 @@ def build_query_map(
     """
     config = MapConfig()
     model = read_model(scene.model)
-    cameras = {*cameras_by_id(model.cameras, scene.model).values()}
-    if len(cameras) > 1:
-        raise MapError("the benchmark's maps have one camera", path=scene.model, value=len(cameras), fix=_FIX)
-    camera = cameras.pop()
-    if not isinstance(camera, PinholeCamera):
-        raise MapError("the map's camera is not a pinhole", path=scene.model, value=camera.model, fix=_FIX)
+    camera, *others = {*cameras_by_id(model.cameras, scene.model).values()}
+    if others or not isinstance(camera, PinholeCamera):
+        raise MapError("the benchmark's maps have one pinhole camera", path=scene.model, fix=_FIX)
     poses = colmap_poses(scene.model, model)
     names = [model.images[number].name for number in sorted(model.images) if model.images[number].has_pose]
     files = [scene.image_file(name) for name in names]
@@ -60,31 +54,28 @@ def build_query_map(
         depth.extend(shrink_depth(renderer.render(DRAWN_CAMERA, poses[start : start + _RENDER_BATCH]).depth_m))
     pairs = choose_pairs(surface_overlap(DRAWN_CAMERA, poses, np.stack(depth)), PARTNERS)
     with WorkerPool(workers) as processes:
-        images = _read(files, camera)
-        run = MapRun(config, processes, device=device, progress=progress)
+        run = MapRun(config, processes, device=device)
+        images = (_read(path, camera) for path in files)
         stored, colors = zip(*extract_with_colors(images, len(files), "map: extract", run), strict=True)
         database = folder / DATABASE_FILE
         built = triangulate_model(database, posed_model(camera, poses), stored, colors, pairs, run)
         finish_map(MapDraft(built, scene.images, config.max_reprojection_error_px, _FIX, database), folder, run)
-    return folder / LANDMARKS_FILE
 
 
-def _read(files: list[Path], camera: PinholeCamera) -> Iterator[NDArray[np.uint8]]:
-    """Yield images (H, W, 3), RGB."""
-    for path in files:
-        image = read_image(path)
-        if image is None or image.shape[:2] != (camera.height, camera.width):
-            size = None if image is None else f"{image.shape[1]}x{image.shape[0]}"
-            problem = f"not an image of {camera.width}x{camera.height} px, the size of the map's camera"
-            raise MapError(problem, path=path, value=size, fix="Copy the original file.")
-        yield image
+def _read(path: Path, camera: PinholeCamera) -> NDArray[np.uint8]:
+    """Read an image (H, W, 3), RGB, of a camera."""
+    image = read_rgb(path)
+    if image is None or image.shape[:2] != (camera.height, camera.width):
+        problem = f"not an image of {camera.width}x{camera.height} px, the size of the map's camera"
+        raise MapError(problem, path=path, fix="Copy the original file.")
+    return image
 
 
-def read_image(path: Path) -> NDArray[np.uint8] | None:
-    """Return an image (H, W, 3) uint8, RGB; None if it is missing or unreadable."""
+def read_rgb(path: Path) -> NDArray[np.uint8] | None:
+    """Read an image (H, W, 3) uint8, RGB; None if it is missing or unreadable."""
     import cv2
 
     try:
-        return np.asarray(read_file(path, cv2.IMREAD_COLOR)[:, :, ::-1], dtype=np.uint8)
+        return np.asarray(read_image(path, cv2.IMREAD_COLOR)[:, :, ::-1], dtype=np.uint8)
     except (OSError, ValueError):
         return None

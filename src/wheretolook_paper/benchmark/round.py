@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.lattices import Lattice
@@ -18,8 +17,7 @@ from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.select.waypoints import Waypoints, read_waypoints
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
-from wheretolook.utils.confine import safe_child
-from wheretolook.utils.errors import SceneError, StorageError, TableError
+from wheretolook.utils.errors import MapError, SceneError, StorageError, TableError
 from wheretolook.utils.files import atomic_folder, fingerprint, write_bytes
 from wheretolook.utils.version import VERSION
 from wheretolook_paper.benchmark.actloc_baseline import ACTLOC, ACTLOC_FIXED, MAX_ERROR_PX, actloc_views
@@ -58,7 +56,6 @@ class RoundConfig:
     localize: bool = True  # False: errors are read from files of the benchmark's own script
     workers: int = 1
     device: str = "cpu"
-    progress: bool = True
 
 
 class SceneRound:
@@ -72,8 +69,9 @@ class SceneRound:
         self.folder = folder
         self.config = config
         self.waypoints = _checked(read_waypoints(scene.waypoints))
-        if config.localize and not (folder / MAP_FOLDER / CACHE).is_file():
-            scene.check_images()
+        if config.localize and not (folder / MAP_FOLDER / CACHE).is_file() and not scene.images.is_dir():
+            fix = "Put the images of the map there, or localize with the benchmark's own script: --localizer none."
+            raise MapError("the images of the map are missing", path=scene.images, fix=fix)
         self.messages: list[str] = []
 
     def run(self, method: str) -> Scores | None:
@@ -85,7 +83,7 @@ class SceneRound:
         """
         folder = self.folder / self.folder_name(method)
         poses = self._select(method, folder)
-        omitted = len(self.waypoints) - len(poses)
+        omitted = len(self.waypoints) - len(poses.ids)
         if omitted:
             self.messages.append(f"{method}: {omitted} of {len(self.waypoints)} waypoints omitted, see the selection")
         self._render(poses, folder)
@@ -106,26 +104,32 @@ class SceneRound:
 
     def _select(self, method: str, folder: Path) -> PoseFile:
         path = folder / POSES
+        cache = ArtifactCache(folder, self._selection_key(method), "select", CACHE, STEPS)
+        if not cache.is_current(path):
+            outputs = [folder / name for name in (POSES, ERRORS, ESTIMATES, IMAGES)]
+            foreign = [output for output in outputs if output.exists()]
+            if foreign and cache.stored_key is None:
+                problem = "a file that this command did not write would be replaced"
+                raise StorageError(problem, path=foreign[0], fix="Give another folder: --out FOLDER.")
+            ids, poses = self._actloc_selection() if method == ACTLOC else self._selection(method)
+            for output in outputs[:-1]:
+                output.unlink(missing_ok=True)
+            shutil.rmtree(folder / IMAGES, ignore_errors=True)
+            cache.clear()
+            write_poses(path, ids, poses)
+            cache.store()
+        return read_poses(path)
+
+    def _selection_key(self, method: str) -> str:
+        from wheretolook.weights.resolve import resolve_weights
+
         config = self.config
         parts: list[Any] = [VERSION, self._model_key, fingerprint(self.scene.mesh), fingerprint(self.scene.waypoints)]
         if method not in (ACTLOC, ACTLOC_FIXED):
-            parts += [self._weight_fingerprints(method), config.directions, config.lattice, config.max_turn_deg]
-        cache = ArtifactCache(folder, cache_key("select", method, *parts), "select", CACHE, STEPS)
-        if cache.is_current(path):
-            return read_poses(path)
-        outputs = [folder / name for name in (POSES, ERRORS, ESTIMATES, IMAGES)]
-        foreign = [output for output in outputs if output.exists()]
-        if foreign and cache.stored_key is None:
-            problem = "a file that this command did not write would be replaced"
-            raise StorageError(problem, path=foreign[0], fix="Give another folder: --out FOLDER.")
-        ids, poses = self._actloc_selection() if method == ACTLOC else self._selection(method)
-        for output in outputs[:-1]:
-            output.unlink(missing_ok=True)
-        shutil.rmtree(folder / IMAGES, ignore_errors=True)
-        cache.clear()
-        write_poses(path, ids, poses)
-        cache.store()
-        return read_poses(path)
+            weights = resolve_weights("" if method == BEST else method, config.weights)
+            parts += [[] if weights is None else [fingerprint(weights)]]
+            parts += [config.directions, config.lattice, config.max_turn_deg]
+        return cache_key("select", method, *parts)
 
     def _actloc_selection(self) -> tuple[Sequence[str], Float]:
         from wheretolook.mapping.colmap_model import model_arrays, read_model
@@ -151,15 +155,10 @@ class SceneRound:
             device=config.device,
         )
         self._check_frame(look.localization_map.landmarks.points)
-        max_turn_deg = None if baseline else config.max_turn_deg
-        views = look.best(self.waypoints, max_turn_deg=max_turn_deg, skip=True, progress=config.progress)
+        views = look.best(
+            self.waypoints, max_turn_deg=None if baseline else config.max_turn_deg, skip=True, progress=True
+        )
         return views.waypoint_id, views.cam_from_world
-
-    def _weight_fingerprints(self, method: str) -> list[str]:
-        from wheretolook.weights.resolve import resolve_weights
-
-        path = resolve_weights("" if method == BEST else method, self.config.weights)
-        return [] if path is None else [fingerprint(path)]
 
     def _check_frame(self, points: Float) -> None:
         """Raise a SceneError if most landmarks (N, 3) m are far from the mesh."""
@@ -170,9 +169,8 @@ class SceneRound:
         max_distance_m = float(np.linalg.norm(high - low) + np.abs(some - low).max())
         offset_m = float(np.median(MeshRaycaster(self._mesh).distance_to_surface(some, max_distance_m)))
         if not offset_m <= MAX_OFFSET_M:
-            problem = "mesh and map have different frames: half of the landmarks are farther from the mesh than this"
-            fix = "Give the mesh in the frame of the map, in metres, z up: --mesh FILE."
-            raise SceneError(problem, path=self.scene.mesh, value=f"{offset_m:.3g} m", fix=fix)
+            problem = f"mesh and map have different frames: half of the landmarks are {offset_m:.3g} m from the mesh"
+            raise SceneError(problem, path=self.scene.mesh, fix="Give the mesh in the frame of the map: --mesh FILE.")
 
     # -- images and localization
 
@@ -181,7 +179,7 @@ class SceneRound:
         import cv2
 
         files = [_image_file(folder, name) for name in poses.ids]
-        missing = np.flatnonzero([not path.is_file() for path in files])
+        missing = [row for row, path in enumerate(files) if not path.is_file()]
         for rows in self._batches(missing, len(files), f"{folder.name}: render"):
             images = self._renderer.render(DRAWN_CAMERA, poses.cam_from_world[rows]).rgb
             for row, rgb in zip(rows, images, strict=True):
@@ -190,9 +188,9 @@ class SceneRound:
     def _localize(self, poses: PoseFile, folder: Path) -> None:
         """Localize the images without errors; errors written by the benchmark's own script are kept."""
         errors = folder / ERRORS
-        cache = ArtifactCache(
-            folder, cache_key("localize", self._map_key, LOCALIZER.record()), "localize", CACHE, STEPS
-        )
+        estimates = folder / ESTIMATES
+        key = cache_key("localize", self._map_key, LOCALIZER.record())
+        cache = ArtifactCache(folder, key, "localize", CACHE, STEPS)
         if errors.is_file() and cache.stored_key is None:
             self.messages.append(f"{folder.name}: errors of another localizer are kept, {errors}")
             return
@@ -201,44 +199,50 @@ class SceneRound:
         if cache.is_current(errors):
             done = read_errors(errors)
             error_of = dict(zip(done.ids, zip(done.metres, done.degrees, strict=True), strict=True))
-            if (folder / ESTIMATES).is_file():
-                estimates = read_poses(folder / ESTIMATES)
-                estimate_of = dict(zip(estimates.ids, estimates.cam_from_world, strict=True))
+            if estimates.is_file():
+                known = read_poses(estimates)
+                estimate_of = dict(zip(known.ids, known.cam_from_world, strict=True))
         else:
             errors.unlink(missing_ok=True)
-            (folder / ESTIMATES).unlink(missing_ok=True)
-        missing = np.flatnonzero([name not in error_of for name in poses.ids])
-        if len(missing):
+            estimates.unlink(missing_ok=True)
+        missing = [row for row, name in enumerate(poses.ids) if name not in error_of]
+        if missing:
             cache.store()
-        for rows in self._batches(missing, len(poses), f"{folder.name}: localize"):
-            names = [poses.ids[row] for row in rows]
-            for name, pose, true in zip(names, self._estimates(folder, names), poses.cam_from_world[rows], strict=True):
+        for rows in self._batches(missing, len(poses.ids), f"{folder.name}: localize"):
+            found = self._estimates([_image_file(folder, poses.ids[row]) for row in rows])
+            for row, pose in zip(rows, found, strict=True):
                 if pose is not None:
-                    estimate_of[name] = pose
-                metres, degrees = pose_error(np.full((3, 4), np.nan) if pose is None else pose, true)
-                error_of[name] = (float(metres), float(degrees))
-            in_order = [name for name in poses.ids if name in estimate_of]
-            if in_order:
-                write_poses(folder / ESTIMATES, in_order, np.array([estimate_of[name] for name in in_order]))
+                    estimate_of[poses.ids[row]] = pose
+                metres, degrees = pose_error(
+                    np.full((3, 4), np.nan) if pose is None else pose, poses.cam_from_world[row]
+                )
+                error_of[poses.ids[row]] = (float(metres), float(degrees))
+            if estimate_of:
+                in_order = [name for name in poses.ids if name in estimate_of]
+                write_poses(estimates, in_order, np.array([estimate_of[name] for name in in_order]))
             write_errors(errors, list(error_of), *np.array(list(error_of.values()), dtype=np.float64).T)
 
-    def _estimates(self, folder: Path, names: Sequence[str]) -> list[Float | None]:
+    def _estimates(self, files: list[Path]) -> list[Float | None]:
         """Return the estimated poses (3, 4) of images; like the benchmark, any pose counts."""
-        from wheretolook_paper.benchmark.query_map import read_image
+        from wheretolook_paper.benchmark.query_map import read_rgb
 
         images = []
-        for name in names:
-            image = read_image(_image_file(folder, name))
+        for path in files:
+            image = read_rgb(path)
             if image is None:
-                problem = "a rendered image is unreadable"
-                raise SceneError(problem, path=_image_file(folder, name), fix="Remove it and run again.")
+                raise SceneError("a rendered image is unreadable", path=path, fix="Remove it and run again.")
             images.append(image)
         keypoints = self._localizer.extractor.extract_batch(images)
         matches = self._localizer.match(keypoints)
-        return [
-            self._localizer.estimate(of_image, *matched).cam_from_world
-            for of_image, matched in zip(keypoints, matches, strict=True)
-        ]
+        estimate = self._localizer.estimate
+        return [estimate(one, *matched).cam_from_world for one, matched in zip(keypoints, matches, strict=True)]
+
+    def _batches(self, rows: list[int], total: int, title: str) -> Iterator[list[int]]:
+        """Yield batches of rows, with a progress bar of all."""
+        with tqdm(total=total, initial=total - len(rows), desc=f"{self.scene.name}, {title}", disable=not rows) as bar:
+            for start in range(0, len(rows), BATCH):
+                yield rows[start : start + BATCH]
+                bar.update(len(rows[start : start + BATCH]))
 
     # -- shared by all methods
 
@@ -250,12 +254,12 @@ class SceneRound:
         from wheretolook_paper.benchmark.query_map import build_query_map
 
         folder = self.folder / MAP_FOLDER
-        config = self.config
+        device = self.config.device
         if not ArtifactCache(folder, self._map_key, "map", CACHE).is_current(folder / LANDMARKS_FILE):
             with atomic_folder(folder) as partial:
-                build_query_map(self.scene, self._renderer, partial, config.workers, config.device, config.progress)
+                build_query_map(self.scene, self._renderer, partial, self.config.workers, device)
                 ArtifactCache(partial, self._map_key, "map", CACHE).store()
-        return Localizer(Landmarks.load(folder / LANDMARKS_FILE), CAMERA, LOCALIZER, device=config.device)
+        return Localizer(Landmarks.load(folder / LANDMARKS_FILE), CAMERA, LOCALIZER, device=device)
 
     @cached_property
     def _mesh(self) -> TexturedMesh:
@@ -282,27 +286,16 @@ class SceneRound:
 
         return cache_key("map", self._model_key, fingerprint(self.scene.mesh), versions())
 
-    def _batches(self, rows: NDArray[np.int64], total: int, title: str) -> Iterator[NDArray[np.int64]]:
-        """Yield batches of rows, with a progress bar of all."""
-        text = f"{self.scene.name}, {title}"
-        show = self.config.progress and len(rows) > 0
-        with tqdm(total=total, initial=total - len(rows), desc=text, unit="image", disable=not show) as bar:
-            for start in range(0, len(rows), BATCH):
-                yield rows[start : start + BATCH]
-                bar.update(len(rows[start : start + BATCH]))
-
 
 def _image_file(folder: Path, name: str) -> Path:
-    return safe_child(folder / IMAGES, f"{name}{IMAGE_ENDING}", "a view's id")
+    return folder / IMAGES / f"{name}{IMAGE_ENDING}"
 
 
 def _checked(waypoints: Waypoints) -> Waypoints:
     """Return waypoints whose ids are unique and can name files; raise a TableError otherwise."""
     for row, name in enumerate(waypoints.ids):
-        if not name or set(name) & set(' /\\:*?"<>|#') or name.startswith(".") or name.endswith(IMAGE_ENDING):
-            fix = "Use numbers or letters, because ids name images."
+        invalid = not name or set(name) & set(' /\\:*?"<>|#') or name.startswith(".") or name.endswith(IMAGE_ENDING)
+        if invalid or name in waypoints.ids[:row]:
+            fix = "Use numbers or letters, each once, because ids name images."
             raise TableError("an id cannot name a file", path=waypoints.path, value=waypoints.where(row), fix=fix)
-    if len({*waypoints.ids}) < len(waypoints.ids):
-        twice = next(name for row, name in enumerate(waypoints.ids) if name in waypoints.ids[:row])
-        raise TableError("an id appears twice", path=waypoints.path, value=twice, fix="Make ids unique.")
     return waypoints

@@ -27,76 +27,46 @@ from wheretolook_paper.benchmark.files import IMAGE_ENDING, ErrorFile, PoseFile
 PLAN_THRESHOLD = (0.25, 2.0)
 PLAN_TURN_DEG = 30.0
 PLAN = f"plan_{threshold_key(PLAN_THRESHOLD)}_turn{PLAN_TURN_DEG:g}deg"
-MEASURES = (*(threshold_key(threshold) for threshold in THRESHOLDS), PLAN)
-"""Names of the measures: those of evaluate_loc, and that of evaluate_plan."""
 
-
-@dataclass(frozen=True)
-class Share:
-    """A count and its total."""
-
-    hits: int
-    total: int
-
-    @property
-    def percent(self) -> float:
-        """Hits in percent of the total; NaN without a total."""
-        return 100 * self.hits / self.total if self.total else float("nan")
-
-    def __add__(self, other: Share) -> Share:
-        return Share(self.hits + other.hits, self.total + other.total)
-
-    def __str__(self) -> str:
-        return f"{self.hits}/{self.total} ({self.percent:.2f} %)"
+Successes = dict[str, NDArray[np.bool_]]
+"""Which poses (N,) count as a success, by measure: the thresholds of evaluate_loc, and `PLAN` of evaluate_plan."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Poses of a method, their errors, and both versions of the measures; arrays are in the order of the poses."""
+    """Poses of a method, their errors, and both versions of the measures."""
 
     poses: PoseFile
-    metres: Float  # (N,) joined by id; NaN without a pose or a line
-    degrees: Float  # (N,)
-    turns_deg: Float  # (N,) rotation from the previous pose
-    by_row: NDArray[np.int64] | None  # (N,) row of the errors that evaluate_plan.py takes; None where it stops
     errors: ErrorFile
-    mended: dict[str, Share]
-    as_shipped: dict[str, Share | None]  # None where the script stops
+    metres: Float  # (N,) in the order of the poses, joined by id; NaN without a pose or a line
+    degrees: Float  # (N,) likewise
+    turns_deg: Float  # (N,) rotation from the previous pose
 
     @classmethod
     def of(cls, poses: PoseFile, errors: ErrorFile) -> Scores:
-        """Join poses and errors and measure both ways. Raises a TableError for an error without a pose."""
+        """Join poses and errors. Raises a TableError for an error without a pose."""
         rows = _join(poses.ids, errors)
-        found = rows >= 0
-        metres, degrees = (np.where(found, values[rows], np.nan) for values in (errors.metres, errors.degrees))
-        turns = turns_deg(poses.quaternions)
-        by_row = np.arange(len(poses)) if len(poses) == len(errors) else None
-        shipped: dict[str, Share | None] = dict(evaluate_loc(errors.metres, errors.degrees))
-        shipped[PLAN] = None if by_row is None else evaluate_plan(errors.metres, errors.degrees, turns)
-        mended = evaluate_loc(metres, degrees) | {PLAN: evaluate_plan(metres, degrees, turns)}
-        return cls(poses, metres, degrees, turns, by_row, errors, mended, shipped)
+        metres, degrees = (np.where(rows >= 0, values[rows], np.nan) for values in (errors.metres, errors.degrees))
+        return cls(poses, errors, metres, degrees, turns_deg(poses.quaternions))
+
+    @property
+    def mended(self) -> Successes:
+        """The successes in the order of the poses, joined by id."""
+        return _successes(self.metres, self.degrees, self.turns_deg)
+
+    @property
+    def as_shipped(self) -> Successes:
+        """The successes in the order of the errors; without `PLAN` where evaluate_plan.py stops."""
+        stops = len(self.poses.ids) != len(self.errors.ids)
+        return _successes(self.errors.metres, self.errors.degrees, None if stops else self.turns_deg)
 
 
-def evaluate_loc(metres: Float, degrees: Float) -> dict[str, Share]:
-    """Return the shares of errors (N,) in metres and degrees within each threshold, by `threshold_key`."""
-    return {
-        threshold_key(limits): Share(int(within(metres, degrees, limits).sum()), len(metres)) for limits in THRESHOLDS
-    }
+def _successes(metres: Float, degrees: Float, turns: Float | None) -> Successes:
+    def within(limits: tuple[float, float]) -> NDArray[np.bool_]:
+        return np.asarray((metres <= limits[0]) & (degrees <= limits[1]))
 
-
-def evaluate_plan(metres: Float, degrees: Float, turns: Float) -> Share:
-    """Return the share of poses by errors (N,) in metres and degrees and rotations (N,) from the previous pose."""
-    return Share(int(planned(metres, degrees, turns).sum()), len(metres))
-
-
-def within(metres: Float, degrees: Float, limits: tuple[float, float]) -> NDArray[np.bool_]:
-    """Return which errors (N,) are within limits in metres and degrees; NaN is not."""
-    return np.asarray((metres <= limits[0]) & (degrees <= limits[1]))
-
-
-def planned(metres: Float, degrees: Float, turns: Float) -> NDArray[np.bool_]:
-    """Return which poses (N,) count in `evaluate_plan`."""
-    return within(metres, degrees, PLAN_THRESHOLD) & (turns <= PLAN_TURN_DEG)
+    found = {threshold_key(limits): within(limits) for limits in THRESHOLDS}
+    return found if turns is None else {**found, PLAN: within(PLAN_THRESHOLD) & (turns <= PLAN_TURN_DEG)}
 
 
 def turns_deg(quaternions: Float) -> Float:
@@ -127,9 +97,6 @@ def _join(ids: Sequence[str], errors: ErrorFile) -> NDArray[np.int64]:
     """
     rows = {name: row for row, name in enumerate(errors.ids)}
     found = np.array([rows.get(name, rows.get(name.strip(IMAGE_ENDING), -1)) for name in ids], dtype=np.int64)
-    used = found[found >= 0]
-    if len(np.unique(used)) < len(used) or len(used) < len(errors):
-        strange = next((name for row, name in enumerate(errors.ids) if row not in used), "two poses with one error")
-        fix = "Give the errors of these very poses."
-        raise TableError("the errors do not belong to the poses", value=strange, fix=fix)
+    if sorted(found[found >= 0]) != list(range(len(errors.ids))):
+        raise TableError("the errors do not belong to the poses", fix="Give the errors of these very poses.")
     return found

@@ -15,7 +15,7 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.tracking.store import check_store
 from wheretolook.utils.confine import check_folder_name, safe_child
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.files import copy_file
+from wheretolook.utils.files import copy_file, write_text
 
 if TYPE_CHECKING:
     from wheretolook.dataset.layout import Dataset
@@ -82,7 +82,7 @@ def _finish(options: Release, dataset: Dataset, log: Log, progress: Progress) ->
     """Choose the weights that ship with a release, evaluate them, and write its card."""
     from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV
     from wheretolook_paper.release import copy as releases
-    from wheretolook_paper.release.card import write_card
+    from wheretolook_paper.release.card import release_card
     from wheretolook_paper.release.training_histories import keep_histories
 
     check_store(options.tracking)
@@ -101,7 +101,8 @@ def _finish(options: Release, dataset: Dataset, log: Log, progress: Progress) ->
     keep_histories(dataset, options.tracking)
     releases.sizes(dataset.root)  # an error if too large, before the evaluation
     on_cpu.run(log, progress)
-    log(f"the card -> {write_card(dataset, release_settings(Experiment()))}")
+    write_text(dataset.root / releases.CARD, release_card(dataset, release_settings(Experiment())))
+    log(f"the card -> {dataset.root / releases.CARD}")
     log(releases.size_text(releases.sizes(dataset.root)))
     return dataset
 

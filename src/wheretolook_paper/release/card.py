@@ -21,12 +21,13 @@ from wheretolook.scorers.registry import learned
 from wheretolook.scorers.styles import method_style
 from wheretolook.training.config import DECIDING
 from wheretolook.utils.errors import TableError, WeightsError
-from wheretolook.utils.files import sha256, write_text
+from wheretolook.utils.files import sha256
 from wheretolook.utils.markdown import markdown_table
 from wheretolook.utils.reading import read_json_object
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_paper.evaluation.comparisons import comparisons_markdown
-from wheretolook_paper.release.copy import CARD, SHELF, read_about, size_text, sizes
+from wheretolook_paper.release.copy import read_about, size_text, sizes
+from wheretolook_paper.release.training_histories import records
 
 GENERALIZATION_CSV = "generalization.csv"
 GENERALIZATION_MD = "generalization.md"
@@ -36,13 +37,6 @@ weights at that time; rows of other weights are not shown), and a description of
 TEMPLATE = Path(__file__).with_name("card.md.j2")
 
 _LEARNER_METRICS = ("average_precision", "roc_auc", "bce")
-
-
-def write_card(release: Dataset, defaults: Mapping[str, Any]) -> Path:
-    """Write `<release>/README.md` from the files in the release's folder and return its path; see `release_card`."""
-    path = release.root / CARD
-    write_text(path, release_card(release, defaults))
-    return path
 
 
 def release_card(release: Dataset, defaults: Mapping[str, Any]) -> str:
@@ -59,78 +53,58 @@ def release_card(release: Dataset, defaults: Mapping[str, Any]) -> str:
     environment = Environment(
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
     )
-    template = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
+    environment.filters |= {"pairs": _pairs, "thousands": "{:,}".format}
     about = read_about(release)
-    network = _network(release)
     tables = {scene.name: scene.read_table() for scene in release.scenes}
     shares = label_summary(tables, {scene.name: scene.split for scene in release.scenes}).shares
-    total = shares.iloc[-1]
-    scenes = about["settings"]["scenes"]
     changed = _difference(about["settings"], defaults)
-    text = template.render(
-        source=about["source"],
-        version=about["code_version"],
-        config=f"configs/{release.name}.yaml",
-        root=f"data/{release.name}",
-        n_views=f"{total['n_views']:,}",
-        n_locations=f"{total['n_locations']:,}",
+    text = environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
+        about=about,
+        scenes=about["settings"]["scenes"],
+        name=release.name,
         n_scenes=len(release.scenes),
+        total=shares.iloc[-1],
+        n_views={row["split"]: row["n_views"] for row in shares[shares["scene"] == ALL].to_dict("records")},
         limits=threshold_label(threshold_key(THRESHOLDS[0])),
-        scenes=_scenes_text(scenes),
-        meshes=", ".join(mesh["name"] for mesh in scenes["meshes"]),
         label_table=_label_table(release, shares),
-        labelled_with=_label_text(release),
+        labels=_labels(release),
         changed=yaml.safe_dump(changed, sort_keys=False, default_flow_style=None, width=110),
         has_cameras=all(scene.mapping_cameras.is_file() for scene in release.scenes),
         fingerprints=_fingerprints(release, about),
-        sizes=_size_text(release),
-        **_scores(release, network, about["source"]),
-        **_training(network, shares),
-        **_learners(network),
+        sizes=_size_text(release, shares.iloc[-1]["n_views"]),
+        **_weights(release),
+        **_scores(release, about["source"]),
     )
     return re.sub(r"\n{3,}", "\n\n", text)
 
 
-def _weights(release: Dataset) -> list[Path]:
+def _weight_files(release: Dataset) -> list[Path]:
     return sorted((release.root / "weights").glob("*.safetensors"))
 
 
-def _network(release: Dataset) -> Path:
-    """Return the weights of the paper's network."""
-    networks = [name for name, method in learned().items() if method.ships == "network"]
-    found = [path for path in _weights(release) if path.stem in networks]
-    if len(found) != 1:
-        problem = "a release ships the weights of one of the paper's networks"
-        fix = f"Run `wheretolook release --config configs/{release.name}.yaml`."
-        raise WeightsError(problem, path=release.root / "weights", value=[path.name for path in found], fix=fix)
-    return found[0]
-
-
-def _scores(release: Dataset, network: Path, source: str) -> dict[str, Any]:
-    """Return names of the weights, and the tables of scores."""
-    from wheretolook.training.weights import read_training
+def _best(release: Dataset) -> Path:
     from wheretolook.weights.resolve import resolve_weights
 
+    best = resolve_weights(path=release.root / "weights")
+    assert best is not None
+    return best
+
+
+def _scores(release: Dataset, source: str) -> dict[str, Any]:
+    """Return the tables of scores: of what ships, of all that was trained, and on other datasets."""
     results = release.root / "results"
     if not (results / SCORES_CSV).is_file():
         raise TableError("there are no scores", path=results / SCORES_CSV, fix="Run `wheretolook evaluate`.")
-    best = resolve_weights(path=network.parent)
-    assert best is not None
-    shipped = f"{method_style(read_training(network)['method']).label}, half precision"
-    if best != network:
-        shipped = f"{method_style(read_training(best)['method']).label}; and of the paper's best network, {shipped}"
-    *names, last = [path.name for path in _weights(release)]
-    others = _read(results / GENERALIZATION_CSV)
-    others = others[others["weights_sha256"] == sha256(best)].drop(columns="weights_sha256") if len(others) else others
+    scores, variants, others = (_read(results / name) for name in (SCORES_CSV, VARIANTS_CSV, GENERALIZATION_CSV))
+    if len(others):
+        others = others[others["weights_sha256"] == sha256(_best(release))].drop(columns="weights_sha256")
     parts = others.groupby("dataset", sort=False) if len(others) else ()
-    about = results / GENERALIZATION_MD
+    description = results / GENERALIZATION_MD
     return {
-        "shipped": shipped,
-        "names": " and ".join(filter(None, [", ".join(names), last])),
-        "scores": _score_table(read_scores(results / SCORES_CSV), source),
-        "variants": _score_table(_read(results / VARIANTS_CSV), source),
+        "scores": _score_table(scores, source),
+        "variants": _score_table(variants, source),
         "others": [_score_table(part.drop(columns="dataset"), str(name)) for name, part in parts],
-        "others_about": about.read_text().strip("\n") if about.is_file() else "",
+        "others_about": description.read_text().strip("\n") if description.is_file() else "",
     }
 
 
@@ -150,19 +124,6 @@ def _score_table(scores: pd.DataFrame, dataset: str) -> str:
     return re.sub(r"^#", "###", joined, flags=re.MULTILINE)
 
 
-def _scenes_text(scenes: Mapping[str, Any]) -> str:
-    generated = scenes["train"] + scenes["val"] + scenes["test"]
-    parts = []
-    if generated:
-        first = scenes["seed"]
-        kinds = [*scenes.get("kinds", ["apartment"])]
-        what = "apartments" if kinds == ["apartment"] else f"scenes ({', '.join(kinds)} in turn)"
-        parts.append(f"{generated} generated {what} with seeds {first} to {first + generated - 1}")
-    if scenes["meshes"]:
-        parts.append(f"{len(scenes['meshes'])} meshes made by others")
-    return f"{' and '.join(parts).capitalize()}. A scene belongs to one split."
-
-
 def _label_table(release: Dataset, shares: pd.DataFrame) -> str:
     landmarks = {scene: len(Landmarks.load(scene.landmarks)) for scene in release.scenes}
     lines = []
@@ -174,24 +135,17 @@ def _label_table(release: Dataset, shares: pd.DataFrame) -> str:
     return markdown_table(["scene", "split", "landmarks", "locations", "viewpoints", *limits], lines)
 
 
-def _label_text(release: Dataset) -> str:
-    """Describe extractor, localizer and versions of the labels; empty if no scene records them."""
-    manifests = []
-    for scene in release.scenes:
-        if scene.label_manifest.is_file():
-            try:
-                manifests.append(read_json_object(scene.label_manifest))
-            except (OSError, ValueError) as error:
-                raise TableError(f"not a manifest of labels: {error}", path=scene.label_manifest) from error
+def _labels(release: Dataset) -> dict[str, Any]:
+    """Return extractor, localizer and versions of the labels; empty if no scene records them."""
+    files = [scene.label_manifest for scene in release.scenes if scene.label_manifest.is_file()]
+    manifests = [read_json_object(path) for path in files]
     if not manifests:
-        return ""
-    first = manifests[0]
+        return {}
     versions = {}
-    for package in first["versions"]:
+    for package in manifests[0]["versions"]:
         used = {manifest["versions"].get(package, "unknown") for manifest in manifests}
         versions[package] = " and ".join(sorted(used))
-    made = f"Keypoints: {_pairs(first['extractor'])}. Localizer: {_pairs(first['localizer'])}."
-    return f"{made} Labelled with {_pairs(versions)}."
+    return {**manifests[0], "versions": versions}
 
 
 def _difference(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
@@ -207,65 +161,44 @@ def _difference(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[
     return changed
 
 
-def _training(network: Path, shares: pd.DataFrame) -> dict[str, Any]:
-    """Describe the training of the shipped network and of the others trained the same way."""
-    from wheretolook.training.weights import read_record, read_training
-    from wheretolook_paper.release.training_histories import records
-
-    training = read_training(network)
-    record = read_record(network)
-    config = training["config"]
-    n_views = {row["split"]: row["n_views"] for row in shares[shares["scene"] == ALL].to_dict("records")}
-    validated = f"{100 * config['val_fraction']:g} % of each scene's locations held out for validation"
-    if "val" in n_views:
-        validated = f"validated on the {n_views['val']:,} of the val scenes"
-    trained = [record]
-    for other in records(network.parent / SHELF).values():
-        about = other["about"]
-        if about["method"] != training["method"] and {**about, "method": training["method"]} == training:
-            trained.append(other)
-    names = [name.removeprefix("val_") for name in record["metrics"] if name.startswith("val_")]
-    lines = []
-    for number, one in enumerate(trained):
-        epoch = f"{one['metrics']['epoch'] + 1:.0f}"
-        lines.append([_label(one), "no" if number else "yes", epoch, *_validated(one, names)])
+def _weights(release: Dataset) -> dict[str, Any]:
+    """Describe the shipped weights and the training of the paper's network and of the other learners."""
+    files = {path.stem: path for path in _weight_files(release)}
+    networks = [name for name, method in learned().items() if method.ships == "network" and name in files]
+    if len(networks) != 1:
+        fix = f"Run `wheretolook release --config configs/{release.name}.yaml`."
+        problem = "a release ships the weights of one of the paper's networks"
+        raise WeightsError(problem, path=release.root / "weights", value=networks, fix=fix)
+    known = {path.stem: record for path, record in records(release.root / "weights").items()}
+    network = known[networks[0]]
+    about = network["about"]
+    alike = [network]
+    for name, other in known.items():
+        if name != networks[0] and {**other["about"], "method": about["method"]} == about:
+            alike.append(other)
+    metrics = [name.removeprefix("val_") for name in network["metrics"] if name.startswith("val_")]
+    epochs = [[_label(one), "no" if one is not network else "yes", _epoch(one)] for one in alike]
+    folder = learned()[networks[0]].folder
+    learners = [
+        {**known[name]["about"], "label": _label(known[name]), "ships": name in files, "record": known[name]}
+        for name, method in learned().items()
+        if method.folder != folder and name in known
+    ]
+    for one in learners:
+        one["options"] = {name: value for name, value in one["config"].items() if name not in DECIDING}
+    rows = [[one["label"], "yes" if one["ships"] else "no", str(one["dataset"])] for one in learners]
     return {
-        "n_train": f"{n_views['train']:,}",
-        "validated": validated,
-        "network": network.name,
-        "epoch": f"{record['metrics']['epoch'] + 1:.0f}",
-        "epochs": config["epochs"],
-        "options": _pairs({name: value for name, value in config.items() if name != "epochs"}),
-        "network_table": _table(["network", "ships", "epoch"], names, lines),
-    }
-
-
-def _learners(network: Path) -> dict[str, str]:
-    """Describe the other learners, trained besides the paper's network; empty without any."""
-    from wheretolook.training.weights import read_record
-
-    names = [name for name, method in learned().items() if method.folder != learned()[network.stem].folder]
-    paths = [place / f"{name}.safetensors" for name in names for place in (network.parent, network.parent / SHELF)]
-    lines = []
-    options = []
-    further = []
-    for path in paths:
-        if not path.with_suffix(".json").is_file():
-            continue
-        ships = path.parent == network.parent
-        record = read_record(path)
-        about = record["about"]
-        label = _label(record)
-        lines.append([label, "yes" if ships else "no", str(about["dataset"]), *_validated(record, _LEARNER_METRICS)])
-        own = {name: value for name, value in about["config"].items() if name not in DECIDING}
-        if ships and own:
-            options.append(f"{label}: {_pairs(own)}, seed {about['config']['seed']}.")
-        if about.get("also"):
-            further.append(f"{label}: {', '.join(about['also'])}.")
-    return {
-        "learner_table": _table(["beside it", "ships", "dataset"], _LEARNER_METRICS, lines) if lines else "",
-        "learner_options": " ".join(options),
-        "further": " ".join(further),
+        "best": known[_best(release).stem]["about"]["method"],
+        "network": about["method"],
+        "label_of": lambda method: method_style(method).label,
+        "files": [path.name for path in files.values()],
+        "config": about["config"],
+        "epoch": _epoch(network),
+        "network_table": _table(["network", "ships", "epoch"], epochs, metrics, alike),
+        "learners": learners,
+        "learner_table": _table(
+            ["beside it", "ships", "dataset"], rows, _LEARNER_METRICS, [one["record"] for one in learners]
+        ),
     }
 
 
@@ -273,12 +206,18 @@ def _label(record: Mapping[str, Any]) -> str:
     return method_style(record["about"]["method"]).label
 
 
-def _validated(record: Mapping[str, Any], names: Sequence[str]) -> list[str]:
-    """Return the validation metrics of a training record."""
-    return [f"{record['metrics'].get(f'val_{name}', float('nan')):.4f}" for name in names]
+def _epoch(record: Mapping[str, Any]) -> str:
+    return f"{record['metrics']['epoch'] + 1:.0f}"
 
 
-def _table(header: list[str], metrics: Sequence[str], lines: list[list[str]]) -> str:
+def _table(
+    header: list[str], rows: list[list[str]], metrics: Sequence[str], trained: Sequence[Mapping[str, Any]]
+) -> str:
+    """Format rows followed by the validation metrics of their records of training."""
+    lines = [
+        [*row, *[f"{record['metrics'].get(f'val_{name}', float('nan')):.4f}" for name in metrics]]
+        for row, record in zip(rows, trained, strict=True)
+    ]
     return markdown_table([*header, *[name.replace("_", " ") for name in metrics]], lines)
 
 
@@ -290,13 +229,12 @@ def _fingerprints(release: Dataset, about: Mapping[str, Any]) -> str:
         ["its train and val scenes", training_fingerprint(release)],
         [f"{about['source']}, from which it was made", about["source_fingerprint"]],
     ]
-    rows += [[f"weights/{path.name}, SHA-256", sha256(path)] for path in _weights(release)]
+    rows += [[f"weights/{path.name}, SHA-256", sha256(path)] for path in _weight_files(release)]
     return markdown_table(["what", "fingerprint"], rows)
 
 
-def _size_text(release: Dataset) -> str:
+def _size_text(release: Dataset, n_views: int) -> str:
     parts = sizes(release.root)
-    n_views = sum(len(scene.read_table()) for scene in release.scenes)
     n_landmarks = sum(len(Landmarks.load(scene.landmarks)) for scene in release.scenes)
     n_locations = sum(len(StoredOcclusion.load(scene.occlusion).locations) for scene in release.scenes)
     shown = {name: size for name, size in parts.items() if size and name != "text"}

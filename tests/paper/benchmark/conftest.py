@@ -47,7 +47,7 @@ def make_scene(folder: Path) -> Path:
     (scene / "waypoints.txt").write_text("\n".join(lines) + "\n")
     made = folder / "made"
     made.mkdir()
-    build_query_map(BenchmarkScene.of(scene), renderer, made, 1, "cpu", False)
+    build_query_map(BenchmarkScene.of(scene), renderer, made, 1, "cpu")
     for path in (scene / "scene_reconstruction").glob("*.txt"):
         path.unlink()
     for path in made.glob("*.bin"):

@@ -140,9 +140,7 @@ def test_missing_files(missing: str, error: type[WhereToLookError], scene_folder
     scene = Path(shutil.copytree(scene_folder, tmp_path / scene_folder.name))
     (scene / missing).unlink()
     with pytest.raises(error):
-        SceneRound(BenchmarkScene.of(scene), tmp_path / "out", RoundConfig(directions=60, progress=False)).run(
-            "max-visibility-shipped"
-        )
+        SceneRound(BenchmarkScene.of(scene), tmp_path / "out", RoundConfig(directions=60)).run("max-visibility-shipped")
 
 
 @pytest.mark.parametrize("arguments", [(), ("--errors", "e.txt"), ("a", "--lattice", "x"), ("a", "a"), ("nowhere",)])

@@ -57,14 +57,14 @@ def some_trees(localization_map: LocalizationMap) -> BoostedTrees:
     directions = poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (300, 3)), rng.normal(size=(300, 3)))
     values = pool(LandmarkDescriber(localization_map).describe(directions), directions, CAMERA).numpy()
     labels = np.nan_to_num(values[:, 0] + values[:, 10]) + rng.normal(size=300) > 3
-    views = PooledViews(values, labels, np.zeros(300, int), np.arange(300))
+    views = PooledViews(values, labels, np.zeros(300, int), np.arange(300), np.zeros((300, 6)))
     return fit_trees(views, views, CAMERA, TreesConfig(max_trees=10, max_leaves=15, min_leaf=3))[0]
 
 
 def weights_of(method: str, path: Path, localization_map: LocalizationMap) -> Path:
     """Write untrained weights of a method, whose scores differ from view to view."""
     if method == "trees":
-        some_trees(localization_map).save(path)
+        some_trees(localization_map).save(path, {})
         return path
     torch.manual_seed(0)
     mean = (80.0, 60.0, 0.0, 0.0, 2.0, *[0.5] * 10)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 from wheretolook.commands.options import LabelOptions, Log, Progress, SceneOptions, ignore_progress
 from wheretolook.commands.preconditions import extractor_of, load_dataset, open_scene
 from wheretolook.dataset.dataset_lock import reading
-from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.dataset.layout import Dataset
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.store import check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError, SceneError
@@ -58,13 +58,14 @@ class ComparePaths(SceneOptions, LabelOptions):
 
         from wheretolook.localization.labeller import label_scenes
         from wheretolook.planning.scene_map import check_methods
-        from wheretolook_paper.paths.joint_localization import check_joint
+        from wheretolook.planning.stops import can_stop
 
         with reading(self.root, "compare-paths", FOLDER):
             dataset = load_dataset(self, "map")
             config = self.paths
             check_methods(config.methods)
-            check_joint(config)
+            if config.stops.looks > 1 and not any(map(can_stop, config.methods)):
+                raise ConfigError("stops need a method whose scores are probabilities", value=config.methods)
             check_store(self.tracking)
             scenes = _comparisons(self, dataset, log)
             tasks = [task for scene in scenes for task in scene.tasks()]
@@ -84,28 +85,21 @@ def _comparisons(options: ComparePaths, dataset: Dataset, log: Log) -> list[Scen
     from wheretolook_paper.paths.scene_comparison import SceneComparison
 
     config = options.paths
-    comparisons = []
-    weights = None
-    for files in _scene_folders(dataset, config):
-        scene = open_scene(options, files)
-        if weights is None:
-            methods = config.methods
-            weights = {name: resolve_weights(name, config.weights, dataset=dataset, log=log) for name in methods}
-        extractor = extractor_of(files, options.map.extractor)
-        job = SceneJob(files.mesh, files.landmarks, scene.camera, options.label.localizer, extractor, scene.device)
-        folder = dataset.root / "results" / FOLDER / scene.name
-        comparisons.append(SceneComparison(scene, dataset, folder, config, weights, job, log))
-    return comparisons
-
-
-def _scene_folders(dataset: Dataset, config: PathsConfig) -> list[SceneFolder]:
     scenes = [dataset.scene(name) for name in config.scenes] or list(dataset.split("test"))
     if not scenes:
         raise ConfigError("the dataset has no test scene", path=dataset.root, fix="Name scenes in paths.scenes.")
     for files in scenes:
         if not files.mesh.is_file():
             raise SceneError("rendering needs a mesh", path=files.folder, fix="Choose other scenes.")
-    return scenes
+    weights = {name: resolve_weights(name, config.weights, dataset=dataset, log=log) for name in config.methods}
+    comparisons = []
+    for files in scenes:
+        scene = open_scene(options, files)
+        extractor = extractor_of(files, options.map.extractor)
+        job = SceneJob(files.mesh, files.landmarks, scene.camera, options.label.localizer, extractor, scene.device)
+        folder = dataset.root / "results" / FOLDER / scene.name
+        comparisons.append(SceneComparison(scene, dataset, folder, config, weights, job, log))
+    return comparisons
 
 
 def _report(

@@ -34,27 +34,27 @@ class BinnedImage:
     counts: NDArray[np.int32]  # (bins, bins) landmarks in each bin
 
 
-def inputs_figure(image: BinnedImage, variants: Mapping[str, tuple[str, ...]] = PAPER_VARIANTS) -> Figure:
+def inputs_figure(image: BinnedImage) -> Figure:
     """Draw the image with its landmarks, their number in each bin, and the channels of each input variant.
 
-    Right, a row for each of `variants` (names of channels, all of which `image` must have); empty bins are grey.
+    Right, a row for each of the paper's variants; empty bins are grey.
     """
-    channels = [*dict.fromkeys(name for names in variants.values() for name in names)]
+    channels = [*dict.fromkeys(name for names in PAPER_VARIANTS.values() for name in names)]
     with context(PRINT):
-        figure = new_figure(TWO_COLUMNS_IN, 0.55 + 1.05 * max(3, len(variants)))
+        figure = new_figure(TWO_COLUMNS_IN, 0.55 + 1.05 * len(PAPER_VARIANTS))
         left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(0.42, 0.8))[0]
         picture, bins = left.subplots(2, 1)
         draw_landmarks(picture, image)
-        picture.set_title(f"image, {n_landmarks(image)} in view")
+        picture.set_title(f"image, {len(image.pixels):,} landmarks in view")
         draw_counts(bins, image)
         bins.set_title(f"{int((image.counts > 0).sum())} of {image.counts.size} bins filled")
-        grid = right.add_gridspec(len(variants), len(channels))
-        for row, (variant, names) in enumerate(variants.items()):
+        grid = right.add_gridspec(len(PAPER_VARIANTS), len(channels))
+        for row, (variant, names) in enumerate(PAPER_VARIANTS.items()):
             for column, name in enumerate(channels):
                 axes = right.add_subplot(grid[row, column])
                 if name in names:
                     draw_channel(axes, image, name)
-                    if row == min(r for r, other in enumerate(variants.values()) if name in other):
+                    if variant == next(other for other, inputs in PAPER_VARIANTS.items() if name in inputs):
                         axes.set_title(f"${name}$ ({UNITS.get(name, '')})")
                 else:
                     axes.axis("off")
@@ -73,11 +73,6 @@ def draw_landmarks(axes: Axes, image: BinnedImage) -> None:
     axes.scatter(image.pixels[:, 0], image.pixels[:, 1], s=1.5, color=ORANGE, linewidths=0, rasterized=True)
     axes.set(xlim=(0, width), ylim=(height, 0))
     frame(axes)
-
-
-def n_landmarks(image: BinnedImage) -> str:
-    """Format the number of visible landmarks."""
-    return f"{len(image.pixels):,} landmark{'s' * (len(image.pixels) != 1)}"
 
 
 def draw_counts(axes: Axes, image: BinnedImage) -> None:

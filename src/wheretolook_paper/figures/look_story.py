@@ -58,21 +58,21 @@ class Estimate:
         return GREEN if self.is_good else VERMILION
 
     @property
-    def n_inliers(self) -> int:
-        """Number of inliers."""
-        return sum(map(len, self.pixels))
-
-    @property
     def summary(self) -> str:
         """The result in a few words."""
         if self.cams_from_world is None:
             return "no pose found"
+        n_inliers = sum(map(len, self.pixels))
         if self.is_good:
-            return f"{self.n_inliers} inliers, right, {100 * self.error_m:.1f} cm off"
+            return f"{n_inliers} inliers, right, {100 * self.error_m:.1f} cm off"
         off = f"{self.error_deg:.1f}°"
         if self.error_m > MAX_ERROR_M:
             off = f"{self.error_m:.1f} m" if self.error_m >= 1 else f"{100 * self.error_m:.0f} cm"
-        return f"{self.n_inliers} inliers, wrong, {off} off"
+        return f"{n_inliers} inliers, wrong, {off} off"
+
+
+Result = tuple[str, list[int], Estimate]
+"""What was localized in a word, the rows of its views, and the estimate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +84,12 @@ class LookStory:
     images: Pixels  # (N, H, W, 3)
     single: tuple[Estimate, ...]
     joint: Estimate
+
+    @property
+    def results(self) -> list[Result]:
+        """The result of each view, then of all jointly."""
+        single = [(f"look {k + 1}", [k], estimate) for k, estimate in enumerate(self.single)]
+        return [*single, ("together", [*range(len(self.single))], self.joint)]
 
 
 def localize_views(localizer: Localizer, camera: Camera, cam_from_world: ArrayLike, images: Pixels) -> LookStory:
@@ -118,38 +124,34 @@ def _estimate(pose: JointLocalization, views: Sequence[Look], true: Float) -> Es
 def story_figure(story: LookStory, house: Dollhouse) -> Figure:
     """Draw a column for each view, and one for all of them jointly: the estimated pose from above, and the inliers."""
     with context(RC):
-        n = len(story.single)
-        figure = new_figure(4.2 * (n + 1), 4.6)
-        grid = figure.add_gridspec(2, n + 1, height_ratios=(1.5, 1.0))
-        for column in range(n + 1):
-            images = grid[1, column].subgridspec(1, 1 if column < n else n)
-            _draw_result(figure, story, house, column, grid[0, column], images)
+        columns = len(story.results)
+        figure = new_figure(4.2 * columns, 4.6)
+        grid = figure.add_gridspec(2, columns, height_ratios=(1.5, 1.0))
+        for column, result in enumerate(story.results):
+            images = grid[1, column].subgridspec(1, len(result[1]))
+            _draw_result(figure, story, house, result, grid[0, column], images)
         return figure
 
 
 def film_frames(story: LookStory, house: Dollhouse) -> Iterator[tuple[Pixels, int]]:
     """Yield frames (H, W, 3) and their durations in ms: each view with its estimate, then all views jointly."""
-    n = len(story.single)
-    for column in range(n + 1):
+    for result in story.results:
+        views = result[1]
         with context(RC):
             figure = new_figure(8.4, 4.2)
             grid = figure.add_gridspec(1, 2, width_ratios=(1.5, 1.0))
-            images = grid[1].subgridspec(1 if column < n else n, 1)
-            _draw_result(figure, story, house, column, grid[0], images)
-            yield pixels_of(figure), FRAME_MS if column < n else LAST_MS
+            _draw_result(figure, story, house, result, grid[0], grid[1].subgridspec(len(views), 1))
+            yield pixels_of(figure), FRAME_MS if len(views) == 1 else LAST_MS
 
 
-def _draw_result(figure: Figure, story: LookStory, house: Dollhouse, column: int, plan: Any, images: Any) -> None:
-    """Draw the result of one view, or of all jointly (the last column), into cells of grids."""
-    n = len(story.single)
-    estimate = (*story.single, story.joint)[column]
-    shown = [column] if column < n else [*range(n)]
+def _draw_result(figure: Figure, story: LookStory, house: Dollhouse, result: Result, plan: Any, images: Any) -> None:
+    """Draw a result into cells of grids."""
+    name, views, estimate = result
     above = figure.add_subplot(plan)
-    _draw_plan(above, story.camera, house, story.cam_from_world[shown], estimate)
-    name = f"look {column + 1}" if column < n else "together"
+    _draw_plan(above, story.camera, house, story.cam_from_world[views], estimate)
     above.set_title(f"{name}: {estimate.summary}", color=estimate.color, fontsize=10)
-    for k, number in enumerate(shown):
-        _draw_image(figure.add_subplot(images[k]), story.images[number], estimate.pixels[k], estimate.color)
+    for k, view in enumerate(views):
+        _draw_image(figure.add_subplot(images[k]), story.images[view], estimate.pixels[k], estimate.color)
 
 
 def _draw_plan(axes: Axes, camera: Camera, house: Dollhouse, poses: Float, estimate: Estimate) -> None:

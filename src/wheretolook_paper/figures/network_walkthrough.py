@@ -14,7 +14,7 @@ from matplotlib.style import context
 
 from wheretolook.figures.style import BLUE, INK, PRINT, TWO_COLUMNS_IN, VERMILION, Style, frame, new_figure
 from wheretolook.geometry.poses import Float
-from wheretolook_paper.figures.inputs import BinnedImage, draw_counts, draw_landmarks, n_landmarks
+from wheretolook_paper.figures.inputs import BinnedImage, draw_counts, draw_landmarks
 
 _COLUMNS = 12  # of a hidden layer's values
 _WIDE = 10  # letters below the score
@@ -34,7 +34,7 @@ def learning_figure(image: BinnedImage, activations: Sequence[Float], channels: 
         bins = figure.add_subplot(stages[1])
         draw_landmarks(picture, image)
         picture.set_title("a  pose and\nlandmarks in view", loc="left")
-        picture.set_xlabel(n_landmarks(image))
+        picture.set_xlabel(f"{len(image.pixels):,} landmarks")
         draw_counts(bins, image)
         bins.set_title(f"b  image binning\n{len(image.counts)} × {len(image.counts)}", loc="left")
         bins.set_xlabel(f"{int((image.counts > 0).sum())} of {image.counts.size} filled")

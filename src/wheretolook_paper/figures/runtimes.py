@@ -65,8 +65,8 @@ def runtime_figure(sizes: pd.DataFrame) -> Figure:
     Bars are on a logarithmic axis in seconds, with whiskers from the shortest to the longest run: above the counts
     alone, which the paper times; below, if there are such rows, the complete work. `sizes` has a row for each machine,
     work and number of threads, with `what`, `threads`, `median_s`, `min_s`, `max_s`, `repeats`, `device` ("cpu" or
-    Warp's CUDA device), `name` and `cores` of the machine. Rows of other work are ignored, and the NumPy twin of a
-    machine with a GPU if there is one of a CPU.
+    Warp's CUDA device), `name` and `cores` of the machine. Rows of other work, and of the NumPy twin of
+    a machine with a GPU, are ignored.
     """
     measured = _measured_bars(sizes)
     bars = {COUNTS: [*_FIXED_BARS, *measured[COUNTS]], EVERYTHING: measured[EVERYTHING]}
@@ -129,20 +129,16 @@ def _wrapped(label: str) -> str:
 def _measured_bars(sizes: pd.DataFrame) -> dict[str, list[_Bar]]:
     """Return the bars of each panel: the NumPy twin first, CPUs before GPUs, few threads before many."""
     bars: dict[str, list[_Bar]] = {COUNTS: [], EVERYTHING: []}
-    rows = [row for row in sizes.to_dict("records") if row["what"] in (TWIN, *bars)]
-    cpus = {row["name"] for row in rows if not _is_gpu(row)}
-    twins = {row["name"] for row in rows if row["what"] == TWIN} & cpus
-    kept = [row for row in rows if row["what"] != TWIN or not twins or not _is_gpu(row)]
-    for row in sorted(kept, key=lambda row: (row["what"] != TWIN, _is_gpu(row), row["name"], row["threads"])):
+    rows = [row for row in sizes.to_dict("records") if row["what"] in (bars if _is_gpu(row) else (TWIN, *bars))]
+    for row in sorted(rows, key=lambda row: (row["what"] != TWIN, _is_gpu(row), row["name"], row["threads"])):
         median = float(row["median_s"])
         repeats = int(row["repeats"])
         spread = (float(row["min_s"]), float(row["max_s"])) if repeats > 1 else None
-        if row["what"] == TWIN:
-            several = len(twins) > 1
-            label = f"NumPy, scaled up, {machine_label(row['name'])}" if several else "NumPy, 1 thread, scaled up"
-        else:
-            label = machine_label(row["name"]) + ("" if _is_gpu(row) else f", {_threads(row)}")
-        what = COUNTS if row["what"] == TWIN else str(row["what"])
+        label = machine_label(row["name"]) + ("" if _is_gpu(row) else f", {_threads(row)}")
+        what = str(row["what"])
+        if what == TWIN:
+            label = "NumPy, 1 thread, scaled up"
+            what = COUNTS
         bars[what].append(_Bar(label, median, _OURS, duration(median), spread))
     return bars
 

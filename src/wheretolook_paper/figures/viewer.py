@@ -1,4 +1,4 @@
-"""A scene, its map, cameras and a path in Open3D's interactive viewer."""
+"""A scene, its landmarks and cameras in Open3D's interactive viewer."""
 
 from __future__ import annotations
 
@@ -7,52 +7,34 @@ from typing import Any
 import numpy as np
 import open3d as o3d
 from matplotlib.colors import to_rgb
-from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.figures.dollhouse import frustum_segments
-from wheretolook.figures.style import BLUE, ORANGE, VERMILION
+from wheretolook.figures.style import BLUE, ORANGE
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.poses import Float
 from wheretolook.scenes.cutting import cut_above
 
 FRUSTUM_M = 0.25  # depth of the cameras that are drawn
 
-_POINT_PX = 3
 
+def show_scene(mesh: TexturedMesh, landmarks: Float, cameras: Float | None, cut_m: float = np.inf) -> None:
+    """Show a scene in a window until that is closed. Needs a display.
 
-def scene_geometries(
-    mesh: TexturedMesh | None = None,
-    landmarks: ArrayLike | None = None,
-    cameras: ArrayLike | None = None,
-    path: ArrayLike | None = None,
-    camera: PinholeCamera = PinholeCamera(),
-    cut_m: float | None = None,
-) -> list[dict[str, Any]]:
-    """Return the `name`, `geometry` and `material` of each part of a scene, for `open3d.visualization.draw`.
-
-    There is a geometry for each texture of the mesh (metres, z up), of which what lies above `cut_m` is left out; for
-    landmarks (N, 3) m; for `cameras`, cam_from_world (B, 3, 4), with intrinsics `camera`; and for the path (P, 3) m.
+    Draws the mesh (metres, z up) below the height `cut_m`, landmarks (N, 3) m, and `cameras`, cam_from_world (B, 3, 4).
     """
-    found: list[dict[str, Any]] = []
-    if mesh is not None:
-        found += _mesh_geometries(mesh if cut_m is None else cut_above(mesh, cut_m))
-    if landmarks is not None:
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(landmarks, dtype=np.float64)))
-        cloud.paint_uniform_color(np.array(to_rgb(ORANGE)))
-        found.append(_named("landmarks", cloud, "defaultUnlit", point_size=_POINT_PX))
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(landmarks))
+    cloud.paint_uniform_color(np.array(to_rgb(ORANGE)))
+    geometries = [*_mesh_geometries(cut_above(mesh, cut_m)), _named("landmarks", cloud, "defaultUnlit", point_size=3)]
     if cameras is not None:
-        segments = frustum_segments(camera, cameras, FRUSTUM_M).reshape(-1, 2, 3)
-        found.append(_lines("cameras", segments, BLUE, 1.5))
-    if path is not None:
-        at = np.asarray(path, dtype=np.float64)
-        found.append(_lines("path", np.stack([at[:-1], at[1:]], axis=1), VERMILION, 4.0))
-    return found
-
-
-def show_scene(*parts: Any, title: str = "wheretolook", **named_parts: Any) -> None:
-    """Show a scene in a window until that is closed. Needs a display. Arguments are those of `scene_geometries`."""
-    geometries = scene_geometries(*parts, **named_parts)
-    o3d.visualization.draw(geometries, title=title, show_skybox=False, bg_color=(1.0, 1.0, 1.0, 1.0))
+        segments = frustum_segments(PinholeCamera(), cameras, FRUSTUM_M).reshape(-1, 3)
+        lines = o3d.geometry.LineSet(
+            o3d.utility.Vector3dVector(segments.astype(np.float64)),
+            o3d.utility.Vector2iVector(np.arange(len(segments), dtype=np.int32).reshape(-1, 2)),
+        )
+        lines.paint_uniform_color(np.array(to_rgb(BLUE)))
+        geometries.append(_named("cameras", lines, "unlitLine", line_width=1.5))
+    o3d.visualization.draw(geometries, title="wheretolook", show_skybox=False, bg_color=(1.0, 1.0, 1.0, 1.0))
 
 
 def _mesh_geometries(mesh: TexturedMesh) -> list[dict[str, Any]]:
@@ -75,15 +57,6 @@ def _mesh_geometries(mesh: TexturedMesh) -> list[dict[str, Any]]:
         name = "mesh" if len(mesh.textures) == 1 else f"mesh {number + 1}"
         found.append(_named(name, part, "defaultUnlit", albedo_img=image))
     return found
-
-
-def _lines(name: str, segments: NDArray[np.floating[Any]], color: str, width_px: float) -> dict[str, Any]:
-    lines = o3d.geometry.LineSet(
-        o3d.utility.Vector3dVector(segments.reshape(-1, 3).astype(np.float64)),
-        o3d.utility.Vector2iVector(np.arange(2 * len(segments), dtype=np.int32).reshape(-1, 2)),
-    )
-    lines.paint_uniform_color(np.array(to_rgb(color)))
-    return _named(name, lines, "unlitLine", line_width=width_px)
 
 
 def _named(name: str, geometry: Any, shader: str, **properties: Any) -> dict[str, Any]:

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.geometry.pose_information import N_NUMBERS, TRACE
 from wheretolook.geometry.poses import Float
 from wheretolook_paper.fisher.field_sums import field_sums
-from wheretolook_paper.fisher.metrics import metric_of
 from wheretolook_paper.fisher.soft_visibility import QuadraticVisibility, SoftVisibility
 
 
@@ -34,15 +33,9 @@ class FisherField:
         """Sum the information of all landmarks (N, 3) m at each of locations (L, 3) m.
 
         The mask (L, N) is True where the line of sight is free; None if all are. The CPU uses all cores.
-
-        Raises:
-            ConfigError: no such device.
-            ValueError: the mask has another shape.
         """
         at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
         landmarks = np.asarray(points, dtype=np.float64).reshape(-1, 3)
-        if unoccluded is not None and unoccluded.shape != (len(at), len(landmarks)):
-            raise ValueError(f"unoccluded must be of shape {(len(at), len(landmarks))}, got {unoccluded.shape}")
         return cls(at, visibility, visibility.finish(field_sums(at, landmarks, visibility, unoccluded, device)))
 
     def information(self, row: int, axes: ArrayLike) -> Float:
@@ -59,19 +52,10 @@ class FisherField:
             numbers[here] = self.information(row, axes[here])
         return numbers
 
-    def metric(self, row: int, axes: ArrayLike, metric: str, about_origin: bool = False) -> Float:
-        """Return a metric (D,) (see `metric_of`) of the information at location `row` along unit axes (D, 3).
-
-        With `about_origin` rotations are about the world's origin, as in the released code of the field.
-        """
-        numbers = self.information(row, axes)
-        pivots = np.broadcast_to(-self.locations[row], (len(numbers), 3)) if about_origin else None
-        return metric_of(numbers, metric, pivots)
-
 
 def worst_axis_of_trace(field: FisherField, row: int, axes: ArrayLike) -> Float:
     """Return the axis (3,) of (D, 3) with the smallest trace, as a probe of the field."""
-    return np.asarray(axes, dtype=np.float64)[np.argmin(field.metric(row, axes, "trace"))]
+    return np.asarray(axes, dtype=np.float64)[np.argmin(field.information(row, axes) @ TRACE)]
 
 
 def stationary_axis_of_trace(field: FisherField, row: int) -> Float:

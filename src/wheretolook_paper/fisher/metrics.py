@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -10,34 +10,26 @@ from numpy.typing import ArrayLike
 
 from wheretolook.geometry.pose_information import N_NUMBERS, TRACE
 from wheretolook.geometry.poses import Float
-from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.parts import run_in_parts
 from wheretolook.utils.warp import start_warp
 from wheretolook_paper.fisher import metrics_kernel
 from wheretolook_paper.fisher.metrics_kernel import eigenvalues_kernel
 
-Metric = Literal["mineig", "logdet", "trace"]
-METRICS: tuple[str, ...] = get_args(Metric)
+METRICS = ("mineig", "logdet", "trace")
 
 ROWS_AT_ONCE = 4096  # matrices that a thread of a CPU takes at a time: a few milliseconds
 
 
-def metric_of(numbers: ArrayLike, metric: str, pivots: ArrayLike | None = None, device: str = "cpu") -> Float:
-    """Return a metric (B,) of information matrices (B, 15), rotated about pivots (B, 3).
+def metric_of(numbers: ArrayLike, metric: str, device: str = "cpu") -> Float:
+    """Return a metric (B,) of information matrices (B, 15) about the camera; more is better.
 
-    More is better. The metric is "trace"; "logdet", the logarithm of one plus the determinant (log(1 + d), and
-    -log(1 - d) where an approximation makes d negative), so that it is finite without landmarks and keeps the
-    determinant's order; or "mineig", the smallest absolute eigenvalue, the singular value that the released code takes.
-
-    Raises:
-        ConfigError: no such metric, or no such device.
+    The metric is "trace"; "logdet", the logarithm of one plus the determinant (log(1 + d), and -log(1 - d) where an
+    approximation makes d negative), so that it is finite without landmarks and keeps the determinant's order; or
+    "mineig", the smallest absolute eigenvalue, the singular value that the released code takes.
     """
-    if metric not in METRICS:
-        raise ConfigError("unknown metric of information", value=metric, fix=f"There are {', '.join(METRICS)}.")
-    numbers = np.asarray(numbers, dtype=np.float64)
-    if metric == "trace" and pivots is None:
-        return np.asarray(numbers @ TRACE)
-    return metric_of_eigenvalues(eigenvalues(numbers, pivots, device), metric)
+    if metric == "trace":
+        return np.asarray(np.asarray(numbers, dtype=np.float64) @ TRACE)
+    return metric_of_eigenvalues(eigenvalues(numbers, None, device), metric)
 
 
 def metric_of_eigenvalues(values: Float, metric: str) -> Float:
@@ -52,7 +44,10 @@ def metric_of_eigenvalues(values: Float, metric: str) -> Float:
 
 
 def eigenvalues(numbers: ArrayLike, pivots: ArrayLike | None = None, device: str = "cpu") -> Float:
-    """Return unordered eigenvalues (B, 6) of information matrices; errors are about 1e-16 of the norm."""
+    """Return unordered eigenvalues (B, 6) of information matrices (B, 15), with errors of about 1e-16 of the norm.
+
+    The matrices are about pivots (B, 3) as in `information_matrices`, or about the camera.
+    """
     numbers = np.ascontiguousarray(numbers, dtype=np.float64).reshape(-1, N_NUMBERS)
     arms = np.empty((0, 3)) if pivots is None else np.ascontiguousarray(pivots, dtype=np.float64).reshape(-1, 3)
     device = start_warp(device)

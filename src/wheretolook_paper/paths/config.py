@@ -7,6 +7,7 @@ from pathlib import Path
 
 from wheretolook.planning.config import FORWARD, MappedLattice, PathConfig, StopConfig
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.validation import check_positive, check_range
 
 
 @dataclass(frozen=True)
@@ -21,8 +22,8 @@ class PathsConfig(MappedLattice):
         height_m: range of the heights of starts and goals above the floor.
         methods: methods to compare: forward, the shortest path, and some that score views. See `wheretolook evaluate
             --list-methods`. Scores that are no probabilities enter by their ranks.
-        weights: file of weights, for a method that has learnt. By default, and for methods of another kind, the best of
-            each method in the dataset, or else of those that ship.
+        weights: file of weights of a learned method. By default, and for methods of another kind, the best of each
+            method in the dataset, or else of those that ship.
         max_turn_deg: along a path that is given, the camera turns by no more from one waypoint to the next.
         max_error_m: a view is good if it localizes with a smaller error of its position.
         max_error_deg: and with a smaller error of its orientation.
@@ -56,14 +57,16 @@ class PathsConfig(MappedLattice):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("pairs", "min_distance_m", "max_turn_deg", "max_error_m", "max_error_deg", "resamples"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} must be positive", value=getattr(self, name))
+            check_positive(name, getattr(self, name))
         if not 0 < self.height_m[0] <= self.height_m[1]:
             raise ConfigError("height_m needs a range above 0", value=self.height_m)
-        if self.last_views < 1:
-            raise ConfigError("last_views must be at least 1", value=self.last_views)
-        for name in ("odometry_m_per_m", "odometry_deg_per_deg"):
-            if not 0 <= getattr(self, name) < 1:
-                raise ConfigError(f"{name} must be at least 0 and below 1", value=getattr(self, name))
+        check_range("last_views", self.last_views, 1)
+        check_range("odometry_m_per_m", self.odometry_m_per_m, 0, 0.999)
+        check_range("odometry_deg_per_deg", self.odometry_deg_per_deg, 0, 0.999)
         if FORWARD not in self.methods or len(set(self.methods)) < len(self.methods):
             raise ConfigError(f'methods need "{FORWARD}" to compare with, and every name once', value=self.methods)
+
+    @property
+    def is_joint(self) -> bool:
+        """Whether views are localized jointly, which needs the pixels of their matches."""
+        return self.stops.looks > 1 or self.last_views > 1

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.viewpoint_table import pose_columns, poses
-from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
+from wheretolook.geometry.poses import Float, camera_centers, invert_poses, poses_looking_along, rotation_angle_deg
+from wheretolook.planning.stops import can_stop, stops_along, within_pitch
 from wheretolook.scorers.base import Scorer
-from wheretolook.utils.errors import ConfigError
 from wheretolook_paper.paths.config import PathsConfig
-from wheretolook_paper.paths.odometry import noisy_steps, rig_of_last
 
 KEY = ["pair", "task", "method"]
 """Columns that identify the path of a view."""
@@ -30,24 +28,8 @@ LAST_VIEWS = "last {} together"
 """Suffixes of a method's name for rows whose views of a stop, or whose last views, are localized jointly."""
 
 
-class LocalizeSets(Protocol):
-    """Localizes sets of a table's rows jointly: `label_sets` with the map and the camera of a scene bound."""
-
-    def __call__(self, table: pd.DataFrame, sets: list[Any], *, rigs: list[Float] | None = None) -> pd.DataFrame: ...
-
-
-def is_joint(config: PathsConfig) -> bool:
-    """Return whether views are localized jointly, which needs the pixels of their matches."""
-    return config.stops.looks > 1 or config.last_views > 1
-
-
-def check_joint(config: PathsConfig) -> None:
-    """Raise a ConfigError if stops are requested and no method supports them."""
-    from wheretolook.planning.stops import can_stop
-
-    if config.stops.looks > 1 and not any(map(can_stop, config.methods)):
-        fix = "Add one that does, such as set, or omit paths.stops."
-        raise ConfigError("stops need a method whose scores are probabilities", value=config.methods, fix=fix)
+LocalizeSets = Callable[..., pd.DataFrame]
+"""Localizes sets of a table's rows jointly: `label_sets` with the map and the camera of a scene bound."""
 
 
 def choose_stop_views(
@@ -58,19 +40,16 @@ def choose_stop_views(
     Returns a row per further view with `STOP_COLUMNS` and its pose. `look` starts at 2; `together` is the joint score
     of all views of the stop, `turn_deg` the rotation that the stop takes.
     """
-    from wheretolook.planning.stops import stops_along, within_pitch
-
     directions = within_pitch(config.axes(), config.planner)
     rows = []
     cam_from_world = []
     paths = list(views[views["method"].isin(list(scorers))].groupby(KEY, sort=False))
-    for (pair, task, method), path in tqdm(paths, desc=progress, unit="path"):
+    for key, path in tqdm(paths, desc=progress, unit="path"):
         along = poses(path)
         centers = camera_centers(along)
-        for stop in stops_along(scorers[method], centers, along[:, 2, :3], directions, config.stops, config.planner):
+        for stop in stops_along(scorers[key[-1]], centers, along[:, 2, :3], directions, config.stops, config.planner):
             for look, (score, axis) in enumerate(zip(stop.scores, stop.axes, strict=True), 2):
-                values = (pair, task, method, stop.place, look, float(score), stop.together, stop.turn_deg)
-                rows.append(dict(zip(STOP_COLUMNS, values, strict=True)))
+                rows.append((*key, stop.place, look, float(score), stop.together, stop.turn_deg))
                 cam_from_world.append(poses_looking_along(centers[stop.place], axis))
     chosen = pd.DataFrame(rows, columns=STOP_COLUMNS)
     return chosen.assign(**pose_columns(np.stack(cam_from_world))) if rows else chosen
@@ -83,17 +62,14 @@ def localize_stops(
 
     `labels` are those of the views, followed by those of the further views at stops, with their matches.
     """
-    from wheretolook.planning.stops import can_stop
-
     result = _without_other_rules(views)
     result = result[result["method"].map(can_stop)].copy()
-    waypoints = result[[*KEY, "waypoint"]].itertuples(index=False, name=None)
-    row_of: dict[Any, int] = dict(zip(waypoints, result.index, strict=True))
-    further: dict[Any, NDArray[np.int64]] = stop_views.groupby([*KEY, "waypoint"], sort=False).indices  # type: ignore[assignment]
-    rows = [row_of[waypoint] for waypoint in further]
-    sets = [[row, *(len(views) + more)] for row, more in zip(rows, further.values(), strict=True)]
+    places = pd.MultiIndex.from_frame(result[[*KEY, "waypoint"]])
+    further = stop_views.groupby([*KEY, "waypoint"], sort=False)
+    rows = result.index[places.get_indexer(pd.MultiIndex.from_tuples(list(further.indices)))].tolist()
+    sets = [[row, *(len(views) + more)] for row, more in zip(rows, further.indices.values(), strict=True)]
     _replace_outcome(result, rows, localize(labels, sets))
-    result.loc[rows, "score"] = [stop_views["together"].iloc[more[0]] for more in further.values()]
+    result.loc[rows, "score"] = further["together"].first().to_numpy()
     return result.assign(method=result["method"] + f" {WITH_STOPS}")
 
 
@@ -121,13 +97,43 @@ def joint_paths(paths: pd.DataFrame, views: pd.DataFrame, stop_views: pd.DataFra
     renamed = dict(zip(plain, views["method"], strict=True))
     result = paths[paths["method"].isin(list(renamed))].set_index(KEY)
     result["promised"] = views.assign(method=plain).groupby(KEY)["score"].mean()
-    result["n_looks"] = result["n_views"]
     turns = stop_views.drop_duplicates([*KEY, "waypoint"]).groupby(KEY)["turn_deg"].sum().to_dict()
     counts = stop_views.groupby(KEY).size().to_dict()
     result["turn_deg"] += [turns.get(key, 0.0) for key in result.index]
-    result["n_looks"] += [counts.get(key, 0) for key in result.index]
+    result["n_looks"] = result["n_views"] + [counts.get(key, 0) for key in result.index]
     result = result.reset_index()
     return result.assign(method=result["method"].map(renamed))[[*paths.columns, "n_looks"]]
+
+
+def noisy_steps(cam_from_world: Float, m_per_m: float, deg_per_deg: float, rng: np.random.Generator) -> Float:
+    """Return steps (W - 1, 3, 4) between views (W, 3, 4) along a path: each camera from the next, with noise.
+
+    The standard deviation of the translation is `m_per_m` metres along each axis per metre of the step, that of the
+    rotation `deg_per_deg` degrees about each axis per degree.
+    """
+    steps = chained(cam_from_world[:-1], invert_poses(cam_from_world[1:]))
+    metres = np.linalg.norm(steps[:, :, 3], axis=1, keepdims=True)
+    radians = np.radians(rotation_angle_deg(steps[:, :, :3], np.eye(3)))[:, None]
+    shift = m_per_m * metres * rng.normal(size=(len(steps), 3))
+    rotation = Rotation.from_rotvec(deg_per_deg * radians * rng.normal(size=(len(steps), 3))).as_matrix()
+    return np.concatenate([rotation @ steps[:, :, :3], (steps[:, :, 3] + shift)[..., None]], axis=2)
+
+
+def rig_of_last(steps: Float, view: int, n: int) -> Float:
+    """Return cam_from_rig (N, 3, 4) of a view and up to n - 1 views before it, newest first, given `noisy_steps`.
+
+    The rig's frame is the camera of the view.
+    """
+    cam_from_rig: list[Float] = [np.eye(3, 4)]
+    for step in steps[max(0, view - n + 1) : view][::-1]:
+        cam_from_rig.append(chained(step, cam_from_rig[-1]))
+    return np.stack(cam_from_rig)
+
+
+def chained(a: Float, b: Float) -> Float:
+    """Compose rigid transforms (..., 3, 4): first b, then a."""
+    rotation = a[..., :3] @ b[..., :3]
+    return np.concatenate([rotation, a[..., :3] @ b[..., 3:] + a[..., 3:]], axis=-1)
 
 
 def _without_other_rules(views: pd.DataFrame) -> pd.DataFrame:

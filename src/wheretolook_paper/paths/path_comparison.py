@@ -68,41 +68,36 @@ def draw_pairs(space: Space, config: PathsConfig) -> Float:
     """
     rng = np.random.default_rng(config.seed)
     low, high = space.bounds
-    reachability = Reachability(space, GRID_M)
+    reachability = Reachability(space)
     found: list[Float] = []
     for _ in range(MAX_DRAWS * config.pairs):
         if len(found) == config.pairs:
             break
-        ends = _free_points(space, rng.uniform(low, high, (400, 3)), config, rng)[:2]
-        if len(ends) < 2 or np.linalg.norm(ends[1] - ends[0]) < config.min_distance_m:
-            continue
-        if reachability.connects(ends[0], ends[1]):
+        points = rng.uniform(low, high, (400, 3))
+        points = points[space.is_free(points)]
+        if isinstance(space, FreeSpace) and len(points):
+            points[:, 2] = space.floor_below(points) + rng.uniform(*config.height_m, len(points))
+            points = points[space.is_free(points)]
+        ends = points[:2]
+        apart = len(ends) == 2 and np.linalg.norm(ends[1] - ends[0]) >= config.min_distance_m
+        if apart and reachability.connects(ends[0], ends[1]):
             found.append(ends)
     if len(found) < config.pairs:
-        apart = f"{config.min_distance_m:g} m apart with a way between them"
-        fix = "Lower paths.min_distance_m or paths.pairs."
-        raise SceneError(f"found only {len(found)} starts and goals {apart}", value=config.pairs, fix=fix)
+        problem = f"found only {len(found)} starts and goals {config.min_distance_m:g} m apart with a way between them"
+        raise SceneError(problem, value=config.pairs, fix="Lower paths.min_distance_m or paths.pairs.")
     return np.array(found)
-
-
-def _free_points(space: Space, points: Float, config: PathsConfig, rng: np.random.Generator) -> Float:
-    points = points[space.is_free(points)]
-    if isinstance(space, FreeSpace) and len(points):
-        points[:, 2] = space.floor_below(points) + rng.uniform(*config.height_m, len(points))
-        points = points[space.is_free(points)]
-    return points
 
 
 class Reachability:
     """Reachability in free space: connected components of a grid whose edges are free straight segments.
 
-    The step `step_m` is enlarged if there would be more than `MAX_NODES` nodes.
+    The step `GRID_M` is enlarged if there would be more than `MAX_NODES` nodes.
     """
 
-    def __init__(self, space: Space, step_m: float) -> None:
+    def __init__(self, space: Space) -> None:
         self.space = space
         low, high = np.asarray(space.bounds, dtype=np.float64)
-        step_m = max(step_m, float(np.prod(high - low) / MAX_NODES) ** (1 / 3))
+        step_m = max(GRID_M, float(np.prod(high - low) / MAX_NODES) ** (1 / 3))
         axes = [np.arange(a + step_m / 2, max(b, a + step_m), step_m) for a, b in zip(low, high, strict=True)]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         number = np.full(points.shape[:3], -1)
@@ -110,29 +105,25 @@ class Reachability:
         free = np.concatenate([space.is_free(block) for block in blocks]).reshape(number.shape)
         number[free] = np.arange(free.sum())
         self._nodes: Float = points[free]
-        pairs = []
-        for axis in range(3):
-            here, there = (np.moveaxis(number, axis, 0)[part].ravel() for part in (slice(None, -1), slice(1, None)))
-            both = (here >= 0) & (there >= 0)
-            pairs.append(np.stack([here[both], there[both]], axis=1))
-        edges = np.concatenate(pairs)
+        lines = [np.moveaxis(number, axis, 0) for axis in range(3)]
+        edges = np.concatenate([np.stack([line[:-1].ravel(), line[1:].ravel()], axis=1) for line in lines])
+        edges = edges[(edges >= 0).all(1)]
         edges = edges[space.segments_are_free(self._nodes[edges[:, 0]], self._nodes[edges[:, 1]])]
         n = len(self._nodes)
         graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
         self._part = connected_components(graph, directed=False)[1] if n else np.empty(0, dtype=np.int32)
-        self._tree = cKDTree(self._nodes) if n else None
+        self._tree = cKDTree(self._nodes)
 
     def connects(self, a: ArrayLike, b: ArrayLike) -> bool:
         """Return whether points (3,) m are connected."""
         return bool(self._parts_near(a) & self._parts_near(b))
 
     def _parts_near(self, point: ArrayLike) -> set[int]:
-        at = np.asarray(point, dtype=np.float64)
-        if self._tree is None:
+        if not len(self._nodes):
             return set()
-        near = np.atleast_1d(self._tree.query(at, k=min(N_NEAREST, len(self._nodes)))[1])
-        straight = self.space.segments_are_free(np.tile(at, (len(near), 1)), self._nodes[near])
-        return {int(part) for part in self._part[near[straight]]}
+        near = np.atleast_1d(self._tree.query(point, k=min(N_NEAREST, len(self._nodes)))[1])
+        straight = self.space.segments_are_free(np.tile(point, (len(near), 1)), self._nodes[near])
+        return set(self._part[near[straight]].tolist())
 
 
 def plan_pairs(
@@ -143,51 +134,50 @@ def plan_pairs(
     `pairs` are starts and goals (P, 2, 3) m, `maps` the viewpoint map of each method except "forward", with scores in
     [0, 1]. Raises PlanningError if no path was found at all.
     """
-    paths: list[dict[str, Any]] = []
-    tables: list[pd.DataFrame] = []
-
-    def add(pair: int, task: str, method: str, path: PlannedPath | None) -> None:
-        key = {"pair": pair, "task": task, "method": method}
-        names = ("length_m", "turn_deg", "n_views", "promised")
-        numbers: tuple[float, ...] = (np.nan, np.nan, 0, np.nan)
-        if path is not None:
-            numbers = (path.length_m, path.turn_deg, len(path.positions), float(path.scores.mean()))
-            of_view = {"waypoint": np.arange(len(path.positions)), "score": path.scores}
-            poses = pose_columns(poses_looking_along(path.positions, path.axes))
-            tables.append(pd.DataFrame({**key, **of_view, **poses}))
-        found = {**dict(zip(names, numbers, strict=True)), "found_by": path.found_by if path else ""}
-        paths.append({**key, "planned": path is not None, **found})
-
-    def planned(ends: Float, viewpoint_map: ViewpointMap | None) -> PlannedPath | None:
-        try:
-            return plan_path(ends[0], ends[1], space, space.bounds, viewpoint_map, config.planner, progress=False)
-        except PlanningError:
-            return None
-
     limits = {name: TurnLimit.of(views.directions, config.max_turn_deg) for name, views in maps.items()}
-    with tqdm(total=len(pairs) * (1 + len(maps)), desc=progress, unit="path", disable=progress is None) as bar:
-        for number, ends in enumerate(pairs):
-            shortest = planned(ends, None)
-            add(number, PLANNED, FORWARD, shortest)
-            bar.update()
-            for name, views in maps.items():
-                add(number, PLANNED, name, planned(ends, views))
-                bar.update()
-            along = None if shortest is None else resample_path(shortest.positions, config.planner.spacing_m)
-            add(number, GIVEN, FORWARD, _forward_views(shortest, along))
-            for name, views in maps.items():
-                for rule, choose in RULES.items():
-                    path = None if along is None else _chosen_views(along, views, limits[name], config, choose)
-                    add(number, GIVEN, f"{name} {rule}".strip(), path)
-    if not tables:
+    found: list[tuple[dict[str, Any], PlannedPath | None]] = []
+    for number, ends in enumerate(tqdm(pairs, progress, unit="pair", disable=progress is None)):
+        planned = {name: _planned(ends, space, views, config) for name, views in {FORWARD: None, **maps}.items()}
+        found += [({"pair": number, "task": PLANNED, "method": name}, path) for name, path in planned.items()]
+        given: dict[str, PlannedPath | None] = {FORWARD: None}
+        if (shortest := planned[FORWARD]) is not None:
+            along = resample_path(shortest.positions, config.planner.spacing_m)
+            given[FORWARD] = _forward_views(shortest, along)
+        for name, views in maps.items():
+            for rule, choose in RULES.items():
+                chosen = None if shortest is None else _chosen_views(along, views, limits[name], config, choose)
+                given[f"{name} {rule}".strip()] = chosen
+        found += [({"pair": number, "task": GIVEN, "method": name}, path) for name, path in given.items()]
+    if all(path is None for _, path in found):
         raise PlanningError("no path was found at all", value=f"{len(pairs)} pairs", fix="Raise paths.planner.time_s.")
-    return ComparedPaths(pd.DataFrame(paths), pd.concat(tables, ignore_index=True))
+    tables = [
+        pd.DataFrame({**key, "waypoint": np.arange(len(path.positions)), "score": path.scores}).assign(
+            **pose_columns(poses_looking_along(path.positions, path.axes))
+        )
+        for key, path in found
+        if path is not None
+    ]
+    return ComparedPaths(pd.DataFrame([_row(*one) for one in found]), pd.concat(tables, ignore_index=True))
 
 
-def _forward_views(shortest: PlannedPath | None, given: Float | None) -> PlannedPath | None:
-    """Return the given waypoints with the axes of the nearest views of the shortest path."""
-    if shortest is None or given is None:
+def _row(key: dict[str, Any], path: PlannedPath | None) -> dict[str, Any]:
+    if path is None:
+        missing = {"length_m": np.nan, "turn_deg": np.nan, "n_views": 0, "promised": np.nan, "found_by": ""}
+        return {**key, "planned": False, **missing}
+    numbers = {"length_m": path.length_m, "turn_deg": path.turn_deg, "n_views": len(path.positions)}
+    promised = float(path.scores.mean())
+    return {**key, "planned": True, **numbers, "promised": promised, "found_by": path.found_by or ""}
+
+
+def _planned(ends: Float, space: Space, viewpoint_map: ViewpointMap | None, config: PathsConfig) -> PlannedPath | None:
+    try:
+        return plan_path(ends[0], ends[1], space, space.bounds, viewpoint_map, config.planner, progress=False)
+    except PlanningError:
         return None
+
+
+def _forward_views(shortest: PlannedPath, given: Float) -> PlannedPath:
+    """Return the given waypoints with the axes of the nearest views of the shortest path."""
     nearest = np.linalg.norm(given[:, None] - shortest.positions[None], axis=2).argmin(1)
     return PlannedPath(given, shortest.axes[nearest], np.full(len(given), np.nan), shortest.cost)
 

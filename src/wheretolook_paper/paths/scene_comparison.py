@@ -27,8 +27,8 @@ from wheretolook_paper.paths.config import PathsConfig
 from wheretolook_paper.paths.joint_localization import (
     OUTCOME,
     STOP_COLUMNS,
+    LocalizeSets,
     choose_stop_views,
-    is_joint,
     joint_paths,
     localize_last_views,
     localize_stops,
@@ -99,7 +99,7 @@ class SceneComparison:
     def tasks(self) -> list[LabelTask]:
         """The labelling tasks of the scene: the views of paths, and the further views at stops."""
         manifest = self._manifest("shards")
-        job = replace(self.job, store_pixels=is_joint(self.config) or bool(manifest.get("store_pixels")))
+        job = replace(self.job, store_pixels=self.config.is_joint or bool(manifest.get("store_pixels")))
         tables = {"shards": self.planned.views, "stop-shards": self.stop_views}
         return [
             LabelTask(self.scene.name, job, _as_viewpoints(table), self.folder / name)
@@ -113,27 +113,21 @@ class SceneComparison:
         of_views = labels[self.folder / "shards"]
         views = pd.concat([self.planned.views, of_views[OUTCOME]], axis=1)
         paths = self.planned.paths
-        if not is_joint(self.config):
+        config = self.config
+        if not config.is_joint:
             return ComparedPaths(paths, views)
         all_paths = [paths.assign(n_looks=paths["n_views"])]
         all_views = [views]
-        stops = self.config.stops
-        if stops.looks > 1:
+        if config.stops.looks > 1:
             of_stops = labels.get(self.folder / "stop-shards", pd.DataFrame())
             both = pd.concat([of_views, of_stops], ignore_index=True)
-            localize = self._localizer("stops")
-            joint = self._joint(
-                "stops", [used, asdict(stops)], lambda: localize_stops(views, self.stop_views, both, localize)
-            )
-            all_views.append(joint)
-            all_paths.append(joint_paths(paths, joint, self.stop_views))
-        if self.config.last_views > 1:
-            options = ("last_views", "odometry_m_per_m", "odometry_deg_per_deg", "seed")
-            key = [used, [getattr(self.config, name) for name in options]]
-            localize = self._localizer("last")
-            joint = self._joint("last", key, lambda: localize_last_views(views, of_views, self.config, localize))
-            all_views.append(joint)
-            all_paths.append(joint_paths(paths, joint, self.stop_views.iloc[:0]))
+            key = [used, asdict(config.stops)]
+            all_views.append(self._joint("stops", key, lambda fit: localize_stops(views, self.stop_views, both, fit)))
+            all_paths.append(joint_paths(paths, all_views[-1], self.stop_views))
+        if config.last_views > 1:
+            key = [used, [config.last_views, config.odometry_m_per_m, config.odometry_deg_per_deg, config.seed]]
+            all_views.append(self._joint("last", key, lambda fit: localize_last_views(views, of_views, config, fit)))
+            all_paths.append(joint_paths(paths, all_views[-1], self.stop_views.iloc[:0]))
         return ComparedPaths(pd.concat(all_paths, ignore_index=True), pd.concat(all_views, ignore_index=True))
 
     @cached_property
@@ -153,15 +147,15 @@ class SceneComparison:
         names = filter(chosen, self.config.methods)
         return {name: planner_scorer(self.scene, self.dataset, name, self.weights[name]) for name in names}
 
-    def _localizer(self, what: str) -> Any:
-        points = self.scene.landmarks.points
-        given: dict[str, Any] = {"points": points, "cameras": self.scene.camera, "config": self.job.localizer}
-        return partial(label_sets, **given, progress=f"{what} {self.scene.name}")
-
-    def _joint(self, name: str, key: list[Any], localize: Callable[[], pd.DataFrame]) -> pd.DataFrame:
+    def _joint(self, name: str, key: list[Any], localize_views: Callable[[LocalizeSets], pd.DataFrame]) -> pd.DataFrame:
         cache = self._cache(f"{name}-together", cache_key(f"{name} together 1", key))
         file = f"{name}-together.parquet"
-        return (cache.load(file) or cache.store({file: localize()}))[file]
+        if (known := cache.load(file)) is not None:
+            return known[file]
+        points = self.scene.landmarks.points
+        given: dict[str, Any] = {"points": points, "cameras": self.scene.camera, "config": self.job.localizer}
+        localize = partial(label_sets, **given, progress=f"{name} {self.scene.name}")
+        return cache.store({file: localize_views(localize)})[file]
 
     def _manifest(self, shards: str) -> dict[str, Any]:
         try:

@@ -21,7 +21,7 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.method import Method
 from wheretolook.scorers.registry import learned, scorers
 from wheretolook.utils.confine import safe_child
-from wheretolook.utils.errors import ConfigError, StorageError, TableError, WeightsError
+from wheretolook.utils.errors import ConfigError, StorageError, WeightsError
 from wheretolook.utils.files import sha256, write_json
 from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.version import VERSION
@@ -71,7 +71,9 @@ def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> D
             save_mapping_poses(mapping_poses, copy.mapping_cameras)
         copy.label_manifest.unlink(missing_ok=True)
         if scene.label_manifest.is_file():
-            write_json(copy.label_manifest, _manifest(scene.label_manifest))
+            manifest = read_json_object(scene.label_manifest)
+            left_out = ("shards", "store_matches", "store_pixels")
+            write_json(copy.label_manifest, {k: value for k, value in manifest.items() if k not in left_out})
     source = {"source": dataset.name, "source_fingerprint": dataset.fingerprint()}
     write_json(root / RELEASE_FILE, {**source, "code_version": VERSION, "settings": dict(settings)})
     release = Dataset(root, tuple(copy for _, copy in copied))
@@ -121,8 +123,6 @@ def choose_weights_to_ship(release: Dataset) -> Choice:
         if record["about"] != training or not was_trained_on(release, training):
             raise WeightsError("these weights were not trained on this release", path=path, fix=fix)
         precision[path] = float(record["metrics"]["val_average_precision"])
-    if not precision:
-        raise WeightsError("there are no weights to ship", path=folder, fix=fix)
     networks = [path for path, method in methods.items() if method.ships == "network"]
     if not networks:
         raise WeightsError("there are no weights to ship of the paper's network", path=folder, fix=fix)
@@ -178,9 +178,8 @@ def sizes(root: Path, weights: bool = True) -> dict[str, int]:
         if path.is_file() and not shelved and not drawn:
             parts["weights" if path.suffix == ".safetensors" else kinds.get(path.name, "text")] += path.stat().st_size
     if sum(parts.values()) >= MAX_BYTES:
-        problem = f"the release is not smaller than {MAX_BYTES / 1e6:.0f} MB"
-        fix = "Label fewer viewpoints or scenes, or map with fewer landmarks."
-        raise StorageError(problem, path=root, value=size_text(parts), fix=fix)
+        problem = f"the release is not smaller than {MAX_BYTES / 1e6:.0f} MB: {size_text(parts)}"
+        raise StorageError(problem, path=root, fix="Label fewer viewpoints or scenes, or map with fewer landmarks.")
     return parts
 
 
@@ -198,9 +197,8 @@ def read_about(release: Dataset) -> dict[str, Any]:
     try:
         about = read_json_object(path)
         return {name: about[name] for name in ("source", "source_fingerprint", "code_version", "settings")}
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        fix = "Run `wheretolook release` on its source."
-        raise ConfigError(f"not the description of a release: {error}", path=path, fix=fix) from error
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigError(f"this is no release made by `wheretolook release`: {error}", path=path) from error
 
 
 def _release_of(root: Path, source: str) -> Dataset | None:
@@ -211,19 +209,6 @@ def _release_of(root: Path, source: str) -> Dataset | None:
     fix = "Move it elsewhere first."
     if not is_release(release):
         raise ConfigError("this dataset is no release and would be overwritten", path=root, fix=fix)
-    found = read_about(release)["source"]
-    if found != source:
-        raise ConfigError(f"this is the release of another dataset than {source}", path=root, value=found, fix=fix)
+    if read_about(release)["source"] != source:
+        raise ConfigError(f"this is the release of another dataset than {source}", path=root, fix=fix)
     return release
-
-
-def _manifest(path: Path) -> dict[str, Any]:
-    """Return a manifest of labels without its shards and matches."""
-    try:
-        content = read_json_object(path)
-        return {
-            name: value for name, value in content.items() if name not in ("shards", "store_matches", "store_pixels")
-        }
-    except (ValueError, AttributeError) as error:
-        fix = "Remove it, or label the scene again."
-        raise TableError(f"not what the label stage wrote: {error}", path=path, fix=fix) from error

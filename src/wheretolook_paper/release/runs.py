@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from wheretolook.dataset.layout import Dataset
@@ -43,8 +45,7 @@ from wheretolook_paper.evaluation.looks import LOOKS_CSV, log_looks
 from wheretolook_paper.paths.path_report import PATHS_CSV, log_paths
 from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
 from wheretolook_paper.release.card import GENERALIZATION_CSV
-from wheretolook_paper.release.training_histories import TRAINING_CSV, read_histories, records
-from wheretolook_paper.release.training_histories import train_runs as runs_of_training
+from wheretolook_paper.release.training_histories import TRAINING_CSV, read_histories, records, train_runs
 
 LEARNERS_CSV = "learners.csv"
 """In a release's `results/`: metrics of all learners by seed on validation, test and other scenes."""
@@ -58,15 +59,14 @@ Values = dict[str, Any]
 
 @dataclass
 class ReleaseRuns:
-    """Ids of a release's runs in a store; None for what the release does not have."""
+    """A release's runs in a store.
 
-    evaluate: dict[str, str] = field(default_factory=dict)  # by the dataset evaluated on, the release first
-    train: dict[str, str] = field(default_factory=dict)  # by the method
-    learners: str | None = None
-    paths: str | None = None
-    looks: str | None = None
-    benchmark: str | None = None
-    new: int = 0  # how many of all these were logged now
+    `ids` are by name: the stage, for an evaluation on another dataset followed by its name, for training by the method,
+    as in "evaluate", "evaluate interiors", "train set", "paths". `new` is how many were logged now.
+    """
+
+    ids: dict[str, str] = field(default_factory=dict)
+    new: int = 0
 
 
 def log_release(dataset: Dataset, tracking: TrackingConfig, say: Say = lambda text: None) -> ReleaseRuns:
@@ -99,34 +99,28 @@ def _log_missing(dataset: Dataset, tracking: TrackingConfig, say: Say) -> Releas
     runs = ReleaseRuns()
     results = dataset.root / "results"
 
-    def find_or_log(name: str, found: str | None, make: Callable[..., str], *arguments: Any) -> str:
-        if found is not None:
-            return found
-        say(f"logging {name}")
-        runs.new += 1
-        return make(*arguments, tracking)
+    def add(name: str, found: str | None, log_it: Callable[[TrackingConfig], str]) -> None:
+        if found is None:
+            say(f"logging {name}")
+            runs.new += 1
+            found = log_it(tracking)
+        runs.ids[name] = found
 
-    if (scores := results / SCORES_CSV).is_file():
-        found = _run_with_file(tracking, "evaluate", SCORES_CSV, scores.read_bytes())
-        runs.evaluate[dataset.name] = find_or_log("the evaluation", found, _log_scores, dataset)
-    if (others := results / GENERALIZATION_CSV).is_file():
-        for key, rows in read_scores(others).groupby("dataset", sort=False):
-            name = str(key)
-            table = rows.drop(columns=["dataset", "weights_sha256"]).reset_index(drop=True)
-            found = _run_with_file(tracking, "evaluate", SCORES_CSV, table.to_csv(index=False).encode())
-            what = f"the evaluation on {name}"
-            runs.evaluate[name] = find_or_log(what, found, _log_others, name, table, dataset)
+    for stage, (file, log_file) in _LOGGED.items():
+        if (results / file).is_file():
+            found = _run_with_file(tracking, stage, file, (results / file).read_bytes())
+            add(stage, found, partial(log_file, dataset))
+    others = results / GENERALIZATION_CSV
+    for name, rows in read_scores(others).groupby("dataset", sort=False) if others.is_file() else ():
+        table = rows.drop(columns=["dataset", "weights_sha256"]).reset_index(drop=True)
+        found = _run_with_file(tracking, "evaluate", SCORES_CSV, table.to_csv(index=False).encode())
+        add(f"evaluate {name}", found, partial(_log_others, dataset, str(name), table))
     histories = dict(iter(read_histories(results / TRAINING_CSV).groupby("method")))
     for path, record in records(dataset.root / "weights").items():
         method = record["about"]["method"]
         history = histories.get(method)
         found = _train_run(tracking, path, record, history is not None)
-        what = f"the training of {method}"
-        runs.train[method] = find_or_log(what, found, _log_training, dataset, path, record, history)
-    for stage, (file, log_file) in _STUDIES.items():
-        if (results / file).is_file():
-            found = _run_with_file(tracking, stage, file, (results / file).read_bytes())
-            setattr(runs, stage, find_or_log(file, found, log_file, dataset))
+        add(f"train {method}", found, partial(_log_training, dataset, path, record, history))
     return runs
 
 
@@ -138,10 +132,9 @@ def _run_with_file(tracking: TrackingConfig, stage: str, name: str, content: byt
     return None
 
 
-def _train_run(tracking: TrackingConfig, path: Path, record: dict[str, Any], with_history: bool) -> str | None:
+def _train_run(tracking: TrackingConfig, path: Path, record: Values, with_history: bool) -> str | None:
     """Return the id of the run that trained these weights, or that was logged from their record."""
-    method = record["about"]["method"]
-    for _, run in runs_of_training(tracking, method=method, file=HISTORY_CSV if with_history else ""):
+    for _, run in train_runs(tracking, method=record["about"]["method"], file=HISTORY_CSV if with_history else ""):
         logged = artifact(tracking, run.info.run_id, path.name)
         if run.info.run_id == record["run_id"] or (logged.is_file() and logged.read_bytes() == path.read_bytes()):
             return str(run.info.run_id)
@@ -152,38 +145,34 @@ def _log_scores(dataset: Dataset, tracking: TrackingConfig) -> str:
     """Log the evaluation on the release's test scenes like the evaluate stage, without tables of locations."""
     results = dataset.root / "results"
     scenes = dataset.split("test")
-    table = read_scores(results / SCORES_CSV)
     named = (dataset.root / "weights" / f"{name}.safetensors" for name in learned())
-    params = {**evaluation_params(dataset, scenes, [path for path in named if path.is_file()]), **_choices(table)}
+    params = evaluation_params(dataset, scenes, [path for path in named if path.is_file()])
     views = pd.concat([scene.read_table() for scene in scenes])
     views = views[views["status"] != UNLABELLED]
     metrics = {"n_views": float(len(views)), "positives": float(is_good(views).mean())}
     files = [path for path in results.iterdir() if path.is_file() and path.suffix != ".png"]
-    return _log_evaluation(dataset.name, table, params, metrics, files, tracking)
+    return _log_evaluation(read_scores(results / SCORES_CSV), params, metrics, files, tracking)
 
 
-def _log_others(name: str, table: pd.DataFrame, dataset: Dataset, tracking: TrackingConfig) -> str:
+def _log_others(dataset: Dataset, name: str, table: pd.DataFrame, tracking: TrackingConfig) -> str:
     """Log an evaluation on another dataset, which does not ship."""
     scenes = " ".join(scene for scene in table["scene"].unique() if scene != ALL)
-    params = {"dataset": name, "scenes": scenes, "weights": f"of {dataset.name}", **_choices(table)}
+    params = {"dataset": name, "scenes": scenes, "weights": f"of {dataset.name}"}
     with temporary_folder() as folder:
         path = folder / SCORES_CSV
         path.write_bytes(table.to_csv(index=False).encode())
-        return _log_evaluation(name, table, params, {}, [path], tracking)
-
-
-def _choices(table: pd.DataFrame) -> Values:
-    """Return the options of an evaluation that its table shows."""
-    choices = {name: tuple(table[name].unique().tolist()) for name in ("top_n", "occlusion", "candidates")}
-    return {**choices, "reference": table["reference"].iloc[0]}
+        return _log_evaluation(table, params, {}, [path], tracking)
 
 
 def _log_evaluation(
-    name: str, table: pd.DataFrame, params: Values, metrics: Values, files: list[Path], tracking: TrackingConfig
+    table: pd.DataFrame, params: Values, metrics: Values, files: list[Path], tracking: TrackingConfig
 ) -> str:
+    """Log a table of scores with the options that it shows, and a nested run for each of its methods."""
+    choices = {name: tuple(table[name].unique().tolist()) for name in ("top_n", "occlusion", "candidates")}
+    params = {**params, **choices, "reference": table["reference"].iloc[0]}
     best, first = best_of(table)
     metrics |= {**first, "n_locations": float(table.loc[table["scene"] == ALL, "n_locations"].iloc[0])}
-    tags = {**TAGS, "dataset": name, **best}
+    tags = {**TAGS, "dataset": params["dataset"], **best}
     with start_run(tracking, ALL_METHODS, "evaluate", params, tags=tags) as (mlflow, run):
         log(mlflow, run, metrics=metrics)
         for path in files:
@@ -218,28 +207,27 @@ def _log_learners(dataset: Dataset, tracking: TrackingConfig) -> str:
     """
     path = dataset.root / "results" / LEARNERS_CSV
     table = pd.read_csv(path, dtype=str, keep_default_na=False)
+    measures = ["average_precision", "roc_auc", "ece", "regret"]
+    table[measures] = table[measures].apply(pd.to_numeric)
     nested = []
-    for key, rows in table.groupby(["learner", "learnt_from", "seed"], sort=False):
-        learner, source, seed = map(str, key)
+    of_learner: dict[str, list[tuple[float, float]]] = {}
+    for (learner, source, seed), rows in table.groupby(["learner", "learnt_from", "seed"], sort=False):
         numbers: dict[str, float] = {}
-        for measure in ("average_precision", "roc_auc", "ece", "regret"):
-            values = pd.to_numeric(rows[measure])
-            means = values.groupby(rows["split"]).mean()
-            numbers |= {f"{measure}_{split}": float(mean) for split, mean in means.items()}
-            if measure in ("average_precision", "regret"):
-                numbers |= {f"{measure}/{scene}": float(x) for scene, x in zip(rows["scene"], values, strict=True)}
-        sorted_by = {REGRET: "regret_test", AUC: "roc_auc_test"}
-        numbers |= {name: numbers[measure] for name, measure in sorted_by.items() if measure in numbers}
+        for split, means in rows.groupby("split")[measures].mean().iterrows():
+            numbers |= {f"{measure}_{split}": mean for measure, mean in means.items()}
+        for measure in ("average_precision", "regret"):
+            numbers |= {f"{measure}/{scene}": x for scene, x in zip(rows["scene"], rows[measure], strict=True)}
+        if "regret_test" in numbers:
+            numbers |= {REGRET: numbers["regret_test"], AUC: numbers["roc_auc_test"]}
+            of_learner.setdefault(joined(learner, source), []).append((numbers[REGRET], numbers[AUC]))
         params = {"dataset": dataset.name, "learner": learner, "learnt_from": source, "seed": seed}
         nested.append(NestedRun(joined(learner, source, f"seed {seed}" if seed else ""), params, numbers))
-    by_learner = [{"what": joined(one.params["learner"], one.params["learnt_from"]), **one.metrics} for one in nested]
-    of_learner = pd.DataFrame(by_learner).groupby("what").mean().filter((REGRET, AUC))
     tags = dict(TAGS)
     metrics = {}
-    if REGRET in of_learner:
-        tags[BEST_TAG] = str(of_learner[REGRET].idxmin())
-        best: Any = of_learner.loc[tags[BEST_TAG]]
-        metrics = {str(name): float(value) for name, value in best.items()}
+    if of_learner:
+        means_of = {name: np.mean(numbers, axis=0) for name, numbers in of_learner.items()}
+        tags[BEST_TAG] = min(means_of, key=lambda name: means_of[name][0])
+        metrics = dict(zip((REGRET, AUC), map(float, means_of[tags[BEST_TAG]]), strict=True))
     with start_run(tracking, "all learners", "learners", {"dataset": dataset.name}, tags=tags) as (mlflow, run):
         log(mlflow, run, metrics=metrics)
         mlflow.log_artifact(run, str(path))
@@ -267,7 +255,8 @@ def _log_benchmark(dataset: Dataset, tracking: TrackingConfig) -> str:
     return log_runtimes(tracking, pd.read_csv(times), growth, TAGS, times)
 
 
-_STUDIES: dict[str, tuple[str, Callable[..., str]]] = {
+_LOGGED: dict[str, tuple[str, Callable[..., str]]] = {
+    "evaluate": (SCORES_CSV, _log_scores),
     "learners": (LEARNERS_CSV, _log_learners),
     "paths": (PATHS_CSV, _log_paths),
     "looks": (LOOKS_CSV, _log_looks),

@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.dataset.environment import EnvironmentConfig, SceneEnvironment
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.names import RELEASE_FILE
 from wheretolook.dataset.sampling import free_locations
 from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.viewpoint_table import instructive_location, is_good
@@ -25,14 +24,14 @@ from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.space.config import FreeSpaceConfig
-from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.errors import SceneError
 from wheretolook.utils.records import from_record
 from wheretolook.visibility.config import OcclusionConfig
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_paper.release.copy import read_about
 from wheretolook_rooms.generator import generate_scene
 
-EYE_M = 1.45  # default height of the shown locations, about that of the mapping cameras
+EYE_M = 1.45  # height of the shown locations above the floor, about that of the mapping cameras
 SAME_OCCLUSION = 0.999  # required share of equal lines of sight; rounding may differ
 
 _CHECKED = 16  # locations whose lines of sight are compared
@@ -88,10 +87,10 @@ class Showcase(SceneEnvironment):
         """Render the views of cameras (B, 3, 4), (B, H, W, 3)."""
         return self.renderer.render(self.camera, cam_from_world).rgb
 
-    def layer(self, height_m: float = EYE_M) -> NDArray[np.int64]:
-        """Return the ids (nx ny,) of all voxels of the layer at a height above the floor."""
+    def layer(self) -> NDArray[np.int64]:
+        """Return the ids (nx ny,) of all voxels of the layer at eye height."""
         nz = self.grid.shape[2]
-        z = (self._floor + height_m - self.grid.lower[2]) / self.grid.voxel_m[2]
+        z = (self._floor + EYE_M - self.grid.lower[2]) / self.grid.voxel_m[2]
         ids = np.arange(len(self.grid))
         return ids[ids % nz == np.clip(int(z), 0, nz - 1)]
 
@@ -117,30 +116,22 @@ class Showcase(SceneEnvironment):
         )
 
     def viewpoints(self, location_id: int) -> pd.DataFrame:
-        """Return the rows of the table at a location. Raises ConfigError without any."""
-        rows = self.table[self.table["location_id"] == location_id]
-        if len(rows) == 0:
-            fix = "Take one of the table's location_id."
-            raise ConfigError("no viewpoint was sampled at this location", value=location_id, fix=fix)
-        return rows
+        """Return the rows of the table at a location."""
+        return self.table[self.table["location_id"] == location_id]
 
-    def instructive_location(self, height_m: float = EYE_M) -> int:
-        """Return the location of a layer where the choice of view matters most; of any layer if it has no viewpoint."""
-        rows = self.table[self.table["location_id"].isin(self.layer(height_m))]
+    def instructive_location(self) -> int:
+        """Return the location at eye height where the choice of view matters most; of any height if none has a view."""
+        rows = self.table[self.table["location_id"].isin(self.layer())]
         return instructive_location(rows if len(rows) else self.table)
 
 
-def open_showcase(dataset: Dataset, name: str | None = None, device: str = "cpu") -> Showcase:
+def open_showcase(dataset: Dataset, name: str | None = None) -> Showcase:
     """Open a scene of a release of generated apartments, by default the first test scene.
 
     Raises:
-        ConfigError: it is no release, its description is damaged, or it has no such scene.
+        ConfigError: the description of the release is missing or damaged, or it has no such scene.
         SceneError: the scene was not generated from a seed, or the seed gives another scene than the labelled one.
     """
-    about = dataset.root / RELEASE_FILE
-    if not about.is_file():
-        fix = "Open one that `wheretolook release` made."
-        raise ConfigError("this dataset is no release", path=dataset.root, fix=fix)
     settings = read_about(dataset)["settings"]
     scene = dataset.scene(name) if name else (*dataset.split("test"), *dataset.scenes)[0]
     seeded = _SEEDED.fullmatch(scene.name)
@@ -150,8 +141,8 @@ def open_showcase(dataset: Dataset, name: str | None = None, device: str = "cpu"
     config = EnvironmentConfig(occlusion, from_record(FreeSpaceConfig, settings["scenes"]["free_space"]))
     kind = cast(SceneKind, seeded[1])
     apartment = from_record(ApartmentConfig, settings["scenes"]["apartment"])
-    mesh, _ = generate_scene(kind, apartment, int(seeded[2]), device=device)
-    showcase = Showcase(scene, None, config, device, mesh=mesh)
+    mesh, _ = generate_scene(kind, apartment, int(seeded[2]))
+    showcase = Showcase(scene, None, config, "cpu", mesh=mesh)
     showcase.sampling = from_record(SampleConfig, settings["sample"])
     if settings["occlusion"]["model"] == "mesh":
         _check_same(showcase)
@@ -165,7 +156,6 @@ def _check_same(scene: SceneEnvironment) -> None:
     some = stored.locations[:: max(1, len(stored.locations) // _CHECKED)]
     same = (scene.occlusion.unoccluded(some, points) == stored.unoccluded(some, points)).mean()
     if not same >= SAME_OCCLUSION:
-        problem = "generated from its seed, the scene is not the one that was labelled"
-        value = f"{same:.1%} of the lines of sight are as stored"
+        problem = f"generated from its seed, only {same:.1%} of the lines of sight are as in the labelled scene"
         fix = "Check out the version of the code that release.json names."
-        raise SceneError(problem, path=scene.files.folder, value=value, fix=fix)
+        raise SceneError(problem, path=scene.files.folder, fix=fix)

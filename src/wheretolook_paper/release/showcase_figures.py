@@ -7,6 +7,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.dataset.layout import Dataset
@@ -19,7 +20,6 @@ from wheretolook.planning.method_paths import path_views, plan_by_methods
 from wheretolook.planning.routes import PathView
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.binned_network import BinnedNetworkScorer
-from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility.frustum import pixels_of
 from wheretolook.visibility.survey import Survey, SurveyOptions, survey
 from wheretolook_paper.figures.inputs import BinnedImage
@@ -28,7 +28,7 @@ from wheretolook_paper.figures.pipeline import Pipeline
 from wheretolook_paper.figures.sampling import Sampling
 from wheretolook_paper.paths.config import PathsConfig
 from wheretolook_paper.paths.path_comparison import draw_pairs
-from wheretolook_paper.release.showcase import EYE_M, Showcase
+from wheretolook_paper.release.showcase import Showcase
 
 
 class Peaks(NamedTuple):
@@ -50,14 +50,14 @@ class Learning(NamedTuple):
     outcome: str
 
 
-def pipeline_of(showcase: Showcase, scorer: Scorer, location_id: int, height_m: float = EYE_M) -> Pipeline:
+def pipeline_of(showcase: Showcase, scorer: Scorer, location_id: int) -> Pipeline:
     """Return the steps from the scene's map to the best labelled view of a location.
 
-    At each location of the layer at a height above the floor, only the K directions with the most visible landmarks are
+    At each location at eye height, only the K directions with the most visible landmarks are
     scored (paper, Sec. 3.2), by a scorer whose scores are probabilities.
     """
     localization_map = showcase.localization_map
-    locations = showcase.grid.centers()[np.intersect1d(showcase.layer(height_m), showcase.free)]
+    locations = showcase.grid.centers()[np.intersect1d(showcase.layer(), showcase.free)]
     kept = _survey(showcase, locations).best
     looking = poses_looking_along(np.repeat(locations, kept.shape[1], axis=0), showcase.directions[kept.ravel()])
     scores = scorer.score(looking).reshape(kept.shape)
@@ -135,23 +135,17 @@ def learning_of(showcase: Showcase, scorer: BinnedNetworkScorer, location_id: in
     return Learning(image, tuple(found), spec.channels, outcome_in_words(candidates.iloc[row], brief=True))
 
 
-def mistaken_location(showcase: Showcase, scorer: Scorer, height_m: float = EYE_M) -> int:
-    """Return the location of a layer with the largest mean difference between predictions and labels.
-
-    Raises ConfigError if the layer has no viewpoint.
-    """
-    rows = showcase.table[showcase.table["location_id"].isin(showcase.layer(height_m))]
-    if len(rows) == 0:
-        raise ConfigError("no viewpoint was sampled at this height", value=height_m, fix="Take another.")
-    off = np.abs(scorer.score(poses(rows)) - is_good(rows))
-    ids, group = np.unique(rows["location_id"].to_numpy(np.int64), return_inverse=True)
-    return int(ids[np.argmax(np.bincount(group, weights=off) / np.bincount(group))])
+def mistaken_location(showcase: Showcase, scorer: Scorer) -> int:
+    """Return the location at eye height with the largest mean difference between predictions and labels."""
+    rows = showcase.table[showcase.table["location_id"].isin(showcase.layer())]
+    error = pd.Series(np.abs(scorer.score(poses(rows)) - is_good(rows)), rows["location_id"])
+    return int(error.groupby(level=0).mean().idxmax())
 
 
-def peaks_of(showcase: Showcase, scorer: Scorer, location_id: int, n: int = 3, apart_deg: float = 40.0) -> Peaks:
+def peaks_of(showcase: Showcase, scorer: Scorer, location_id: int, n: int = 3) -> Peaks:
     """Return the scores of all directions at a location, and its n labelled views with the highest and lowest scores.
 
-    The views are at least `apart_deg` apart. Scores must be probabilities.
+    Scores must be probabilities.
     """
     rows = showcase.viewpoints(location_id)
     looked = poses(rows)
@@ -159,7 +153,7 @@ def peaks_of(showcase: Showcase, scorer: Scorer, location_id: int, n: int = 3, a
     axes = looked[:, 2, :3]
 
     def views(highest: bool) -> tuple[View, ...]:
-        found = spread_extrema(axes, scores, n, apart_deg, highest)
+        found = spread_extrema(axes, scores, n, highest=highest)
         return rendered_views(showcase, rows.iloc[found], scores[found], partial(outcome_in_words, brief=True))
 
     known = (rows["status"] != UNLABELLED).to_numpy()

@@ -40,11 +40,9 @@ def train_runs(
 
 def histories(tracking: TrackingConfig, dataset: str) -> dict[str, pd.DataFrame]:
     """Return the history of the newest run of each method trained on a dataset, by method."""
-    found: dict[str, pd.DataFrame] = {}
-    for method, run in train_runs(tracking, dataset, file=HISTORY_CSV):
-        if method not in found:
-            found[method] = pd.read_csv(artifact(tracking, run.info.run_id, HISTORY_CSV))
-    return dict(sorted(found.items()))
+    oldest_first = reversed([*train_runs(tracking, dataset, file=HISTORY_CSV)])
+    newest = {method: artifact(tracking, run.info.run_id, HISTORY_CSV) for method, run in oldest_first}
+    return {method: pd.read_csv(path) for method, path in sorted(newest.items())}
 
 
 def trained(tracking: TrackingConfig, dataset: str) -> pd.DataFrame:
@@ -71,9 +69,9 @@ def records(folder: Path) -> dict[Path, dict[str, Any]]:
     found = {}
     for path in sorted(folder.rglob("*.json")):
         try:
-            record = read_json_object(path)
-            found[path] = record | {"about": dict(record["about"])}
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            found[path] = read_json_object(path)
+            found[path]["about"]["method"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
             raise WeightsError(f"not a record of training: {error}", path=path, fix="Train again.") from error
     return found
 
@@ -94,14 +92,13 @@ def keep_histories(release: Dataset, tracking: TrackingConfig) -> pd.DataFrame:
     kept = []
     for record in records(release.root / "weights").values():
         method = record["about"]["method"]
-        history = None
         same = {name: str(value) for name, value in params_of(record["about"]).items() if name != "method"}
         runs = (run for _, run in train_runs(tracking, same["dataset"], method, HISTORY_CSV))
         alike = [run for run in runs if same.items() <= run.data.params.items()]
         own = [run for run in alike if run.info.run_id == record["run_id"]]
-        for run in (own or alike)[:1]:
-            history = pd.read_csv(artifact(tracking, run.info.run_id, HISTORY_CSV))
-        if history is None:
+        if own or alike:
+            history = pd.read_csv(artifact(tracking, (own or alike)[0].info.run_id, HISTORY_CSV))
+        else:
             history = history_not_logged(record)
         rows = known[known["method"] == method] if history is None else history.assign(method=method)
         kept.append(rows[["method", *rows.columns.drop("method")]])

@@ -107,7 +107,7 @@ class ExpectedScorer(LandmarkScorer):
             return sums[:, 16] / BINS**2
         if self.kind == "inliers":
             return sums[:, 0] / max(1, len(self.localization_map.landmarks))
-        return metric_of(sums[:, 1:16], self.kind, device=self.localization_map.device)
+        return metric_of(sums[:, 1:16], self.kind, self.localization_map.device)
 
     def expected_inliers(self, cam_from_world: Float) -> Float:
         """Return (B,), the sum of the detection probabilities of the visible landmarks."""

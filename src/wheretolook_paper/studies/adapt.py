@@ -53,25 +53,17 @@ def main() -> None:
         start = time.monotonic()
         rest = views.rows(~training)
         adapted = adapt(views.rows(training))
-        seconds = time.monotonic() - start
         judged = rest.good, rest.group, rest.centers
         gain = compare_log_odds(rest.log_odds, adapted.adaptation.log_odds(rest), *judged)
         by_bins = compare_log_odds(rest.log_odds, bins[~training], *judged).after
-        row = {
-            "scene": files.name,
-            "views": int(training.sum()),
-            "regret_bins": by_bins["regret"],
-            "auc_bins": by_bins["auc"],
-        }
+        row = {"scene": files.name, "views": int(training.sum())}
+        row |= {"regret_bins": by_bins["regret"], "auc_bins": by_bins["auc"]}
         row |= {f"{name}_set": value for name, value in gain.before.items()}
         row |= {f"{name}_adapted": value for name, value in gain.after.items()}
-        less = zip(("less", "low", "high"), gain.regret_less, strict=True)
-        row |= {f"regret_{name}": value for name, value in less}
-        rows.append({**row, "length_m": adapted.length_m, "amplitude": adapted.amplitude, "seconds": seconds})
-        print(
-            {name: round(value, 3) if isinstance(value, float) else value for name, value in rows[-1].items()},
-            flush=True,
-        )
+        row |= dict(zip(("regret_less", "regret_low", "regret_high"), gain.regret_less, strict=True))
+        row |= {"length_m": adapted.length_m, "amplitude": adapted.amplitude, "seconds": time.monotonic() - start}
+        rows.append(row)
+        print(pd.Series(row).to_frame().T.round(3).to_string(header=len(rows) == 1), flush=True)
     found = pd.DataFrame(rows)
     print(found.mean(numeric_only=True).round(3).to_string())
     if options.out is not None:

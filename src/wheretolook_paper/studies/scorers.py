@@ -53,36 +53,28 @@ CHOICES: list[dict[str, Any]] = [
 """Options of the set network to try."""
 
 
-class Table:
-    """Rows in a CSV file, appended one by one.
+def has_row(path: Path, **key: Any) -> bool:
+    """Return whether a CSV file has a row with these values."""
+    if not path.is_file():
+        return False
+    table = pd.read_csv(path, keep_default_na=False, dtype=str)
+    return bool((table[list(key)] == [str(value) for value in key.values()]).all(axis=1).any())
 
-    Args:
-        path: of the file.
-    """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        path.parent.mkdir(parents=True, exist_ok=True)
-
-    def has(self, **key: Any) -> bool:
-        """Whether there is a row with these values."""
-        if not self.path.is_file():
-            return False
-        table = pd.read_csv(self.path, keep_default_na=False)
-        return bool(np.logical_and.reduce([table[name].astype(str) == str(value) for name, value in key.items()]).any())
-
-    def add(self, row: dict[str, Any]) -> None:
-        """Append a row and print it."""
-        pd.DataFrame([row]).to_csv(self.path, mode="a", index=False, header=not self.path.is_file())
-        print(" ".join(f"{name} {value}" for name, value in row.items()), flush=True)
+def add_row(path: Path, row: dict[str, Any], metrics: dict[str, float]) -> None:
+    """Append a row with validation metrics to a CSV file and print it."""
+    row |= {name: round(metrics[f"val_{name}"], 5) for name in ("average_precision", "roc_auc", "bce")}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pd.DataFrame([row]).to_csv(path, mode="a", index=False, header=not path.is_file())
+    print(row, flush=True)
 
 
 def seeds(dataset: Dataset, args: argparse.Namespace, tracking: TrackingConfig) -> None:
     """Train every learner with every seed."""
-    table = Table(args.out / "seeds.csv")
+    table = args.out / "seeds.csv"
     for seed in args.seeds:
         for method in args.methods:
-            if table.has(method=method, seed=seed):
+            if has_row(table, method=method, seed=seed):
                 continue
             own = Dataset(args.out / f"{method}-{seed}", dataset.scenes)
             start = weights_path(dataset, "matchability")
@@ -91,17 +83,12 @@ def seeds(dataset: Dataset, args: argparse.Namespace, tracking: TrackingConfig) 
                 shutil.copyfile(start, own.root / "weights" / start.name)
             config = TrainConfig(methods=(method,), seed=seed, mlp=OF_NETWORKS)
             (model,) = train(own, config, tracking, progress=args.progress)
-            table.add({"method": method, "seed": seed, **metrics_of(model.metrics)})
-
-
-def metrics_of(metrics: dict[str, float]) -> dict[str, float]:
-    """Return the metrics of a study's row."""
-    return {name: round(metrics[f"val_{name}"], 5) for name in ("average_precision", "roc_auc", "bce")}
+            add_row(table, {"method": method, "seed": seed}, model.metrics)
 
 
 def of_set_network(dataset: Dataset, args: argparse.Namespace, tracking: TrackingConfig) -> None:
     """Train the set network under other conditions, on views that are described once."""
-    table = Table(args.out / f"{args.part}.csv")
+    table = args.out / f"{args.part}.csv"
     log = RunLog(tracking, "")
     task = TrainingJob(dataset, "set", TrainConfig(methods=("set",)), SetConfig(), "set", args.progress, log)
     data = SetDataModule(task)
@@ -125,7 +112,7 @@ def of_set_network(dataset: Dataset, args: argparse.Namespace, tracking: Trackin
         conditions = [(name, {}, torch.from_numpy(chosen)) for name, chosen in some.items()]
     for seed in args.seeds:
         for name, options, rows in conditions:
-            if table.has(condition=name, seed=seed):
+            if has_row(table, condition=name, seed=seed):
                 continue
             data.train_rows = rows
             settings = replace(SetConfig(**args.set), **options)
@@ -140,7 +127,7 @@ def of_set_network(dataset: Dataset, args: argparse.Namespace, tracking: Trackin
                 result = learn_set(replace(task, config=config, options=own, run_log=RunLog(tracking, run)), data)
             file = f"{name.replace(' ', '_').replace('=', '-') or 'default'}-{seed}.safetensors"
             result.model.save(args.out / args.part / file, {"method": "set", "condition": name, "seed": seed})
-            table.add({"condition": name, "seed": seed, "views": len(rows), **metrics_of(result.metrics)})
+            add_row(table, {**about, "views": len(rows)}, result.metrics)
 
 
 def main() -> None:

@@ -87,7 +87,7 @@ def test_a_story_of_views_is_a_figure_and_a_film() -> None:
     good = Estimate(poses[:1], (np.ones((5, 2)),), 0.9, 0.01, 0.1)
     none = Estimate(None, (np.zeros((0, 2)),), 0.0, np.inf, np.inf)
     joint = Estimate(poses, (np.ones((5, 2)), np.ones((2, 2))), 0.9, 0.01, 0.1)
-    assert (good.is_good, good.n_inliers, none.is_good, joint.n_inliers) == (True, 5, False, 7)
+    assert (good.is_good, none.is_good) == (True, False) and "7 inliers" in joint.summary
     story = LookStory(CAMERA, poses, np.stack([RGB, RGB]), (good, none), joint)
     house = dollhouse(furnished_room(), width_px=100)
     assert len(story_figure(story, house).axes) == 3 + 4

@@ -5,20 +5,18 @@ from __future__ import annotations
 from itertools import product
 
 import numpy as np
-import pytest
 
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook_paper.paths.greedy import greedy_sequence, resample_path
 
 
-@pytest.mark.parametrize("keep_limit", [True, False])
-def test_greedy_rule_is_actlocs(keep_limit: bool) -> None:
+def test_greedy_rule_is_actlocs() -> None:
     """Written out for rows of pitch and columns of yaw."""
     directions = direction_lattice(0, "yaw-pitch")
     limit = TurnLimit.of(directions, 30)
     scores = np.random.default_rng(3).random((50, 108))
-    sequence = greedy_sequence(scores, limit, turn_penalty=0.05, keep_limit=keep_limit)
+    sequence = greedy_sequence(scores, limit)
     ids = sequence.direction_ids
     row, column = divmod(int(scores[0].argmax()), 18)
     assert ids[0] == row * 18 + column
@@ -26,13 +24,12 @@ def test_greedy_rule_is_actlocs(keep_limit: bool) -> None:
         values = {}
         for r, c in product(range(6), range(18)):
             across = min(abs(c - column), 18 - abs(c - column))
-            if not keep_limit or max(abs(r - row), across) <= 1:
-                values[r * 18 + c] = scores[waypoint, r * 18 + c] - 0.05 * (abs(r - row) + across)
+            if max(abs(r - row), across) <= 1:
+                values[r * 18 + c] = scores[waypoint, r * 18 + c] - 0.02 * (abs(r - row) + across)
         best = max(values, key=lambda key: values[key])
         assert ids[waypoint] == best
         row, column = divmod(best, 18)
-    if keep_limit:
-        assert best_sequence(scores, limit).total > sequence.total
+    assert best_sequence(scores, limit).total > sequence.total
 
 
 def test_waypoints_every_20_cm() -> None:

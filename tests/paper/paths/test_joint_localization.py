@@ -16,8 +16,15 @@ from wheretolook.localization.joint_labels import label_sets
 from wheretolook.planning.config import StopConfig
 from wheretolook_paper.figures.paths import paths_figure
 from wheretolook_paper.paths.config import PathsConfig
-from wheretolook_paper.paths.joint_localization import OUTCOME, joint_paths, localize_last_views, localize_stops
-from wheretolook_paper.paths.odometry import chained, noisy_steps, rig_of_last
+from wheretolook_paper.paths.joint_localization import (
+    OUTCOME,
+    chained,
+    joint_paths,
+    localize_last_views,
+    localize_stops,
+    noisy_steps,
+    rig_of_last,
+)
 from wheretolook_paper.paths.path_comparison import ComparedPaths
 from wheretolook_paper.paths.path_report import path_markdown, summarize_paths
 

@@ -85,8 +85,8 @@ def test_ways_lead_round_walls_but_not_through_them() -> None:
 
     left = (0.5, 0.5, 0.5)
     right = (3.5, 0.5, 0.5)
-    assert Reachability(Rooms(True), 0.25).connects(left, right)
-    closed = Reachability(Rooms(False), 0.25)
+    assert Reachability(Rooms(True)).connects(left, right)
+    closed = Reachability(Rooms(False))
     assert closed.connects(left, (1.5, 1.5, 0.5)) and not closed.connects(left, right)
     assert not closed.connects(left, (2.0, 0.5, 0.5))  # in the wall
 

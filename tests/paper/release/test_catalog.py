@@ -74,13 +74,13 @@ def test_all_that_has_a_run_is_written_and_attached(store: tuple[Dataset, Tracki
 def test_scenes_of_the_release_are_drawn_with_the_runs_of_their_weights(tmp_path: Path) -> None:
     release = Dataset.load(RELEASE)
     tracking = TrackingConfig(str(tmp_path / "mlruns"))
-    runs = log_release(release, tracking).train
+    runs = log_release(release, tracking).ids
     drawn = tuple(OF_SCENES - {"planning"})
     assert write_items(release, tracking, FiguresConfig(tmp_path / "out", drawn, ("png",)), quiet) == {}
     notes = {name: note_of(tmp_path / "out" / f"{name}.png") for name in drawn}
     assert notes == {
-        "pipeline": f"runs: {runs['set']} (train)", "peaks": f"runs: {runs['set']} (train)",
-        "learning": f"runs: {runs['mlp-2d+z']} (train)", "inputs": f"runs: {runs['mlp-2d+z']} (train)",
+        "pipeline": f"runs: {runs['train set']} (train)", "peaks": f"runs: {runs['train set']} (train)",
+        "learning": f"runs: {runs['train mlp-2d+z']} (train)", "inputs": f"runs: {runs['train mlp-2d+z']} (train)",
         "viewpoint_generation": "",
     }  # fmt: skip
     showcase = open_showcase(release)

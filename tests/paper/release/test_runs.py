@@ -50,9 +50,8 @@ def children(tracking: TrackingConfig, parent: str) -> dict[str, tuple[dict[str,
 
 def test_every_kind_of_result_becomes_a_run_once(logged: tuple[Dataset, TrackingConfig, ReleaseRuns]) -> None:
     release, tracking, runs = logged
-    assert [*runs.evaluate] == ["release", "interiors"] and [*runs.train] == ["mlp-2d+3d"]
-    ids = [*runs.evaluate.values(), *runs.train.values(), runs.learners, runs.paths, runs.looks, runs.benchmark]
-    assert None not in ids and len({*ids}) == runs.new == 7
+    names = {"evaluate", "learners", "paths", "looks", "benchmark", "evaluate interiors", "train mlp-2d+3d"}
+    assert runs.ids.keys() == names and len({*runs.ids.values()}) == runs.new == 7
     again = log_release(release, tracking)
     assert again == dataclasses.replace(runs, new=0)
     pd.testing.assert_frame_equal(
@@ -67,7 +66,7 @@ def test_every_kind_of_result_becomes_a_run_once(logged: tuple[Dataset, Tracking
 def test_rows_over_all_scenes_are_nested(logged: tuple[Dataset, TrackingConfig, ReleaseRuns]) -> None:
     release, tracking, runs = logged
     scores = read_scores(release.root / "results" / "scores.csv")
-    nested = children(tracking, runs.evaluate["release"])
+    nested = children(tracking, runs.ids["evaluate"])
     assert len(nested) == 2 * (len(METHODS) + 1)
     params, metrics = nested["mlp-2d+z, none (evaluate release)"]
     assert params["occlusion"] == "none" and params["dataset"] == "release" and params["scenes"] == "scene-0 scene-1"
@@ -76,13 +75,13 @@ def test_rows_over_all_scenes_are_nested(logged: tuple[Dataset, TrackingConfig, 
         assert metrics[f"top-{n}/raw_0.05m_0.4deg"] == rows.loc[(n, "all"), "raw_0.05m_0.4deg"]
         assert metrics[f"top-{n}/regret_5m_10deg"] == rows.loc[(n, "all"), "regret_5m_10deg"]
         assert metrics[f"top-{n}/scene-1/regret_0.05m_0.4deg"] == rows.loc[(n, "scene-1"), "regret_0.05m_0.4deg"]
-    learners = children(tracking, str(runs.learners))
+    learners = children(tracking, runs.ids["learners"])
     last = learners["set, apartments, seed 1 (learners release)"][1]
     assert last["regret_test"] == last["1_regret"] == pytest.approx(0.2)
-    assert children(tracking, str(runs.paths)).keys() == {
+    assert children(tracking, runs.ids["paths"]).keys() == {
         f"{method}, {task} (paths release)" for task in ("planned", "given") for method in ("forward", "bins")
     }
-    looks = children(tracking, str(runs.looks))
+    looks = children(tracking, runs.ids["looks"])
     assert {*looks} == {f"{name} looks (looks release)" for name in ("together, 1", "together, 2", "random, 2")}
     assert looks["together, 2 looks (looks release)"][1] == {"good": 0.8, "any_good": 0.75}
 
@@ -98,14 +97,14 @@ def test_a_release_is_logged_as_its_evaluation_was(tmp_path: Path) -> None:
     runs = log_release(dataset, other)
     found = log_release(dataset, own)
     (evaluated,) = finished_runs(own, "evaluate")
-    assert found.new == 0 and found.evaluate == {"tiny": evaluated.info.run_id}
+    assert found.new == 0 and found.ids == {"evaluate": evaluated.info.run_id}
     theirs = children(own, evaluated.info.run_id)
-    ours = children(other, runs.evaluate["tiny"])
+    ours = children(other, runs.ids["evaluate"])
     assert ours.keys() == theirs.keys() and len(ours) == 3
     for name, (params, metrics) in ours.items():
         assert metrics == theirs[name][1]
         assert params.items() - theirs[name][0].items() <= {("reference", "")}
-    logged = client(other).get_run(runs.evaluate["tiny"]).data.metrics
+    logged = client(other).get_run(runs.ids["evaluate"]).data.metrics
     assert logged == client(own).get_run(evaluated.info.run_id).data.metrics
 
 
@@ -113,7 +112,7 @@ def test_histories_travel_with_a_release(store: tuple[Dataset, TrackingConfig]) 
     release, tracking = store
     assert histories(tracking, "release") == {}
     history().assign(method="mlp-2d+3d").to_csv(release.root / "results" / "training.csv", index=False)
-    run = log_release(release, tracking).train["mlp-2d+3d"]
+    run = log_release(release, tracking).ids["train mlp-2d+3d"]
     assert log_release(release, tracking).new == 0
     (found,) = histories(tracking, "release").values()
     pd.testing.assert_frame_equal(found, history())
@@ -140,6 +139,6 @@ def test_an_interrupted_run_is_logged_again(store: tuple[Dataset, TrackingConfig
     before = names("tags.stage = 'paths'")
     mlflow.update_run(run.info.run_id, status="RUNNING")  # as `kill -9` leaves it, with all that is nested in it
     runs = log_release(release, tracking)
-    assert runs.new == 1 and runs.paths != run.info.run_id
+    assert runs.new == 1 and runs.ids["paths"] != run.info.run_id
     assert names("tags.stage = 'paths'") == before and len(before) > 1  # none twice
     assert log_release(release, tracking).new == 0

@@ -30,7 +30,7 @@ def some_views(n: int, seed: int) -> PooledViews:
     values = rng.normal(size=(n, len(POOLED))).astype(np.float32)
     labels = values[:, 0] + 2 * np.maximum(values[:, 7], 0) + 0.5 * rng.normal(size=n) > 0.5
     values[rng.random(n) < 0.2, 7] = np.nan
-    return PooledViews(values, labels, np.zeros(n, int), np.arange(n))
+    return PooledViews(values, labels, np.zeros(n, int), np.arange(n), np.zeros((n, 6)))
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_the_scorer_is_the_trees_on_pooled_views(tmp_path: Path) -> None:
     scene = dataset.scenes[1]
     localization_map = scene.localization_map(dataset.camera)
     scorer = load_scorer(model.path, localization_map)
-    views = load_pooled(Dataset(dataset.root, (scene,)), [scene], (0.05, 0.4), progress=False)
+    views = load_pooled(Dataset(dataset.root, (scene,)), [scene], (0.05, 0.4), "cpu", False)
     table = scene.read_table()
     np.testing.assert_array_equal(views.labels, is_good(table))
     logits = BoostedTrees.load(model.path).logits(views.values)

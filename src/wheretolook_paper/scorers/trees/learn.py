@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +23,7 @@ from wheretolook.training.data import check_classes, labelled_rows, validation_v
 from wheretolook.training.fit import home_device
 from wheretolook.training.learner import TrainingJob, TrainingResult, class_counts, fit_platt
 from wheretolook.training.scenes import training_scenes
-from wheretolook.training.training_range import QUANTITIES, TrainingRange, camera_quantities, view_quantities
+from wheretolook.training.training_range import TrainingRange, camera_quantities, view_quantities
 from wheretolook.training.weights import check_method_of_weights, read_weights, write_weights
 from wheretolook.utils.errors import ConfigError, WeightsError
 from wheretolook_paper.scorers.pooled_features import POOLED, pool
@@ -61,10 +61,10 @@ class BoostedTrees:
         raw = self.booster.predict(np.asarray(pooled, dtype=np.float64), raw_score=True, num_threads=1)
         return np.asarray(raw, dtype=np.float64)
 
-    def save(self, path: Path, training: dict[str, Any] | None = None) -> None:
+    def save(self, path: Path, training: dict[str, Any]) -> None:
         """Write one safetensors file atomically, with a record of the training; equal trees give equal bytes."""
         header: dict[str, Any] = {"features": list(POOLED), "scale": self.scale, "offset": self.offset}
-        header |= {"camera": None if self.camera is None else self.camera.record(), "training": training or {}}
+        header |= {"camera": None if self.camera is None else self.camera.record(), "training": training}
         if self.training_range is not None:
             header["range"] = self.training_range.record()
         text = np.frombuffer(self.model.encode(), dtype=np.uint8)
@@ -99,20 +99,15 @@ class PooledViews:
     labels: NDArray[np.bool_]  # (B,) bool, whether the viewpoint localizes
     scene: NDArray[np.int64]  # (B,) int64, number of the scene
     location: NDArray[np.int64]  # (B,) int64, location_id, unique within a scene
-    quantities: Float = field(default_factory=lambda: np.empty((0, len(QUANTITIES))))  # (B, 6), or none
+    quantities: Float  # (B, 6), see `wheretolook.training.training_range`
 
     def only(self, mask: NDArray[np.bool_]) -> PooledViews:
         """Return the views where `mask` (B,) is set."""
-        quantities = self.quantities[mask] if len(self.quantities) else self.quantities
-        return PooledViews(self.values[mask], self.labels[mask], self.scene[mask], self.location[mask], quantities)
+        return PooledViews(*(getattr(self, column.name)[mask] for column in fields(self)))
 
 
 def load_pooled(
-    dataset: Dataset,
-    scenes: Sequence[SceneFolder],
-    limits: tuple[float, float],
-    device: str = "cpu",
-    progress: bool = True,
+    dataset: Dataset, scenes: Sequence[SceneFolder], limits: tuple[float, float], device: str, progress: bool
 ) -> PooledViews:
     """Describe the labelled viewpoints of scenes; positive are those within limits in metres and degrees.
 

@@ -132,7 +132,7 @@ def main() -> None:
         def all_rows(s: LandmarkSets = sets) -> None:
             numbers = exact_information(PosedViews(camera, views, points, s, rows), device)
             for metric in METRICS:
-                metric_of(numbers, metric, None, device)
+                metric_of(numbers, metric, device)
 
         timed(f"  the three metrics, {label}", all_rows, few)
         start = time.perf_counter()

@@ -4,7 +4,6 @@
     python tests/benchmarks/bench_visibility.py --device cuda --out h200.json
     python tests/benchmarks/bench_visibility.py --scaling --out scaling.json
     python tests/benchmarks/bench_visibility.py --draw laptop.json h200.json --figures FOLDER --log
-    python tests/benchmarks/bench_visibility.py --draw FOLDER/runtimes.csv h200.json --figures FOLDER  # adds one
 
 The size is the paper's (Sec. "Runtimes"): 648 locations, 24,919 landmarks and the 500 directions of its released
 configuration, in a synthetic apartment whose mesh is subdivided into at least 250,000 triangles.
@@ -31,6 +30,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import trimesh
 import warp as wp
 from common import free_points, points_on_surface
 
@@ -52,8 +52,6 @@ CAMERA = PinholeCamera()
 COUNTS = "counts alone"
 EVERYTHING = "occlusion, counts, best 100"
 TWIN = "NumPy twin, counts alone, scaled"
-FLOPS_PER_PROJECTION = 22
-"""A plain projection: 9 multiplies and 6 additions of the rotation, 3 of the offset, 4 of focal length and centre."""
 
 SCALING = {
     "landmarks": (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000, 2_000_000),
@@ -68,19 +66,9 @@ def subdivided(mesh: TexturedMesh, min_triangles: int) -> TexturedMesh:
     vertices = mesh.vertices.astype(np.float64)
     triangles = mesh.triangles
     while len(triangles) < min_triangles:
-        a, b, c = np.moveaxis(vertices[triangles], 1, 0)
-        area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        cut = np.argsort(-area)[: -(-(min_triangles - len(triangles)) // 3)]
-        n = len(vertices)
-        m = len(cut)
-        a, b, c = np.moveaxis(vertices[triangles[cut]], 1, 0)
-        vertices = np.concatenate([vertices, (a + b) / 2, (b + c) / 2, (c + a) / 2])
-        ab = n + np.arange(m)
-        bc = n + m + np.arange(m)
-        ca = n + 2 * m + np.arange(m)
-        i, j, k = triangles[cut].T
-        parts = np.concatenate([np.stack(part, 1) for part in ((i, ab, ca), (ab, j, bc), (ca, bc, k), (ab, bc, ca))])
-        triangles = np.concatenate([np.delete(triangles, cut, 0), parts])
+        largest = np.argsort(-trimesh.triangles.area(vertices[triangles]))
+        cut = largest[: -(-(min_triangles - len(triangles)) // 3)]
+        vertices, triangles = trimesh.remesh.subdivide(vertices, triangles, face_index=cut)
     n = len(triangles)
     corners = np.zeros((n, 3, 2), np.float32)
     texture = np.zeros((1, 1, 3), np.uint8)
@@ -147,42 +135,6 @@ def seconds_of(work: Callable[[], object], repeats: int) -> dict[str, float]:
     return {"median_s": statistics.median(seconds), "min_s": min(seconds), "max_s": max(seconds), "repeats": repeats}
 
 
-@wp.kernel
-def _multiply_add_kernel(n: wp.int32, out: wp.array[wp.float32]):
-    i = wp.tid()
-    a = wp.float32(i)
-    b = wp.float32(i + 1)
-    c = wp.float32(i + 2)
-    d = wp.float32(i + 3)
-    e = wp.float32(i + 4)
-    f = wp.float32(i + 5)
-    g = wp.float32(i + 6)
-    h = wp.float32(i + 7)
-    for _ in range(n):
-        a = a * 0.999 + 0.5
-        b = b * 0.999 + 0.5
-        c = c * 0.999 + 0.5
-        d = d * 0.999 + 0.5
-        e = e * 0.999 + 0.5
-        f = f * 0.999 + 0.5
-        g = g * 0.999 + 0.5
-        h = h * 0.999 + 0.5
-    out[i] = a + b + c + d + e + f + g + h
-
-
-def peak_flops(device: str) -> float:
-    """Return the single-precision operations per second of independent multiply-add chains on a GPU."""
-    threads = 1 << 21
-    n = 2048
-    out = wp.empty(threads, dtype=wp.float32, device=device)
-
-    def work() -> None:
-        wp.launch(_multiply_add_kernel, threads, [n], [out], device=device)
-        wp.synchronize_device(device)
-
-    return threads * n * 8 * 2 / seconds_of(work, 5)["min_s"]
-
-
 def machine(device: str) -> dict[str, Any]:
     """Return the name of the device and of the host's processor, and the number of usable cores."""
     host = platform.machine()
@@ -242,12 +194,6 @@ def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     seen = survey(CAMERA, rotations, some, landmarks, setup.occlusion, SurveyOptions(keep=100))
     masked = count_plain(CAMERA, rotations, some, setup.points, mask)
     print("counts with occlusion equal the twin's:", np.array_equal(seen.counts, masked))
-    if setup.on_gpu:
-        flops = peak_flops(device)
-        rate = next(row["projections_per_s"] for row in rows if row["what"] == COUNTS)
-        share = rate * FLOPS_PER_PROJECTION / flops
-        rows.append({"what": "peak", "threads": 1, "flops": flops, "equivalent_share_of_peak": share})
-        print(f"measured peak {flops / 1e12:.1f} TFLOP/s; projecting everything as fast would take {share:.0%} of it")
     return rows
 
 
@@ -300,14 +246,6 @@ def bounded(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     return [row]
 
 
-def rows_of(file: Path, part: str) -> list[dict[str, Any]]:
-    """Return the rows of an earlier result (JSON), or of a table made of such (CSV)."""
-    if file.suffix == ".csv":
-        return pd.read_csv(file).to_dict("records") if part == "paper_size" else []
-    result = json.loads(file.read_text())
-    return [{**row, **result["machine"]} for row in result.get(part, [])]
-
-
 def draw(args: argparse.Namespace) -> None:
     """Write tables and figures of earlier results, and log them to MLflow if asked to."""
     from wheretolook.figures.style import save_figure
@@ -315,8 +253,9 @@ def draw(args: argparse.Namespace) -> None:
     from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
     from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
 
+    results = [json.loads(Path(file).read_text()) for file in args.draw]
     sizes, growth = (
-        pd.DataFrame([row for file in args.draw for row in rows_of(Path(file), part)])
+        pd.DataFrame([{**row, **result["machine"]} for result in results for row in result.get(part, [])])
         for part in ("paper_size", "scaling")
     )
     folder = Path(args.figures)
@@ -348,7 +287,7 @@ def main() -> None:
     parser.add_argument("--bounded", action="store_true", help="also run 2 million landmarks x 5,000 locations")
     parser.add_argument("--memory-gb", type=float, default=2.0, help="memory bound of the blocks in work")
     parser.add_argument("--out", help="write the results to this JSON file")
-    parser.add_argument("--draw", nargs="+", metavar="JSON", help="draw earlier results, or a table of such")
+    parser.add_argument("--draw", nargs="+", metavar="JSON", help="draw earlier results")
     parser.add_argument("--figures", default=".", help="folder for figures and tables")
     parser.add_argument("--log", action="store_true", help="log tables and figures to MLflow")
     args = parser.parse_args()

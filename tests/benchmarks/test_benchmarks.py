@@ -19,9 +19,7 @@ pytestmark = pytest.mark.slow
 
 SMALL = {
     "fisher": "--landmarks 300 --voxels 2 --directions 20 --repeats 1 --samples 10",
-    "load": "--every 0.2 bogus",
     "looks": f"{ROOT}/data/release/apartment-209 --directions 30 --places 2",
-    "queries": "--queries 4000 --processes 2",
     "robot": f"--weights {WEIGHTS} --landmarks 500 --directions 20 --repeats 2",
     "scorers": f"--weights {WEIGHTS} --landmarks 500 --locations 2 --directions 20 --repeats 1 --poses 2",
     "select": "--landmarks 400 --waypoints 2 --repeats 1",
@@ -45,21 +43,9 @@ def test_small(name: str) -> None:
 
 def test_visibility_is_measured_and_drawn(tmp_path: Path) -> None:
     out = tmp_path / "cpu.json"
-    sizes = [
-        "--locations",
-        "4",
-        "--directions",
-        "20",
-        "--landmarks",
-        "300",
-        "--triangles",
-        "500",
-        "--repeats",
-        "1",
-        "--twin-repeats",
-        "1",
-    ]
-    run("visibility", *sizes, "--scaling", "--scaling-limit", "1000", "--scaling-repeats", "1", "--out", str(out))
+    sizes = "--locations 4 --directions 20 --landmarks 300 --triangles 500 --repeats 1 --twin-repeats 1"
+    scaling = "--scaling --scaling-limit 1000 --scaling-repeats 1"
+    run("visibility", *sizes.split(), *scaling.split(), "--out", str(out))
     assert {"paper_size", "scaling"} < json.loads(out.read_text()).keys()
     run("visibility", "--draw", str(out), "--figures", str(tmp_path))
     assert {"runtimes.csv", "runtimes.png", "scaling.csv"} < {path.name for path in tmp_path.iterdir()}

@@ -20,7 +20,7 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import newest_run
 from wheretolook.utils.errors import ConfigError, PoseError, TableError
-from wheretolook_paper.commands.look_sets import LookConfig, evaluate_looks
+from wheretolook_paper.commands.evaluation_extras import LookConfig, evaluate_look_sets
 from wheretolook_paper.evaluation.looks import look_table, stopping_table
 
 WEIGHTS = Path(__file__).parents[2] / "data" / "release" / "weights" / "set.safetensors"
@@ -59,6 +59,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     write_table(
         with_matches(scene).astype({"n_inliers": np.int32, "error_m": np.float32, "error_deg": np.float32}), scene.table
     )
+    scene.stage_cache("label", "key").store()
     made = Dataset(root, (scene,))
     made.save()
     return made
@@ -118,7 +119,7 @@ def test_invalid_sets(table: pd.DataFrame, points: np.ndarray) -> None:
 def test_strategies_are_compared_and_logged(dataset: Dataset, tmp_path: Path) -> None:
     tracking = TrackingConfig(tmp_path / "mlruns")
     config = LookConfig(numbers=(1, 3), strategies=("together", "in-turn", "one-by-one", "even", "fisher"))
-    found = evaluate_looks(dataset, EvaluateConfig(weights=(WEIGHTS,)), tracking, config, progress=False)
+    found = evaluate_look_sets(dataset, EvaluateConfig(weights=(WEIGHTS,)), tracking, "cpu", config, False)
     assert found is not None and len(found) == 10
     good = found.set_index(["strategy", "n_looks"])
     ones = good.loc[[(name, 1) for name in ("together", "in-turn", "one-by-one", "even")]]

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -66,8 +66,6 @@ from wheretolook_paper.release.training_histories import histories, method_of_ru
 if TYPE_CHECKING:
     from mlflow.entities import Run
 
-    from wheretolook.scorers.base import Scorer
-    from wheretolook.scorers.binned_network import BinnedNetworkScorer
 
 Texts = Mapping[str, str]
 """A table: its text by file suffix, such as "md"."""
@@ -172,7 +170,7 @@ def _paper_table(name: str) -> Drawer:
 _open = lru_cache(maxsize=1)(open_showcase)
 
 
-def _shown(source: Source, weights: str = "") -> tuple[Showcase, Scorer, int]:
+def _shown(source: Source, weights: str = "") -> tuple[Showcase, Any, int]:
     """Return the first test scene of a release, a scorer, and an instructive location."""
     showcase = _open(source.dataset)
     scorer = load_scorer(source.dataset.root / "weights" / weights, showcase.localization_map)
@@ -180,8 +178,7 @@ def _shown(source: Source, weights: str = "") -> tuple[Showcase, Scorer, int]:
 
 
 def _walkthrough(source: Source) -> Learning:
-    showcase, scorer, location = _shown(source, f"{method_of_run(source.runs[0])}.safetensors")
-    return learning_of(showcase, cast("BinnedNetworkScorer", scorer), location)
+    return learning_of(*_shown(source, f"{method_of_run(source.runs[0])}.safetensors"))
 
 
 def _trained(method: str, command: str, **more: Any) -> dict[str, Any]:
@@ -238,7 +235,7 @@ def _architecture(source: Source) -> Texts:
     params = {method_of_run(run): run.data.params for run in source.runs}
     networks = [params[name] for name, method in learned().items() if method.ships == "network" and name in params]
     if not networks:
-        raise MissingRunError("none of the paper's networks was trained")
+        raise ConfigError("none of the paper's networks was trained")
     table = paper_architecture_table(networks[-1])  # that of most inputs, the paper's proposal
     return {
         "md": markdown_table(list(table.columns), table.to_numpy().tolist()) + "\n",
@@ -362,23 +359,21 @@ def write_items(
             say(f"{item.name}: only releases have it")
             continue
         try:
-            source = Source(dataset, tracking, item.runs(dataset, tracking))
-            if item.stage and not source.runs:
-                missing[item.name] = item.command_for(dataset)
-                say(f"{item.name}: no such run; first: {missing[item.name]}")
-                continue
-            content = item.draw(source)
+            runs = item.runs(dataset, tracking)
+            if item.stage and not runs:
+                raise MissingRunError(item.command_for(dataset))
+            content = item.draw(Source(dataset, tracking, runs))
         except WhereToLookError as error:
             missing[item.name] = str(error)
-            say(f"{item.name}: {error}")
+            say(f"{item.name}: {'no such run; first: ' if isinstance(error, MissingRunError) else ''}{error}")
             continue
-        ids = [run.info.run_id for run in source.runs]
+        ids = [run.info.run_id for run in runs]
         files = _write(item.name, content, f"runs: {', '.join(ids)} ({item.stage})" if ids else "", out, config.kinds)
         with kept_if_not_logged(f"{item.name} in {out}"):
             for run_id in ids:
                 for file in files:
                     client(tracking).log_artifact(run_id, str(file), "figures")
-        say(f"{item.name}: -> {', '.join(str(file) for file in files)}")
+        say(f"{item.name}: -> {', '.join(map(str, files))}")
     return missing
 
 
@@ -388,7 +383,6 @@ def _write(name: str, content: Figure | Texts, note: str, out: Path, kinds: tupl
         for file in files:
             save_figure(content, file, note)
         return files
-    out.mkdir(parents=True, exist_ok=True)
     comments = {"md": f"\n<!-- {note} -->\n", "tex": f"% {note}\n"} if note else {}
     for ending, text in content.items():
         write_text(out / f"{name}.{ending}", text + comments.get(ending, ""))

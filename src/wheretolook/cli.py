@@ -197,8 +197,7 @@ def named_values(command: Any, types: Mapping[str, Any], arguments: Sequence[str
     words: list[list[str]] = [[f"--{command.POSITIONAL}"]]
     for argument in arguments:
         if argument.startswith("--"):
-            option, equals, value = argument.partition("=")
-            words.append([option, value] if equals else [option])
+            words.append(argument.split("=", 1))
         else:
             words[-1].append(argument)
     if len(words[0]) == 1:
@@ -213,7 +212,7 @@ def named_values(command: Any, types: Mapping[str, Any], arguments: Sequence[str
             near = nearest(name, [*known, *command.SHORT])
             raise ConfigError("unknown option", value=option, fix=f"Did you mean --{near}?" if near else None)
         if is_sequence(types.get(name)) and values[:1] != ["null"] and not "".join(values[:1]).startswith("["):
-            yield name, f"[{', '.join(value if is_number(value) else json.dumps(value) for value in values)}]"
+            yield name, json.dumps(values)
         elif len(values) > 1:
             raise ConfigError("this option takes one value", value=" ".join([option, *values]))
         elif not values and types.get(name) is not bool and name != "print_config":
@@ -230,15 +229,6 @@ def is_option(name: str, known: Sequence[str]) -> bool:
 def is_sequence(kind: Any) -> bool:
     """Return whether a type is a tuple, or an optional one."""
     return tuple in (get_origin(kind), *map(get_origin, get_args(kind)))
-
-
-def is_number(text: str) -> bool:
-    """Return whether a text is a number."""
-    try:
-        float(text)
-        return True
-    except ValueError:
-        return False
 
 
 def read_settings(path: Path, types: Mapping[str, Any]) -> list[tuple[str, str]]:

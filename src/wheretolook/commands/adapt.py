@@ -27,14 +27,12 @@ from wheretolook.tracking.store import check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError, MapError, OutOfRangeWarning, SceneError, TableError
 from wheretolook.utils.files import fingerprint, storage_errors, write_text
 from wheretolook.utils.locks import hold
-from wheretolook.utils.reading import read_json_object
 from wheretolook.weights.resolve import load_scorer, resolve_weights
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from wheretolook.evaluation.adaptation import Gain
-    from wheretolook.localization.labeller import LabelTask
     from wheretolook.scorers.adapted.gp_correction import Adapted, LocalizedViews
     from wheretolook.visibility.occlusion import OcclusionModel
 
@@ -93,7 +91,7 @@ class Adapt(SceneOptions, LabelOptions):
 
         Raises:
             ConfigError: no such scene. SceneError: it has neither labels, nor a mesh to render, nor photographs.
-            TableError: it has no viewpoints, or too few, or all localize, or none.
+            TableError: it has too few viewpoints or photographs, or too few that localize, or that do not.
             WeightsError: the weights to start from are not of the method `set`.
             MapError: the map is not in metres, or on its side, or its photographs' features are not known.
         """
@@ -269,7 +267,6 @@ class Adapt(SceneOptions, LabelOptions):
                     end = time.monotonic() + 60 * minutes - sum(labelled.seconds.values()) / self.n_workers
                 if end is not None and time.monotonic() >= end:
                     break
-        _remove_stale(files.adapt_shards, tasks)
         labelled_table = pd.concat([done[task.name] for task in tasks if task.name in done], ignore_index=True)
         if len(labelled_table) < len(table):
             log(f"{files.name}: {len(labelled_table):,} of {len(table):,} views labelled; run again to label more")
@@ -283,19 +280,6 @@ def _scene(dataset: Dataset, name: str) -> SceneFolder:
         names = ", ".join(scene.name for scene in dataset.scenes[:10])
         raise ConfigError("weights are adapted to one scene", path=dataset.root, fix=f"Give --scene: {names}.")
     return dataset.scenes[0]
-
-
-def _remove_stale(folder: Path, tasks: list[LabelTask]) -> None:
-    """Remove shards of other viewpoints, maps or settings."""
-    from wheretolook.localization.labeller import MANIFEST
-
-    for path in {*folder.iterdir()} - {task.shards for task in tasks}:
-        shutil.rmtree(path, ignore_errors=True)
-    for task in tasks:
-        current = read_json_object(task.shards / MANIFEST)["shards"]
-        for path in task.shards.glob("*.parquet"):
-            if path.name not in current:
-                path.unlink()
 
 
 def labelled_views(files: SceneFolder, scene: SceneEnvironment, table: pd.DataFrame, weights: Path) -> LocalizedViews:
@@ -318,17 +302,17 @@ def labelled_views(files: SceneFolder, scene: SceneEnvironment, table: pd.DataFr
 
 
 def _check_enough(views: LocalizedViews, source: Path) -> None:
-    """Raise TableError, or for photographs alone MapError, if there are too few views of either label to fit to."""
+    """Raise TableError if there are too few views of either label to fit to."""
     n_good = int(views.good.sum())
-    n_locations = len(np.unique(views.group))
     rendered = bool((views.photograph < 0).any())
-    few = rendered and (len(views) < MIN_VIEWS or n_locations < MIN_LOCATIONS)
-    if few or min(n_good, len(views) - n_good) < MIN_OF_EACH_LABEL:
-        needed = f"{MIN_VIEWS} views at {MIN_LOCATIONS} locations" if rendered else "held-out photographs"
-        problem = f"adapting needs {needed}, of which {MIN_OF_EACH_LABEL} localize and {MIN_OF_EACH_LABEL} do not"
-        value = f"{len(views)} views at {n_locations} locations, {n_good} of which localize"
+    counts = (len(views), len(np.unique(views.group)), n_good, len(views) - n_good)
+    needed = (rendered * MIN_VIEWS, rendered * MIN_LOCATIONS, MIN_OF_EACH_LABEL, MIN_OF_EACH_LABEL)
+    if np.less(counts, needed).any():
+        problem = "adapting needs {} views at {} locations or blocks, of which {} localize and {} do not".format(
+            *needed
+        )
         fix = "Sample more viewpoints, or give more minutes." if rendered else "Use the bundled weights."
-        raise (TableError if rendered else MapError)(problem, path=source, value=value, fix=fix)
+        raise TableError(problem, path=source, value=counts, fix=fix)
 
 
 def _counts(views: LocalizedViews) -> dict[str, object]:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from wheretolook.commands.options import Log, Progress, SceneOptions, ignore_progress
 from wheretolook.commands.preconditions import load_dataset, open_scene
 from wheretolook.dataset.dataset_lock import reads_dataset
-from wheretolook.dataset.layout import Dataset
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.planning.config import PlanConfig
@@ -94,26 +93,32 @@ class Plan(SceneOptions):
                 written.append("path.rrd")
             written.insert(0, "path.csv")
             with kept_if_not_logged(f"the path in {folder}"):
-                _log(self, dataset, scene.name, list(paths), path, [folder / name for name in written])
-        log(f"{scene.name}: {_summary(path, config)} -> {folder}: {', '.join(written)}")
+                _log(self, dataset.name, scene.name, list(paths), path, [folder / name for name in written])
+        log(f"{scene.name}: {_summary(path)} -> {folder}: {', '.join(written)}")
         progress(1)
         return path
 
 
-def _summary(path: PlannedPath, config: PlanConfig) -> str:
-    from wheretolook.figures.path_film import score_text
-
-    score = "" if np.isnan(path.scores).any() else f", mean score {score_text(float(np.mean(path.scores)))}"
-    text = f"{path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, {len(path.positions)} views{score}"
-    return text + (_describe_stops(path) if config.stops.looks > 1 else "")
-
-
 WAIT_S = 120.0  # for another plan to write its path into the same folder
 
-Film = Literal["gif", "mp4", "none"]
+
+def _summary(path: PlannedPath) -> str:
+    """Describe a path and its stops in a line."""
+    from wheretolook.figures.path_film import score_text
+    from wheretolook.planning.view_sequence import lengths_along
+
+    text = f"{path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, {len(path.positions)} views"
+    if not np.isnan(path.scores).any():
+        text += f", mean score {score_text(float(np.mean(path.scores)))}"
+    if path.stops:
+        along = lengths_along(path.positions)[[stop.place for stop in path.stops]]
+        n_further = path.n_looks - len(path.positions)
+        text += f", {n_further} further looks at stops at {', '.join(f'{at:.2f}' for at in along)} m"
+        text += f": mean score {score_text(float(path.scores_with_stops.mean()))}"
+    return text
 
 
-def _draw(views: dict[str, list[PathView]], landmarks: np.ndarray, title: str, folder: Path, film: Film) -> list[str]:
+def _draw(views: dict[str, list[PathView]], landmarks: np.ndarray, title: str, folder: Path, film: str) -> list[str]:
     """Draw the last of several methods' paths, and all side by side. Returns the names of the files written."""
     from wheretolook.figures.animation import save_moving
     from wheretolook.figures.path_film import FRAME_MS, film_frames, methods_figure, still_figure
@@ -131,27 +136,27 @@ def _draw(views: dict[str, list[PathView]], landmarks: np.ndarray, title: str, f
     return written
 
 
-def _log(options: Plan, dataset: Dataset, scene: str, methods: list[str], path: PlannedPath, files: list[Path]) -> None:
+def _log(options: Plan, dataset: str, scene: str, methods: list[str], path: PlannedPath, files: list[Path]) -> None:
     config = options.plan
-    params: dict[str, object] = {"dataset": dataset.name, "scene": scene, "method": methods[-1]}
+    params: dict[str, object] = {"dataset": dataset, "scene": scene, "method": methods[-1]}
     params |= {"methods": " ".join(methods), "start": config.start, "goal": config.goal}
     params["score_weight"] = config.planner.score_weight
     metrics = {"length_m": path.length_m, "turn_deg": path.turn_deg, "score": float(path.scores.mean())}
     if config.stops.looks > 1:
         params |= {"stops.looks": config.stops.looks, "stops.least_score": config.stops.least_score}
         metrics |= {"stops": len(path.stops), "score_with_stops": float(path.scores_with_stops.mean())}
-    tags = {"dataset": dataset.name}
-    with start_run(options.tracking, joined(scene, methods[-1]), "plan", params, tags=tags) as (client, run):
+    run_name = joined(scene, methods[-1])
+    with start_run(options.tracking, run_name, "plan", params, tags={"dataset": dataset}) as (client, run):
         log_to_run(client, run, metrics=metrics)
         for file in files:
             client.log_artifact(run, str(file))
 
 
 def _table(path: PlannedPath, stopping: bool) -> pd.DataFrame:
-    """A row a view: position, axis, the pose's own score (empty if the method scores nothing), pose cam_from_world.
+    """Return a row a view: position, axis, its score (NaN if the method scores nothing), pose cam_from_world.
 
-    Where stops were asked for, further looks are rows of the same place; `look` counts from 1, the path's own view, and
-    `together` is the score of all looks of the stop (empty elsewhere).
+    With stops, further looks are rows of the same location; `look` counts from 1, the path's own view, and `together`
+    is the joint score of all looks of the stop (NaN elsewhere).
     """
     import pandas as pd
 
@@ -160,30 +165,12 @@ def _table(path: PlannedPath, stopping: bool) -> pd.DataFrame:
     places, looks = path.looks
     at = path.positions[places]
     along = path.all_axes
-    positions = dict(zip(("x_m", "y_m", "z_m"), at.T, strict=True))
-    axes = dict(zip(("axis_x", "axis_y", "axis_z"), along.T, strict=True))
-    poses = pose_columns(poses_looking_along(at, along))
-    table = pd.DataFrame({**positions, **axes, "score": path.all_scores, **poses})
-    if not stopping:
-        return table
-    together = np.full(len(path.positions), np.nan)
-    for stop in path.stops:
-        together[stop.place] = stop.together
-    return table.assign(look=looks, together=together[places])
-
-
-def _describe_stops(path: PlannedPath) -> str:
-    """Describe where the path stops."""
-    from wheretolook.figures.path_film import score_text
-    from wheretolook.planning.view_sequence import lengths_along
-
-    if not path.stops:
-        return ", no stops"
-    along = lengths_along(path.positions)[[stop.place for stop in path.stops]]
-    where = ", ".join(f"{at:.2f}" for at in along)
-    stops = f"{len(path.stops)} stop{'s' if len(path.stops) > 1 else ''} at {where} m"
-    looks = path.n_looks - len(path.positions)
-    return f", {stops} with {looks} further looks: mean score {score_text(float(path.scores_with_stops.mean()))}"
+    columns = dict(zip(("x_m", "y_m", "z_m", "axis_x", "axis_y", "axis_z"), (*at.T, *along.T), strict=True))
+    table = pd.DataFrame({**columns, "score": path.all_scores, **pose_columns(poses_looking_along(at, along))})
+    if stopping:
+        joint_scores = pd.Series({stop.place: stop.together for stop in path.stops}, dtype=float)
+        table = table.assign(look=looks, together=joint_scores.reindex(places).to_numpy())
+    return table
 
 
 def _record(views: list[PathView], landmarks: np.ndarray, camera: Camera, file: Path) -> None:

@@ -82,28 +82,24 @@ def train_methods(
     from wheretolook.training.provenance import about_training, trained_before, weights_path
     from wheretolook.training.scenes import with_also
 
-    shared: dict[str, Any] = {"progress": progress, "kept": {}}
+    shared: Values = {"progress": progress, "kept": {}}
     models = []
     with ExitStack() as stack:
-        for root in (
-            dataset.root,
-            *(safe_child(dataset.root.parent, name, "a dataset's name") for name in config.also),
-        ):
+        also = [safe_child(dataset.root.parent, name, "a dataset's name") for name in config.also]
+        for root in (dataset.root, *also):
             stack.enter_context(reading(root, "train"))
         dataset = with_also(dataset, config.also)
         for method in config.chosen():
             with reading(dataset.root, "train", f"{method.name}-weights"):
-                path = weights_path(dataset, method.name)
-                for left in path.parent.glob(f"{path.stem}.*.partial"):  # of a run that was killed
-                    left.unlink(missing_ok=True)
                 about = about_training(dataset, method.name, config, config.options_of(method))
-                known = None if force else trained_before(path, about)
+                known = None if force else trained_before(weights_path(dataset, method.name), about)
                 if known is None or not known.run_id:
                     check_store(tracking)
                 if known is None:
-                    models.append(_train(method, dataset, config, about, tracking, shared))
-                else:
-                    models.append(known if known.run_id else _log_later(known, tracking))
+                    known = _train(method, dataset, config, about, tracking, shared)
+                elif not known.run_id:
+                    known = _log_later(known, tracking)
+                models.append(known)
     return models
 
 

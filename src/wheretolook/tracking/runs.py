@@ -296,12 +296,7 @@ def artifact(tracking: TrackingConfig, run_id: str, path: str) -> Path:
 
 def ui_command(tracking: TrackingConfig) -> str:
     """Shell command that opens MLflow's UI on the store."""
-    program = Path(sys.executable).with_name("mlflow")
-    store = tracking.root / "mlflow.db"
-    if store.is_relative_to(Path.cwd()):
-        store = store.relative_to(Path.cwd())
-    shown = program.relative_to(Path.cwd()) if program.is_relative_to(Path.cwd()) else program
-    return f"{shown} ui --backend-store-uri {shlex.quote(f'sqlite:///{store}')}"
+    return f"{Path(sys.executable).with_name('mlflow')} ui --backend-store-uri {shlex.quote(tracking.uri)}"
 
 
 @cache

@@ -38,10 +38,13 @@ class TexturedMesh:
         return np.cross(b - a, c - a)
 
     def only(self, keep: NDArray[np.bool_]) -> TexturedMesh:
-        """The mesh with only some of its triangles, (T,) bool, and all of its vertices."""
+        """The mesh with only some of its triangles, (T,) bool, and the vertices that they use."""
+        used, triangles = np.unique(self.triangles[keep], return_inverse=True)
         return replace(
             self,
-            triangles=self.triangles[keep],
+            vertices=self.vertices[used],
+            triangles=triangles.reshape(-1, 3).astype(np.int32),
             corner_uvs=self.corner_uvs[keep],
             triangle_texture=self.triangle_texture[keep],
+            vertex_colors=None if self.vertex_colors is None else self.vertex_colors[used],
         )

@@ -144,7 +144,4 @@ def _without_small_pieces(mesh: TexturedMesh) -> TexturedMesh:
     if not keep.any():
         fix = "Check the poses, and that depths are in metres."
         raise SceneError("the depth images show no connected surface", value=f"{area_m2.max():.2g} m2", fix=fix)
-    used, triangles = np.unique(mesh.triangles[keep], return_inverse=True)
-    triangles = triangles.reshape(-1, 3).astype(np.int32)
-    colors = None if mesh.vertex_colors is None else mesh.vertex_colors[used]
-    return replace(mesh.only(keep), triangles=triangles, vertices=mesh.vertices[used], vertex_colors=colors)
+    return mesh.only(keep)

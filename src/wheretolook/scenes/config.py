@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.validation import check_positive, check_range
 
 SceneKind = Literal["apartment", "hall", "court", "office", "building"]
 
@@ -49,16 +48,14 @@ class ApartmentConfig:
     light_rays: int = 24
 
     def __post_init__(self) -> None:
-        if self.n_rooms is not None and not 3 <= self.n_rooms <= 6:
-            raise ConfigError("n_rooms must be 3 to 6", value=self.n_rooms)
-        if self.area_m2 is not None and not 25 <= self.area_m2 <= 200:
-            raise ConfigError("area_m2 must be 25 to 200", value=self.area_m2)
+        if self.n_rooms is not None:
+            check_range("n_rooms", self.n_rooms, 3, 6)
+        if self.area_m2 is not None:
+            check_range("area_m2", self.area_m2, 25, 200)
         for name in ("texture_richness", "clutter", "repetition", "dark_rooms"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"{name} must be between 0 and 1", value=getattr(self, name))
+            check_range(name, getattr(self, name), 0, 1)
         for name in ("enlarged", "texels_per_m", "texture_size", "light_spacing_m", "light_rays"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"{name} must be a positive number", value=getattr(self, name))
+            check_positive(name, getattr(self, name))
 
     def key(self) -> dict[str, Any]:
         """Settings that determine an apartment apart from its seed; later options only if they are not the default."""

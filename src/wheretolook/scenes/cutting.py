@@ -45,9 +45,13 @@ def cut_above(mesh: TexturedMesh, height_m: float) -> TexturedMesh:
     triangles = [mesh.triangles[whole], *(np.stack(at, axis=1)[keep] for keep, at, _ in pieces)]
     corner_uvs = [mesh.corner_uvs[whole], *(np.stack(at, axis=1)[keep] for keep, _, at in pieces)]
     texture = [mesh.triangle_texture[whole], *(mesh.triangle_texture[rows[keep]] for keep, _, _ in pieces)]
-    used, renamed = np.unique(np.concatenate(triangles), return_inverse=True)
-    vertices = with_cuts(mesh.vertices)[used]
-    numbered = renamed.reshape(-1, 3).astype(np.int32)
-    colors = None if mesh.vertex_colors is None else with_cuts(mesh.vertex_colors)[used]
-    uv = np.concatenate(corner_uvs).astype(np.float32)
-    return TexturedMesh(vertices, numbered, uv, np.concatenate(texture), mesh.textures, colors, mesh.origin)
+    cut = TexturedMesh(
+        with_cuts(mesh.vertices),
+        np.concatenate(triangles).astype(np.int32),
+        np.concatenate(corner_uvs).astype(np.float32),
+        np.concatenate(texture),
+        mesh.textures,
+        None if mesh.vertex_colors is None else with_cuts(mesh.vertex_colors),
+        mesh.origin,
+    )
+    return cut.only(np.full(len(cut.triangles), True))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,9 @@ from PIL import Image
 from wheretolook.geometry.local_origin import local_origin
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.scenes.mesh_checks import check_mesh_file
-from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.errors import SceneError
 from wheretolook.utils.files import write_bytes
+from wheretolook.utils.validation import check_choice, check_range
 
 # Rotations that turn the named axis of a file into the world's z axis.
 _Z_UP_FROM = {
@@ -43,9 +44,8 @@ class _Part:
     vertices: NDArray[np.float64]
     triangles: NDArray[np.int64]
     uvs: NDArray[np.float64] | None  # (V, 2), v down
-    texture: NDArray[np.uint8]
+    texture: NDArray[np.uint8]  # `_WHITE` if the file defines none
     colors: NDArray[np.uint8] | None  # (V, 3)
-    colored: bool  # whether the file defines its colour
 
 
 def load_mesh(path: str | PathLike[str], up: str = "z", colored: bool = True) -> TexturedMesh:
@@ -62,8 +62,7 @@ def load_mesh(path: str | PathLike[str], up: str = "z", colored: bool = True) ->
     Raises SceneError if the file is missing, unreadable, empty, flat, not finite, without any texture or colour, or
     names a texture that is missing or in an unsupported format; ConfigError if `up` is not an axis.
     """
-    if up not in _Z_UP_FROM:
-        raise ConfigError("unknown up axis", value=up, fix=f"Use one of {', '.join(_Z_UP_FROM)}")
+    check_choice("up axis", up, _Z_UP_FROM)
     file = _mesh_file(Path(path))
     check_mesh_file(file)
     try:
@@ -73,12 +72,10 @@ def load_mesh(path: str | PathLike[str], up: str = "z", colored: bool = True) ->
         raise SceneError("the mesh cannot be read", path=file, value=str(error), fix="Check the file") from error
     if not parts:
         raise SceneError("the file has no triangles", path=file, fix="Export the scene as a triangle mesh")
-    if colored and not any(part.colored for part in parts):
+    if colored and all(part.texture is _WHITE and part.colors is None for part in parts):
         fix = "Export it with its textures; a map cannot be built from a plain surface"
         raise SceneError("the mesh has no texture and no colours", path=file, fix=fix)
-    mesh = _merge(parts, np.array(_Z_UP_FROM[up], dtype=np.float64))
-    _check(mesh, file)
-    return _without_degenerate(mesh, file)
+    return _cleaned(_merge(parts, np.array(_Z_UP_FROM[up], dtype=np.float64)), file)
 
 
 def save_glb(mesh: TexturedMesh, path: str | PathLike[str], jpeg_quality: int = 90) -> None:
@@ -94,8 +91,7 @@ def save_glb(mesh: TexturedMesh, path: str | PathLike[str], jpeg_quality: int = 
 
 def glb_bytes(mesh: TexturedMesh, jpeg_quality: int = 90) -> bytes:
     """The content of the file that `save_glb` writes."""
-    if not 1 <= jpeg_quality <= 100:
-        raise ConfigError("JPEG quality is a number from 1 to 100", value=jpeg_quality)
+    check_range("JPEG quality", jpeg_quality, 1, 100)
     scene = trimesh.Scene()
     for index, texture in enumerate(mesh.textures):
         faces = np.flatnonzero(mesh.triangle_texture == index)
@@ -108,38 +104,28 @@ def glb_bytes(mesh: TexturedMesh, jpeg_quality: int = 90) -> bytes:
 
 def _mesh_file(path: Path) -> Path:
     """The mesh file of a path, which may be a Habitat-Matterport folder. Raises SceneError if there is none."""
-    file = path
-    if path.is_dir():
-        file = path / f"{path.name.partition('-')[2]}.glb"
-        if not file.is_file():
-            fix = "A Habitat-Matterport folder <id>-<name> holds <name>.glb; otherwise give the mesh file itself"
-            raise SceneError("the folder holds no scene", path=path, value=file.name, fix=fix)
-    if not file.is_file():
-        raise SceneError("no such file", path=file, fix="Give an existing .glb, .ply or .obj file")
-    if file.suffix.lower() not in _SUFFIXES:
-        raise SceneError("unknown kind of mesh", path=file, value=file.suffix, fix=f"Use {', '.join(_SUFFIXES)}")
-    if file.stat().st_size == 0:
-        raise SceneError("the file is empty", path=file, fix="Check that it was copied whole")
+    file = path / f"{path.name.partition('-')[2]}.glb" if path.is_dir() else path
+    if not file.is_file() or file.suffix.lower() not in _SUFFIXES:
+        fix = f"Give an existing file {', '.join(_SUFFIXES)}, or a Habitat-Matterport folder <id>-<name>"
+        raise SceneError("there is no mesh", path=file, fix=fix)
     return file
 
 
 def _parts(scene: trimesh.Scene) -> Iterator[_Part]:
     """The triangle meshes of a scene with their node transforms applied, in the order of the file."""
-    order = {name: index for index, name in enumerate(scene.geometry)}
-    nodes = [(order[scene.graph[node][1]], node) for node in scene.graph.nodes_geometry]
-    for _, node in sorted(nodes):
+    order = {name: number for number, name in enumerate(scene.geometry)}
+    for node in sorted(scene.graph.nodes_geometry, key=lambda node: (order[scene.graph[node][1]], node)):
         matrix, name = scene.graph[node]
         part: Any = scene.geometry[name]
-        if not isinstance(scene.geometry[name], trimesh.Trimesh) or len(part.faces) == 0:
-            continue
-        if part.visual.kind == "face":  # colours by face become colours by vertex
-            part = part.copy()
-            part.unmerge_vertices()
-        yield _part(part, np.asarray(matrix, dtype=np.float64))
+        if isinstance(part, trimesh.Trimesh) and len(part.faces):
+            if part.visual.kind == "face":  # colours by face become colours by vertex
+                part = part.copy()
+                part.unmerge_vertices()
+            yield _part(part, np.asarray(matrix, dtype=np.float64))
 
 
 def _part(geometry: Any, matrix: NDArray[np.float64]) -> _Part:
-    with np.errstate(invalid="ignore"):  # `_check` reports vertices that are not finite
+    with np.errstate(invalid="ignore"):  # `_cleaned` reports vertices that are not finite
         vertices = np.asarray(geometry.vertices, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
     triangles = np.asarray(geometry.faces, dtype=np.int64)
     if np.linalg.det(matrix[:3, :3]) < 0:  # a mirroring transform turns triangles inside out
@@ -152,7 +138,6 @@ def _part(geometry: Any, matrix: NDArray[np.float64]) -> _Part:
     uvs = None
     colors = None
     texture = _WHITE
-    colored = False
     if visual.kind == "texture":
         colors = visual.vertex_attributes.get("color")
         image, factor = _material(visual.material)
@@ -163,15 +148,13 @@ def _part(geometry: Any, matrix: NDArray[np.float64]) -> _Part:
             texture = np.array(image.convert("RGB"), dtype=np.uint8)
         if factor is not None:
             texture = np.rint(texture * factor).astype(np.uint8)
-        colored = uvs is not None or factor is not None or colors is not None
     elif visual.kind in ("vertex", "face"):
         colors = visual.vertex_colors
-        colored = True
     if colors is not None:
         colors = _as_uint8(np.asarray(colors)[:, :3])
         if colors.shape != (len(vertices), 3):
             raise ValueError(f"colours of shape {colors.shape} for {len(vertices)} vertices")
-    return _Part(vertices, triangles, uvs, texture, colors, colored)
+    return _Part(vertices, triangles, uvs, texture, colors)
 
 
 def _material(material: Any) -> tuple[Image.Image | None, NDArray[np.float64] | None]:
@@ -235,27 +218,16 @@ def _merge(parts: list[_Part], rotation: NDArray[np.float64]) -> TexturedMesh:
     return TexturedMesh(vertices, indices, all_uvs, np.concatenate(triangle_texture), tuple(images), colors, origin)
 
 
-def _check(mesh: TexturedMesh, path: Path) -> None:
-    for what, values in (("vertices", mesh.vertices), ("texture coordinates", mesh.corner_uvs)):
-        bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
-        if bad.any():
-            first = values[np.flatnonzero(bad)[0]].tolist()
-            fix = "Clean the mesh, for instance in MeshLab"
-            raise SceneError(f"{bad.sum()} {what} are NaN or infinite", path=path, value=first, fix=fix)
-
-
-def _without_degenerate(mesh: TexturedMesh, path: Path) -> TexturedMesh:
-    """Remove triangles without area and vertices that no triangle uses. Raises SceneError if the rest is empty or flat."""
+def _cleaned(mesh: TexturedMesh, path: Path) -> TexturedMesh:
+    """Remove triangles without area and unused vertices. Raises SceneError for NaN, or if the rest is empty or flat."""
+    finite = [bool(np.isfinite(values).all()) for values in (mesh.vertices, mesh.corner_uvs)]
+    if not all(finite):
+        what = "texture coordinates" if finite[0] else "vertices"
+        raise SceneError(f"some {what} are NaN or infinite", path=path, fix="Clean the mesh, for instance in MeshLab")
     keep = 0.5 * np.linalg.norm(mesh.normals, axis=1) > _MIN_AREA_M2
     if not keep.any():
         raise SceneError("all triangles are degenerate", path=path, value=len(keep), fix="Check the export")
-    used, triangles = np.unique(mesh.triangles[keep], return_inverse=True)
-    cleaned = replace(
-        mesh.only(keep),
-        vertices=mesh.vertices[used],
-        triangles=triangles.reshape(-1, 3).astype(np.int32),
-        vertex_colors=None if mesh.vertex_colors is None else mesh.vertex_colors[used],
-    )
+    cleaned = mesh.only(keep)
     extent = np.ptp(cleaned.bounds, axis=0)
     if (extent < _MIN_EXTENT_M).any():
         fix = "A scene needs an extent in x, y and z, in metres"

@@ -7,17 +7,15 @@ whatever accessors without data ask for, and takes the square of the number of p
 from __future__ import annotations
 
 import base64
-import io
+import math
 import os
 import struct
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
-
-from PIL import Image
+from typing import Any
 
 from wheretolook.utils.errors import SceneError
+from wheretolook.utils.images import image_size
 from wheretolook.utils.memory import fitting
 from wheretolook.utils.reading import max_expanded_bytes, parse_json_object, read_text
 
@@ -33,34 +31,14 @@ def check_mesh_file(path: Path) -> None:
     """Raise SceneError if counts in a mesh file exceed its size, or a texture is missing, unreadable or too large."""
     list_textures = {".glb": _glb_textures, ".ply": _ply_textures, ".obj": _obj_textures}[path.suffix.lower()]
     try:
-        total = sum(count_pixels(texture, path) for texture in dict.fromkeys(list_textures(path)))
+        n_pixels = sum(math.prod(image_size(texture)) for texture in dict.fromkeys(list_textures(path)))
     except (ValueError, OSError, KeyError, IndexError, TypeError, AttributeError, struct.error) as error:
-        problem = f"the file is truncated or corrupt: {type(error).__name__}: {error}"
+        problem = f"the file or a texture is truncated, corrupt or too large: {type(error).__name__}: {error}"
         raise SceneError(problem, path=path, fix="Copy or export the scene again.") from error
     limit = fitting(BYTES_PER_PIXEL)
-    if total > limit:
+    if n_pixels > limit:
         fix = f"Scale them down: {limit:,} pixels fit into memory."
-        raise SceneError("the textures are too large together", path=path, value=f"{total:,} pixels", fix=fix)
-
-
-def count_pixels(texture: Path | bytes, path: Path) -> int:
-    """The number of pixels of a texture of the mesh at `path`, without decoding it.
-
-    Raises SceneError if it is not an image that Pillow opens, or has more pixels than Pillow's limit.
-    """
-    limit = Image.MAX_IMAGE_PIXELS or 2**27
-    name = texture.name if isinstance(texture, Path) else "an embedded texture"
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # its limit is checked below
-            with Image.open(texture if isinstance(texture, Path) else io.BytesIO(texture)) as image:
-                n_pixels = image.width * image.height
-        if n_pixels > limit:
-            raise ValueError(f"{n_pixels:,} pixels")
-    except Exception as error:  # decoders raise errors of many kinds
-        fix = f"Export the scene with PNG or JPEG textures of at most {limit:,} pixels."
-        raise SceneError(f"{name} cannot be read or is too large: {error}", path=path, fix=fix) from error
-    return n_pixels
+        raise SceneError("the textures are too large together", path=path, value=f"{n_pixels:,} pixels", fix=fix)
 
 
 def _sibling(path: Path, name: str) -> Path:
@@ -73,32 +51,27 @@ def _sibling(path: Path, name: str) -> Path:
 
 
 def _glb_textures(path: Path) -> Iterator[Path | bytes]:
-    """Images of a binary glTF 2.0 file (specification, section 4.4): sibling files, or their bytes."""
-    n_bytes = path.stat().st_size
-    with path.open("rb") as file:
-        magic, version, length, json_length, _ = struct.unpack("<4sIIII", file.read(20))
-        if magic != b"glTF" or version != 2 or length != n_bytes:
-            raise ValueError(f"it is not glTF 2.0, or has {n_bytes} of {length} bytes")
-        tree = parse_json_object(file.read(json_length).decode())
+    """Images of a binary glTF 2.0 file (specification, section 4.4): sibling files, or their content."""
+    content = path.read_bytes()
+    magic, version, length, json_length, _ = struct.unpack_from("<4sIIII", content)
+    if magic != b"glTF" or version != 2 or length != len(content):
+        raise ValueError(f"it is not glTF 2.0, or has {len(content)} of {length} bytes")
+    tree = parse_json_object(content[20 : 20 + json_length].decode())
     for accessor in tree.get("accessors", []):
-        if not 0 < accessor["count"] <= max_expanded_bytes(n_bytes) // _LARGEST_ELEMENT:
+        if not 0 < accessor["count"] <= max_expanded_bytes(length) // _LARGEST_ELEMENT:
             raise ValueError(f"an accessor has {accessor['count']} elements")
     _check_nodes(tree.get("nodes", []))
-    buffers = [_open_buffer(buffer.get("uri"), path, 28 + json_length) for buffer in tree.get("buffers", [])]
-    try:
-        for image in tree.get("images", []):
-            if "bufferView" in image:
-                view = tree["bufferViews"][image["bufferView"]]
-                source, start = buffers[view["buffer"]]
-                source.seek(start + view.get("byteOffset", 0))
-                yield source.read(view["byteLength"])
-            elif image["uri"].startswith("data:"):
-                yield _decoded(image["uri"])
-            else:
-                yield _sibling(path, image["uri"])
-    finally:
-        for source, _ in buffers:
-            source.close()
+    buffers = [content[28 + json_length :]]
+    for buffer in tree.get("buffers", []):
+        source = _at_uri(buffer["uri"], path) if "uri" in buffer else buffers[0]
+        buffers.append(source.read_bytes() if isinstance(source, Path) else source)
+    for image in tree.get("images", []):
+        if "bufferView" in image:
+            view = tree["bufferViews"][image["bufferView"]]
+            start = view.get("byteOffset", 0)
+            yield buffers[1 + view["buffer"]][start : start + view["byteLength"]]
+        else:
+            yield _at_uri(image["uri"], path)
 
 
 def _check_nodes(nodes: list[Any]) -> None:
@@ -118,18 +91,11 @@ def _check_nodes(nodes: list[Any]) -> None:
             raise ValueError(f"nodes are nested deeper than {MAX_DEPTH}")
 
 
-def _open_buffer(uri: str | None, path: Path, start: int) -> tuple[BinaryIO, int]:
-    """A buffer of a GLB file, whose own data begin at byte `start`: a file and the offset of the data in it."""
-    if uri is None:
-        return path.open("rb"), start
-    if uri.startswith("data:"):
-        return io.BytesIO(_decoded(uri)), 0
-    return _sibling(path, uri).open("rb"), 0
-
-
-def _decoded(uri: str) -> bytes:
-    """The bytes of a `data:` URI. Raises ValueError if it is not base64."""
+def _at_uri(uri: str, path: Path) -> Path | bytes:
+    """The file, or the content of a `data:` URI, that the mesh at `path` names."""
     kind, _, content = uri.partition(",")
+    if not kind.startswith("data:"):
+        return _sibling(path, uri)
     if not kind.endswith(";base64"):
         raise ValueError(f"a URI without base64, {kind[:40]!r}")
     return base64.b64decode(content, validate=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,19 +19,20 @@ MAX_DEPTH_PIXELS = 25_000_000
 """Limit for depth images; those of phones have half of it."""
 
 
-def image_size(path: Path, at_most: int = MAX_PIXELS) -> tuple[int, int]:
-    """Width and height of an image file.
+def image_size(image: Path | bytes, at_most: int = MAX_PIXELS) -> tuple[int, int]:
+    """Width and height of an image file, or of its content.
 
     Raises ValueError if it is no image or has more pixels than `at_most`, OSError if it is missing.
     """
     from PIL import Image
 
-    check_file(path)
+    if isinstance(image, Path):
+        check_file(image)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit is ours
-            with Image.open(path) as image:
-                width, height = image.size
+            with Image.open(image if isinstance(image, Path) else io.BytesIO(image)) as opened:
+                width, height = opened.size
     except Exception as error:  # decoders raise errors of many kinds
         raise ValueError(f"this is no image: {error}") from error
     if width * height > at_most:

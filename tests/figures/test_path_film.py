@@ -40,7 +40,7 @@ def test_films_have_a_frame_per_view(tmp_path: Path) -> None:
     save_moving(frames, FRAME_MS, tmp_path / "a.gif")
     with Image.open(tmp_path / "a.gif") as film:
         assert film.n_frames == 4 and film.info["duration"] == 120
-    save_moving(frames, [FRAME_MS] * 3 + [2 * FRAME_MS], tmp_path / "a.mp4")
+    save_moving(frames, FRAME_MS, tmp_path / "a.mp4", 2 * FRAME_MS)
     video = cv2.VideoCapture(str(tmp_path / "a.mp4"))
     assert (video.get(cv2.CAP_PROP_FPS), video.get(cv2.CAP_PROP_FRAME_COUNT)) == (8, 5)
     with pytest.raises(ConfigError):
@@ -68,5 +68,5 @@ def test_stops_are_marked_with_their_joint_score() -> None:
     figure = still_figure([*views[:2], stop, *further, *views[3:]], LANDMARKS)
     scores = next(axes for axes in figure.axes if axes.get_ylabel() == "score")
     np.testing.assert_allclose(scores.lines[0].get_ydata(), np.arange(6) / 6)  # without further looks
-    (mark,) = (line for line in scores.lines if line.get_label() == "all looks of a stop")
+    (mark,) = (line for line in scores.lines if line.get_label() == "all views of a stop")
     assert (mark.get_xdata(), mark.get_ydata()) == ([1.0], [0.9])

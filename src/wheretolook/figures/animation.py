@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from itertools import repeat
-from math import gcd
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +10,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from wheretolook.utils.errors import ConfigError, StorageError
-from wheretolook.utils.files import STORAGE_FIX, atomic_write
+from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.files import atomic_write
 
-Pixels = NDArray[np.uint8]  # an image (H, W, 3) or several (N, H, W, 3)
+Pixels = NDArray[np.uint8]  # an image (H, W, 3)
 
 WEBP_QUALITY = 55  # of 100
 GIF_COLORS = 128
@@ -28,56 +26,54 @@ def pixels_of(figure: Figure) -> Pixels:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def save_moving(frames: Iterable[Pixels], times_ms: int | Sequence[int], path: Path) -> None:
+def save_moving(frames: Iterable[Pixels], frame_ms: int, path: Path, last_ms: int | None = None) -> None:
     """Write frames (H, W, 3) of equal size, at least one, as .webp, .gif or .mp4, atomically.
 
-    `times_ms` is the duration of every frame, or one duration per frame. Raises ConfigError for another file name
-    suffix or if OpenCV cannot write MP4.
+    Each frame is shown for `frame_ms`, the last one for `last_ms`. Raises ConfigError for another file name suffix or
+    if OpenCV cannot write MP4.
     """
     if path.suffix not in (".webp", ".gif", ".mp4"):
         raise ConfigError("unsupported film format", path=path, fix="Use .webp, .gif or .mp4.")
     with atomic_write(path, path.with_name(f".partial-{path.name}")) as partial:
-        if path.suffix == ".mp4":
-            _save_mp4(frames, times_ms, partial, path)
-        else:
-            _save_animation(frames, times_ms, partial)
+        save = _save_mp4 if path.suffix == ".mp4" else _save_animation
+        save(frames, frame_ms, last_ms or frame_ms, partial)
 
 
-def _save_animation(frames: Iterable[Pixels], times_ms: int | Sequence[int], partial: Path) -> None:
+def _save_animation(frames: Iterable[Pixels], frame_ms: int, last_ms: int, partial: Path) -> None:
     from PIL import Image
 
-    images = (Image.fromarray(frame) for frame in frames)
-    times = times_ms if isinstance(times_ms, int) else list(times_ms)
+    images = map(Image.fromarray, frames)
     if partial.suffix == ".gif":
-        first, *rest = (image.quantize(GIF_COLORS) for image in images)
-        first.save(partial, save_all=True, append_images=rest, duration=times, loop=0)
-    else:
-        first, *rest = images
-        first.save(partial, save_all=True, append_images=rest, duration=times, loop=0, quality=WEBP_QUALITY, method=6)
+        images = (image.quantize(GIF_COLORS) for image in images)
+    first, *rest = images
+    times = [frame_ms] * len(rest) + [last_ms]
+    options = {"quality": WEBP_QUALITY, "method": 6} if partial.suffix == ".webp" else {}
+    first.save(partial, save_all=True, append_images=rest, duration=times, loop=0, **options)
 
 
-def _save_mp4(frames: Iterable[Pixels], times_ms: int | Sequence[int], partial: Path, path: Path) -> None:
-    """Write the temporary file `partial` of the film `path`."""
+def _save_mp4(frames: Iterable[Pixels], frame_ms: int, last_ms: int, partial: Path) -> None:
     import cv2
 
     partial.write_bytes(b"")  # raises with the cause if the file cannot be written; OpenCV would not
-    step_ms, times = (times_ms, repeat(times_ms)) if isinstance(times_ms, int) else (gcd(*times_ms), times_ms)
     writer = None
     n_frames = 0
-    for frame, time_ms in zip(frames, times, strict=False):
+    for frame in frames:
         even = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]  # the codec needs even sides
         if writer is None:
             codec = cv2.VideoWriter.fourcc(*"mp4v")
-            writer = cv2.VideoWriter(str(partial), codec, 1000 / step_ms, even.shape[1::-1])
+            writer = cv2.VideoWriter(str(partial), codec, 1000 / frame_ms, even.shape[1::-1])
             if not writer.isOpened():
-                raise ConfigError("this OpenCV build cannot write MP4", path=path, fix="Use .gif.")
-        for _ in range(time_ms // step_ms):  # the frame rate is constant: longer frames are repeated
-            writer.write(np.ascontiguousarray(even[..., ::-1]))
-            n_frames += 1
-    if writer is not None:
-        writer.release()
-        written = cv2.VideoCapture(str(partial))  # OpenCV does not report a full disk
-        complete = written.get(cv2.CAP_PROP_FRAME_COUNT) == n_frames
-        written.release()
-        if not complete:
-            raise StorageError("the film is incomplete; is the disk full?", path=path, fix=STORAGE_FIX)
+                raise ConfigError("this OpenCV build cannot write MP4", fix="Use .gif.")
+        bgr = np.ascontiguousarray(even[..., ::-1])
+        writer.write(bgr)
+        n_frames += 1
+    assert writer is not None
+    for _ in range(last_ms // frame_ms - 1):  # the frame rate is constant
+        writer.write(bgr)
+        n_frames += 1
+    writer.release()
+    written = cv2.VideoCapture(str(partial))  # OpenCV does not report a full disk
+    complete = written.get(cv2.CAP_PROP_FRAME_COUNT) == n_frames
+    written.release()
+    if not complete:
+        raise OSError("the film is incomplete; is the disk full?")

@@ -9,7 +9,6 @@ from matplotlib.style import context
 
 from wheretolook.evaluation.scores import main_rows, methods_of
 from wheretolook.figures.style import GREY, INK, RC, Style, new_figure
-from wheretolook.scorers.method import MethodStyle
 from wheretolook.scorers.styles import method_style
 
 
@@ -26,15 +25,13 @@ def calibration_figure(table: pd.DataFrame) -> Figure:
         figure = new_figure(0.9 + 2.8 * len(methods), 4.3)
         panels = figure.subplots(2, len(methods), sharex=True, sharey="row", squeeze=False, height_ratios=(3, 1))
         for (curve, counts), method in zip(panels.T, methods, strict=True):
-            style = method_style(method)
-            rows = table[table["method"] == method].sort_values("bin_low")
             curve.plot([0, 1], [0, 1], color=INK, linewidth=1, linestyle="--")
+            rows = table[table["method"] == method].sort_values("bin_low")
             for when in ("before", "after"):
-                part = rows[rows["when"] == when]
-                if len(part):
-                    _draw(curve, counts, part, style, scaled=when == "after")
-            curve.set(title=style.label, xlim=(0, 1), ylim=(0, 1))
-            for x, y, text in ((0.3, 0.7, "too careful"), (0.7, 0.3, "too sure")):
+                if (rows["when"] == when).any():
+                    _draw(curve, counts, rows[rows["when"] == when])
+            curve.set(title=method_style(method).label, xlim=(0, 1), ylim=(0, 1))
+            for x, y, text in ((0.3, 0.7, "underconfident"), (0.7, 0.3, "overconfident")):
                 curve.text(x, y, text, color=GREY, fontsize=9, ha="center", rotation=45, rotation_mode="anchor")
             curve.legend(handlelength=1.6, borderaxespad=0.2)
             counts.set_xlabel("predicted probability")
@@ -44,19 +41,16 @@ def calibration_figure(table: pd.DataFrame) -> Figure:
         return figure
 
 
-def _draw(curve: Axes, counts: Axes, part: pd.DataFrame, style: MethodStyle, scaled: bool) -> None:
+def _draw(curve: Axes, counts: Axes, bins: pd.DataFrame) -> None:
+    """Draw the bins of one method before or after scaling."""
+    first = bins.iloc[0]
+    style = method_style(first["method"])
+    scaled = first["when"] == "after"
     line: Style = {"color": style.color, "linewidth": 1.2, "linestyle": "-" if scaled else ":"}
     mark: Style = {"marker": style.marker, "markersize": 5, "markerfacecolor": style.color if scaled else "white"}
-    first = part.iloc[0]
-    label = f"T = {first['temperature']:.2f}" if scaled else "as predicted"
-    filled = part[part["n"] > 0]
-    curve.plot(
-        filled["mean_predicted"],
-        filled["share_good"],
-        label=f"{label}: ECE {first['ece']:.3f}",
-        clip_on=False,
-        zorder=3 if scaled else 2.5,
-        **line,
-        **mark,
-    )
-    counts.stairs(part["n"], [*part["bin_low"], part["bin_high"].iloc[-1]], **line)
+    name = f"T = {first['temperature']:.2f}" if scaled else "as predicted"
+    filled = bins[bins["n"] > 0]
+    points = filled[["mean_predicted", "share_good"]].to_numpy().T
+    label = f"{name}: ECE {first['ece']:.3f}"
+    curve.plot(*points, label=label, clip_on=False, zorder=3 if scaled else 2.5, **line, **mark)
+    counts.stairs(bins["n"], [*bins["bin_low"], bins["bin_high"].iloc[-1]], **line)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, invert_poses, poses_looking_along, rotation_looking_along, transform
 from wheretolook.rendering.registry import make_renderer
 from wheretolook.scenes.cutting import cut_above
-from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.errors import SceneError
 
 EYE_DISTANCE = 25.0  # in diagonals of the scene: close to an orthographic projection
 
@@ -67,37 +68,32 @@ def dollhouse(
         one_sided: leave out triangles that face away from the eye, such as ceilings; needs consistent winding.
         device: where to render.
 
-    Raises ConfigError if elevation or width is out of range, SceneError if no triangle remains.
+    Raises SceneError if no triangle remains.
     """
-    if not 0 < elevation_deg <= 90 or width_px < 2:
-        raise ConfigError("the elevation must be in (0, 90] and the width at least 2", value=(elevation_deg, width_px))
-    low, high = mesh.bounds
+    bounds = mesh.bounds
     if cut_m is not None:
         mesh = cut_above(mesh, cut_m)
     azimuth = np.radians(azimuth_deg)
     elevation = np.radians(elevation_deg)
-    to_eye = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-    if elevation_deg == 90:
-        to_eye = np.array([0.0, 0.0, 1.0])
+    level = np.cos(elevation) if elevation_deg < 90 else 0.0
+    to_eye = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
     if one_sided:
         mesh = mesh.only(mesh.normals @ to_eye > 0)
     if len(mesh.triangles) == 0:
         raise SceneError("no triangle of the scene is visible", value=cut_m, fix="Cut higher.")
-    corners = np.stack(np.meshgrid(*np.stack([low, high], axis=1), indexing="ij"), axis=-1).reshape(-1, 3)
+    corners = np.array(list(product(*bounds.T)))
     rotation = rotation_looking_along(-to_eye)
     in_eye_frame = corners @ rotation.T
     extent = np.ptp(in_eye_frame[:, :2], axis=0)
     center = (in_eye_frame.min(0) + in_eye_frame.max(0)) / 2 @ rotation
-    distance = EYE_DISTANCE * float(np.linalg.norm(high - low))
+    distance = EYE_DISTANCE * float(np.linalg.norm(np.ptp(bounds, axis=0)))
     focal_px = 0.98 * width_px * distance / extent[0]
     height_px = max(2, int(np.ceil(width_px * extent[1] / extent[0])))
     camera = PinholeCamera(width_px, height_px, float(focal_px))
     pose = poses_looking_along(center + distance * to_eye, -to_eye)
     rendering = make_renderer(mesh, device).render(camera, pose[None])
-    rgb = rendering.rgb[0]
-    depth_m = rendering.depth_m[0]
-    rgb[depth_m == 0] = 255
-    return Dollhouse(rgb, depth_m, camera, pose)
+    rendering.rgb[rendering.depth_m == 0] = 255
+    return Dollhouse(rendering.rgb[0], rendering.depth_m[0], camera, pose)
 
 
 def draw_house(axes: Axes, house: Dollhouse, fade: float = 0.5) -> None:

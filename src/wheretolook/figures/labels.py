@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import textwrap
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -36,7 +35,7 @@ def label_figure(summary: LabelSummary) -> Figure:
         figure = new_figure(11.0, max(4.2, 2.0 + 0.33 * n_bars))
         scenes, errors = figure.subplots(1, 2, width_ratios=(1.0, 1.25))
         _draw_scenes(scenes, summary.shares)
-        _draw_errors(errors, summary.errors_m, summary.overall)
+        _draw_errors(errors, summary)
         figure.supxlabel("\n".join(textwrap.wrap(threshold_sentence(summary), 125)), fontsize=9)
         return figure
 
@@ -44,51 +43,46 @@ def label_figure(summary: LabelSummary) -> Figure:
 def _draw_scenes(axes: Axes, shares: pd.DataFrame) -> None:
     """Draw one bar per scene, grouped by split, and one for all scenes at the bottom."""
     scenes = shares[shares["scene"] != ALL]
-    order = [*dict.fromkeys(scenes["split"])]
-    scenes = scenes.sort_values("split", key=lambda splits: splits.map(order.index), kind="stable")
-    rows = pd.concat([scenes, shares.iloc[-1:]], ignore_index=True)
+    groups = [scenes[scenes["split"] == split] for split in scenes["split"].unique()]
+    rows = pd.concat([*groups, shares.iloc[-1:]], ignore_index=True)
     gaps = rows["split"] != rows["split"].shift(fill_value=rows["split"].iloc[0])
     y = np.arange(len(rows)) + 0.4 * gaps.cumsum().to_numpy()
     for end in reversed(_ENDS):  # the finer over the coarser, which includes it
         values = np.nan_to_num(100 * rows[POSITIVE[end]].to_numpy())
-        name = threshold_label(threshold_key(THRESHOLDS[end]))
-        axes.barh(y, values, 0.72, color=SHADES[end], label=f"within {name}")
-    text: Style = {"textcoords": "offset points", "va": "center", "fontsize": 9}
+        axes.barh(y, values, 0.72, color=SHADES[end], label=f"within {threshold_label(threshold_key(THRESHOLDS[end]))}")
     for height, share in zip(y, values, strict=True):
-        if share > 15:
-            axes.annotate(f"{share:.0f}", (share, height), (-4, 0), ha="right", color="white", **text)
-        else:
-            axes.annotate(f"{share:.0f}", (share, height), (4, 0), ha="left", color=INK, **text)
-    names = [
-        "all scenes" if split == ALL else f"{scene_label(scene)} ({split})"
-        for scene, split in rows[["scene", "split"]].to_numpy()
-    ]
+        at: Style = {"xytext": (-4, 0), "ha": "right", "color": "white"}
+        if share <= 15:
+            at = {"xytext": (4, 0), "ha": "left", "color": INK}
+        axes.annotate(f"{share:.0f}", (share, height), textcoords="offset points", va="center", fontsize=9, **at)
+    names = [f"{scene_label(row.scene)} ({row.split})" for row in rows[:-1].itertuples()]
     # at least six rows high: a few scenes do not get thick bars
-    axes.set(yticks=y, yticklabels=names, ylim=(max(y[-1] + 0.6, 5.4), -0.6), xlim=(0, 100))
+    axes.set(yticks=y, yticklabels=[*names, "all scenes"], ylim=(max(y[-1] + 0.6, 5.4), -0.6), xlim=(0, 100))
     axes.set_xlabel("viewpoints that localize (%)")
     axes.grid(axis="y", visible=False)
     axes.tick_params(axis="y", length=0)
-    handles, labels = axes.get_legend_handles_labels()
-    axes.legend(handles[::-1], labels[::-1], loc="lower left", bbox_to_anchor=(0, 1.01), ncols=2, columnspacing=1.4)
+    axes.legend(reverse=True, loc="lower left", bbox_to_anchor=(0, 1.01), ncols=2, columnspacing=1.4)
 
 
-def _draw_errors(axes: Axes, errors: pd.DataFrame, overall: dict[str, Any]) -> None:
+def _draw_errors(axes: Axes, summary: LabelSummary) -> None:
+    """Draw the histogram of position errors, and a bar of viewpoints without a pose, set apart from it."""
+    errors = summary.errors_m
     low = errors["low"].to_numpy()
     high = errors["high"].to_numpy()
     edges: Style = {"align": "edge", "edgecolor": INK, "linewidth": 0.5}
     bottom = np.zeros(len(errors))
     for column, (label, color) in _OUTCOMES.items():
-        share = 100 * errors[column].to_numpy() / overall["n_views"]
+        share = 100 * errors[column].to_numpy() / summary.overall["n_views"]
         axes.bar(low, share, high - low, bottom, color=color, label=label, **edges)
         bottom += share
     step = high[-1] / low[-1]
-    end = high[-1] * step**2  # the bar of viewpoints without a pose is set apart from the errors
-    axes.bar(end, 100 * overall["without_pose"], end * (step**2 - 1), color="white", label="no pose", **edges)
+    end = high[-1] * step**2
+    axes.bar(end, 100 * summary.overall["without_pose"], end * (step**2 - 1), color="white", label="no pose", **edges)
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1.06), ncols=3, columnspacing=1.4)
     for shade, threshold in zip(SHADES, _ENDS, strict=True):
         limit = THRESHOLDS[threshold][0]
         axes.axvline(limit, color=shade, linewidth=1.6, linestyle="--")
-        name = f"{100 * limit:g} cm" if limit < 0.5 else f"{limit:g} m"
+        name = threshold_label(threshold_key(THRESHOLDS[threshold])).partition(",")[0]
         at: Style = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "ha": "center"}
         axes.annotate(name, (limit, 1), (0, 3), fontsize=9, **at)
     axes.set_xscale("log")

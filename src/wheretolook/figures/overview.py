@@ -44,10 +44,8 @@ def rendered_views(
     """Render B labelled viewpoints (rows of the viewpoint table) with scores (B,) and outcomes described by `words`."""
     cam_from_world = poses(rows)
     images = scene.renderer.render(scene.camera, cam_from_world).rgb
-    return tuple(
-        View(images[row], cam_from_world[row, 2, :3], float(scores[row]), words(rows.iloc[row]))
-        for row in range(len(rows))
-    )
+    outcomes = [words(row) for _, row in rows.iterrows()]
+    return tuple(map(View, images, cam_from_world[:, 2, :3], scores.tolist(), outcomes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,33 +66,37 @@ class Overview:
 
 def overview_figure(overview: Overview) -> Figure:
     """Draw a plan of the labels, the sphere of scores at the ringed location, and two of its views with outcomes."""
+    views = (("best", "best view", overview.best, BLUE), ("worst", "worst level view", overview.worst, VERMILION))
     with context(RC):
         figure = new_figure(13.5, 4.7)
         left, middle, right = figure.subfigures(1, 3, squeeze=False, width_ratios=(1.1, 1.45, 0.8))[0]
-        axes = left.add_subplot()
-        points = _draw_plan(axes, overview)
-        axes.set_title(f"{overview.scene}, from above", loc="left")
-        bar = left.colorbar(points, ax=axes, orientation="horizontal", shrink=0.8, pad=0.03, aspect=28)
+        plan = left.add_subplot()
+        points = _draw_plan(plan, overview)
+        plan.set_title(f"{overview.scene}, from above", loc="left")
+        bar = left.colorbar(points, ax=plan, orientation="horizontal", shrink=0.8, pad=0.03, aspect=28)
         bar.set_label("share of a location's views that localize", color=INK)
-        axes = middle.add_subplot(projection="hammer")
-        points = _draw_sphere(axes, overview)
-        axes.set_title(f'every direction from the ringed location,\nscored by "{overview.method}"', loc="left")
-        bar = middle.colorbar(points, ax=axes, orientation="horizontal", shrink=0.8, pad=0.06, aspect=28)
+        sphere = middle.add_subplot(projection="hammer")
+        azimuth, elevation = pan_tilt_angles(overview.directions)
+        size = 20_000 / max(len(azimuth), 1)
+        points = sphere.scatter(azimuth, elevation, size, c=overview.scores, linewidths=0, **SCORE_COLORS)
+        sphere.set(xticklabels=[], yticklabels=[])
+        sphere.grid(False)
+        sphere.set_title(f'every direction from the ringed location,\nscored by "{overview.method}"', loc="left")
+        bar = middle.colorbar(points, ax=sphere, orientation="horizontal", shrink=0.8, pad=0.06, aspect=28)
         bar.set_label("predicted probability to localize", color=INK)
-        above, below = right.subplots(2, 1)
-        _draw_view(above, "best view", overview.best, BLUE)
-        _draw_view(below, "worst level view", overview.worst, VERMILION)
+        text: Style = {"fontsize": 9, "fontweight": "bold", "ha": "center", "va": "center", "zorder": 4}
+        for axes, (name, title, view, color) in zip(right.subplots(2, 1), views, strict=True):
+            box: Style = {"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": color}
+            sphere.text(*map(float, pan_tilt_angles(view.direction)), name, color=color, bbox=box, **text)
+            axes.imshow(view.rgb)
+            frame(axes, color, 2.0)
+            axes.set_title(f"{title}: predicted {view.score:.2f}", loc="left", fontsize=10)
+            axes.set_xlabel(view.outcome, fontsize=9)
         return figure
 
 
-def _draw_view(axes: Axes, name: str, view: View, color: str) -> None:
-    axes.imshow(view.rgb)
-    frame(axes, color, 2.0)
-    axes.set_title(f"{name}: predicted {view.score:.2f}", loc="left", fontsize=10)
-    axes.set_xlabel(view.outcome, fontsize=9)
-
-
 def _draw_plan(axes: Axes, overview: Overview) -> PathCollection:
+    """Draw the scene from above with labelled locations, the ringed one and a scale."""
     plan = overview.plan
     draw_house(axes, plan, 0.2)
     order = np.argsort(overview.share_good, kind="stable")
@@ -104,23 +106,9 @@ def _draw_plan(axes: Axes, overview: Overview) -> PathCollection:
     ring: Style = {"markersize": 14, "markerfacecolor": "none", "markeredgecolor": VERMILION, "markeredgewidth": 2.4}
     outline = withStroke(linewidth=4.5, foreground="white")
     axes.plot(*plan.pixels(overview.place), "o", zorder=3, path_effects=[outline], **ring)
-    start, end = plan.pixels(np.stack([overview.place, overview.place + np.array([1.0, 0.0, 0.0])]))
+    start, end = plan.pixels(overview.place + np.eye(2, 3, -1))
     metre_px = float(end[0] - start[0])
     height, width = plan.rgb.shape[:2]
     axes.plot([width - metre_px, width], [height * 1.03] * 2, color=INK, linewidth=2, clip_on=False)
     axes.text(width - 1.1 * metre_px, height * 1.03, "1 m", ha="right", va="center")
-    return points
-
-
-def _draw_sphere(axes: Axes, overview: Overview) -> PathCollection:
-    azimuth, elevation = pan_tilt_angles(overview.directions)
-    size = 20_000 / max(len(azimuth), 1)
-    points = axes.scatter(azimuth, elevation, size, c=overview.scores, linewidths=0, **SCORE_COLORS)
-    text: Style = {"fontsize": 9, "fontweight": "bold", "ha": "center", "va": "center", "zorder": 4}
-    for view, name, color in ((overview.best, "best", BLUE), (overview.worst, "worst", VERMILION)):
-        x, y = (float(angle) for angle in pan_tilt_angles(view.direction))
-        box: Style = {"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": color}
-        axes.text(x, y, name, color=color, bbox=box, **text)
-    axes.set(xticklabels=[], yticklabels=[])
-    axes.grid(False)
     return points

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 
 from wheretolook.figures.animation import Pixels, pixels_of
-from wheretolook.figures.style import INK, RC, Style, new_figure
+from wheretolook.figures.style import INK, RC, Style, frame, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook.planning.routes import PathView
 from wheretolook.planning.view_sequence import lengths_along
@@ -22,7 +22,7 @@ FRAME_MS = 125
 N_STILLS = 5
 N_ARROWS = 12
 
-_STOP: Style = {"color": "white", "markeredgecolor": PATH, "markeredgewidth": 1.6}
+_STOP: Style = {"marker": "o", "color": "white", "markeredgecolor": PATH, "markeredgewidth": 1.6, "linestyle": "none"}
 _ARROW: Style = {"arrowstyle": "-|>", "color": INK, "linewidth": 0.9, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 8}
 _NUMBER: Style = {"boxstyle": "circle,pad=0.15", "facecolor": PATH, "edgecolor": "white"}
 
@@ -33,10 +33,10 @@ def film_frames(views: Sequence[PathView], landmarks: Float) -> Iterator[Pixels]
     `landmarks` (N, 3) m are those of the map; there is at least one view.
     """
     with context(RC):
-        for number in range(len(views)):
+        for number, view in enumerate(views):
             figure = new_figure(9.6, 4.4)
             grid = figure.add_gridspec(2, 2, width_ratios=(1.5, 1.0), height_ratios=(1.7, 1.0))
-            _draw_view(figure.add_subplot(grid[:, 0]), views[number])
+            _draw_view(figure.add_subplot(grid[:, 0]), view)
             _draw_map(figure.add_subplot(grid[0, 1]), views, landmarks, number)
             _draw_scores(figure.add_subplot(grid[1, 1]), views, number)
             yield pixels_of(figure)
@@ -57,9 +57,8 @@ def still_figure(views: Sequence[PathView], landmarks: Float, title: str = "") -
         _draw_map(axes, views, landmarks, None, shown)
         axes.set_title(title)
         _draw_scores(figure.add_subplot(above[1]), views, None, shown)
-        for column, number in enumerate(shown):
-            axes = figure.add_subplot(grid[1].subgridspec(1, len(shown))[column])
-            _draw_view(axes, views[number], f"{column + 1}: ")
+        for cell, (label, number) in zip(grid[1].subgridspec(1, len(shown)), enumerate(shown, 1), strict=True):
+            _draw_view(figure.add_subplot(cell), views[number], f"{label}: ")
         return figure
 
 
@@ -86,13 +85,12 @@ def _draw_view(axes: Axes, view: PathView, prefix: str = "") -> None:
     width, height = view.size_px
     if view.rgb is not None:
         axes.imshow(view.rgb, extent=(0, width, height, 0))
-    axes.scatter(view.pixels[:, 0], view.pixels[:, 1], s=3, color=LANDMARKS, linewidths=0)
-    axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[], aspect="equal", anchor="N")
-    stop = f"look {view.look} of {view.n_looks}: " if view.n_looks > 1 else ""
+    axes.scatter(*view.pixels.T, s=3, color=LANDMARKS, linewidths=0)
+    axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal", anchor="N")
+    frame(axes, linewidth=0.8)
+    stop = f"view {view.look} of {view.n_looks}: " if view.n_looks > 1 else ""
     score = "" if np.isnan(view.score) else f", score {score_text(view.score)}"
     axes.set_title(f"{prefix}{stop}{len(view.pixels):,} landmarks{score}", fontsize=9)
-    axes.grid(False)
-    axes.spines[:].set_visible(True)
 
 
 def _draw_map(
@@ -104,22 +102,20 @@ def _draw_map(
     low, high = np.percentile(landmarks[:, :2], (1, 99), axis=0)
     low = np.minimum(low, xy.min(0))
     high = np.maximum(high, xy.max(0))
-    axes.scatter(landmarks[:, 0], landmarks[:, 1], s=0.5, color="#9a9a9a", linewidths=0, rasterized=True)
+    axes.scatter(*landmarks[:, :2].T, s=0.5, color="#9a9a9a", linewidths=0, rasterized=True)
     axes.plot(*xy.T, color=PATH, linewidth=2.2, zorder=3)
     stops = xy[[view.look == 1 < view.n_looks for view in views]]
-    if len(stops):
-        axes.plot(*stops.T, "o", markersize=7, zorder=3.5, **_STOP)
+    axes.plot(*stops.T, markersize=7, zorder=3.5, **_STOP)
+    along = lengths_along(positions)
+    arrows = np.unique(np.searchsorted(along, np.linspace(0, along[-1], N_ARROWS) - 1e-9)).tolist()
     length = 0.07 * float(np.max(high - low))
-    if number is None:
-        along = lengths_along(positions)
-        arrows = np.unique(np.searchsorted(along, np.linspace(0, along[-1], N_ARROWS) - 1e-9)).tolist()
-    else:
+    if number is not None:
         arrows = [number]
         length *= 2
     for at in arrows:
         axes.annotate("", xy[at] + views[at].axis[:2] * length, xy[at], arrowprops=_ARROW, zorder=4)
     for label, at in enumerate(shown, 1):
-        axes.annotate(str(label), xy[at], fontsize=9, color="white", ha="center", va="center", bbox=_NUMBER)
+        axes.annotate(str(label), xy[at], fontsize=9, color="white", ha="center", va="center", bbox=_NUMBER, zorder=5)
     axes.set(xlim=(low[0] - 0.3, high[0] + 0.3), ylim=(low[1] - 0.3, high[1] + 0.3), aspect="equal")
     axes.set(xlabel="x (m)", ylabel="y (m)")
 
@@ -134,7 +130,7 @@ def _draw_scores(axes: Axes, views: Sequence[PathView], number: int | None, show
     stops = own & np.isfinite(joint)
     if stops.any():
         axes.vlines(along[stops], scores[stops], joint[stops], color=PATH, linewidth=0.8, linestyle=":")
-        axes.plot(along[stops], joint[stops], "o", label="all looks of a stop", markersize=6, **_STOP)
+        axes.plot(along[stops], joint[stops], label="all views of a stop", markersize=6, **_STOP)
         axes.legend(loc="best", fontsize=8)
     if number is not None:
         axes.plot(along[number], scores[number], "o", color=INK, markersize=6)
@@ -143,7 +139,7 @@ def _draw_scores(axes: Axes, views: Sequence[PathView], number: int | None, show
         axes.annotate(str(label), (along[at], scores[at]), (0, 6), textcoords="offset points", ha=side)
     finite = np.concatenate([scores, joint])
     finite = finite[np.isfinite(finite)]
-    lowest, highest = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
+    lowest, highest = (finite.min(), finite.max()) if len(finite) else (0.0, 1.0)
     margin = max(0.25 * (highest - lowest), 0.02 * max(1.0, abs(highest)))  # a constant score is in the middle
     axes.set(xlim=(0, max(along[-1], 1e-6)), ylim=(lowest - margin, highest + margin))
     axes.set(xlabel="along the path (m)", ylabel="score")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,11 +16,11 @@ from matplotlib.ticker import MaxNLocator
 from wheretolook.dataset.thresholds import ALL, threshold_label
 from wheretolook.evaluation.scores import is_random, main_rows, reference_of, threshold_keys
 from wheretolook.figures.style import INK, RC, Style, new_figure
+from wheretolook.geometry.poses import Float
 from wheretolook.scorers.styles import ORACLE, method_group, method_style
 
 _MAX_METHODS = {"Fisher": 3, "probes": 0}  # the best methods of a group that a figure shows; all of other groups
 _WRAP = 36  # characters; longer labels are broken into two lines
-_WHISKERS = "whiskers: 95 % bootstrap interval over locations"
 _DASHED: Style = {"color": INK, "linewidth": 1, "linestyle": "--", "zorder": 1}
 
 
@@ -34,18 +34,14 @@ def score_figure(scores: pd.DataFrame) -> Figure:
     """
     pooled = _pooled(scores)
     keys = threshold_keys(scores)
-    shown = methods_to_show(pooled, keys[0])
-    columns = {f"normalized_{key}": f"within {threshold_label(key)}" for key in dict.fromkeys((keys[0], keys[-1]))}
-    low = min(_range(pooled, _close_to_oracle(pooled, shown, keys[0]), list(columns))[0], 95.0)
+    rows = _first_rows(pooled).loc[methods_to_show(pooled, keys[0])]
+    columns = {f"normalized_{key}": f"within {threshold_label(key)}" for key in (keys[0], keys[-1])}
+    values = np.stack([_intervals(rows, column) for column in columns])[:, _close_to_oracle(rows, keys[0])]
+    low = float(np.min(values, where=np.isfinite(values), initial=95.0))
     margin = 0.04 * (100 - low)
-    with context(RC):
-        figure, panels = _rows_and_panels(pooled, shown, columns)
-        for axes in panels:
-            _set_range(axes, shown, low - margin, 100 + margin, 100)
-        oracle = method_style(ORACLE).label
-        reached = f"{_chosen_views(pooled)} that localize, % of what the {oracle} reaches (dashed)"
-        figure.supxlabel(f"{reached}\n{_WHISKERS}", fontsize=9)
-        return figure
+    ranges = [(low - margin, 100 + margin)] * len(columns)
+    reached = f"{_chosen_views(pooled)} that localize, % of what the {method_style(ORACLE).label} reaches (dashed)"
+    return _draw_panels(rows, columns, ranges, 100, reached)
 
 
 def regret_figure(scores: pd.DataFrame) -> Figure:
@@ -58,22 +54,20 @@ def regret_figure(scores: pd.DataFrame) -> Figure:
     key = threshold_keys(scores)[0]
     if f"regret_{key}" not in scores:
         raise ValueError("the score table has no regret: evaluate again")
-    shown = methods_to_show(pooled, key)
-    reference = reference_of(pooled)
+    rows = _first_rows(pooled).loc[methods_to_show(pooled, key)]
     columns = {f"regret_{key}": "regret: oracle minus method\n(lower is better)"}
-    if reference:
+    if reference := reference_of(pooled):
         columns[f"difference_{key}"] = f"method minus {method_style(reference).label}\n(higher is better)"
-    with context(RC):
-        figure, panels = _rows_and_panels(pooled, shown, columns)
-        for axes, column in zip(panels, columns, strict=True):
-            low, high = _range(pooled, _close_to_oracle(pooled, shown, key), [column])
-            low = min(low, 0.0)
-            high = max(high, 0.0)
-            margin = 0.06 * max(high - low, 1.0)
-            _set_range(axes, shown, low - margin, high + margin, 0)
-        views = f"{_chosen_views(pooled)} within {threshold_label(key)}, percentage points"
-        figure.supxlabel(f"{views}\n{_WHISKERS}", fontsize=9)
-        return figure
+    ranges = []
+    for column in columns:
+        values = _intervals(rows, column)[_close_to_oracle(rows, key)]
+        finite = np.isfinite(values)
+        low = float(np.min(values, where=finite, initial=0.0))
+        high = float(np.max(values, where=finite, initial=0.0))
+        margin = 0.06 * max(high - low, 1.0)
+        ranges.append((low - margin, high + margin))
+    views = f"{_chosen_views(pooled)} within {threshold_label(key)}, percentage points"
+    return _draw_panels(rows, columns, ranges, 0, views)
 
 
 def methods_to_show(pooled: pd.DataFrame, key: str) -> list[str]:
@@ -86,34 +80,13 @@ def methods_to_show(pooled: pd.DataFrame, key: str) -> list[str]:
     rows = _first_rows(pooled).drop(index=ORACLE, errors="ignore")
     ordered = rows[f"normalized_{key}"].fillna(0.0).sort_values(ascending=False, kind="stable").index
     shown: list[str] = []
-    counts = dict.fromkeys(_MAX_METHODS, 0)
+    counts: Counter[str] = Counter()
     for method in ordered:
         group = method_group(method)
-        counts[group] = counts.get(group, 0) + 1
+        counts[group] += 1
         if counts[group] <= _MAX_METHODS.get(group, len(ordered)):
             shown.append(method)
     return shown or list(ordered)
-
-
-def _close_to_oracle(pooled: pd.DataFrame, shown: Sequence[str], key: str) -> list[str]:
-    """Select the methods at least halfway from random choice to the oracle, or all."""
-    shares = _first_rows(pooled)[f"normalized_{key}"].fillna(0.0)
-    baseline = max((share for method, share in shares.items() if is_random(str(method))), default=0.0)
-    return [method for method in shown if shares[method] >= (1 + baseline) / 2] or list(shown)
-
-
-def _set_range(axes: Axes, shown: Sequence[str], low: float, high: float, dashed: float) -> None:
-    """Set the range of the x axis, draw a dashed line, and point arrows to marks outside the range."""
-    axes.set_xlim(low, high)
-    axes.axvline(dashed, **_DASHED)
-    for y, method in enumerate(shown):
-        style = method_style(method)
-        (value,) = (float(line.get_xdata()[0]) for line in axes.lines if line.get_label() == style.label)  # type: ignore[index,arg-type]
-        text: Style = {"color": style.color, "fontsize": 13, "va": "center"}
-        if value < low:
-            axes.text(low, y, "◂", ha="left", **text)
-        elif value > high:
-            axes.text(high, y, "▸", ha="right", **text)
 
 
 def _pooled(scores: pd.DataFrame) -> pd.DataFrame:
@@ -126,48 +99,62 @@ def _first_rows(pooled: pd.DataFrame) -> pd.DataFrame:
     return pooled[pooled["top_n"] == pooled["top_n"].iloc[0]].set_index("method")
 
 
-def _interval(row: Any, column: str) -> tuple[float, float, float]:
-    """Read value, lower and upper end of an interval from a row of the table, in percent; NaN if missing."""
+def _close_to_oracle(rows: pd.DataFrame, key: str) -> Sequence[bool]:
+    """Select the methods (M,) at least halfway from random choice to the oracle, or all."""
+    shares = rows[f"normalized_{key}"].fillna(0.0)
+    baseline = shares[[is_random(str(method)) for method in rows.index]].max()
+    close = shares >= (1 + np.nan_to_num(baseline)) / 2
+    return list(close if close.any() else ~close)
+
+
+def _intervals(rows: pd.DataFrame, column: str) -> Float:
+    """Read values and lower and upper ends of their intervals (M, 3), in percent; NaN where missing."""
     name, _, key = column.partition("_")
-    value, low, high = (
-        100 * float(row.get(part, np.nan)) for part in (column, f"{name}_low_{key}", f"{name}_high_{key}")
-    )
-    return value, low, high
+    return 100 * rows.reindex(columns=[column, f"{name}_low_{key}", f"{name}_high_{key}"]).to_numpy(float)
 
 
-def _range(pooled: pd.DataFrame, methods: Sequence[str], columns: Sequence[str]) -> tuple[float, float]:
-    """Find the smallest and largest finite value or interval end of methods in columns of the table, in percent."""
-    rows = _first_rows(pooled)
-    values = np.array([_interval(rows.loc[method], column) for method in methods for column in columns])
-    values = values[np.isfinite(values)]
-    return (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
+def _draw_panels(
+    rows: pd.DataFrame, titles: dict[str, str], ranges: list[tuple[float, float]], dashed: float, caption: str
+) -> Figure:
+    """Draw one titled panel per column of the table, one row per method: mark, whiskers and number.
+
+    Each panel has a range of values and a dashed line; arrows point to marks outside the range.
+    """
+    with context(RC):
+        figure = new_figure(3.1 + 2.9 * len(titles), 1.5 + 0.3 * len(rows))
+        panels: list[Axes] = list(figure.subplots(1, len(titles), sharey=True, squeeze=False)[0])
+        for axes, (column, title), limits in zip(panels, titles.items(), ranges, strict=True):
+            axes.set_title(title, fontsize=10)
+            axes.tick_params(axis="y", length=0)
+            axes.tick_params(axis="x", labelsize=9)
+            axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
+            axes.grid(axis="y", visible=False)
+            for y, (method, interval) in enumerate(zip(rows.index, _intervals(rows, column), strict=True)):
+                _draw_row(axes, y, str(method), interval, limits)
+            axes.set_xlim(limits)
+            axes.axvline(dashed, **_DASHED)
+        labels = [method_style(str(method)).label for method in rows.index]
+        labels = [",\n".join(label.rsplit(", ", 1)) if len(label) > _WRAP else label for label in labels]
+        panels[0].set_yticks(range(len(rows)), labels, fontsize=9)
+        panels[0].set_ylim(len(rows) - 0.4, -0.6)
+        figure.supxlabel(f"{caption}\nwhiskers: 95 % bootstrap interval over locations", fontsize=9)
+        return figure
 
 
-def _rows_and_panels(pooled: pd.DataFrame, shown: Sequence[str], columns: dict[str, str]) -> tuple[Figure, list[Axes]]:
-    """Draw one titled panel per column of the table, one row per method: mark, whiskers and number."""
-    figure = new_figure(3.1 + 2.9 * len(columns), 1.5 + 0.3 * len(shown))
-    panels: list[Axes] = list(figure.subplots(1, len(columns), sharey=True, squeeze=False)[0])
-    rows = _first_rows(pooled)
-    for axes, (column, title) in zip(panels, columns.items(), strict=True):
-        axes.set_title(title, fontsize=10)
-        axes.tick_params(axis="y", length=0)
-        axes.tick_params(axis="x", labelsize=9)
-        axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
-        axes.grid(axis="y", visible=False)
-        for y, method in enumerate(shown):
-            style = method_style(method)
-            value, low, high = _interval(rows.loc[method], column)
-            axes.hlines(y, low, high, color=style.color, linewidth=1.6)
-            filled = style.marker in Line2D.filled_markers
-            edge: Style = {"markeredgecolor": INK if filled else style.color, "markeredgewidth": 0.5 if filled else 1.6}
-            axes.plot(value, y, style.marker, color=style.color, markersize=7, label=style.label, **edge)
-            number = "" if np.isnan(value) else f"{value:.1f}".replace("-", "−")
-            axes.annotate(number, (1.02, y), xycoords=("axes fraction", "data"), va="center", fontsize=8.5)
-    labels = [method_style(method).label for method in shown]
-    labels = [",\n".join(label.rsplit(", ", 1)) if len(label) > _WRAP else label for label in labels]
-    panels[0].set_yticks(range(len(shown)), labels, fontsize=9)
-    panels[0].set_ylim(len(shown) - 0.4, -0.6)
-    return figure, panels
+def _draw_row(axes: Axes, y: float, method: str, interval: Float, limits: tuple[float, float]) -> None:
+    style = method_style(method)
+    value, low, high = interval
+    axes.hlines(y, low, high, color=style.color, linewidth=1.6)
+    filled = style.marker in Line2D.filled_markers
+    edge: Style = {"markeredgecolor": INK if filled else style.color, "markeredgewidth": 0.5 if filled else 1.6}
+    axes.plot(value, y, style.marker, color=style.color, markersize=7, label=style.label, **edge)
+    number = "" if np.isnan(value) else f"{value:.1f}".replace("-", "−")
+    axes.annotate(number, (1.02, y), xycoords=("axes fraction", "data"), va="center", fontsize=8.5)
+    text: Style = {"color": style.color, "fontsize": 13, "va": "center"}
+    if value < limits[0]:
+        axes.text(limits[0], y, "◂", ha="left", **text)
+    elif value > limits[1]:
+        axes.text(limits[1], y, "▸", ha="right", **text)
 
 
 def _chosen_views(pooled: pd.DataFrame) -> str:

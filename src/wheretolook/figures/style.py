@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import html
 import io
-import re
 from pathlib import Path
 from typing import Any
 
@@ -104,20 +102,12 @@ def scene_label(name: str) -> str:
     return name.replace("_", " ").replace("-", " ")
 
 
-_NOTE = {"png": "Description", "pdf": "Subject", "svg": "Description"}  # metadata field of the note
-_UNDATED: dict[str, dict[str, Any]] = {
-    "png": {"Software": None},
-    "pdf": {"CreationDate": None, "Creator": None},
-    "svg": {"Date": None},
+_METADATA: dict[str, tuple[str, dict[str, Any]]] = {
+    "png": ("Description", {"Software": None}),
+    "pdf": ("Subject", {"CreationDate": None, "Creator": None}),
+    "svg": ("Description", {"Date": None}),
 }
-"""Metadata without dates and versions: equal figures give equal bytes."""
-
-
-def _kind(path: Path) -> str:
-    kind = path.suffix[1:].lower()
-    if kind not in KINDS:
-        raise ConfigError("unsupported figure format", path=path, fix=f"Use {', '.join(KINDS)}.")
-    return kind
+"""The field of a file's metadata that holds the note, and fields without dates and versions."""
 
 
 def save_figure(figure: Figure, path: Path, note: str = "") -> None:
@@ -126,24 +116,11 @@ def save_figure(figure: Figure, path: Path, note: str = "") -> None:
     `note`, such as the runs that the figure shows, is stored in the file's metadata. Raises ConfigError for another
     format.
     """
-    kind = _kind(path)
-    metadata = _UNDATED[kind] | ({_NOTE[kind]: note} if note else {})
+    kind = path.suffix[1:].lower()
+    if kind not in KINDS:
+        raise ConfigError("unsupported figure format", path=path, fix=f"Use {', '.join(KINDS)}.")
+    field, metadata = _METADATA[kind]
     buffer = io.BytesIO()  # the PDF writer does not report the cause of a failed write
     with context(RC):
-        figure.savefig(buffer, format=kind, metadata=metadata)
+        figure.savefig(buffer, format=kind, metadata=metadata | ({field: note} if note else {}))
     write_bytes(path, buffer.getvalue())
-
-
-def note_of(path: Path) -> str:
-    """Read the note that `save_figure` stored in a file; empty if there is none. Raises ConfigError as it does."""
-    kind = _kind(path)
-    if kind == "png":
-        from PIL import Image
-
-        with Image.open(path) as image:
-            return str(image.info.get(_NOTE[kind], ""))
-    if kind == "svg":
-        description = re.search(r"<dc:description>(.*?)</dc:description>", path.read_text(encoding="utf-8"), re.DOTALL)
-        return html.unescape(description[1]).strip() if description else ""
-    subject = re.search(rb"/Subject \((.*?)(?<!\\)\)", path.read_bytes(), re.DOTALL)
-    return re.sub(rb"\\(.)", rb"\1", subject[1]).decode("latin-1") if subject else ""

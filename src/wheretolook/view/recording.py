@@ -13,7 +13,6 @@ from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.utils.errors import StorageError
 from wheretolook.utils.files import atomic_write
 from wheretolook.view import drawing
 from wheretolook.view.scenery import CAMERA_COLOR, LANDMARK_COLOR
@@ -71,10 +70,6 @@ class Recording:
 @contextmanager
 def open_recording(path: Path) -> Iterator[Recording]:
     """Write a recording atomically. Raises StorageError if the file cannot be written."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StorageError(f"cannot be written: {error}", path=path, fix="Name a file in another folder.") from error
     with atomic_write(path) as partial:
         recording = Recording(partial)
         yield recording

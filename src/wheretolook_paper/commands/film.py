@@ -55,7 +55,7 @@ def film(viewed: ViewedMap, path: Path, state: ViewState = ViewState()) -> int:
         fix = "Give --path of a scene with a mesh."
         raise ConfigError("a film needs a mesh, and two paths to compare", path=path, fix=fix)
     frames = list(_frames(viewed, viewed.complete(state)))
-    save_moving(frames, [FRAME_MS] * (len(frames) - 1) + [LAST_MS], path)
+    save_moving(frames, FRAME_MS, path, LAST_MS)
     return len(frames)
 
 

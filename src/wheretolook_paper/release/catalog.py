@@ -343,8 +343,8 @@ def write_items(
 ) -> dict[str, str]:  # fmt: skip
     """Write all items of a dataset, figures as several kinds of files, and attach them to their runs.
 
-    Files name the runs that they were drawn from: figures in their metadata (`wheretolook.figures.style.note_of`),
-    Markdown and TeX in a comment. Returns, for each item that could not be made, the command to run first, or the
+    Files name the runs that they were drawn from: figures in their metadata, Markdown and TeX in a
+    comment. Returns, for each item that could not be made, the command to run first, or the
     error. Raises as `check_names`.
     """
     check_names(config)

@@ -21,6 +21,7 @@ from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, invert_poses, poses_looking_along
 from wheretolook.inputs.channels import ATTRIBUTES
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.robot import wheretolook_robot
 from wheretolook.robot.export import export_robot, pinhole_of
@@ -28,7 +29,6 @@ from wheretolook.robot.wheretolook_robot import RobotScorer
 from wheretolook.scorers.set import network as set_network
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.space.free_space import FreeSpace
-from wheretolook.training.landmark_views import AttributeStatistics
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.training_range import TrainingRange
 from wheretolook.utils.errors import CameraError, WeightsError
@@ -74,7 +74,7 @@ def random_network(
     rng = np.random.default_rng(seed)
     mean = rng.normal(size=len(attributes))
     std = rng.uniform(0.3, 2, len(attributes))
-    network = SetNetwork(AttributeStatistics(tuple(mean.tolist()), tuple(std.tolist()), attributes), **options)
+    network = SetNetwork(FeatureStatistics(attributes, tuple(mean.tolist()), tuple(std.tolist())), **options)
     for module in network.modules():
         if isinstance(module, nn.BatchNorm1d):
             module.running_mean.normal_()
@@ -87,8 +87,11 @@ def random_network(
 
 NETWORKS = {
     "default": {"hidden": ("distance", "mapped_distance", "mapped_pixel_size")},
-    "attention": {"pooled": 5, "told": set_network.ALL_STATISTICS, "dropout": 0.5, "width": 24, "head": 16},
-    "another order": {"attributes": ATTRIBUTES[::-1], "told": ("axis_height", "log_visible", "log_variance_z")},
+    "attention": {"pooled": 5, "view_statistics": set_network.ALL_STATISTICS, "dropout": 0.5, "width": 24, "head": 16},
+    "another order": {
+        "attributes": ATTRIBUTES[::-1],
+        "view_statistics": ("axis_height", "log_visible", "log_variance_z"),
+    },
 }
 
 

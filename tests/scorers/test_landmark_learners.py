@@ -15,6 +15,7 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good, poses
 from wheretolook.geometry import pose_information as information
 from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.scorers.matchability.network import MatchabilityNetwork, bearing_numbers, expected_parts
 from wheretolook.scorers.set.config import SetConfig
 from wheretolook.scorers.set.learn import of_size
@@ -26,11 +27,11 @@ from wheretolook.scorers.set.network import (
     information_matrices,
 )
 from wheretolook.training.data import labelled_rows
-from wheretolook.training.landmark_views import AttributeStatistics, LandmarkBatches, load_landmark_views
+from wheretolook.training.landmark_views import LandmarkBatches, load_landmark_views
 from wheretolook.training.scenes import training_scenes
 
 DISTANCE = ATTRIBUTES.index("distance")
-NO_STATISTICS = AttributeStatistics((0.0,) * len(ATTRIBUTES), (1.0,) * len(ATTRIBUTES))
+NO_STATISTICS = FeatureStatistics(ATTRIBUTES, (0.0,) * len(ATTRIBUTES), (1.0,) * len(ATTRIBUTES))
 
 
 def attributes_of(offsets: np.ndarray) -> torch.Tensor:
@@ -134,7 +135,7 @@ def test_a_sample_of_all_landmarks_scores_as_all_of_them(pooled: int) -> None:
 def test_unknown_attributes_become_the_mean_and_hidden_ones_are_ignored() -> None:
     values = torch.randn(100, len(ATTRIBUTES))
     values[:, -1] = torch.nan
-    statistics = AttributeStatistics.of(values)
+    statistics = FeatureStatistics.of_attributes(values)
     assert statistics.mean[-1] == 0 and statistics.std[-1] == 1
     assert statistics.mean[0] == pytest.approx(float(values[:, 0].mean()), rel=1e-5)
     network = MatchabilityNetwork(statistics, hidden=("ambiguity",))

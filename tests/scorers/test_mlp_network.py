@@ -8,8 +8,8 @@ import torch
 
 from twins.bins import compact as move_to_front_plain
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.inputs.bins import InputStatistics
 from wheretolook.inputs.channels import ALL_CHANNELS, LANDMARK_CHANNELS, PAPER_VARIANTS
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.scorers.mlp.network import BinnedInput, NetworkSpec, ViewpointNetwork, move_to_front
 
 BINS = 6
@@ -31,7 +31,7 @@ def views() -> tuple[torch.Tensor, torch.Tensor]:
 def make_network(
     views: tuple[torch.Tensor, torch.Tensor], variant: str = "2d+z", **options: object
 ) -> ViewpointNetwork:
-    statistics = InputStatistics.of(*views, torch.arange(50), ALL_CHANNELS).select(INPUTS[variant])
+    statistics = FeatureStatistics.of_bins(*views, torch.arange(50), ALL_CHANNELS).select(INPUTS[variant])
     torch.manual_seed(1)
     spec = NetworkSpec(statistics, bins=BINS, hidden=(8, 8), **options)  # type: ignore[arg-type]
     return ViewpointNetwork(spec).eval()
@@ -42,9 +42,9 @@ def test_standardized_inputs_have_mean_0_and_deviation_1_where_filled_and_are_0_
     views: tuple[torch.Tensor, torch.Tensor], variant: str
 ) -> None:
     means, filled = views
-    statistics = InputStatistics.of(means, filled, torch.arange(50), ALL_CHANNELS).select(INPUTS[variant])
+    statistics = FeatureStatistics.of_bins(means, filled, torch.arange(50), ALL_CHANNELS).select(INPUTS[variant])
     layer = BinnedInput(NetworkSpec(statistics, bins=BINS))
-    chosen = [ALL_CHANNELS.index(name) for name in statistics.channels]
+    chosen = [ALL_CHANNELS.index(name) for name in statistics.names]
     values = layer(means[:, chosen], filled).reshape(50, -1, BINS, BINS)
     assert values.shape[1] == len(INPUTS[variant])
     for channel in values.unbind(1):
@@ -58,8 +58,8 @@ def test_unknown_landmark_attributes_become_the_mean_of_known_ones(views: tuple[
     ambiguity, spread = (ALL_CHANNELS.index(name) for name in ("ambiguity", "distance_spread"))
     means[:20, ambiguity] = torch.where(filled[:20], torch.nan, 0.0)  # a map without descriptors
     means[:, spread] = torch.where(filled, torch.nan, 0.0)  # known of no map
-    statistics = InputStatistics.of(means, filled, torch.arange(50), ALL_CHANNELS)
-    rest = InputStatistics.of(means[20:], filled[20:], torch.arange(30), ALL_CHANNELS)
+    statistics = FeatureStatistics.of_bins(means, filled, torch.arange(50), ALL_CHANNELS)
+    rest = FeatureStatistics.of_bins(means[20:], filled[20:], torch.arange(30), ALL_CHANNELS)
     assert statistics.mean[ambiguity] == pytest.approx(rest.mean[ambiguity], rel=1e-9)
     assert statistics.std[ambiguity] == pytest.approx(rest.std[ambiguity], rel=1e-6)
     values = BinnedInput(NetworkSpec(statistics, bins=BINS))(means, filled).reshape(means.shape)

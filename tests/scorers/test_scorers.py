@@ -13,10 +13,11 @@ from learning_options import save_network
 from synthetic_dataset import CAMERA, make_landmarks, make_mapping_poses
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, poses_looking_along
-from wheretolook.inputs.bins import BinnedViews, InputStatistics
+from wheretolook.inputs.bins import BinnedViews
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
 from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.scorers.adapted.network import AdaptedNetwork
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.bins import BinsScorer
@@ -25,7 +26,6 @@ from wheretolook.scorers.mlp.network import NetworkSpec, ViewpointNetwork
 from wheretolook.scorers.registry import make_scorer, scorers
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.visible import VisibleScorer
-from wheretolook.training.landmark_views import AttributeStatistics
 from wheretolook.utils.errors import CameraError, ConfigError, PoseError, WeightsError
 from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.scorers.conv.network import ConvNetwork, ConvSpec
@@ -48,7 +48,7 @@ def views() -> Float:
     return poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (40, 3)), rng.normal(size=(40, 3)))
 
 
-NO_STATISTICS = AttributeStatistics((0.0,) * len(ATTRIBUTES), (1.0,) * len(ATTRIBUTES))
+NO_STATISTICS = FeatureStatistics(ATTRIBUTES, (0.0,) * len(ATTRIBUTES), (1.0,) * len(ATTRIBUTES))
 
 
 def some_trees(localization_map: LocalizationMap) -> BoostedTrees:
@@ -70,9 +70,9 @@ def weights_of(method: str, path: Path, localization_map: LocalizationMap) -> Pa
     mean = (80.0, 60.0, 0.0, 0.0, 2.0, *[0.5] * 10)
     std = (40.0, 30.0, *[1.0] * 13)
     if method.startswith("mlp"):
-        network = ViewpointNetwork(NetworkSpec(InputStatistics(CHANNELS, mean[:5], std[:5]), hidden=(16,)))
+        network = ViewpointNetwork(NetworkSpec(FeatureStatistics(CHANNELS, mean[:5], std[:5]), hidden=(16,)))
     elif method == "conv":
-        network = ConvNetwork(ConvSpec(InputStatistics(ALL_CHANNELS, mean, std), 30, (8, 8), 0.0))
+        network = ConvNetwork(ConvSpec(FeatureStatistics(ALL_CHANNELS, mean, std), 30, (8, 8), 0.0))
     elif method == "sphere":
         network = SphereNetwork(SphereConfig())
     elif method == "matchability":

@@ -70,7 +70,6 @@ def test_data_module_reads_labelled_train_views_only(dataset: Dataset) -> None:
     table.loc[table.index[::3], "status"] = UNLABELLED
     write_table(table, scene.table)
     data = data_of(dataset, train_config(accelerator="cpu"))
-    data.setup()
     labelled = pd.concat([table[table["status"] != UNLABELLED], dataset.scenes[1].read_table()])
     np.testing.assert_array_equal(data.views.labels.numpy() > 0, is_good(labelled))
     np.testing.assert_array_equal(data.views.filled.any(2).any(1).numpy(), labelled["n_visible"] > 0)
@@ -86,14 +85,12 @@ def test_data_module_reads_labelled_train_views_only(dataset: Dataset) -> None:
 def test_validation_scenes_are_used_where_there_are_some(tmp_path: Path) -> None:
     dataset = make_dataset(tmp_path / "tiny", ("train", "val", "test"), n_locations=6, n_directions=12)
     data = data_of(dataset, SMALL)
-    data.setup()
     assert {*data.views.scene[data.train_rows]} == {0}
     assert {*data.views.scene[data.val_rows]} == {1}
 
 
 def test_every_epoch_visits_every_training_view_once_in_its_own_order(dataset: Dataset) -> None:
     data = data_of(dataset, changed(SMALL, batch_size=100))
-    data.setup()
     loader = data.train_dataloader()
     first, second = (torch.cat([batch.labels for batch in loader]) for _ in range(2))
     assert len(first) == len(data.train_rows) and first.sum() == data.views.labels[data.train_rows].sum()
@@ -106,8 +103,6 @@ def test_balanced_training_views_are_equally_many_and_all_of_the_rarer_class(dat
         table = scene.read_table()
         write_table(table.assign(status=np.where(table.index % 4 == 0, table["status"], NO_POSE)), scene.table)
     plain, balanced = (data_of(dataset, changed(SMALL, balance=balance)) for balance in (False, True))
-    plain.setup()
-    balanced.setup()
     positives = {*plain.train_rows[plain.views.labels[plain.train_rows] > 0].tolist()}
     chosen = {*balanced.train_rows.tolist()}
     assert 0 < len(positives) < len(plain.train_rows) / 3

@@ -47,7 +47,7 @@ def test_most_training_views_are_in_range() -> None:
     far = views_at([[12.0] * 9] * 3 + [[]])
     near = views_at([[2.0] * 9])
     assert known.contains(far).tolist() == [False] * 3 + [True] and known.contains(near).all()
-    assert not TrainingRange.of(views, enlarged=2).outside(views_at([[6.0] * 9])).any()
+    assert not TrainingRange.of(views, max_scale=2).outside(views_at([[6.0] * 9])).any()
     assert known.complaint(far)
     assert known.outside(views_at([[2.0] * 500])).sum(0)[[*QUANTITIES].index("in_view")] == 1
     assert not known.complaint(np.concatenate([near] * 99 + [far]), 0.05)  # three odd ones in a hundred

@@ -11,10 +11,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 import warp as wp
 from numpy.typing import NDArray
-from torch import Tensor
 
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import split_poses
@@ -172,50 +170,3 @@ def bin_views_plain(posed: PosedViews, bins: int = 30, landmarks: Landmarks | No
         for channel, values in enumerate(columns):
             means[view, channel] = np.bincount(cell, weights=values, minlength=n_cells) / np.maximum(counts[view], 1)
     return BinnedViews(means.reshape(n_views, -1, bins, bins), counts.reshape(n_views, bins, bins), channels)
-
-
-STATISTICS_BLOCK = 256  # views worked through at a time when statistics are taken: few enough for a processor's cache
-
-
-@dataclass(frozen=True)
-class InputStatistics:
-    """Mean and standard deviation of each kind of input over the filled bins of the training views.
-
-    They are in each channel's unit (such as pixels or metres), over the values that are known. The deviation is 1 where
-    it would be 0, and infinite where no value is known, so that a network does not look at a channel never seen.
-    """
-
-    channels: tuple[str, ...]
-    mean: tuple[float, ...]
-    std: tuple[float, ...]
-
-    @classmethod
-    def of(cls, means: Tensor, filled: Tensor, rows: Tensor, channels: tuple[str, ...] = CHANNELS) -> InputStatistics:
-        """Statistics over the bins of views `rows` (n,) int64 among `means` (B, C, bins, bins) that are `filled`.
-
-        Means are zero in empty bins and NaN where a value is not known; `filled` is (B, bins, bins) bool.
-        """
-        rows = rows.to(means.device)
-        total = torch.zeros(len(channels), dtype=torch.float64, device=means.device)
-        n_filled = torch.zeros_like(total)
-        unknown = torch.zeros_like(total)
-        for block in rows.split(STATISTICS_BLOCK):  # empty bins are zero: they add nothing to the sum
-            values = means[block]
-            n_filled += filled[block].sum()
-            unknown += values.isnan().sum((0, 2, 3))
-            total += values.nan_to_num_().sum((0, 2, 3), dtype=torch.float64)
-        count = (n_filled - unknown).clamp(min=1)
-        mean = total / count
-        squares = torch.zeros_like(total)
-        for block in rows.split(STATISTICS_BLOCK):  # a second pass: no cancellation between large numbers
-            centred = (means[block] - mean.float()[:, None, None]) * filled[block][:, None]
-            squares += centred.nan_to_num_().square_().sum((0, 2, 3), dtype=torch.float64)
-        std = (squares / count).sqrt()
-        std = torch.where(std > 0, std, 1.0)
-        std = torch.where((n_filled > 0) & (unknown == n_filled), torch.inf, std)
-        return cls(channels, tuple(mean.tolist()), tuple(std.tolist()))
-
-    def select(self, channels: tuple[str, ...]) -> InputStatistics:
-        """Statistics of some channels."""
-        index = [self.channels.index(name) for name in channels]
-        return InputStatistics(channels, tuple(self.mean[i] for i in index), tuple(self.std[i] for i in index))

@@ -1,7 +1,7 @@
-"""Attributes of each landmark in view: where it lies in the image, and how it was mapped.
+"""Attributes of each visible landmark: its position in the image, and how it was mapped.
 
-The paper's network is given the landmarks' positions only. Whether they will be found again depends as much on other
-attributes: from where they were mapped, how well, and how distinctive they are. All are known from map and pose alone.
+The paper's network uses the landmarks' positions only. Whether they are detected again depends as much on other
+attributes: from where they were mapped, how well, and how distinctive they are. All follow from map and pose alone.
 """
 
 from __future__ import annotations
@@ -23,12 +23,15 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.visibility.frustum import LandmarkSets
 
-BLOCK_ENTRIES = {"cpu": 1 << 15, "cuda": 1 << 22}  # landmarks in view a block: fits the cache, or takes 1 GB of a GPU
+BLOCK_ENTRIES = {
+    "cpu": 1 << 15,
+    "cuda": 1 << 22,
+}  # visible landmarks in a block: fits the cache, or takes 1 GB of a GPU
 
 
 @dataclass(frozen=True, eq=False)
 class ViewLandmarks:
-    """The landmarks in view of each of B views, E entries in all, one view after the other."""
+    """The visible landmarks of B views, E entries in all, one view after the other."""
 
     starts: Tensor  # (B + 1,) int64; view b has entries `starts[b]` to `starts[b + 1]`
     rows: Tensor  # (E,) int64, rows of the landmarks in the map
@@ -50,36 +53,31 @@ class ViewLandmarks:
 
 
 class LandmarkDescriber:
-    """Finds the landmarks that views of a map see, and their attributes, on the map's device.
-
-    Of each landmark it gives those of `ATTRIBUTES` that are asked for by name, in that order.
-    """
+    """Describes the landmarks visible in views of a map, on the map's device, by some of `ATTRIBUTES` in any order."""
 
     def __init__(self, localization_map: LocalizationMap, attributes: tuple[str, ...] = ATTRIBUTES) -> None:
         self.localization_map = localization_map
         self.attributes = attributes
         self._columns = [ATTRIBUTES.index(name) for name in attributes]
         landmarks = localization_map.landmarks
-        device = localization_map.device
-        self._points = torch.from_numpy(landmarks.points).to(device)
-        self._directions = torch.from_numpy(landmarks.mapping_direction).to(device)
-        self._attributes = torch.from_numpy(landmarks.attributes()).to(device)
+        arrays = landmarks.points, landmarks.mapping_direction, landmarks.attributes()
+        self._points, self._directions, self._attributes = (
+            torch.from_numpy(array).to(localization_map.device) for array in arrays
+        )
 
     def of_camera(self, camera: Camera) -> LandmarkDescriber:
-        """The same with another camera that looks."""
-        if camera == self.localization_map.camera:
-            return self
+        """Return a describer of the same map's views with another camera."""
         other = copy(self)
         other.localization_map = self.localization_map.of_camera(camera)
         return other
 
-    def describe(self, cam_from_world: Float, in_view: LandmarkSets | None = None) -> ViewLandmarks:
-        """Landmarks of views (B, 3, 4); `in_view` are those each of them sees, if that is known already."""
-        if in_view is None:
+    def describe(self, cam_from_world: Float, visible: LandmarkSets | None = None) -> ViewLandmarks:
+        """Describe the landmarks of views (B, 3, 4): all visible ones, or those in `visible`."""
+        if visible is None:
             starts, indices = self.localization_map.in_view_on_device(cam_from_world)
         else:
-            starts = in_view.starts.astype(np.int64)
-            indices = torch.from_numpy(in_view.indices)
+            starts = visible.starts.astype(np.int64)
+            indices = torch.from_numpy(visible.indices)
         return self._describe(cam_from_world, torch.from_numpy(starts), indices)
 
     def _describe(self, cam_from_world: Float, starts: Tensor, indices: Tensor) -> ViewLandmarks:
@@ -97,55 +95,58 @@ class LandmarkDescriber:
         distance = offsets.norm(dim=1)
         # in double precision and rounded once, so that every machine places a landmark at the same point of the image
         x, y, z = (offsets.double()[:, None] @ axes.mT)[:, 0].unbind(1)
-        across = (x / z).float()
-        down = (y / z).float()
         map_values = self._attributes[rows]
         log_distance = distance.log()
         mapped_angle = (offsets * self._directions[rows]).sum(1) / distance
         ratio = log_distance - map_values[:, MAP_ATTRIBUTES.index("mapped_distance")]
         pixel_angle = torch.full_like(ratio, -log(self.localization_map.camera.mean_focal_px))
         size_ratio = log_distance + pixel_angle - map_values[:, MAP_ATTRIBUTES.index("mapped_pixel_size")]
-        pose_values = torch.stack([across, down, log_distance, mapped_angle, ratio, pixel_angle, size_ratio], dim=1)
-        values = torch.cat([pose_values, map_values], dim=1)
+        of_pose = [(x / z).float(), (y / z).float(), log_distance, mapped_angle, ratio, pixel_angle, size_ratio]
+        values = torch.cat([torch.stack(of_pose, dim=1), map_values], dim=1)
         if self.attributes != ATTRIBUTES:
             values = values[:, self._columns]
         return ViewLandmarks(starts, rows, values, self.attributes)
 
     def in_blocks(
-        self, cam_from_world: Float, most: int | None = None
+        self, cam_from_world: Float, limit: int | None = None
     ) -> Iterator[tuple[slice, ViewLandmarks, Tensor]]:
-        """Landmarks of views (B, 3, 4), in blocks of views that leave a network over the landmarks room to work.
+        """Describe the landmarks of views (B, 3, 4) in blocks that leave a network over the landmarks memory to work.
 
-        Of each view at most `most` landmarks are described, evenly spread over those it sees in the map's order. Yields
-        which views a block holds, their landmarks, and how many each of them sees in all.
+        At most `limit` landmarks of each view are described, evenly spread over the visible ones in the map's order.
+        Yields which views a block holds, their landmarks, and how many each of them sees in all.
         """
         starts, indices = self.localization_map.in_view_on_device(cam_from_world)
-        n_in_view = np.diff(starts)
-        if most is not None and len(n_in_view) and n_in_view.max() > most:
-            starts, indices = _thinned(torch.from_numpy(starts), indices, most)
-        begin = 0
-        room = BLOCK_ENTRIES[self._points.device.type]
-        while begin < len(n_in_view):
-            # as many views as have at most `room` landmarks together, but at least one
-            end = int(np.searchsorted(starts, starts[begin] + room, side="right")) - 1
-            end = min(max(end, begin + 1), len(n_in_view))
-            rows = slice(begin, end)
-            part = torch.from_numpy(starts[begin : end + 1] - starts[begin])
-            described = self._describe(cam_from_world[rows], part, indices[int(starts[begin]) : int(starts[end])])
-            yield rows, described, torch.from_numpy(n_in_view[rows]).to(self._points.device)
-            begin = end
+        n_visible = np.diff(starts)
+        if limit is not None and len(n_visible) and n_visible.max() > limit:
+            starts, indices = _thinned(torch.from_numpy(starts), indices, limit)
+        for rows in ragged_blocks(starts, BLOCK_ENTRIES[self._points.device.type]):
+            part = starts[rows.start : rows.stop + 1]
+            entries = indices[int(part[0]) : int(part[-1])]
+            described = self._describe(cam_from_world[rows], torch.from_numpy(part - part[0]), entries)
+            yield rows, described, torch.from_numpy(n_visible[rows]).to(self._points.device)
 
 
-def _thinned(starts: Tensor, indices: Tensor, most: int) -> tuple[NDArray[np.int64], Tensor]:
-    """At most `most` entries of each set, evenly spread over it."""
+def ragged_blocks(starts: NDArray[np.int64], limit: int) -> Iterator[slice]:
+    """Yield consecutive blocks of sets with at most `limit` entries together, but at least one set each.
+
+    Set k has the entries `starts[k]` to `starts[k + 1]`.
+    """
+    begin = 0
+    while begin < len(starts) - 1:
+        end = max(int(np.searchsorted(starts, starts[begin] + limit, side="right")) - 1, begin + 1)
+        yield slice(begin, end)
+        begin = end
+
+
+def _thinned(starts: Tensor, indices: Tensor, limit: int) -> tuple[NDArray[np.int64], Tensor]:
+    """Return the starts and indices of at most `limit` entries of each set, evenly spread over it."""
     if len(starts) == 2:
-        return np.array([0, most]), indices[torch.arange(most, device=indices.device) * int(starts[1]) // most]
+        return np.array([0, limit]), indices[torch.arange(limit, device=indices.device) * int(starts[1]) // limit]
     lengths = starts.diff()
-    kept = lengths.clamp(max=most)
-    ends = kept.cumsum(0)
-    new = torch.cat([torch.zeros(1, dtype=torch.int64), ends])
+    kept = lengths.clamp(max=limit)
+    new = torch.cat([torch.zeros(1, dtype=torch.int64), kept.cumsum(0)])
     # entry k of a set comes from k * length / kept, rounded down
     sets = torch.arange(len(kept), device=indices.device).repeat_interleave(kept.to(indices.device))
-    there = torch.stack([starts[:-1], lengths, kept, new[:-1]]).to(indices.device)[:, sets]
-    place = torch.arange(len(sets), device=indices.device) - there[3]
-    return new.numpy(), indices[there[0] + place * there[1] // there[2]]
+    first, length, count, begin = torch.stack([starts[:-1], lengths, kept, new[:-1]]).to(indices.device)[:, sets]
+    place = torch.arange(len(sets), device=indices.device) - begin
+    return new.numpy(), indices[first + place * length // count]

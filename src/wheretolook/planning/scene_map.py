@@ -15,7 +15,7 @@ from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.rrt import Space
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.registry import fallback, find, make_scorer, members, methods_named, scorers
+from wheretolook.scorers.registry import FALLBACK, find, make_scorer, members, methods_named, scorers
 from wheretolook.utils.errors import ConfigError
 from wheretolook.weights.resolve import load_scorer
 
@@ -38,7 +38,7 @@ def scene_scorer(
     """
     if weights is not None and not method:
         return load_scorer(weights, scene.localization_map, anywhere=anywhere)
-    return make_scorer(method or fallback().name, scene.localization_map, weights=weights, anywhere=anywhere)
+    return make_scorer(method or FALLBACK, scene.localization_map, weights=weights, anywhere=anywhere)
 
 
 def scene_viewpoint_map(scene: SceneEnvironment, views: ViewLattice, scorer: Scorer) -> ViewpointMap:

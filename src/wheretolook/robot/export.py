@@ -15,7 +15,7 @@ from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.scorers.set.network import SetNetwork
-from wheretolook.scorers.set.score import MOST
+from wheretolook.scorers.set.score import MAX_LANDMARKS
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.training_range import TrainingRange, camera_quantities
 from wheretolook.utils.errors import CameraError, ConfigError
@@ -91,7 +91,7 @@ def _description(trained: TrainedNetwork[SetNetwork], camera: PinholeCamera) -> 
         "camera": {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
         "attributes": list(trained.network.attributes),
         "map_attributes": list(MAP_ATTRIBUTES),
-        "most": MOST,
+        "most": MAX_LANDMARKS,
         "range": training_range.record(),
         "serves_camera": bool(training_range.contains(camera_quantities(camera)[None])[0]),
     }

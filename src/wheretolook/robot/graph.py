@@ -75,11 +75,7 @@ class RobotNetwork(nn.Module):
         own = torch.arange(values.shape[1]) < n_sampled[:, None]
         each = (n_visible.double() / n_sampled.clamp(min=1))[:, None]  # visible landmarks per sampled one
         sums = (network.parts(values, log_odds).double() * own[..., None]).sum(1) * each
-        cells = (
-            self._expected_cells(values, log_odds, own, each)
-            if "log_expected_cells" in network.options["told"]
-            else None
-        )
+        cells = self._expected_cells(values, log_odds, own, each) if network.needs_cells else None
         logits = network.logits(sums, n_visible, axis_height, cells)
         return torch.sigmoid(logits.double() * self.scale + self.offset), sums[:, 0].float()
 

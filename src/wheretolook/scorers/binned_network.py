@@ -11,34 +11,32 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from wheretolook.geometry.poses import Float, check_poses
-from wheretolook.inputs.bins import BinnedViews, InputStatistics
+from wheretolook.inputs.bins import BinnedViews
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.scorers.base import BLOCK, BinnedScorer, check_field_of_view
-from wheretolook.scorers.range_watch import RangeWatch
-from wheretolook.training.attribute_statistics import mean_and_std
 from wheretolook.training.trained_network import StoredNetwork, TrainedNetwork
-from wheretolook.training.training_range import TrainingRange, bin_quantities
-from wheretolook.utils.errors import WeightsError
+from wheretolook.training.training_range import RangeWatch, TrainingRange, bin_quantities
 
 
 class BinnedNetwork(StoredNetwork):
     """A network with inputs means (B, C, bins, bins) of its channels and filled bins (B, bins, bins)."""
 
-    statistics: InputStatistics
+    statistics: FeatureStatistics
     bins: int
     scored_at_once: int = 4096
 
 
-def stored_statistics(stored: Mapping[str, Any]) -> InputStatistics:
-    """Return input statistics from the header of weights; a WeightsError for an unknown channel."""
-    values = stored["statistics"]
-    for name in values["channels"]:
-        if name not in ALL_CHANNELS:
-            fix = "Use the version that wrote them, or train again."
-            raise WeightsError("these weights need an unknown channel of the bins", value=name, fix=fix)
-    channels = tuple(values["channels"])
-    return InputStatistics(channels, *mean_and_std(values, channels))
+def statistics_record(statistics: FeatureStatistics) -> dict[str, Any]:
+    """Return statistics of channels as the JSON values of a header."""
+    return {"channels": statistics.names, **statistics.record()}
+
+
+def statistics_of_record(stored: Mapping[str, Any]) -> FeatureStatistics:
+    """Return the statistics of channels in the header of weights; ValueError for an unknown channel."""
+    record = stored["statistics"]
+    return FeatureStatistics.of_record(tuple(record["channels"]), record, ALL_CHANNELS)
 
 
 class StandardBins(nn.Module):
@@ -51,9 +49,9 @@ class StandardBins(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, statistics: InputStatistics) -> None:
+    def __init__(self, statistics: FeatureStatistics) -> None:
         super().__init__()
-        channels = statistics.channels
+        channels = statistics.names
         self.n_certain = next((i for i, name in enumerate(channels) if name not in CHANNELS), len(channels))
         # not persistent: the header of weights stores them
         self.register_buffer("mean", torch.tensor(statistics.mean)[:, None, None], persistent=False)
@@ -79,7 +77,7 @@ class BinnedNetworkScorer(BinnedScorer):
 
     def __init__(self, localization_map: LocalizationMap, trained: TrainedNetwork[Any]) -> None:
         network: BinnedNetwork = trained.network
-        self.channels = network.statistics.channels
+        self.channels = network.statistics.names
         super().__init__(localization_map, network.bins, not {*self.channels} <= {*CHANNELS})
         camera = localization_map.camera
         self.device = localization_map.device

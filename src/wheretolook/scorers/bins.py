@@ -26,11 +26,5 @@ class BinsScorer(CountingScorer):
 
 
 METHODS = (
-    rule(
-        BinsScorer,
-        MethodStyle("reprojections with bins", "#009E73", "D", "-."),
-        position=30,
-        of_the_few=True,
-        fallback=True,
-    ),
+    rule(BinsScorer, MethodStyle("reprojections with bins", "#009E73", "D", "-."), position=30, of_the_few=True),
 )

@@ -13,19 +13,18 @@ from wheretolook.inputs.landmark_features import LandmarkDescriber, ViewLandmark
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scorers.base import LandmarkProbabilities, Scorer
 from wheretolook.scorers.matchability.network import bearing_precision
-from wheretolook.scorers.range_watch import RangeWatch
-from wheretolook.training.training_range import TrainingRange, camera_quantities, view_quantities
+from wheretolook.training.training_range import RangeWatch, TrainingRange, camera_quantities, view_quantities
 from wheretolook.visibility.frustum import LandmarkSets
 
 
 class LandmarkScorer(Scorer):
-    """Scores a view by the named attributes of its visible landmarks, of which at most `most` are described.
+    """Scores a view by the named attributes of its visible landmarks, of which at most `max_landmarks` are described.
 
-    Where the weights do not store the range of the training views, it is that of their camera's field of view, if they
-    had one camera. `score` warns once with an `OutOfRangeWarning`, see `RangeWatch`.
+    Without a stored range of the training views, the field of view of their camera, if it was one, bounds the range.
+    `score` warns once with an `OutOfRangeWarning`, see `RangeWatch`.
     """
 
-    most: int | None = None
+    max_landmarks: int | None = None
 
     def __init__(
         self,
@@ -39,16 +38,16 @@ class LandmarkScorer(Scorer):
         self.describer = LandmarkDescriber(localization_map, attributes)
         self._of_camera = camera_quantities(localization_map.camera)
         self._serves_camera = bool(self.training_range.contains(self._of_camera[None])[0])
-        watching = self.training_range.asks_for_landmarks or not self._serves_camera
+        watching = self.training_range.bounds_landmarks or not self._serves_camera
         self._watch = RangeWatch(self.training_range, watching)
 
     def in_range(self, cam_from_world: Float) -> NDArray[np.bool_]:
         """Return which poses (B, 3, 4) have views like the training views, (B,) bool."""
         cam_from_world = check_poses(cam_from_world)
         inside = np.full(len(cam_from_world), self._serves_camera)
-        if self._serves_camera and self.training_range.asks_for_landmarks:
-            for rows, described, n_in_view in self.describer.in_blocks(cam_from_world, self.most):
-                inside[rows] = self.training_range.contains(view_quantities(described, n_in_view, self._of_camera))
+        if self._serves_camera and self.training_range.bounds_landmarks:
+            for rows, described, n_visible in self.describer.in_blocks(cam_from_world, self.max_landmarks):
+                inside[rows] = self._in_range(described, n_visible)
         return inside
 
     def log_odds_of_detection(self, values: Tensor) -> Tensor | None:
@@ -69,6 +68,10 @@ class LandmarkScorer(Scorer):
             described.rows.cpu().numpy(), log_odds.sigmoid().double().cpu().numpy(), precision.double().cpu().numpy()
         )
 
-    def _quantities(self, described: ViewLandmarks, n_in_view: Tensor) -> list[Float]:
+    def _in_range(self, described: ViewLandmarks, n_visible: Tensor) -> NDArray[np.bool_]:
+        """Return which of some views are in the training range, (B,)."""
+        return self.training_range.contains(view_quantities(described, n_visible, self._of_camera))
+
+    def _quantities(self, described: ViewLandmarks, n_visible: Tensor) -> list[Float]:
         """Return the quantities the range watch checks; empty once it has warned, or has nothing to warn of."""
-        return [view_quantities(described, n_in_view, self._of_camera)] if self._watch.watching else []
+        return [view_quantities(described, n_visible, self._of_camera)] if self._watch.watching else []

@@ -66,7 +66,6 @@ class Method:
     is_random_baseline: bool = False  # whether it is a random baseline, evaluated by its exact expectation
     only_if_named: bool = False  # whether an evaluation includes it only by name
     of_the_few: bool = False  # whether summary figures show it: of a family, the first that is evaluated
-    fallback: bool = False  # whether it scores viewpoint maps where neither a method nor weights are given
     reference: int = 0  # of the learned methods evaluated, the highest is the one others are compared with
     learn: Callable[[TrainingJob], TrainingResult] | None = None  # trains it
     config: type | None = None  # frozen dataclass of its training options, with defaults

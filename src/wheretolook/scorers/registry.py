@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from wheretolook.scorers.feature_domain import warn_of_features
 from wheretolook.scorers.method import Method, ScorerOptions
-from wheretolook.utils.errors import CameraError, ConfigError, WeightsError
+from wheretolook.utils.errors import CameraError, ConfigError, OutOfRangeWarning, WeightsError
+from wheretolook.utils.shipped import WEIGHTS, or_shipped
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
@@ -22,6 +23,12 @@ MODULES = ("random", "forward", "visible", "bins", "mlp", "matchability", "set",
 """Modules of `wheretolook.scorers` whose `METHODS` are the package's own."""
 
 GROUP = "wheretolook.methods"  # entry points of this group are a `Method`, or several, of another package
+
+FALLBACK = "bins"  # the method of viewpoint maps where neither a method nor weights are given
+
+SUBSTITUTES = {"disk": "aliked", "xfeat": "aliked", "superpoint": "aliked"}
+"""Features whose weights are better than those by SIFT where a map's own features have none: measured on val scenes by
+DISK and XFeat (docs/features.md), assumed for SuperPoint."""
 
 
 @cache
@@ -33,37 +40,30 @@ def all_methods() -> Mapping[str, Method]:
     methods: dict[str, Method] = {}
     for module in MODULES:
         for method in import_module(f"wheretolook.scorers.{module}").METHODS:
-            _add(methods, method, f"wheretolook.scorers.{module}")
+            methods[method.name] = method
     for entry in entry_points(group=GROUP):
-        for method in _load(entry):
-            _add(methods, method, f"the entry point {entry.name} = {entry.value}")
+        source = f"{entry.name} = {entry.value}"
+        try:
+            loaded = entry.load()
+            for method in [loaded] if isinstance(loaded, Method) else list(loaded):
+                _check(method, methods)
+                methods[method.name] = method
+        except Exception as error:  # whatever a foreign module raises
+            problem = f"a method of another package cannot be used: {type(error).__name__}: {error}"
+            raise ConfigError(problem, value=source, fix="Fix or uninstall it.") from error
     return MappingProxyType(dict(sorted(methods.items(), key=lambda item: item[1].position)))
 
 
-def _load(entry: EntryPoint) -> Iterable[Method]:
-    try:
-        loaded = entry.load()
-        methods = [loaded] if isinstance(loaded, Method) else list(loaded)
-    except Exception as error:  # whatever a foreign module raises
-        problem = f"a method of another package cannot be loaded: {type(error).__name__}: {error}"
-        raise ConfigError(problem, value=f"{entry.name} = {entry.value}", fix="Fix or uninstall it.") from error
-    if not all(isinstance(method, Method) for method in methods):
-        fix = "The entry point must be one or several wheretolook.scorers.method.Method."
-        raise ConfigError("no method", value=f"{entry.name} = {entry.value}", fix=fix)
-    return methods
-
-
-def _add(methods: dict[str, Method], method: Method, source: str) -> None:
-    problem = ""
+def _check(method: Method, methods: Mapping[str, Method]) -> None:
+    """Raise an error if what another package registers is no method, or clashes with the methods before it."""
+    if not isinstance(method, Method):
+        raise TypeError(f"{method!r} is no wheretolook.scorers.method.Method")
     if method.name in methods or any(method.name == other.family for other in methods.values()):
-        problem = "two methods have the same name"
-    elif " " in method.name or not method.name:
-        problem = "a method's name is one word"
-    elif (method.learn is None) != (method.config is None) or (method.learn is not None and not method.folder):
-        problem = "a learned method needs learn, config and folder"
-    if problem:
-        raise ConfigError(problem, value=method.name, fix=f"Change that of {source}, or uninstall its package.")
-    methods[method.name] = method
+        raise ValueError(f"two methods have the name {method.name}")
+    if " " in method.name or not method.name:
+        raise ValueError(f"a method's name is one word, not {method.name!r}")
+    if (method.learn is None) != (method.config is None) or (method.learn is not None and not method.folder):
+        raise ValueError(f"{method.name} needs learn, config and folder, or none of them")
 
 
 def find(name: str) -> Method | None:
@@ -74,11 +74,6 @@ def find(name: str) -> Method | None:
 def scorers() -> dict[str, Method]:
     """Return the methods that score views, by name."""
     return {name: method for name, method in all_methods().items() if method.build is not None}
-
-
-def fallback() -> Method:
-    """Return the method of viewpoint maps where neither a method nor weights are given."""
-    return next(method for method in scorers().values() if method.fallback)
 
 
 def learned() -> dict[str, Method]:
@@ -150,11 +145,10 @@ def make_scorer(
         raise ConfigError("the method needs weights", value=name, fix="Give a file that the train command wrote.")
     kind = method_of_weights(weights)
     if kind not in kinds:
-        fix = f"Give weights of {' or '.join(dict.fromkeys(kinds))}, or train them."
+        fix = f"Give weights of {' or '.join(kinds)}, or train them."
         raise WeightsError(f"these weights are not of {name}", path=weights, value=kind, fix=fix)
-    return build_scorer(
-        methods[kinds.index(kind)], localization_map, ScorerOptions(seed, Path(weights), heading, anywhere)
-    )
+    options = ScorerOptions(seed, Path(weights), heading, anywhere)
+    return build_scorer(methods[kinds.index(kind)], localization_map, options)
 
 
 def build_scorer(method: Method, localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
@@ -171,5 +165,20 @@ def build_scorer(method: Method, localization_map: LocalizationMap, options: Sco
         raise WeightsError(error.problem, path=path, value=error.value, fix=error.fix) from None
     scorer.name = method.name
     if options.weights is not None:
-        warn_of_features(localization_map.landmarks.features, options.weights, stacklevel=3)
+        _warn_of_features(localization_map.landmarks.features, options.weights)
     return scorer
+
+
+def _warn_of_features(of_map: str, weights: Path) -> None:
+    """Warn if a map's landmarks have other local features than those the weights were trained on."""
+    from wheretolook.training.weights import read_training
+
+    trained_on = read_training(weights).get("features", ["sift"])
+    if not of_map or of_map in trained_on:
+        return
+    text = f"the weights {weights.name} were trained on maps by {', '.join(trained_on)}, and this map is by {of_map}"
+    fix = "docs/features.md has the measured losses; `wheretolook check` measures them on your map"
+    better = SUBSTITUTES.get(of_map, of_map)
+    if better not in trained_on and or_shipped(f"{WEIGHTS}/{better}").is_dir():
+        fix = f"Better weights are bundled, {WEIGHTS}/{better}, and used if none are given; {fix}"
+    warnings.warn(f"{text}. {fix}.", OutOfRangeWarning, stacklevel=4)

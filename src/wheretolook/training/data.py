@@ -18,8 +18,8 @@ from tqdm.auto import tqdm
 
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses
-from wheretolook.inputs.bins import InputStatistics
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.training.batches import Batch, IndexBatches, TensorViews
 from wheretolook.training.config import FittingConfig, SharedConfig
 from wheretolook.training.scenes import training_scenes
@@ -82,7 +82,13 @@ def load_views(
     means = torch.empty((total, len(channels), bins, bins), device=home)
     filled = torch.empty((total, bins, bins), dtype=torch.bool, device=home)
     if config.devices > 1:
-        _share_memory(means, filled)
+        try:
+            means.share_memory_()
+            filled.share_memory_()
+        except RuntimeError as error:
+            fix = "Increase it (in a container, --shm-size), or set train.devices to 1."
+            problem = f"the views, {n_bytes / 1e9:.1f} GB, do not fit into shared memory: {error}"
+            raise ConfigError(problem, fix=fix) from error
     start = 0
     with tqdm(total=total, desc="bin views", unit="view", disable=not progress) as bar:
         for scene, table in zip(scenes, tables, strict=True):
@@ -101,10 +107,10 @@ def load_views(
 
 def labels_of(tables: Sequence[pd.DataFrame], config: SharedConfig) -> tuple[Tensor, Ints, Ints]:
     """Return labels (B,) float32 of scenes' views, the index of each view's scene, and its location_id, (B,) each."""
-    good = [is_good(table, config.max_error_m, config.max_error_deg) for table in tables]
-    location = np.concatenate([table["location_id"].to_numpy(np.int64) for table in tables])
-    scene = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
-    return torch.from_numpy(np.concatenate(good).astype(np.float32)), scene, location
+    table = pd.concat(tables, ignore_index=True)
+    good = is_good(table, config.max_error_m, config.max_error_deg)
+    scene = np.repeat(np.arange(len(tables)), [len(part) for part in tables])
+    return torch.from_numpy(good.astype(np.float32)), scene, table["location_id"].to_numpy(np.int64)
 
 
 def labelled_rows(scene: SceneFolder, matches: bool = False) -> pd.DataFrame:
@@ -117,17 +123,6 @@ def labelled_rows(scene: SceneFolder, matches: bool = False) -> pd.DataFrame:
     if table.empty:
         raise TableError("no viewpoint has a label", path=scene.table, fix="Run the label command.")
     return table
-
-
-def _share_memory(*tensors: Tensor) -> None:
-    """Move tensors into memory that other processes can map."""
-    try:
-        for tensor in tensors:
-            tensor.share_memory_()
-    except RuntimeError as error:
-        size = sum(tensor.nbytes for tensor in tensors) / 1e9
-        fix = "Increase it (in a container, --shm-size), or set train.devices to 1."
-        raise ConfigError(f"the views, {size:.1f} GB, do not fit into shared memory: {error}", fix=fix) from error
 
 
 def validation_views(dataset: Dataset, scene: Ints, location: Ints, config: SharedConfig) -> NDArray[np.bool_]:
@@ -167,16 +162,12 @@ def hold_out_locations(scene: Ints, location: Ints, fraction: float, seed: int) 
     return held_out
 
 
-def balance_classes(labels: Tensor, seed: int) -> Tensor:
-    """Choose equally many views of both classes: all of the rarer one, and as many of the other at random.
-
-    Returns the rows (n,) int64 of labels (B,), 0 or 1, that are chosen, in ascending order, on the CPU.
-    """
-    positive = labels.cpu().numpy() > 0
+def balance_classes(positive: NDArray[np.bool_], seed: int) -> Ints:
+    """Choose all views of the rarer class and as many of the other at random; return their rows (n,), ascending."""
     classes = [np.flatnonzero(positive), np.flatnonzero(~positive)]
     count = min(map(len, classes))
     rng = np.random.default_rng(seed)
-    return torch.from_numpy(np.sort(np.concatenate([rng.permutation(rows)[:count] for rows in classes])))
+    return np.sort(np.concatenate([rng.permutation(rows)[:count] for rows in classes]))
 
 
 class BinnedBatches(IndexBatches):
@@ -210,6 +201,7 @@ class ViewsDataModule(LightningDataModule, ABC):
     views: Any  # `TensorViews`
     train_rows: Any  # rows of the training views, (n,) int64
     val_rows: Any  # rows of the validation views
+    training_range: TrainingRange | None = None  # of the training views
 
     def setup(self, stage: str | None = None) -> None:
         """Move the views to the device that trains, if they fit."""
@@ -230,6 +222,17 @@ class ViewsDataModule(LightningDataModule, ABC):
     def batches(self, rows: Any, shuffle_seed: int | None = None) -> Iterable[Batch]:
         """Return batches of the views in `rows`, shuffled by a seed; without one in order, and larger."""
 
+    def labels(self, rows: Any) -> NDArray[np.bool_]:
+        """Return the labels (n,) of what is trained on in the views in `rows`."""
+        return (self.views.labels.cpu().numpy() > 0)[rows]
+
+    def split(self, dataset: Dataset) -> NDArray[np.bool_]:
+        """Set the rows of training and validation views of a dataset; return which views are held out, (B,)."""
+        held_out = validation_views(dataset, self.views.scene, self.views.location, self.config)
+        self.train_rows = torch.from_numpy(np.flatnonzero(~held_out))
+        self.val_rows = torch.from_numpy(np.flatnonzero(held_out))
+        return held_out
+
     @property
     def share(self) -> tuple[int, int]:
         """Rank of this process, and number of all that train."""
@@ -241,14 +244,11 @@ class ViewpointDataModule(ViewsDataModule):
 
     Train scenes are trained on; val scenes, or else held-out locations of the train scenes, decide which epoch was
     best. Batches hold means that are not standardized yet, of `channels`: all that the views have unless set otherwise.
+
+    Raises a TableError if there is no train scene, or the labels of a split are of one class.
     """
 
     views: LabelledViews
-    train_rows: Tensor
-    val_rows: Tensor
-    training_range: TrainingRange  # of the depths of the training views, known after `setup`
-    statistics: InputStatistics  # of all channels over the training views, known after `setup`
-    class_weights: tuple[float, float]  # of the negative and the positive class, known after `setup`
 
     def __init__(
         self,
@@ -261,40 +261,20 @@ class ViewpointDataModule(ViewsDataModule):
         landmark_channels: bool = False,
     ) -> None:
         super().__init__()
-        self.dataset = dataset
         self.config = config
         self.options = options
-        self._loading = bins, device, progress, landmark_channels
-        self.channels: tuple[str, ...] = ALL_CHANNELS if landmark_channels else CHANNELS
-
-    def setup(self, stage: str | None = None) -> None:
-        """Read, bin and split the views, once; in a process that trains, move them to its device.
-
-        Raises a TableError if there is no train scene, or the labels of a split are of one class.
-        """
-        if not hasattr(self, "views"):
-            views = load_views(self.dataset, training_scenes(self.dataset), self.config, *self._loading)
-            self.use(views, validation_views(self.dataset, views.scene, views.location, self.config))
-        super().setup(stage)
-
-    def use(self, views: LabelledViews, held_out: NDArray[np.bool_]) -> None:
-        """Train on these views in place of the dataset's, without those held out (B,).
-
-        Raises a TableError if the labels of a split are of one class.
-        """
-        self.train_rows = torch.from_numpy(np.flatnonzero(~held_out))
-        self.val_rows = torch.from_numpy(np.flatnonzero(held_out))
-        labels = views.labels.cpu()
-        good = labels.numpy() > 0
-        check_classes(self.dataset, self.config, good[~held_out], good[held_out])
-        if self.options.balance:
-            self.train_rows = self.train_rows[balance_classes(labels[self.train_rows], self.config.seed)]
-        self.class_weights = class_weights(labels[self.train_rows])
-        self.statistics = InputStatistics.of(views.means, views.filled, self.train_rows, views.channels)
+        views = load_views(dataset, training_scenes(dataset), config, bins, device, progress, landmark_channels)
+        self.views = views
+        self.channels = views.channels
+        self.split(dataset)
+        check_classes(dataset, config, self.labels(self.train_rows), self.labels(self.val_rows))
+        if options.balance:
+            self.train_rows = self.train_rows[balance_classes(self.labels(self.train_rows), config.seed)]
+        self.class_weights = class_weights(self.labels(self.train_rows))  # of the negative and the positive class
+        self.statistics = FeatureStatistics.of_bins(views.means, views.filled, self.train_rows, views.channels)
         depths = views.means[:, views.channels.index("z")].sum((1, 2), dtype=torch.float64)
         quantities = bin_quantities(depths.cpu().numpy(), views.filled.sum((1, 2)).cpu().numpy())
         self.training_range = TrainingRange.of(quantities[self.train_rows.numpy()])
-        self.views = views
 
     def batches(self, rows: Tensor, shuffle_seed: int | None = None) -> BinnedBatches:
         """See `ViewsDataModule.batches`."""
@@ -302,8 +282,8 @@ class ViewpointDataModule(ViewsDataModule):
         return BinnedBatches(self.views, rows, self.channels, batch_size, shuffle_seed, self.share)
 
 
-def class_weights(labels: Tensor) -> tuple[float, float]:
+def class_weights(positive: NDArray[np.bool_]) -> tuple[float, float]:
     """Return weights that give both classes the same total and a mean of 1: n / (2 n_negative), n / (2 n_positive)."""
-    total = len(labels)
-    positives = float(labels.sum())
-    return total / (2 * (total - positives)), total / (2 * positives)
+    total = len(positive)
+    n_positive = int(np.count_nonzero(positive))
+    return total / (2 * (total - n_positive)), total / (2 * n_positive)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import signal
-import tempfile
 import threading
 import time
 import warnings
@@ -13,7 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import torch
 from lightning.pytorch import Callback, LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint, EarlyStopping
@@ -30,7 +28,6 @@ from wheretolook.utils.errors import ConfigError, TrackingError, WorkerError
 from wheretolook.utils.files import temporary_folder
 
 MONITORED = "val_average_precision"  # the metric that decides which epoch was best
-LIGHTNING_LOGGERS = ("lightning.pytorch", "lightning.fabric")
 LOG_EVERY_S = 2.0  # epochs are logged together after so many seconds: a transaction takes longer than a short epoch
 
 
@@ -54,15 +51,13 @@ def fit(classifier: ViewpointClassifier, data: LightningDataModule, record: Epoc
     callbacks: list[Callback] = [record]
     if options.patience is not None:
         callbacks.append(EarlyStopping(MONITORED, mode="max", patience=options.patience))
-    default_tempdir = tempfile.tempdir
     with _quiet(), temporary_folder() as folder:
         where: dict[str, Any] = {"accelerator": config.accelerator, "devices": config.devices}
         if config.devices > 1:
             record.file = folder / "record.pt"
-            tempfile.tempdir = str(folder)  # a process that outlives this one writes its error to a temporary file
-            where["accelerator"] = "cpu" if home_device(config) == "cpu" else config.accelerator
             where["strategy"] = _SpawnedStrategy(start_method="spawn")
-            where["strategy"].tempdir = str(folder)
+            if home_device(config) == "cpu":
+                where["accelerator"] = "cpu"
         try:
             Trainer(
                 **where,
@@ -78,8 +73,6 @@ def fit(classifier: ViewpointClassifier, data: LightningDataModule, record: Epoc
             problem = f"a training process ended before its work was done: {error}"
             fix = "There may be too little memory: lower train.devices."
             raise WorkerError(problem, value=f"train.devices {config.devices}", fix=fix) from error
-        finally:
-            tempfile.tempdir = default_tempdir
         if record.file is not None:
             record.load(record.file)
     data.trainer = None  # later batches are whole, not one process's share
@@ -127,16 +120,11 @@ class EpochRecord(Checkpoint):
         self.progress = progress
         self.run_log = run_log
         self.keep_best = options.keep == "best"
-        self.rows: list[dict[str, float]] = []
+        self.rows: list[dict[str, float]] = []  # metrics of each epoch
         self.kept = -1
         self.file: Path | None = None
         self._weights: dict[str, torch.Tensor] = {}
         self._bar: Any = None
-
-    @property
-    def history(self) -> pd.DataFrame:
-        """Metrics of each epoch, one row an epoch."""
-        return pd.DataFrame(self.rows)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Show the progress bar."""
@@ -182,17 +170,14 @@ class EpochRecord(Checkpoint):
 class _SpawnedStrategy(DDPStrategy):
     """Lightning's DDP in spawned processes that are as quiet as the calling one."""
 
-    tempdir: str | None = None
-
     def setup_environment(self) -> None:
         """Silence this process and join the others."""
         _silence()
-        tempfile.tempdir = self.tempdir
         super().setup_environment()
 
 
 def _silence() -> None:
-    for name in LIGHTNING_LOGGERS:
+    for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`")  # between Lightning and PyTorch
 
@@ -200,10 +185,8 @@ def _silence() -> None:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Silence Lightning's notes on hardware, and turn its exit on Ctrl-C back into a KeyboardInterrupt."""
-    loggers = [logging.getLogger(name) for name in LIGHTNING_LOGGERS]
-    levels = [logger.level for logger in loggers]
     in_main = threading.current_thread() is threading.main_thread()
-    handler = signal.getsignal(signal.SIGINT) if in_main else None
+    handler = signal.getsignal(signal.SIGINT)
     try:
         with warnings.catch_warnings():
             _silence()
@@ -213,7 +196,5 @@ def _quiet() -> Iterator[None]:
             raise KeyboardInterrupt from stop
         raise
     finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
         if in_main:
             signal.signal(signal.SIGINT, handler)

@@ -19,10 +19,10 @@ from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good, poses
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.channels import ATTRIBUTES, OF_SIZE
 from wheretolook.inputs.landmark_features import LandmarkDescriber, ViewLandmarks
-from wheretolook.training.attribute_statistics import AttributeStatistics
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.training.batches import Batch, IndexBatches, TensorViews
 from wheretolook.training.config import SharedConfig
-from wheretolook.training.data import ViewsDataModule, labelled_rows, validation_views
+from wheretolook.training.data import ViewsDataModule, labelled_rows
 from wheretolook.training.fit import home_device
 from wheretolook.training.learner import TrainingJob
 from wheretolook.training.scenes import training_scenes
@@ -31,8 +31,7 @@ from wheretolook.training.training_range import TrainingRange, camera_quantities
 DISTANCES = [ATTRIBUTES.index(name) for name in OF_SIZE]
 
 CORRECT_WITHIN = 0.5, 5.0
-"""Metres and degrees within which a localized pose is the view's own, so that its inliers are correct. Elsewhere the map
-is ambiguous, and inliers are wrong matches."""
+"""Largest errors in metres and degrees of a localized pose whose inliers count as correct matches."""
 
 BLOCK = 2048  # views described at a time: some million landmarks
 
@@ -75,36 +74,41 @@ def load_landmark_views(
         TableError: a scene has no table or no labelled viewpoint, its occlusion does not fit, or matches are not stored.
         MapError: a scene has no landmarks.
     """
-    tables = [(scene, labelled_rows(scene, matches)) for scene in scenes]
-    blocks: list[LandmarkViews] = []
+    tables = [labelled_rows(scene, matches) for scene in scenes]
+    parts: list[tuple[Tensor, ...]] = []
+    viewpoints: list[pd.DataFrame] = []
     generator = torch.Generator().manual_seed(config.seed)
-    total = sum(len(table) for _, table in tables)
-    with tqdm(total=total, desc="describe views", unit="view", disable=not progress) as bar:
-        for number, (scene, table) in enumerate(tables):
+    with tqdm(total=sum(map(len, tables)), desc="describe views", unit="view", disable=not progress) as bar:
+        for number, (scene, table) in enumerate(zip(scenes, tables, strict=True)):
             describer = LandmarkDescriber(scene.localization_map(device=device))
-            cam_from_world = poses(table)
-            good = is_good(table, config.max_error_m, config.max_error_deg)
-            error_m = np.where(is_good(table, np.inf, config.max_error_deg), table["error_m"], np.inf)
-            location = table["location_id"].to_numpy(np.int64)
             for camera, rows in views_by_camera(scene, table, BLOCK):
-                described = describer.of_camera(camera).describe(cam_from_world[rows])
-                starts, kept = _sample(described, max_landmarks, generator)
-                blocks.append(
-                    LandmarkViews(
-                        starts=starts.cpu(),
-                        values=described.values[kept].to("cpu", torch.float16),
-                        n_visible=described.counts.cpu(),
-                        axis_height=torch.from_numpy(cam_from_world[rows, 2, 2].astype(np.float32)),
-                        labels=torch.from_numpy(good[rows].astype(np.float32)),
-                        error_m=torch.from_numpy(error_m[rows].astype(np.float32)),
-                        scene=np.full(len(described), number),
-                        location=location[rows],
-                        quantities=view_quantities(described, described.counts, camera_quantities(camera)),
-                        detected=_detected(described, table.iloc[rows])[kept.cpu()] if matches else None,
-                    )
-                )
-                bar.update(len(described))
-    return _joined(blocks)
+                block = table.iloc[rows].assign(scene=number)
+                described = describer.of_camera(camera).describe(poses(block))
+                kept = _sample(described, max_landmarks, generator)
+                values = described.values[kept].to("cpu", torch.float16)
+                quantities = view_quantities(described, described.counts, camera_quantities(camera))
+                detected = _detected(described, block) if matches else torch.zeros(len(described.rows))
+                parts.append((values, described.counts.cpu(), torch.from_numpy(quantities), detected[kept.cpu()]))
+                viewpoints.append(block)
+                bar.update(len(block))
+    values, n_visible, quantities, detected = (torch.cat(column) for column in zip(*parts, strict=True))
+    table = pd.concat(viewpoints, ignore_index=True)
+    starts = torch.zeros(len(table) + 1, dtype=torch.int64)
+    starts[1:] = n_visible.clamp(max=max_landmarks).cumsum(0)
+    good = is_good(table, config.max_error_m, config.max_error_deg)
+    error_m = np.where(is_good(table, np.inf, config.max_error_deg), table["error_m"], np.inf)
+    return LandmarkViews(
+        starts=starts,
+        values=values,
+        n_visible=n_visible,
+        axis_height=torch.from_numpy(poses(table)[:, 2, 2].astype(np.float32)),
+        labels=torch.from_numpy(good.astype(np.float32)),
+        error_m=torch.from_numpy(error_m.astype(np.float32)),
+        scene=table["scene"].to_numpy(),
+        location=table["location_id"].to_numpy(np.int64),
+        quantities=quantities.numpy(),
+        detected=detected if matches else None,
+    )
 
 
 def _detected(described: ViewLandmarks, table: pd.DataFrame) -> Tensor:
@@ -121,27 +125,12 @@ def _detected(described: ViewLandmarks, table: pd.DataFrame) -> Tensor:
     return torch.from_numpy(detected)
 
 
-def _sample(described: ViewLandmarks, limit: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Draw at most so many landmarks of each view: return their starts (B + 1,) and entries, in random order."""
+def _sample(described: ViewLandmarks, limit: int, generator: torch.Generator) -> Tensor:
+    """Draw at most so many landmarks of each view; return their entries (n,), in random order within each view."""
     views = described.views
     key = views.double() + torch.rand(len(views), generator=generator, dtype=torch.float64).to(views.device) * 0.999
-    order = key.argsort()
     place = torch.arange(len(views), device=views.device) - described.starts[views]  # views stay where they are
-    starts = torch.zeros_like(described.starts)
-    starts[1:] = described.counts.clamp(max=limit).cumsum(0)
-    return starts, order[place < limit]
-
-
-def _joined(blocks: Sequence[LandmarkViews]) -> LandmarkViews:
-    lengths = torch.cat([block.starts.diff() for block in blocks])
-    starts = torch.zeros(len(lengths) + 1, dtype=torch.int64)
-    starts[1:] = lengths.cumsum(0)
-    joined: dict[str, Any] = {"starts": starts}
-    for name in vars(blocks[0]).keys() - joined.keys():
-        parts = [getattr(block, name) for block in blocks]
-        if parts[0] is not None:
-            joined[name] = torch.cat(parts) if isinstance(parts[0], Tensor) else np.concatenate(parts)
-    return LandmarkViews(**joined)
+    return key.argsort()[place < limit]
 
 
 class LandmarkBatches(IndexBatches):
@@ -158,7 +147,7 @@ class LandmarkBatches(IndexBatches):
         rows: Tensor,
         width: int,
         *options: Any,
-        max_scale: float = 1.0,
+        max_scale: float = 1,
         max_error_m: float = 0.05,
     ) -> None:
         super().__init__(rows.to(views.device), *options)
@@ -191,8 +180,8 @@ class LandmarkBatches(IndexBatches):
         detected = torch.full(entries.shape, torch.nan, device=rows.device)
         if views.detected is not None:
             detected = torch.where(steps < n_sampled[:, None], views.detected[entries].float(), detected)
-        known = (n_sampled, views.n_visible[share], views.axis_height[share])
-        return Batch((values, *known, detected), labels, len(rows))
+        known = (n_sampled, views.n_visible[share], views.axis_height[share], detected)
+        return Batch((values, *known), labels, len(rows))
 
 
 def random_log_scales(count: int, max_scale: float, generator: torch.Generator) -> Tensor | None:
@@ -213,8 +202,6 @@ class LandmarkDataModule(ViewsDataModule):
     """
 
     views: LandmarkViews
-    train_rows: Tensor
-    val_rows: Tensor
 
     def __init__(self, task: TrainingJob, max_landmarks: int, matches: bool = False) -> None:
         super().__init__()
@@ -224,9 +211,7 @@ class LandmarkDataModule(ViewsDataModule):
         device = home_device(task.config)
         scenes = training_scenes(dataset)
         self.views = load_landmark_views(dataset, scenes, self.config, max_landmarks, device, task.progress, matches)
-        held_out = validation_views(dataset, self.views.scene, self.views.location, self.config)
-        self.train_rows = torch.from_numpy(np.flatnonzero(~held_out))
-        self.val_rows = torch.from_numpy(np.flatnonzero(held_out))
-        of_train = torch.from_numpy(~held_out).repeat_interleave(self.views.starts.diff())
-        self.statistics = AttributeStatistics.of(self.views.values[of_train].float())
-        self.training_range = TrainingRange.of(self.views.quantities[~held_out], self.options.enlarged)
+        trained_on = ~self.split(dataset)
+        entries = torch.from_numpy(trained_on).repeat_interleave(self.views.starts.diff())
+        self.statistics = FeatureStatistics.of_attributes(self.views.values[entries].float())
+        self.training_range = TrainingRange.of(self.views.quantities[trained_on], self.options.enlarged)

@@ -9,15 +9,15 @@ from typing import Any, Protocol
 import numpy as np
 import pandas as pd
 import torch
-from lightning.pytorch import LightningDataModule
 from numpy.typing import ArrayLike, NDArray
-from torch import nn
 
 from wheretolook.dataset.layout import Dataset
 from wheretolook.geometry.camera import Camera
 from wheretolook.training.classifier import ViewpointClassifier
 from wheretolook.training.config import SharedConfig
+from wheretolook.training.data import ViewsDataModule
 from wheretolook.training.fit import EpochRecord, RunLog, fit
+from wheretolook.training.trained_network import StoredNetwork, TrainedNetwork
 
 
 class Model(Protocol):
@@ -59,21 +59,27 @@ class TrainingJob:
         return cameras[0] if len(cameras) == 1 else None
 
 
-def fit_network(
-    network: nn.Module, data: LightningDataModule, task: TrainingJob, class_weights: tuple[float, float] = (1.0, 1.0)
-) -> tuple[dict[str, float], pd.DataFrame]:
-    """Train a network, which then holds the kept weights. Return their metrics and those of all epochs."""
+def train_network(
+    network: StoredNetwork,
+    data: ViewsDataModule,
+    task: TrainingJob,
+    class_weights: tuple[float, float] = (1.0, 1.0),
+    calibrate: bool = True,
+) -> TrainingResult:
+    """Train a network and, on request, calibrate it on the validation views."""
     classifier = ViewpointClassifier(network, task.options, class_weights, task.config.seed)
     record = EpochRecord(task.title, task.options, task.progress, task.run_log)
     fit(classifier, data, record, task.config)
     metrics = record.restore(classifier)
     network.eval()
-    return metrics, record.history
+    calibration = fit_platt(*_predict(network, data)) if calibrate else (1.0, 0.0)
+    model = TrainedNetwork(task.method, network.cpu(), task.camera, *calibration, data.training_range)
+    counts = class_counts(train=data.labels(data.train_rows), val=data.labels(data.val_rows))
+    return TrainingResult(model, metrics, counts, pd.DataFrame(record.rows))
 
 
-def predict(network: nn.Module, data: LightningDataModule) -> tuple[NDArray[Any], NDArray[Any]]:
+def _predict(network: StoredNetwork, data: ViewsDataModule) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return logits and labels (B,) of the validation views."""
-    network.eval()
     logits = []
     labels = []
     with torch.inference_mode():
@@ -90,10 +96,9 @@ def class_counts(**sides: NDArray[Any]) -> dict[str, Any]:
 
 
 def fit_platt(logits: ArrayLike, labels: ArrayLike) -> tuple[float, float]:
-    """Scale and offset with which scale * logits + offset are the likeliest log-odds of labels (B,) (Platt 1999).
+    """Return the scale and offset for which scale * logits + offset best predict labels (B,) (Platt 1999).
 
-    Temperature scaling has no offset, so it mends how sure a model is, but not a level that is off. They are 1 and 0
-    where a scale would turn the order round or the labels are of one class.
+    They are 1 and 0 if the scale would reverse the order, or the labels are of one class.
     """
     from sklearn.linear_model import LogisticRegression
 
@@ -103,5 +108,4 @@ def fit_platt(logits: ArrayLike, labels: ArrayLike) -> tuple[float, float]:
         return 1.0, 0.0
     line = LogisticRegression(C=1e6).fit(values[:, None], truth)
     scale = float(line.coef_[0, 0])
-    offset = float(line.intercept_[0])
-    return (scale, offset) if scale > 0 else (1.0, 0.0)
+    return (scale, float(line.intercept_[0])) if scale > 0 else (1.0, 0.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
@@ -27,7 +28,7 @@ class StoredNetwork(nn.Module, ABC):
     @classmethod
     @abstractmethod
     def of_description(cls, stored: Mapping[str, Any]) -> Self:
-        """Build the untrained network of a description; a WeightsError if it names unknown inputs."""
+        """Build the untrained network of a description; ValueError if it is invalid or names unknown inputs."""
 
     @property
     def stored(self) -> nn.Module:
@@ -38,27 +39,16 @@ class StoredNetwork(nn.Module, ABC):
 NetworkT = TypeVar("NetworkT", bound=StoredNetwork)
 
 
+@dataclass(frozen=True, eq=False)
 class TrainedNetwork(Generic[NetworkT]):
-    """A network, the camera of its training views (None for several), and the calibration scale * logit + offset.
+    """A network and the calibration scale * logit + offset of its logits."""
 
-    `training_range` describes the training views; None if the weights do not store it.
-    """
-
-    def __init__(
-        self,
-        method: str,
-        network: NetworkT,
-        camera: Camera | None,
-        scale: float = 1.0,
-        offset: float = 0.0,
-        training_range: TrainingRange | None = None,
-    ) -> None:
-        self.method = method
-        self.network = network.eval()
-        self.camera = camera
-        self.scale = scale
-        self.offset = offset
-        self.training_range = training_range
+    method: str
+    network: NetworkT
+    camera: Camera | None  # of its training views; None for several
+    scale: float = 1.0
+    offset: float = 0.0
+    training_range: TrainingRange | None = None  # of its training views; None if the weights do not store it
 
     def calibrated(self, logits: Tensor) -> Tensor:
         """Return calibrated log-odds of the network's logits, in the same shape and precision."""
@@ -66,11 +56,8 @@ class TrainedNetwork(Generic[NetworkT]):
 
     def save(self, path: Path, training: Mapping[str, Any] | None = None) -> None:
         """Write one safetensors file, atomically, with JSON values about the training in its header."""
-        header = {
-            **self.network.description(),
-            "camera": None if self.camera is None else self.camera.record(),
-            "scale": self.scale,
-        }
+        header = self.network.description()
+        header |= {"camera": None if self.camera is None else self.camera.record(), "scale": self.scale}
         if self.training_range is not None:
             header["range"] = self.training_range.record()
         header |= {"offset": self.offset, "training": dict(training or {})}
@@ -87,27 +74,26 @@ class TrainedNetwork(Generic[NetworkT]):
         tensors, header = read_weights(Path(path))
         check_method_of_weights(path, header, *methods)
         try:
-            with torch.device("meta"):  # build only a network as large as what is stored
-                expected = network_class.of_description(header).stored.state_dict()
-            _check_sizes(expected, tensors)
+            with torch.device("meta"):  # check sizes first: build only a network as large as what is stored
+                expected = network_class.of_description(header).stored
+            expected.load_state_dict({name: tensor.to("meta") for name, tensor in tensors.items()})
             network = network_class.of_description(header)
-            camera = None if header["camera"] is None else camera_of_record(header["camera"])
-            scale = float(header.get("scale", 1.0))
-            offset = float(header.get("offset", 0.0))
-            if not (isfinite(scale) and isfinite(offset)):
-                raise ValueError(f"scale {scale} and offset {offset} are not finite")
-            training_range = TrainingRange.of_record(header["range"]) if "range" in header else None
             network.stored.load_state_dict(tensors)
-        except WeightsError as error:
-            raise WeightsError(error.problem, path=path, value=error.value, fix=error.fix) from error
+            camera = None if header["camera"] is None else camera_of_record(header["camera"])
+            scale = finite(header.get("scale", 1.0))
+            offset = finite(header.get("offset", 0.0))
+            training_range = TrainingRange.of_record(header["range"]) if "range" in header else None
         except (KeyError, TypeError, ValueError, IndexError, AttributeError, RuntimeError, ConfigError) as error:
-            raise WeightsError(f"damaged header: {error}", path=path, fix="Train again.") from error
-        network.to(device).requires_grad_(False)
+            problem = f"the header does not describe these weights: {error}"
+            fix = "Use the version that wrote them, or train again."
+            raise WeightsError(problem, path=path, fix=fix) from error
+        network.to(device).eval().requires_grad_(False)
         return TrainedNetwork(header["method"], network, camera, scale, offset, training_range)
 
 
-def _check_sizes(expected: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> None:
-    for name in sorted({*expected, *tensors}):
-        sizes = [tuple(side[name].shape) if name in side else None for side in (expected, tensors)]
-        if sizes[0] != sizes[1]:
-            raise WeightsError(f"the weights do not fit their header: {name} is of size {sizes[1]}, not {sizes[0]}")
+def finite(value: Any) -> float:
+    """Return a number of a header; ValueError if it is not finite."""
+    number = float(value)
+    if not isfinite(number):
+        raise ValueError(f"{value} is not a finite number")
+    return number

@@ -1,8 +1,9 @@
-"""The range of a model's training views, to detect views outside of it."""
+"""The range of a model's training views, and warnings about views outside of it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,6 +16,7 @@ from torch import Tensor
 from wheretolook.geometry.camera import Camera, field_of_view_deg
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.landmark_features import ViewLandmarks
+from wheretolook.utils.errors import OutOfRangeWarning
 
 QUANTITIES = {
     "distance_m": "mean distance of the landmarks in view {:.3g} m",
@@ -26,12 +28,13 @@ QUANTITIES = {
 }
 """Quantities of a view, NaN where unknown, and their text in messages. The mean distance is geometric."""
 
-OF_CAMERA = ("across_deg", "down_deg", "focal_px")
-_ANGLES = ("across_deg", "down_deg")
+LANDMARK_QUANTITIES = ("distance_m", "depth_m", "in_view")
+ANGLES = ("across_deg", "down_deg")
 
 QUANTILES = (0.005, 0.995)  # of the training views that bound the range
-MARGIN = 1.25  # a range is wider than these quantiles: by this factor, or angle
+MARGIN = 1.25  # factor that widens the range beyond these quantiles; for angles, degrees
 MARGIN_DEG = 2.0
+TOLERATED = 0.05  # share of the views scored at once that may be out of range without a warning
 
 
 @dataclass(frozen=True)
@@ -41,43 +44,42 @@ class TrainingRange:
     bounds: Mapping[str, tuple[float, float]]
 
     @classmethod
-    def of(cls, quantities: Float, enlarged: float = 1.0) -> TrainingRange:
-        """The range of views described by `QUANTITIES` (B, 6); those without landmarks do not count.
+    def of(cls, quantities: Float, max_scale: float = 1.0) -> TrainingRange:
+        """Return the range of views with `QUANTITIES` (B, 6), without those that have no landmark.
 
-        If scenes come larger and smaller by up to a factor while learning, so do the distances.
+        Distances are widened by `max_scale`, the factor by which scenes are scaled in training.
         """
-        seeing = quantities[_have_landmarks(quantities)]
         bounds = {}
-        for name, values in zip(QUANTITIES, seeing.T, strict=True):
+        for name, values in zip(QUANTITIES, quantities[_have_landmarks(quantities)].T, strict=True):
             known = values[np.isfinite(values)]
             if len(known):
                 low, high = np.quantile(known, QUANTILES).tolist()
-                factor = MARGIN * (enlarged if name == "distance_m" else 1.0)
-                wider = (low - MARGIN_DEG, high + MARGIN_DEG) if name in _ANGLES else (low / factor, high * factor)
+                factor = MARGIN * (max_scale if name == "distance_m" else 1.0)
+                wider = (low - MARGIN_DEG, high + MARGIN_DEG) if name in ANGLES else (low / factor, high * factor)
                 bounds[name] = (round(wider[0], 4), round(wider[1], 4))
         return cls(bounds)
 
     @classmethod
     def of_camera(cls, camera: Camera | None) -> TrainingRange:
-        """The range where nothing but the camera of the views is known: its field of view. Any, where it is not."""
+        """Return the range that only a training camera's field of view bounds; unbounded without a camera."""
         if camera is None:
             return cls({})
-        angles = zip(_ANGLES, field_of_view_deg(camera), strict=True)
+        angles = zip(ANGLES, field_of_view_deg(camera), strict=True)
         return cls({name: (angle - MARGIN_DEG, angle + MARGIN_DEG) for name, angle in angles})
 
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> TrainingRange:
-        """The range of a `record`. Raises KeyError, TypeError or ValueError if it is none."""
+        """Return the range of a `record`; KeyError, TypeError, IndexError or ValueError if it is invalid."""
         return cls({name: (float(record[name][0]), float(record[name][1])) for name in QUANTITIES if name in record})
 
     def record(self) -> dict[str, list[float]]:
-        """The bounds as JSON values."""
+        """Return the bounds as JSON values."""
         return {name: list(bounds) for name, bounds in self.bounds.items()}
 
     @property
-    def asks_for_landmarks(self) -> bool:
+    def bounds_landmarks(self) -> bool:
         """Whether the range bounds more than the camera."""
-        return not {*self.bounds} <= {*OF_CAMERA}
+        return any(name in self.bounds for name in LANDMARK_QUANTITIES)
 
     @cached_property
     def _limits(self) -> Float:
@@ -85,62 +87,81 @@ class TrainingRange:
         return np.array([self.bounds.get(name, (-np.inf, np.inf)) for name in QUANTITIES]).T
 
     def outside(self, quantities: Float) -> NDArray[np.bool_]:
-        """Which of `QUANTITIES` (B, 6) lie outside the range; what is not known does not."""
+        """Return which of `QUANTITIES` (B, 6) are outside the range; unknown ones are not."""
         low, high = self._limits
         return np.asarray((quantities < low) | (quantities > high))
 
     def contains(self, quantities: Float) -> NDArray[np.bool_]:
-        """Which views, described by `QUANTITIES` (B, 6), are like those learnt from, (B,)."""
+        """Return which views with `QUANTITIES` (B, 6) are in the range, (B,)."""
         return np.asarray(~self.outside(quantities).any(axis=1))
 
     def complaint(self, quantities: Float, tolerated: float = 0.0) -> str:
-        """What is unlike the views learnt from, in words; "" if no more than this share of the views that see anything.
+        """Describe how views leave the range; "" if at most the share `tolerated` of those with landmarks does.
 
         Each quantity is reported by its median over the views where it is outside.
         """
-        seeing = quantities[_have_landmarks(quantities)]
-        outside = self.outside(seeing)
+        with_landmarks = quantities[_have_landmarks(quantities)]
+        outside = self.outside(with_landmarks)
         n_outside = int(np.count_nonzero(outside.any(axis=1)))
-        if n_outside <= tolerated * len(seeing):
+        if n_outside <= tolerated * len(outside):
             return ""
         parts = []
         for column, (name, text) in enumerate(QUANTITIES.items()):
             if outside[:, column].any():
                 low, high = self.bounds[name]
-                value = np.median(seeing[outside[:, column], column])
+                value = np.median(with_landmarks[outside[:, column], column])
                 parts.append(f"{text.format(value)} (trained on: {low:.3g} to {high:.3g})")
-        return f"{n_outside} of {len(seeing)} views are unlike the training views: {', '.join(parts)}"
+        return f"{n_outside} of {len(outside)} views are unlike the training views: {', '.join(parts)}"
+
+
+class RangeWatch:
+    """Checks scored views until it has warned; `watching` is whether there is anything left to check."""
+
+    def __init__(self, training_range: TrainingRange, watching: bool = True) -> None:
+        self.training_range = training_range
+        self.watching = watching and bool(training_range.bounds)
+
+    def check(self, name: str, quantities: Sequence[Float]) -> None:
+        """Warn once, with an `OutOfRangeWarning`, if too many views of `quantities`, parts (B, 6), are out of range.
+
+        The warning points to the caller of the calling function.
+        """
+        if not self.watching or not quantities:
+            return
+        if complaint := self.training_range.complaint(np.concatenate(quantities), TOLERATED):
+            self.watching = False
+            text = f"{name}: {complaint}. Their scores are less reliable; Scorer.in_range returns which."
+            warnings.warn(text, OutOfRangeWarning, stacklevel=3)
 
 
 def _have_landmarks(quantities: Float) -> NDArray[np.bool_]:
-    """Which views, described by `QUANTITIES` (B, 6), see any landmark, (B,): it then has a distance or a depth."""
+    """Return which views with `QUANTITIES` (B, 6) see any landmark, (B,): they have a distance or a depth."""
     return np.asarray(np.isfinite(quantities[:, :2]).any(axis=1))
 
 
 def camera_quantities(camera: Camera) -> Float:
-    """`QUANTITIES` (6,) that the camera alone tells. One whose image has edges that no ray leads to sees all around."""
+    """Return the `QUANTITIES` (6,) of a camera; the field of view is 360 degrees if no ray meets the image's edges."""
     angles = np.nan_to_num(field_of_view_deg(camera), nan=360.0)
     return np.array([np.nan, np.nan, np.nan, *angles, camera.mean_focal_px])
 
 
 def bin_quantities(depth_sums: Float, n_filled: NDArray[np.integer[Any]]) -> Float:
-    """`QUANTITIES` (B, 6) that bins tell: sums (B,) of the mean depths of a view's bins, and how many are filled."""
-    found = np.full((len(depth_sums), len(QUANTITIES)), np.nan)
+    """Return `QUANTITIES` (B, 6) of binned views: sums (B,) of the mean depths of their bins, and filled bins (B,)."""
+    quantities = np.full((len(depth_sums), len(QUANTITIES)), np.nan)
     some = n_filled > 0
-    found[some, 1] = depth_sums[some] / n_filled[some]
-    return found
+    quantities[some, 1] = depth_sums[some] / n_filled[some]
+    return quantities
 
 
-def view_quantities(landmarks: ViewLandmarks, n_in_view: Tensor, of_camera: Float) -> Float:
-    """`QUANTITIES` (B, 6) of views by landmarks that they see, all or a sample of the `n_in_view` (B,) of each.
+def view_quantities(landmarks: ViewLandmarks, n_visible: Tensor, of_camera: Float) -> Float:
+    """Return `QUANTITIES` (B, 6) of views, from all of their `n_visible` (B,) landmarks or a sample.
 
-    `of_camera` is what `camera_quantities` tells of the camera that looks.
+    `of_camera` are the `camera_quantities` of their camera.
     """
     log_distance = landmarks.values[:, landmarks.attributes.index("distance")].contiguous()
     mean = torch.segment_reduce(log_distance, "mean", lengths=landmarks.counts)
-    found = np.empty((len(landmarks), len(QUANTITIES)))
-    found[:] = of_camera
-    counts = n_in_view.cpu().numpy()
-    found[:, 0] = mean.exp().cpu().numpy()
-    found[:, 2] = np.where(counts > 0, counts, np.nan)
-    return found
+    quantities = np.tile(of_camera, (len(landmarks), 1))
+    counts = n_visible.cpu().numpy()
+    quantities[:, 0] = mean.exp().cpu().numpy()
+    quantities[:, 2] = np.where(counts > 0, counts, np.nan)
+    return quantities

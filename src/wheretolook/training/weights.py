@@ -1,4 +1,4 @@
-"""Read and write trained weights: one safetensors file with a JSON header, and a JSON record of the training beside."""
+"""Read and write trained weights: a safetensors file with a JSON header, and a JSON record of its training."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 FORMAT_VERSION = 1  # of the header
 METADATA_KEY = "wheretolook"  # of the header's JSON text in the safetensors metadata
-MAX_MAGNITUDE = 1e12  # of a finite weight; the coordinates that scene-adapted weights store are far below
+MAX_MAGNITUDE = 1e12  # of a finite weight; the coordinates in scene-adapted weights are far smaller
 
 
 def write_weights(path: str | Path, method: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
@@ -42,12 +42,8 @@ def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         names = file.keys()  # the file is no dict, whatever it looks like
         tensors = {name: file.get_tensor(name) for name in names}
     for name, tensor in tensors.items():
-        if not tensor.is_floating_point():
-            continue
-        if tensor.isnan().any():
-            raise WeightsError("these weights are not numbers (NaN)", path=path, value=name, fix="Train again.")
-        if (tensor[tensor.isfinite()].abs() > MAX_MAGNITUDE).any():
-            raise WeightsError("these weights are too large: they are damaged", path=path, value=name)
+        if tensor.is_floating_point() and (tensor.isnan() | tensor.isfinite() & (tensor.abs() > MAX_MAGNITUDE)).any():
+            raise WeightsError("these weights are NaN or too large", path=path, value=name, fix="Train again.")
     return tensors, header
 
 
@@ -57,18 +53,17 @@ def read_header(path: Path) -> dict[str, Any]:
         raise WeightsError("there are no weights", path=path, fix="Run the train command first, or correct the path.")
     with _open_tensors(path, "np") as file:
         metadata = file.metadata() or {}
-    if METADATA_KEY not in metadata:
-        fix = "Give weights that the train command wrote."
-        raise WeightsError("these weights were not written by wheretolook", path=path, fix=fix)
     try:
         header = parse_json_object(metadata[METADATA_KEY])
-    except ValueError as error:
-        raise WeightsError(f"damaged header: {error}", path=path, fix="Train again.") from error
-    if (version := header.get("format_version")) != FORMAT_VERSION:
-        problem = f"this version of wheretolook reads weights of format {FORMAT_VERSION}"
-        raise WeightsError(problem, path=path, value=version, fix="Install the version that wrote them.")
-    if not isinstance(header.get("training", {}), dict) or not isinstance(header.get("method"), str):
-        raise WeightsError("damaged header: no method, or training is no object", path=path, fix="Train again.")
+        if header["format_version"] != FORMAT_VERSION:
+            problem = f"this version of wheretolook reads weights of format {FORMAT_VERSION}"
+            fix = "Install the version that wrote them."
+            raise WeightsError(problem, path=path, value=header["format_version"], fix=fix)
+        if not isinstance(header["method"], str) or not isinstance(header.get("training", {}), dict):
+            raise ValueError("method is no text, or training is no object")
+    except (KeyError, ValueError) as error:
+        fix = "Give weights that the train command wrote."
+        raise WeightsError(f"no header that wheretolook wrote: {error}", path=path, fix=fix) from error
     return header
 
 
@@ -98,13 +93,8 @@ def read_training(path: str | Path) -> dict[str, Any]:
     return dict(read_header(Path(path)).get("training", {}))
 
 
-def features_of_weights(path: str | Path) -> list[str]:
-    """Return the names of the local features of the maps that weights were trained on."""
-    return list(read_training(path).get("features", ["sift"]))
-
-
 def read_record(path: str | Path) -> dict[str, Any]:
-    """Return the JSON record beside weights: "about", "weights_sha256", "run_id", "metrics".
+    """Return the JSON record next to weights: "about", "weights_sha256", "run_id", "metrics".
 
     Raises a WeightsError if it is missing or damaged.
     """

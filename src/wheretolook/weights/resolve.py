@@ -7,9 +7,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, overload
 
-from wheretolook.scorers.feature_domain import SUBSTITUTES
 from wheretolook.scorers.method import ScorerOptions
-from wheretolook.scorers.registry import build_scorer, check_method, members, scorers
+from wheretolook.scorers.registry import SUBSTITUTES, build_scorer, check_method, members, scorers
 from wheretolook.training.weights import method_of_weights, preference, read_training, read_weights
 from wheretolook.utils.errors import ConfigError, WeightsError
 from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped

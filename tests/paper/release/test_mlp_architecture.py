@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from wheretolook.inputs.bins import InputStatistics
 from wheretolook.inputs.channels import PAPER_VARIANTS
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.scorers.mlp.network import NetworkSpec, ViewpointNetwork
 from wheretolook_paper.release.mlp_architecture import architecture_table
 
@@ -13,7 +13,7 @@ from wheretolook_paper.release.mlp_architecture import architecture_table
 def make_network(variant: str, **options) -> ViewpointNetwork:  # type: ignore[no-untyped-def]
     torch.manual_seed(0)
     channels = PAPER_VARIANTS[variant]
-    statistics = InputStatistics(channels, (1.0,) * len(channels), (2.0,) * len(channels))
+    statistics = FeatureStatistics(channels, (1.0,) * len(channels), (2.0,) * len(channels))
     return ViewpointNetwork(NetworkSpec(statistics, **options)).eval()
 
 

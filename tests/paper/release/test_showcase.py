@@ -16,7 +16,7 @@ from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, outcome_in_w
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
-from wheretolook.inputs.bins import InputStatistics
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.mapping.colmap_model import save_mapping_poses
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.config import ApartmentConfig
@@ -150,7 +150,7 @@ def test_peaks_are_labelled_views_with_what_came_of_them(showcase: Showcase) -> 
 
 
 def test_learning_follows_the_best_and_the_worst_view(showcase: Showcase) -> None:
-    statistics = InputStatistics(("u", "v"), (48.0, 36.0), (20.0, 20.0))
+    statistics = FeatureStatistics(("u", "v"), (48.0, 36.0), (20.0, 20.0))
     network = TrainedNetwork("mlp-2d", ViewpointNetwork(NetworkSpec(statistics, bins=6)), CAMERA)
     scorer = BinnedNetworkScorer(showcase.localization_map, network)
     location = showcase.instructive_location()

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from math import log
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
-from wheretolook.inputs.landmark_features import ATTRIBUTES
-from wheretolook.training.attribute_statistics import AttributeStatistics, mean_and_std
+from wheretolook.inputs.channels import ATTRIBUTES
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.training.trained_network import StoredNetwork
-from wheretolook.utils.errors import WeightsError
 
 INITIAL_LOG_ODDS = -2.0  # of detection, by an untrained network: about one in eight, as in real views
 REQUIRED = ("across", "down", "distance", "pixel_angle", "pixel_size_ratio")  # attributes that locate a landmark
@@ -25,36 +23,28 @@ class LandmarkNetwork(StoredNetwork):
     It is rebuilt from its statistics and options.
     """
 
-    def __init__(self, statistics: AttributeStatistics, **options: Any) -> None:
+    def __init__(self, statistics: FeatureStatistics, **options: Any) -> None:
         super().__init__()
         self.statistics = statistics
+        self.attributes = statistics.names
         self.options = options
-
-    @property
-    def attributes(self) -> tuple[str, ...]:
-        """Names of its A input attributes."""
-        return self.statistics.attributes
 
     def description(self) -> dict[str, Any]:
         """Return the attributes, their statistics, and the options."""
-        stored = asdict(self.statistics)
-        return {"attributes": list(stored.pop("attributes")), "statistics": stored, "options": self.options}
+        stored = {"attributes": list(self.attributes), "statistics": self.statistics.record()}
+        return stored | {"options": self.options}
 
     @classmethod
     def of_description(cls, stored: Mapping[str, Any]) -> Self:
         """Build the untrained network of a description.
 
-        Raises a WeightsError if it names an attribute that this version's maps lack, or none that locates a landmark.
+        Raises a ValueError if it names an attribute that this version's maps lack, or none that locates a landmark.
         """
         names = tuple(stored["attributes"])
-        statistics = stored["statistics"]
-        if unknown := {*names} - {*ATTRIBUTES}:
-            fix = "Use the version that wrote them, or train again."
-            raise WeightsError("these weights need an unknown attribute of landmarks", value=min(unknown), fix=fix)
         if missing := {*REQUIRED} - {*names}:
-            raise WeightsError("these weights lack an attribute that locates a landmark", value=min(missing))
+            raise ValueError(f"the attribute {min(missing)}, which locates a landmark, is missing")
         options = {name: tuple(x) if isinstance(x, list) else x for name, x in stored["options"].items()}
-        return cls(AttributeStatistics(*mean_and_std(statistics, names), names), **options)
+        return cls(FeatureStatistics.of_record(names, stored["statistics"], ATTRIBUTES), **options)
 
 
 class StandardAttributes(nn.Module):
@@ -63,11 +53,11 @@ class StandardAttributes(nn.Module):
     mean: Tensor
     scale: Tensor
 
-    def __init__(self, statistics: AttributeStatistics, hidden: tuple[str, ...] = ()) -> None:
+    def __init__(self, statistics: FeatureStatistics, hidden: tuple[str, ...] = ()) -> None:
         super().__init__()
-        known = zip(statistics.attributes, statistics.std, strict=True)
+        known = zip(statistics.names, statistics.std, strict=True)
         scale = [0.0 if name in hidden else 1 / std for name, std in known]
-        # these follow from the description that is stored beside the weights: persistent=False
+        # not persistent: the header of weights stores them
         self.register_buffer("mean", torch.tensor(statistics.mean), persistent=False)
         self.register_buffer("scale", torch.tensor(scale), persistent=False)
 
@@ -79,7 +69,7 @@ class StandardAttributes(nn.Module):
 class MatchabilityNetwork(LandmarkNetwork):
     """Predicts whether a visible landmark is matched as an inlier, with two layers of `width` units."""
 
-    def __init__(self, statistics: AttributeStatistics, width: int = 48, hidden: tuple[str, ...] = ()) -> None:
+    def __init__(self, statistics: FeatureStatistics, width: int = 48, hidden: tuple[str, ...] = ()) -> None:
         super().__init__(statistics, width=width, hidden=hidden)
         self.input = StandardAttributes(statistics, hidden)
         last = nn.Linear(width, 1)

@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from wheretolook.inputs.bins import InputStatistics
 from wheretolook.inputs.channels import CHANNELS, Layout
-from wheretolook.scorers.binned_network import BinnedNetwork, StandardBins, stored_statistics
+from wheretolook.inputs.statistics import FeatureStatistics
+from wheretolook.scorers.binned_network import BinnedNetwork, StandardBins, statistics_of_record, statistics_record
 from wheretolook.scorers.mlp.config import MlpConfig
 
 
@@ -19,7 +19,7 @@ from wheretolook.scorers.mlp.config import MlpConfig
 class NetworkSpec:
     """Everything that defines a network but its weights."""
 
-    statistics: InputStatistics  # of its channels over the training views; their names are those of its input
+    statistics: FeatureStatistics  # of its channels over the training views
     bins: int = 30  # bins along each side of the image
     layout: Layout = "in_place"  # order of the bins in the input
     hidden: tuple[int, ...] = (300, 300)  # widths of the hidden layers
@@ -29,11 +29,11 @@ class NetworkSpec:
     @property
     def channels(self) -> tuple[str, ...]:
         """Channels of the input, in order."""
-        return self.statistics.channels
+        return self.statistics.names
 
     @property
     def input_size(self) -> int:
-        """Values the first layer takes in."""
+        """Number of input values of the first layer."""
         return len(self.channels) * self.bins**2
 
 
@@ -43,15 +43,14 @@ class BinnedInput(nn.Module):
     def __init__(self, spec: NetworkSpec) -> None:
         super().__init__()
         self.layout = spec.layout
-        self.input_size = spec.input_size
         self.standard = StandardBins(spec.statistics)
 
     def forward(self, means: Tensor, filled: Tensor) -> Tensor:
-        """Means and filled, as `ViewpointNetwork.forward` takes them, to (B, input_size) float32."""
+        """Return inputs (B, C * bins * bins) float32 of means and filled bins as in `ViewpointNetwork.forward`."""
         values = self.standard(means, filled)
         if self.layout == "compact":
             values = move_to_front(values, filled)
-        return values.reshape(-1, self.input_size)
+        return values.flatten(1)
 
 
 def move_to_front(values: Tensor, filled: Tensor) -> Tensor:
@@ -68,9 +67,9 @@ def move_to_front(values: Tensor, filled: Tensor) -> Tensor:
 def add_noise(
     means: Tensor, filled: Tensor, noise_px: float, noise_m: float, channels: tuple[str, ...] = CHANNELS
 ) -> Tensor:
-    """Gaussian noise of these standard deviations, as the released code adds while training, on filled bins.
+    """Add Gaussian noise to filled bins, as the released code does in training.
 
-    It is in pixels on u and v, in metres on x, y and z; what landmarks are like stays as it is.
+    `noise_px` is its deviation on u and v, `noise_m` on x, y and z; other channels stay.
     """
     of_kind = {"u": noise_px, "v": noise_px, "x": noise_m, "y": noise_m, "z": noise_m}
     scale = means.new_tensor([of_kind.get(name, 0.0) for name in channels])
@@ -94,26 +93,26 @@ class ViewpointNetwork(BinnedNetwork):
         self.layers = nn.Sequential(*layers, nn.Linear(width, 1))
 
     def forward(self, means: Tensor, filled: Tensor) -> Tensor:
-        """Logits (B,) of means (B, C, bins, bins) float32 of its channels and filled bins (B, bins, bins)."""
+        """Return logits (B,) of means (B, C, bins, bins) float32 of its channels and filled bins (B, bins, bins)."""
         return self.layers(self.input(means, filled)).squeeze(-1)
 
     def augment(self, options: MlpConfig, means: Tensor, filled: Tensor) -> tuple[Tensor, Tensor]:
-        """The views with the noise that the options ask for, if any."""
+        """Return the views with the noise of the options, if any."""
         if options.noise_px > 0 or options.noise_m > 0:
             means = add_noise(means, filled, options.noise_px, options.noise_m, self.spec.channels)
         return means, filled
 
     def description(self) -> dict[str, Any]:
-        """The fields of `NetworkSpec`."""
-        return asdict(self.spec)
+        """Return the fields of `NetworkSpec`."""
+        return asdict(self.spec) | {"statistics": statistics_record(self.statistics)}
 
     @classmethod
     def of_description(cls, stored: Mapping[str, Any]) -> ViewpointNetwork:
-        """The untrained network of a description; a WeightsError if it looks at an unknown channel of the bins."""
+        """Build the untrained network of a description; ValueError if it names an unknown channel."""
         bins = int(stored["bins"])
         hidden = tuple(stored["hidden"])
         dropouts = float(stored["dropout"]), float(stored["input_dropout"])
-        return cls(NetworkSpec(stored_statistics(stored), bins, stored["layout"], hidden, *dropouts))
+        return cls(NetworkSpec(statistics_of_record(stored), bins, stored["layout"], hidden, *dropouts))
 
     @property
     def stored(self) -> nn.Module:

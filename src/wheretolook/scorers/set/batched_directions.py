@@ -12,7 +12,6 @@ import warnings
 from concurrent.futures import ThreadPoolExecutor
 from math import log
 from threading import Lock
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +19,7 @@ import warp as wp
 from torch import Tensor
 
 from wheretolook.geometry.poses import Float, check_locations, rotation_looking_along
+from wheretolook.inputs.landmark_features import ragged_blocks
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.scorers.matchability.network import N_EXPECTED, bearing_precision
@@ -47,77 +47,67 @@ OF_LOCATION = ("distance", "mapped_angle", "distance_ratio", "pixel_size_ratio")
 IMAGE = ("across", "down")
 """Attributes of a landmark that depend on the camera's orientation."""
 
-ROOM = {"cpu": 1 << 13, "cuda": 1 << 22}  # landmarks in view that pass the network at once: fits the cache, or 2 GB
-NEARBY = {"cpu": 1, "cuda": 1 << 23}  # landmarks around the locations of a block; of a location at least
+AT_ONCE = {"cpu": 1 << 13, "cuda": 1 << 22}  # visible landmarks in a block: fits the cache, or takes 2 GB
+NEARBY = {"cpu": 1, "cuda": 1 << 23}  # landmarks times locations in a block; of one location at least
 SCRATCH_BYTES = 1 << 24
-LEAST_CELLS = 64  # along a side of the sphere's map: of larger cells too many lie on the border of a view
+MIN_CELLS = 64  # along a side of the sphere's map: of larger cells too many are on the border of a view
 
 
 class BatchedDirections:
     """Scores the same directions (D, 3), unit vectors in the world, at any location.
 
-    A view of more than `most` landmarks is scored from every second of the map's, every fourth, and so on, along a
-    curve through space (`DevicePoints`), so that between half of `most` and `most` remain.
+    A view of more than `limit` landmarks is scored from every second of the map's, every fourth, and so on, along a
+    curve through space (`DevicePoints`), so that between half of `limit` and `limit` remain.
     """
 
     def __init__(
-        self, localization_map: LocalizationMap, trained: TrainedNetwork[SetNetwork], directions: Float, most: int
+        self, localization_map: LocalizationMap, trained: TrainedNetwork[SetNetwork], directions: Float, limit: int
     ) -> None:
         self.localization_map = localization_map
         self.trained = trained
         self.directions = directions
-        self.most = most
-        nearby = localization_map
-        matchability = trained.network.matchability
+        self.limit = limit
         self.rotations = rotation_looking_along(directions)
-        self.points = DevicePoints(nearby.landmarks.points, nearby.device)
+        landmarks = localization_map.landmarks
+        matchability = trained.network.matchability
+        self.points = DevicePoints(landmarks.points, localization_map.device)
         names = matchability.attributes
         first, self._second, self._last = (layer for layer in matchability.layers if isinstance(layer, torch.nn.Linear))
-        self.device = matchability.input.mean.device
+        mean = matchability.input.mean
+        self.device = mean.device
+        self._pixel_angle = -log(localization_map.camera.mean_focal_px)
         with torch.inference_mode():
             weight = first.weight * matchability.input.scale
-            self._of_image = self._weight(weight, names, IMAGE)
-            self._of_location = self._weight(weight, names, OF_LOCATION)
-            of_map = torch.from_numpy(nearby.landmarks.attributes()[self.points.order]).to(self.device)
-            self._mean = self._weight(matchability.input.mean[None], names, OF_LOCATION)[:, 0]
-            self._pixel_angle = -log(nearby.camera.mean_focal_px)
-            # the first layer of what neither location nor image tells: the other columns are at their means, so 0
-            values = matchability.input.mean.repeat(len(of_map), 1)
+            self._of_image = _columns(weight, names, IMAGE)
+            self._of_location = _columns(weight, names, OF_LOCATION)
+            self._mean = _columns(mean[None], names, OF_LOCATION)[:, 0]
+            of_map = torch.from_numpy(landmarks.attributes()[self.points.order]).to(self.device)
+            # the first layer of what depends on the map alone: the other columns are at their means, so 0
+            values = mean.repeat(len(of_map), 1)
             for column, name in enumerate(names):
                 if name in MAP_ATTRIBUTES:
                     values[:, column] = of_map[:, MAP_ATTRIBUTES.index(name)]
                 elif name == "pixel_angle":
                     values[:, column] = self._pixel_angle
-            # `across` and `down` are given as they are: their means are taken off here
-            self._first = (
-                first(matchability.input(values))
-                - self._weight(matchability.input.mean[None], names, IMAGE)[:, 0] @ self._of_image
-            )
+            # the kernels give `across` and `down` as they are: their means are subtracted here
+            means_of_image = _columns(mean[None], names, IMAGE)[:, 0] @ self._of_image
+            self._first = first(matchability.input(values)) - means_of_image
             mapped = [MAP_ATTRIBUTES.index(name) for name in ("mapped_distance", "mapped_pixel_size")]
-            mapped_from = torch.from_numpy(nearby.landmarks.mapping_direction[self.points.order]).to(self.device)
+            mapped_from = torch.from_numpy(landmarks.mapping_direction[self.points.order]).to(self.device)
             self._mapped = torch.cat([mapped_from, of_map[:, mapped]], 1)
-        self._asks_for_cells = "log_expected_cells" in trained.network.options["told"]
-        with warnings.catch_warnings():  # PyTorch says once that sparse matrices are young
+        with warnings.catch_warnings():  # PyTorch warns once that sparse matrices are new
             warnings.simplefilter("ignore")
-            torch.sparse_csr_tensor(
-                torch.zeros(1, dtype=torch.int32), torch.zeros(0, dtype=torch.int32), torch.zeros(0)
-            )
+            torch.sparse_csr_tensor([0, 0], [], [], size=(1, 1))
         self._listers: dict[int, FrustumLister] = {}
         self._lock = Lock()
 
     @staticmethod
     def serves(network: SetNetwork) -> bool:
-        """Whether a network is told of views only what is `SERVED`."""
-        return network.attention is None and {*network.options["told"]} <= SERVED
-
-    @staticmethod
-    def _weight(weight: Tensor, names: tuple[str, ...], wanted: tuple[str, ...]) -> Tensor:
-        """Columns of a weight (W, A) by name, transposed (len(wanted), W); 0 for attributes it does not have."""
-        zero = torch.zeros_like(weight[:, 0])
-        return torch.stack([weight[:, names.index(name)] if name in names else zero for name in wanted])
+        """Return whether the inputs of a network's head are only what is `SERVED`."""
+        return network.attention is None and {*network.view_statistics} <= SERVED
 
     def score(self, locations: Float) -> Float:
-        """Scores (L, D) at locations (L, 3) m. Raises PoseError if one is not finite."""
+        """Return scores (L, D) at locations (L, 3) m; a PoseError if one is not finite."""
         locations = check_locations(locations)
         scores = np.empty((len(locations), len(self.rotations)))
         step = max(1, NEARBY[self.device.type] // max(1, len(self.points)))
@@ -148,19 +138,19 @@ class BatchedDirections:
         lister = self._lister(0)
         nearby = lister.surroundings(locations, double, mask)
         in_view = lister.lengths(nearby, pairs)
-        halvings = np.ceil(np.log2(np.maximum(in_view, 1) / self.most)).clip(0).astype(int)
+        halvings = np.ceil(np.log2(np.maximum(in_view, 1) / self.limit)).clip(0).astype(int)
         scores = np.empty(len(pairs))
-        for level in np.unique(halvings):
-            stride = 1 << int(level)
+        for level in np.unique(halvings).tolist():
+            stride = 1 << level
             views = np.flatnonzero(halvings == level)
             lengths = in_view[views]
             if level:
-                lister = self._lister(int(level))
+                lister = self._lister(level)
                 part = None if mask is None else mask[:, ::stride].contiguous()
                 nearby = lister.surroundings(locations, double[::stride].contiguous(), part)
                 lengths = lister.lengths(nearby, pairs[views])
             listed = lister.list(nearby, pairs[views], lengths)
-            # the share of a sample that the camera does see, where that is for the camera to say, is that of all
+            # where the camera itself excludes landmarks, the share of a sample that remains is that of all
             n_visible = np.diff(listed.starts) / np.maximum(lengths, 1) * in_view[views]
             if self.device.type != "cpu":
                 wp.synchronize_device(self.points.device)  # Torch works on a stream of its own
@@ -170,13 +160,16 @@ class BatchedDirections:
     def _lister(self, level: int) -> FrustumLister:
         with self._lock:
             if level not in self._listers:
-                camera = self.localization_map.camera
                 n_points = len(self.points) >> level
-                options: dict[str, Any] = {
-                    "scratch_bytes": SCRATCH_BYTES,
-                    "size": max(LEAST_CELLS, choose_size(n_points)),
-                }
-                self._listers[level] = FrustumLister(camera, self.rotations, n_points, self.points.device, **options)
+                size = max(MIN_CELLS, choose_size(n_points))
+                self._listers[level] = FrustumLister(
+                    self.localization_map.camera,
+                    self.rotations,
+                    n_points,
+                    self.points.device,
+                    scratch_bytes=SCRATCH_BYTES,
+                    size=size,
+                )
             return self._listers[level]
 
     def _of_listed(
@@ -187,42 +180,31 @@ class BatchedDirections:
         starts = listed.starts
         entries = wp.to_torch(listed.entries)
         image = wp.to_torch(listed.image)
-        offsets = wp.to_torch(nearby.offsets)
         rows = wp.to_torch(nearby.rows)
         used = torch.zeros(len(rows), dtype=torch.bool, device=self.device)
         used[entries] = True
         place = used.cumsum(0, dtype=torch.int32) - 1
         seen = used.nonzero()[:, 0]
-        base, terms = self._described(offsets[seen], rows[seen] * stride)
-        n = len(n_visible)
-        kept = torch.from_numpy(np.diff(starts)).to(self.device).clamp(min=1)
-        sums = torch.zeros((n, N_EXPECTED), device=self.device)
-        cells = torch.zeros(n, device=self.device)
+        base, terms = self._described(wp.to_torch(nearby.offsets)[seen], rows[seen] * stride)
+        sums = torch.zeros((len(n_visible), N_EXPECTED), device=self.device)
+        cells = torch.zeros(len(n_visible), device=self.device)
         visible = torch.from_numpy(n_visible).to(sums)
-        height = torch.from_numpy(heights).to(sums)
-        each = visible / kept
-        weight = self._second.weight.T
-        bias = self._second.bias
-        last = self._last
-        begin = 0
-        while begin < n:
-            end = int(np.searchsorted(starts, starts[begin] + ROOM[self.device.type], side="right")) - 1
-            end = min(max(end, begin + 1), n)
-            span = slice(int(starts[begin]), int(starts[end]))
-            views = slice(begin, end)
+        each = visible / torch.from_numpy(np.diff(starts)).to(self.device).clamp(min=1)
+        for views in ragged_blocks(starts, AT_ONCE[self.device.type]):
+            part = starts[views.start : views.stop + 1]
+            span = slice(int(part[0]), int(part[-1]))
             here = place[entries[span]]
             hidden = base.index_select(0, here).addmm_(image[span], self._of_image).relu_()
-            hidden = torch.mm(hidden, weight).add_(bias).relu_()
-            log_odds = torch.mv(hidden, last.weight[0]).add_(last.bias)
-            lengths = torch.from_numpy((starts[begin : end + 1] - starts[begin]).astype(np.int32)).to(self.device)
-            p_detect = torch.sparse_csr_tensor(lengths, here, log_odds.sigmoid(), size=(end - begin, len(terms)))
+            hidden = torch.mm(hidden, self._second.weight.T).add_(self._second.bias).relu_()
+            log_odds = torch.mv(hidden, self._last.weight[0]).add_(self._last.bias)
+            ends = torch.from_numpy((part - part[0]).astype(np.int32)).to(self.device)
+            p_detect = torch.sparse_csr_tensor(ends, here, log_odds.sigmoid(), size=(len(part) - 1, len(terms)))
             sums[views, :16] = p_detect @ terms
-            if self._asks_for_cells:
-                of_view = torch.arange(end - begin, device=self.device).repeat_interleave(lengths.diff())
+            if network.needs_cells:
+                of_view = torch.arange(len(part) - 1, device=self.device).repeat_interleave(ends.diff())
                 cells[views] = expected_cells(image[span], log_odds, of_view, each[views], IMAGE)
-            begin = end
-        spread = cells if self._asks_for_cells else None
-        logits = network.logits(sums * each[:, None], visible, height, spread).double()
+        height = torch.from_numpy(heights).to(sums)
+        logits = network.logits(sums * each[:, None], visible, height, cells if network.needs_cells else None).double()
         return np.asarray(self.trained.calibrated(logits).sigmoid().cpu().numpy())
 
     def _described(self, offsets: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -250,3 +232,9 @@ class BatchedDirections:
         torch.mul(plane, inverse.square()[:, None], out=terms[:, 1:7])
         torch.mul(bearing, (inverse * weight)[:, None], out=terms[:, 7:10])
         return base, terms
+
+
+def _columns(weight: Tensor, names: tuple[str, ...], wanted: tuple[str, ...]) -> Tensor:
+    """Return columns of a weight (W, A) by name, transposed (len(wanted), W); 0 for attributes it does not have."""
+    zero = torch.zeros_like(weight[:, 0])
+    return torch.stack([weight[:, names.index(name)] if name in names else zero for name in wanted])

@@ -13,7 +13,7 @@ from wheretolook.scorers.set.config import SetConfig
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.data import check_classes
 from wheretolook.training.landmark_views import LandmarkBatches, LandmarkDataModule
-from wheretolook.training.learner import TrainingJob, TrainingResult, class_counts, fit_network, fit_platt, predict
+from wheretolook.training.learner import TrainingJob, TrainingResult, train_network
 from wheretolook.training.provenance import weights_path
 from wheretolook.training.scenes import training_scenes
 from wheretolook.training.trained_network import TrainedNetwork
@@ -30,23 +30,14 @@ class SetDataModule(LandmarkDataModule):
     def __init__(self, task: TrainingJob) -> None:
         matches = task.options.landmark_loss > 0 and all(has_matches(s.table) for s in training_scenes(task.dataset))
         super().__init__(task, WINDOWS * task.options.landmarks, matches)
-        positive = (self.views.labels > 0).numpy()
-        check_classes(task.dataset, self.config, positive[self.train_rows], positive[self.val_rows])
+        check_classes(task.dataset, self.config, self.labels(self.train_rows), self.labels(self.val_rows))
 
     def batches(self, rows: Tensor, shuffle_seed: int | None = None) -> LandmarkBatches:
         """Return shuffled views, every time with other windows; or views in order, always with all landmarks stored."""
-        options = self.options
-        width = options.landmarks * (WINDOWS if shuffle_seed is None else 1)
-        return LandmarkBatches(
-            self.views,
-            rows,
-            width,
-            options.batch_size,
-            shuffle_seed,
-            self.share,
-            max_scale=options.enlarged,
-            max_error_m=self.config.max_error_m,
-        )
+        width = self.options.landmarks * (WINDOWS if shuffle_seed is None else 1)
+        order = self.options.batch_size, shuffle_seed, self.share
+        scaling = {"max_scale": self.options.enlarged, "max_error_m": self.config.max_error_m}
+        return LandmarkBatches(self.views, rows, width, *order, **scaling)
 
 
 def of_size(options: SetConfig, n_train: int) -> SetConfig:
@@ -75,12 +66,8 @@ def learn_set(task: TrainingJob, data: SetDataModule | None = None) -> TrainingR
     start = None
     if options.starts_from and path.is_file():
         start = TrainedNetwork.load(path, MatchabilityNetwork, options.starts_from).network
-        statistics = start.statistics if start.attributes == statistics.attributes else statistics
+        statistics = start.statistics if start.attributes == statistics.names else statistics
     network = SetNetwork(statistics, options.width, options.pooled, options.head, options.dropout, options.hidden)
     if start is not None and (start.statistics, start.options) == (statistics, network.matchability.options):
         network.matchability.load_state_dict(start.state_dict())
-    metrics, history = fit_network(network, data, replace(task, options=options))
-    logits, labels = predict(network, data)
-    counts = class_counts(train=data.views.labels[data.train_rows].cpu().numpy(), val=labels)
-    model = TrainedNetwork(task.method, network, task.camera, *fit_platt(logits, labels), data.training_range)
-    return TrainingResult(model, metrics, counts, history)
+    return train_network(network, data, replace(task, options=options))

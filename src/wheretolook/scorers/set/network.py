@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import batch_norm, binary_cross_entropy_with_logits, logsigmoid
 
 from wheretolook.geometry.pose_information import PLACES, PRIOR, SIGNS
-from wheretolook.inputs.landmark_features import ATTRIBUTES, ViewLandmarks
+from wheretolook.inputs.channels import ATTRIBUTES
+from wheretolook.inputs.landmark_features import ViewLandmarks
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.scorers.matchability.network import (
     N_EXPECTED,
     LandmarkNetwork,
@@ -19,12 +22,11 @@ from wheretolook.scorers.matchability.network import (
     expected_parts,
 )
 from wheretolook.scorers.set.config import SetConfig
-from wheretolook.training.attribute_statistics import AttributeStatistics
 from wheretolook.utils.errors import WeightsError
 
 
 def information_matrices(numbers: Tensor) -> Tensor:
-    """`wheretolook.geometry.pose_information.information_matrices` of sums (..., 15), shift first, turn second."""
+    """Return `geometry.pose_information.information_matrices` (..., 6, 6) of sums (..., 15)."""
     places, signs = _layout(numbers.device)
     return numbers[..., places] * signs
 
@@ -72,25 +74,26 @@ class SetNetwork(LandmarkNetwork):
     landmark. All statistics follow from sums over landmarks, so training uses a random sample, scaled up.
 
     `width` and `head` are units of the layers for single landmarks and of the head; `hidden` names attributes that are
-    no inputs of these layers. `told` names the statistics of a view, of `ALL_STATISTICS`, that are inputs of the head:
-    with more than the default ones it overfits its training scenes.
+    no inputs of these layers. `view_statistics` names the inputs of the head, of `ALL_STATISTICS`: with more than the
+    default ones it overfits its training scenes. In weights files they are called "told".
     """
 
     def __init__(
         self,
-        statistics: AttributeStatistics,
+        statistics: FeatureStatistics,
         width: int = 48,
         pooled: int = 0,
         head: int = 48,
         dropout: float = 0.1,
         hidden: tuple[str, ...] = (),
-        told: tuple[str, ...] = DEFAULT_STATISTICS,
+        view_statistics: tuple[str, ...] = DEFAULT_STATISTICS,
     ) -> None:
-        options = {"width": width, "pooled": pooled, "head": head, "dropout": dropout}
-        super().__init__(statistics, **options, hidden=hidden, told=told)
+        options = {"width": width, "pooled": pooled, "head": head, "dropout": dropout, "hidden": hidden}
+        super().__init__(statistics, **options, told=view_statistics)
+        self.view_statistics = view_statistics
         self.pose_variances = pose_variances  # replaced where there is no Cholesky decomposition
-        self._inputs = [ALL_STATISTICS.index(name) for name in told]
-        self._cells = "log_expected_cells" in told
+        self._inputs = [ALL_STATISTICS.index(name) for name in view_statistics]
+        self.needs_cells = "log_expected_cells" in view_statistics
         self.matchability = MatchabilityNetwork(statistics, width, hidden)
         self.attention = None
         if pooled:
@@ -98,14 +101,21 @@ class SetNetwork(LandmarkNetwork):
             self.attention = nn.Sequential(
                 StandardAttributes(statistics, hidden), *layers, nn.Linear(width, 1 + pooled)
             )
-        self.standard = nn.BatchNorm1d(len(told) + pooled)
-        n_features = self.standard.num_features
+        n_features = len(view_statistics) + pooled
+        self.standard = nn.BatchNorm1d(n_features)
         self.linear = nn.Linear(n_features, 1)
         first = nn.Linear(n_features, head), nn.ReLU(), nn.Dropout(dropout)
         self.decide = nn.Sequential(*first, nn.Linear(head, head), nn.ReLU(), nn.Linear(head, 1))
 
+    @classmethod
+    def of_description(cls, stored: Mapping[str, Any]) -> Self:
+        """See `LandmarkNetwork.of_description`."""
+        options = dict(stored["options"])
+        options["view_statistics"] = options.pop("told")
+        return super().of_description({**stored, "options": options})
+
     def forward(
-        self, values: Tensor, n_sampled: Tensor, n_visible: Tensor, axis_height: Tensor, found: Tensor | None = None
+        self, values: Tensor, n_sampled: Tensor, n_visible: Tensor, axis_height: Tensor, detected: Tensor | None = None
     ) -> Tensor:
         """Return logits (B,) from samples (B, K, A) of each view's landmarks, of which the first `n_sampled` (B,) count.
 
@@ -119,34 +129,34 @@ class SetNetwork(LandmarkNetwork):
         The fifth input (B, K) is 1 for detected landmarks, 0 for others, NaN if unknown. The loss is divided by the
         `count` of views and the landmarks of a training step's window.
         """
-        values, n_sampled, n_visible, axis_height, found = inputs
+        values, n_sampled, n_visible, axis_height, detected = inputs
         log_odds = self.matchability(values)
         logits = self._logits_of_samples(values, log_odds, n_sampled, n_visible, axis_height)
-        known = ~found.isnan()
-        missed = binary_cross_entropy_with_logits(log_odds[known], found[known], reduction="sum")
+        known = ~detected.isnan()
+        missed = binary_cross_entropy_with_logits(log_odds[known], detected[known], reduction="sum")
         return logits, options.landmark_loss * missed / (count * options.landmarks)
 
     def _logits_of_samples(
         self, values: Tensor, log_odds: Tensor, n_sampled: Tensor, n_visible: Tensor, axis_height: Tensor
     ) -> Tensor:
-        there = torch.arange(values.shape[1], device=values.device) < n_sampled[:, None]
-        sums = (self.parts(values, log_odds) * there[..., None]).sum(1)
+        valid = torch.arange(values.shape[1], device=values.device) < n_sampled[:, None]
+        sums = (self.parts(values, log_odds) * valid[..., None]).sum(1)
         each = n_visible / n_sampled.clamp(min=1)
         cells = None
-        if self._cells:
-            views = torch.arange(len(values), device=values.device)[:, None].expand_as(log_odds)[there]
-            cells = expected_cells(values[there], log_odds[there], views, each, self.attributes)
+        if self.needs_cells:
+            views = torch.arange(len(values), device=values.device)[:, None].expand_as(log_odds)[valid]
+            cells = expected_cells(values[valid], log_odds[valid], views, each, self.attributes)
         return self.logits(sums * each[:, None], n_visible, axis_height, cells)
 
     def score(self, landmarks: ViewLandmarks, n_visible: Tensor, axis_height: Tensor) -> Tensor:
         """Return logits (B,) from described landmarks, possibly a sample of those visible; see `forward`."""
         values = landmarks.values
-        log_odds = self.matchability(landmarks.values)
+        log_odds = self.matchability(values)
         # summed in double precision: in single, the sums of two machines may differ by more than scores should
         parts = self.parts(values, log_odds).double()
         sums = torch.segment_reduce(parts, "sum", lengths=landmarks.counts, initial=0.0)
         each = n_visible / landmarks.counts.clamp(min=1)
-        cells = expected_cells(values, log_odds, landmarks.views, each, self.attributes) if self._cells else None
+        cells = expected_cells(values, log_odds, landmarks.views, each, self.attributes) if self.needs_cells else None
         return self.logits(sums * each[:, None], n_visible, axis_height, cells)
 
     def parts(self, values: Tensor, log_odds: Tensor) -> Tensor:
@@ -199,8 +209,7 @@ def pose_variances(information: Tensor) -> tuple[Tensor, Tensor]:
     try:
         factor = torch.linalg.cholesky(information)
     except torch.linalg.LinAlgError as error:  # NaN, by weights that are too large
-        problem = "these weights give scores that are not finite: they or the map are damaged"
-        raise WeightsError(problem, fix="Give other weights, or train again.") from error
+        raise WeightsError("scores are not finite", fix="Give other weights, or check the map.") from error
     unit = torch.eye(6, dtype=factor.dtype, device=factor.device).expand_as(factor)
     # not by `cholesky_inverse`, which takes the matrices of a batch one by one on a GPU
     variances = torch.linalg.solve_triangular(factor, unit, upper=False).square().sum(-2)
@@ -210,9 +219,9 @@ def pose_variances(information: Tensor) -> tuple[Tensor, Tensor]:
 def expected_statistics(
     sums: Tensor, n_visible: Tensor, variances_of: Callable[[Tensor], tuple[Tensor, Tensor]] = pose_variances
 ) -> Tensor:
-    """`EXPECTED`, (B, len(EXPECTED)), of views by sums of `expected_parts` (B, N_EXPECTED), and landmarks seen (B,).
+    """Return `EXPECTED`, (B, len(EXPECTED)), from sums of `expected_parts` (B, N_EXPECTED) and visible landmarks (B,).
 
-    `variances_of` computes what `pose_variances` does.
+    `variances_of` is `pose_variances` or a replacement.
     """
     inliers = sums[:, 0]
     moments = sums[:, 16:] / (sums[:, :1] + 1e-6)

@@ -14,18 +14,17 @@ from wheretolook.scorers.landmark_scorer import LandmarkScorer
 from wheretolook.scorers.set.batched_directions import BatchedDirections
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.trained_network import TrainedNetwork
-from wheretolook.training.training_range import view_quantities
 
-MOST = 1024
-"""Landmarks of a view that are described; of more, an even sample stands for all. Against all, log-odds differ by 0.05
-where a view sees thousands."""
+MAX_LANDMARKS = 1024
+"""Landmarks of a view that are described at most; of more, an even sample represents all. Against all, log-odds differ
+by 0.05 where a view sees thousands."""
 
 
 class SetScorer(LandmarkScorer):
     """Network over the set of visible landmarks: their probabilities of detection and their information on the pose."""
 
     local = True
-    most = MOST
+    max_landmarks = MAX_LANDMARKS
 
     def __init__(self, localization_map: LocalizationMap, trained: TrainedNetwork[SetNetwork]) -> None:
         super().__init__(localization_map, trained.network.attributes, trained.training_range, trained.camera)
@@ -33,14 +32,13 @@ class SetScorer(LandmarkScorer):
         self.trained = trained
         self.network = trained.network.to(localization_map.device)
         self._batched: BatchedDirections | None = None
-        self._batched_axes: Float = np.empty((0, 3))
 
     def score(self, cam_from_world: Float) -> Float:
-        """(B,) probabilities in [0, 1]."""
+        """Return probabilities (B,) in [0, 1]."""
         cam_from_world = check_poses(cam_from_world)
         scores = np.empty(len(cam_from_world))
         quantities: list[Float] = []
-        for rows, described, n_visible in self.describer.in_blocks(cam_from_world, MOST):
+        for rows, described, n_visible in self.describer.in_blocks(cam_from_world, MAX_LANDMARKS):
             quantities += self._quantities(described, n_visible)
             scores[rows] = self._probabilities(cam_from_world[rows], described, n_visible)
         self._watch.check(self.name, quantities)
@@ -51,12 +49,10 @@ class SetScorer(LandmarkScorer):
         cam_from_world = check_poses(cam_from_world)
         n = len(cam_from_world)
         report = ViewReport(np.empty(n), np.zeros(n), np.zeros(n, dtype=np.int64), np.full(n, self._serves_camera))
-        for rows, described, n_visible in self.describer.in_blocks(cam_from_world, MOST):
+        for rows, described, n_visible in self.describer.in_blocks(cam_from_world, MAX_LANDMARKS):
             report.score[rows] = self._probabilities(cam_from_world[rows], described, n_visible)
             report.n_visible[rows] = n_visible.cpu().numpy()
-            report.in_range[rows] &= self.training_range.contains(
-                view_quantities(described, n_visible, self._of_camera)
-            )
+            report.in_range[rows] &= self._in_range(described, n_visible)
             with torch.inference_mode():
                 p_detect = self.network.matchability(described.values).sigmoid().double()
                 sums = torch.segment_reduce(p_detect, "sum", lengths=described.counts, initial=0.0)
@@ -79,7 +75,6 @@ class SetScorer(LandmarkScorer):
         """Return probabilities (L, D); where many landmarks are visible, from a smaller sample than `score`."""
         if not BatchedDirections.serves(self.network):
             return super().score_around(locations, directions)
-        if self._batched is None or not np.array_equal(self._batched_axes, directions):
-            self._batched = BatchedDirections(self.localization_map, self.trained, directions, MOST // 2)
-            self._batched_axes = directions
+        if self._batched is None or not np.array_equal(self._batched.directions, directions):
+            self._batched = BatchedDirections(self.localization_map, self.trained, directions, MAX_LANDMARKS // 2)
         return self._batched.score(locations)

@@ -10,15 +10,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import relu
 
-from wheretolook.inputs.bins import InputStatistics
-from wheretolook.scorers.binned_network import BinnedNetwork, StandardBins, stored_statistics
+from wheretolook.inputs.statistics import FeatureStatistics
+from wheretolook.scorers.binned_network import BinnedNetwork, StandardBins, statistics_of_record, statistics_record
 
 
 @dataclass(frozen=True)
 class ConvSpec:
     """Everything that defines a convolutional network but its weights."""
 
-    statistics: InputStatistics  # of its channels over the training views; their names are those of its input
+    statistics: FeatureStatistics  # of its channels over the training views; their names are those of its input
     bins: int  # bins along each side of the image
     widths: tuple[int, ...]  # channels after each convolution
     dropout: float  # share of pooled values dropped in training
@@ -39,7 +39,7 @@ class ConvNetwork(BinnedNetwork):
         self.statistics = spec.statistics
         self.bins = spec.bins
         self.standard = StandardBins(spec.statistics)
-        before = (len(spec.statistics.channels) + 1, *spec.widths)
+        before = (len(spec.statistics.names) + 1, *spec.widths)
         strides = (1, *[2] * (len(spec.widths) - 1))
         sizes = zip(before, spec.widths, strides, strict=False)
         self.convolutions = nn.ModuleList(nn.Conv2d(n_in, n_out, 3, stride, padding=1) for n_in, n_out, stride in sizes)
@@ -57,10 +57,10 @@ class ConvNetwork(BinnedNetwork):
 
     def description(self) -> dict[str, Any]:
         """The fields of `ConvSpec`."""
-        return asdict(self.spec)
+        return asdict(self.spec) | {"statistics": statistics_record(self.statistics)}
 
     @classmethod
     def of_description(cls, stored: Mapping[str, Any]) -> ConvNetwork:
-        """The untrained network of a description; a WeightsError if it looks at an unknown channel of the bins."""
+        """The untrained network of a description; ValueError if it names an unknown channel of the bins."""
         widths = tuple(stored["widths"])
-        return cls(ConvSpec(stored_statistics(stored), int(stored["bins"]), widths, float(stored["dropout"])))
+        return cls(ConvSpec(statistics_of_record(stored), int(stored["bins"]), widths, float(stored["dropout"])))

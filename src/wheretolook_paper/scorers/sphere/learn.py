@@ -1,18 +1,17 @@
-"""Learning the network that scores all directions at a location."""
+"""Train the network that scores all directions at a location."""
 
 from __future__ import annotations
 
 from wheretolook.training.data import check_classes, validation_views
 from wheretolook.training.fit import home_device
-from wheretolook.training.learner import TrainingJob, TrainingResult, class_counts, fit_network, fit_platt, predict
+from wheretolook.training.learner import TrainingJob, TrainingResult, train_network
 from wheretolook.training.scenes import training_scenes
-from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook_paper.scorers.sphere.network import SphereNetwork
 from wheretolook_paper.scorers.sphere.views import SphereDataModule, load_sphere_views
 
 
 def learn_sphere(task: TrainingJob) -> TrainingResult:
-    """A `SphereNetwork` from a dataset's train scenes, calibrated on the validation views.
+    """Train a `SphereNetwork` on a dataset's train scenes, calibrated on the validation views.
 
     Raises a TableError if there is no train scene, no labels, or labels of one class only; a MapError if a scene's
     mapping cameras are not known.
@@ -26,7 +25,4 @@ def learn_sphere(task: TrainingJob) -> TrainingResult:
     labels = views.labels.numpy() > 0
     check_classes(dataset, config, labels[~held_out], labels[held_out])
     data = SphereDataModule(views, held_out, task.options.batch_size, config)
-    network = SphereNetwork(task.options)
-    metrics, history = fit_network(network, data, task)
-    model = TrainedNetwork(task.method, network, dataset.camera, *fit_platt(*predict(network, data)))
-    return TrainingResult(model, metrics, class_counts(train=labels[~held_out], val=labels[held_out]), history)
+    return train_network(SphereNetwork(task.options), data, task)

@@ -50,6 +50,9 @@ class TrainedNetwork(Generic[NetworkT]):
     offset: float = 0.0
     training_range: TrainingRange | None = None  # of its training views; None if the weights do not store it
 
+    def __post_init__(self) -> None:
+        self.network.eval()
+
     def calibrated(self, logits: Tensor) -> Tensor:
         """Return calibrated log-odds of the network's logits, in the same shape and precision."""
         return self.scale * logits + self.offset
@@ -87,7 +90,7 @@ class TrainedNetwork(Generic[NetworkT]):
             problem = f"the header does not describe these weights: {error}"
             fix = "Use the version that wrote them, or train again."
             raise WeightsError(problem, path=path, fix=fix) from error
-        network.to(device).eval().requires_grad_(False)
+        network.to(device).requires_grad_(False)
         return TrainedNetwork(header["method"], network, camera, scale, offset, training_range)
 
 

@@ -82,7 +82,7 @@ def _hdf5(folder: Path) -> None:
 
 def _read_features(path: Path) -> None:
     model = hand_written_model()[0]
-    read_descriptors(path, "model", model, model_arrays(model))
+    read_descriptors(path, model, model_arrays(model))
 
 
 def _landmarks(folder: Path) -> None:

@@ -73,7 +73,7 @@ def test_invalid_hdf5_is_rejected(edit, tmp_path: Path, monkeypatch: pytest.Monk
     with h5py.File(path, "a") as file:
         edit(h5py, file)
     with pytest.raises(MapError) as caught:
-        read_descriptors(path, "model", MODEL, ARRAYS)
+        read_descriptors(path, MODEL, ARRAYS)
     assert caught.value.path == path
 
 
@@ -119,7 +119,7 @@ def test_invalid_databases_are_rejected(statements: list[str], tmp_path: Path) -
     connection.commit()
     connection.close()
     with pytest.raises(MapError) as caught:
-        read_descriptors(path, "model", MODEL, ARRAYS)
+        read_descriptors(path, MODEL, ARRAYS)
     assert caught.value.path == path
 
 
@@ -134,4 +134,4 @@ def test_files_that_are_not_databases_are_rejected(content: bytes | None, tmp_pa
 def test_databases_of_other_keypoints_are_rejected(tmp_path: Path) -> None:
     path = write_database(tmp_path / "moved.db", MODEL, [pixels + 3 for pixels in KEYPOINTS], DESCRIPTORS)
     with pytest.raises(MapError):
-        read_descriptors(path, "model", MODEL, ARRAYS)
+        read_descriptors(path, MODEL, ARRAYS)

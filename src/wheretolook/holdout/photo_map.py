@@ -153,7 +153,7 @@ def open_map(
         arrays = model_arrays(model)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MapWarning)  # the error below replaces it
-        if read_descriptors(features, model_dir, model, arrays) is None:
+        if read_descriptors(features, model, arrays) is None:
             fix = "Give the folder of its photographs instead, --images: then keypoints are extracted from them."
             raise MapError("these features are of an unknown kind", path=features, fix=fix)
     cameras = cameras_by_id(model.cameras, model_dir)

@@ -17,12 +17,11 @@ from wheretolook.mapping.colmap_files import (
     REBUILD,
     check_binary,
     check_cameras_and_images,
+    check_coordinates,
     check_text_complete,
     check_text_counts,
-    file_of_error,
-    point_heads,
-    point_starts,
-    track_elements,
+    model_error,
+    read_points,
 )
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import MapError, StorageError
@@ -86,23 +85,19 @@ def read_model(model_dir: str | Path) -> Any:
     bar = tqdm(total=2, desc=f"model of {n_bytes / 1e9:.1f} GB: read", unit="step", disable=n_bytes < _LARGE_BYTES)
     model = pycolmap.Reconstruction()
     with bar, quiet_colmap():
-        (check_binary(folder, folder) if suffix == ".bin" else check_text_counts(folder))
+        (check_binary if suffix == ".bin" else check_text_counts)(folder)
         bar.update()
         try:
             (model.read_binary if suffix == ".bin" else model.read_text)(str(folder))
             check_cameras_and_images(model, folder, suffix)
         except (ValueError, LookupError, RuntimeError, MemoryError) as error:
-            name = file_of_error(error)
-            path = folder / f"{name}{suffix}" if name else folder
-            raise MapError(f"pycolmap cannot read the model: {error}", path=path, fix=REBUILD) from error
+            raise model_error(error, folder, suffix) from error
         bar.update()
     if suffix == ".txt":
         numbers = (model.num_cameras(), model.num_images(), model.num_points3D())
         for name, number in zip(MODEL_FILES, numbers, strict=True):
             check_text_complete(folder / f"{name}.txt", number)
-        with temporary_folder() as copy:
-            model.write_binary(copy)
-            check_binary(copy, folder, suffix)
+        check_coordinates(_points_and_tracks(model)[0], folder / "points3D.txt")
     return model
 
 
@@ -116,7 +111,7 @@ def write_model(reconstruction: Any, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     try:
         reconstruction.write_binary(str(folder))
-        check_binary(folder, folder)
+        check_binary(folder)
     except (MapError, RuntimeError, ValueError) as error:
         path = (error.path if isinstance(error, MapError) else None) or folder
         problem = f"cannot be written completely: is the disk full? ({getattr(error, 'problem', error)})"
@@ -146,7 +141,7 @@ def model_arrays(reconstruction: Any) -> ModelArrays:
         image_focal_px=np.array([mean_focal_px(reconstruction.cameras[image.camera_id]) for image in images]),
         observation_start=np.concatenate([[0], np.cumsum(points["n"])]).astype(np.int64),
         observation_image=np.searchsorted(image_ids, elements[:, 0]),
-        observation_keypoint=elements[:, 1],
+        observation_keypoint=elements[:, 1].astype(np.int64),
     )
 
 
@@ -221,28 +216,17 @@ def load_mapping_poses(path: str | Path) -> Float:
     """Read the poses (M, 3, 4) that `save_mapping_poses` wrote. Raises MapError if the file is missing or damaged."""
     try:
         poses = load_npz(Path(path))["cam_from_world"]
-        valid = poses.dtype.kind == "f" and poses.ndim == 3 and poses.shape[1:] == (3, 4) and len(poses) > 0
-        if not valid or not np.isfinite(poses).all():
+        has_shape = poses.ndim == 3 and poses.shape[1:] == (3, 4) and len(poses) > 0
+        if not (has_shape and poses.dtype.kind == "f" and np.isfinite(poses).all()):
             raise ValueError(f"an array of {poses.dtype} and shape {poses.shape}")
     except (ValueError, KeyError) as error:
         fix = "Run the map stage again, or remove the file to use the COLMAP model next to it."
         raise MapError(f"cannot read the mapping images' poses: {error}", path=path, fix=fix) from error
-    return np.asarray(poses)
+    return poses
 
 
-def _points_and_tracks(reconstruction: Any) -> tuple[NDArray[Any], NDArray[np.int64]]:
-    """Points (P,) of dtype `POINT`, sorted by id, and their tracks (O, 2) of image id and index of the keypoint.
-
-    They are read from a file: reading 500,000 points one by one takes 15 seconds.
-    """
+def _points_and_tracks(reconstruction: Any) -> tuple[NDArray[Any], NDArray[np.uint32]]:
+    """Points and tracks of a reconstruction as `read_points` gives them."""
     with temporary_folder() as folder:
         reconstruction.write_binary(folder)
-        data = np.fromfile(folder / "points3D.bin", dtype=np.uint8)
-        starts = point_starts(folder / "points3D.bin")
-    points = point_heads(data, starts)
-    elements = track_elements(data, starts).astype(np.int64)
-    order = np.argsort(points["id"])
-    lengths = points["n"].astype(np.int64)
-    ends = np.cumsum(lengths)
-    rows = np.repeat((ends - lengths)[order] - np.cumsum(lengths[order]) + lengths[order], lengths[order])
-    return points[order], elements[rows + np.arange(len(rows))]
+        return read_points(folder / "points3D.bin")

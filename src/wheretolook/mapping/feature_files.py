@@ -6,7 +6,7 @@ import re
 import sqlite3
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +24,7 @@ HDF5_SUFFIXES = (".h5", ".hdf5")
 _KIND_TABLE = "wheretolook_features"  # of a database: the name of the kind of its descriptors
 _TABLES = ("images", "keypoints", "descriptors", _KIND_TABLE)
 _MAX_VALUE = np.float32(1e15)  # no pixel and no number of a descriptor comes near
+_TOLERANCE_PX = 0.01  # between keypoints of a file and of the model that was built from it
 _FIX = "Give the file of features that the model was built from, or none."
 
 
@@ -31,12 +32,12 @@ class _Features(NamedTuple):
     """Keypoints of an image, with descriptors if they are of a known kind."""
 
     keypoints: NDArray[np.float64]  # (K, 2) pixels
-    descriptors: NDArray[Any] | None  # (K, D) as `DescriptorKind.store` gives them
-    kind: DescriptorKind | None
+    descriptors: NDArray[Any] | None = None  # (K, D) as `DescriptorKind.store` gives them
+    kind: DescriptorKind | None = None
 
 
 def read_descriptors(
-    features: str | Path, model_dir: str | Path, reconstruction: Any, model: ModelArrays
+    features: str | Path, reconstruction: Any, model: ModelArrays
 ) -> tuple[DescriptorKind, NDArray[Any]] | None:
     """Read the descriptors (O, D) of the observations of a model, stored as their kind says, and that kind.
 
@@ -51,37 +52,30 @@ def read_descriptors(
     """
     path = Path(features)
     order = np.argsort(model.observation_image, kind="stable")
-    ends = np.searchsorted(model.observation_image[order], np.arange(len(model.image_ids) + 1))
-    result: NDArray[Any] | None = None
-    kind = None
-    without: list[str] = []
-    with _open(path) as read:
-        for row, (image_id, name) in enumerate(zip(model.image_ids, model.image_names, strict=True)):
-            found = read(name)
-            _check_keypoints(found, reconstruction.images[int(image_id)], path)
-            rows = order[ends[row] : ends[row + 1]]
-            if not len(rows):
-                continue
-            if found.descriptors is None or found.kind is None:
-                without.append(name)
-                continue
-            kind = _same_kind(kind, found.kind, path, name)
+    rows_of_image = np.split(
+        order, np.cumsum(np.bincount(model.observation_image, minlength=len(model.image_ids)))[:-1]
+    )
+    result: tuple[DescriptorKind, NDArray[Any]] | None = None
+    without = None
+    for image_id, rows, image in zip(
+        model.image_ids, rows_of_image, _read_images(path, model.image_names), strict=True
+    ):
+        _check_keypoints(image, reconstruction.images[int(image_id)], path)
+        if image.descriptors is not None and image.kind is not None:
             if result is None:
-                result = np.empty((len(order), kind.dimension), dtype=kind.stored_as)
-            result[rows] = found.descriptors[model.observation_keypoint[rows]]
-    if kind is None or result is None:
+                result = image.kind, np.empty((len(order), image.kind.dimension), dtype=image.kind.stored_as)
+            result[1][rows] = image.descriptors[model.observation_keypoint[rows]]
+        elif len(rows):
+            without = reconstruction.images[int(image_id)].name
+    if result is None:
         text = (
             f"{path} holds no descriptors of a known kind ({', '.join(all_kinds())}), so the ambiguity of landmarks is "
-            "unknown; scores do without it"
+            "unknown; scores do without it. If they are of one of these, name it in the file's name: feats-aliked.h5"
         )
-        if path.suffix.lower() in HDF5_SUFFIXES and _kind_in_name(path) is None:
-            text += ". If they are of one of these kinds, name it in the file's name: feats-aliked.h5"
         warnings.warn(text, MapWarning, stacklevel=2)
-        return None
-    if without:
-        problem = f"{len(without)} images have no {kind.name} descriptors in this file"
-        raise MapError(problem, path=path, value=without[0], fix=_FIX)
-    return kind, result
+    elif without is not None:
+        raise MapError(f"an image has no {result[0].name} descriptors in this file", path=path, value=without, fix=_FIX)
+    return result
 
 
 def read_features(features: str | Path, names: Sequence[str]) -> tuple[DescriptorKind, list[Stored]]:
@@ -91,19 +85,16 @@ def read_features(features: str | Path, names: Sequence[str]) -> tuple[Descripto
     kind.
     """
     path = Path(features)
-    kind = None
-    results = []
-    with _open(path) as read:
-        for name in names:
-            found = read(name)
-            if found.descriptors is None and len(found.keypoints):
-                problem = f"this image has no descriptors of {', '.join(all_kinds())} in this file"
-                raise MapError(problem, path=path, value=name, fix=_suggest_hdf5(path))
-            if found.kind is not None:
-                kind = _same_kind(kind, found.kind, path, name)
-            results.append((found.keypoints.astype(np.float32), found.descriptors))
-    kind = kind or SIFT
-    return kind, [(pixels, kind.none() if descriptors is None else descriptors) for pixels, descriptors in results]
+    images = [*_read_images(path, names)]
+    kind = next((image.kind for image in images if image.kind is not None), SIFT)
+    stored = []
+    for name, image in zip(names, images, strict=True):
+        if image.descriptors is None and len(image.keypoints):
+            problem = f"this image has no descriptors of {', '.join(all_kinds())} in this file"
+            raise MapError(problem, path=path, value=name, fix="hloc keeps them in HDF5: --database feats-*.h5.")
+        descriptors = kind.none() if image.descriptors is None else image.descriptors
+        stored.append((image.keypoints.astype(np.float32), descriptors))
+    return kind, stored
 
 
 def name_kind(database: Path, kind: DescriptorKind) -> None:
@@ -114,53 +105,35 @@ def name_kind(database: Path, kind: DescriptorKind) -> None:
         connection.execute(f"INSERT INTO {_KIND_TABLE} VALUES (?)", (kind.name,))
 
 
-def _check_keypoints(found: _Features, image: Any, path: Path) -> None:
+def _read_images(path: Path, names: Sequence[str]) -> Iterator[_Features]:
+    """Read the features of images by their names. Raises MapError if they are of several kinds."""
+    kind = None
+    with (_open_hdf5 if path.suffix.lower() in HDF5_SUFFIXES else _open_database)(path) as read:
+        for name in names:
+            image = read(name)
+            if image.kind is not None and kind not in (None, image.kind):
+                problem = f"descriptors of {name} are of another kind than those before it"
+                raise MapError(problem, path=path, value=image.kind.name, fix="Give features of one extractor.")
+            kind = image.kind or kind
+            yield image
+
+
+def _check_keypoints(features: _Features, image: Any, path: Path) -> None:
     """Raise MapError unless the features of an image are those of the model: by number, first and last keypoint."""
     n = image.num_points2D()
-    if len(found.keypoints) != n or (found.descriptors is not None and len(found.descriptors) != n):
+    pixels = features.keypoints
+    if len(pixels) != n or (features.descriptors is not None and len(features.descriptors) != n):
         problem = f"the file and the model disagree on the number of keypoints of {image.name}"
-        raise MapError(problem, path=path, value=(len(found.keypoints), n), fix=_FIX)
+        raise MapError(problem, path=path, value=(len(pixels), n), fix=_FIX)
     if n:
-        ends = found.keypoints[[0, -1]]
+        ends = pixels[[0, -1]]
+        tolerance_px = np.full(ends.shape, _TOLERANCE_PX)
+        if path.suffix.lower() in HDF5_SUFFIXES:
+            # hloc keeps them in half precision, and adds half a pixel in it: half a unit in the last place more.
+            tolerance_px += np.spacing(np.clip(np.abs(ends), 0, 2.0**15).astype(np.float16)).astype(np.float64) / 2
         expected = np.array([image.points2D[0].xy, image.points2D[-1].xy])
-        if not (np.abs(ends - expected) <= _tolerance_px(ends, path)).all():
+        if not (np.abs(ends - expected) <= tolerance_px).all():
             raise MapError("the file holds other keypoints than the model", path=path, value=image.name, fix=_FIX)
-
-
-def _suggest_hdf5(database: Path) -> str | None:
-    """What to give instead of a database without descriptors, as hloc writes it."""
-    if database.suffix.lower() in HDF5_SUFFIXES:
-        return None
-    folders = (database.parent, database.parent.parent)
-    files = [path for folder in folders for suffix in HDF5_SUFFIXES for path in sorted(folder.glob(f"feats-*{suffix}"))]
-    named = next((path for path in files if "matches" not in path.name), "feats-*.h5")
-    return f"hloc keeps them in HDF5: --database {named}."
-
-
-def _same_kind(kind: DescriptorKind | None, of_image: DescriptorKind, path: Path, name: str) -> DescriptorKind:
-    """The kind of an image's descriptors. Raises MapError if that of previous images differs."""
-    if kind is not None and kind is not of_image:
-        problem = f"descriptors of {name} are of another kind than those before it"
-        value = (of_image.name, kind.name)
-        raise MapError(problem, path=path, value=value, fix="Give features of one extractor.")
-    return of_image
-
-
-def _tolerance_px(keypoints: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
-    """Tolerance between keypoints of a file of features and of the model that was built from it.
-
-    hloc keeps them in half precision, and adds half a pixel in it, which from 1024 pixels on moves them by as much.
-    """
-    if path.suffix.lower() not in HDF5_SUFFIXES:
-        return np.full(keypoints.shape, 0.01)
-    return 0.01 + np.spacing(np.clip(np.abs(keypoints), 0, 2.0**15).astype(np.float16)).astype(np.float64) / 2
-
-
-def _open(path: Path) -> AbstractContextManager[Callable[[str], _Features]]:
-    """Open a file of features; yields a function that reads those of an image by its name."""
-    if not path.is_file():
-        raise MapError("there is no such database", path=path, fix=_FIX)
-    return (_open_hdf5 if path.suffix.lower() in HDF5_SUFFIXES else _open_database)(path)
 
 
 def _kind_in_name(path: Path) -> DescriptorKind | None:
@@ -170,15 +143,16 @@ def _kind_in_name(path: Path) -> DescriptorKind | None:
     return next(kinds, None)
 
 
-def _kind_by_columns(named: DescriptorKind | None, columns: int, path: Path) -> DescriptorKind | None:
-    """The kind of learned descriptors: the named one, or the only one of this dimension."""
+def _kind_by_columns(named: DescriptorKind | None, columns: int) -> DescriptorKind | None:
+    """The kind of learned descriptors: the named one, or the only one of this dimension; else None.
+
+    Raises ValueError if the named one has another dimension.
+    """
     if named is not None and named.dimension != columns:
-        problem = f"descriptors of {named.name} have {named.dimension} numbers"
-        fix = "Name the file after its content, as hloc does: feats-disk.h5, feats-superpoint.h5."
-        raise MapError(problem, path=path, value=columns, fix=fix)
-    if named is not None and not named.in_bytes:
-        return named
+        raise ValueError(f"descriptors of {named.name} have {named.dimension} numbers, not {columns}")
     kinds = [kind for kind in all_kinds().values() if not kind.in_bytes and kind.dimension == columns]
+    if named in kinds:
+        return named
     return kinds[0] if len(kinds) == 1 else None
 
 
@@ -190,63 +164,60 @@ def _open_database(path: Path) -> Iterator[Callable[[str], _Features]]:
     try:
         check_file(path)
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?{mode}", uri=True)) as database:
-            _check_tables(database)
-            ids: dict[str, int] = dict(database.execute("SELECT name, image_id FROM images"))
+            database.row_factory = sqlite3.Row
             named = _kind_in_table(database) or _kind_in_name(path)
-            has_type = any(row[1] == "type" for row in database.execute("PRAGMA table_info(descriptors)"))
-            query = f"SELECT rows, cols, data, {'type' if has_type else 0} FROM descriptors WHERE image_id = ?"
+            ids = {row["name"]: row["image_id"] for row in database.execute("SELECT name, image_id FROM images")}
+
+            def rows_of(table: str, name: str, item_bytes: int) -> tuple[NDArray[np.uint8], int]:
+                """Bytes (K, columns) of a table for an image, and COLMAP's type of descriptors."""
+                query = f"SELECT * FROM {table} WHERE image_id = ?"
+                row = dict(database.execute(query, (ids[name],)).fetchone() or {"rows": 0, "cols": 0})
+                values = np.frombuffer(row.get("data") or b"", dtype=np.uint8)
+                return values.reshape(row["rows"], item_bytes * row["cols"]), row.get("type", SIFT.colmap_type)
 
             def read(name: str) -> _Features:
                 if name not in ids:
                     raise MapError("the database lacks an image of the model", path=path, value=name, fix=_FIX)
-                key = (ids[name],)
-                row = database.execute("SELECT rows, cols, data FROM keypoints WHERE image_id = ?", key).fetchone()
-                n, columns, data = row or (0, 2, b"")
-                keypoints = np.frombuffer(data or b"", dtype="<f4").reshape(n, columns if n else 2)[:, :2]
-                keypoints = _checked(keypoints.astype(np.float64), name)
-                n, columns, data, colmap_type = database.execute(query, key).fetchone() or (0, 0, b"", 0)
-                kind = _kind_in_database(colmap_type, columns, named, path)
-                if kind is None or (n == 0 and len(keypoints)):
-                    return _Features(keypoints, None, None)
-                values = np.frombuffer(data or b"", dtype=np.uint8).reshape(n, columns)
+                pixels = rows_of("keypoints", name, 4)[0].view("<f4")[:, :2]
+                keypoints = _checked(pixels.reshape(-1, 2).astype(np.float64), name)
+                values, colmap_type = rows_of("descriptors", name, 1)
+                kind = _kind_in_database(colmap_type, values.shape[1], named)
+                if kind is None or (len(values) == 0 and len(keypoints)):
+                    return _Features(keypoints)
                 if not kind.in_bytes:
                     values = kind.store(unit_descriptors(_checked(values.view("<f4"), name)))
                 return _Features(keypoints, values, kind)
 
             yield read
-    except (sqlite3.Error, ValueError, TypeError) as error:
+    except (sqlite3.Error, OSError, ValueError, TypeError) as error:
         raise MapError(f"cannot read the database: {error}", path=path, fix=_FIX) from error
 
 
-def _check_tables(database: sqlite3.Connection) -> None:
-    """Raise ValueError if a table is a view or has computed columns, which can produce data without end."""
-    for schema, name, kind, *_ in database.execute("PRAGMA table_list").fetchall():
+def _kind_in_table(database: sqlite3.Connection) -> DescriptorKind | None:
+    """The kind that `name_kind` wrote, if it did.
+
+    Raises ValueError if a table is a view or has computed columns, which can produce data without end.
+    """
+    named = None
+    for schema, name, table_type, *_ in database.execute("PRAGMA table_list").fetchall():
         if schema == "main" and str(name).lower() in _TABLES:
             columns = database.execute(f'PRAGMA table_xinfo("{name}")').fetchall()
-            if kind != "table" or any(column[-1] for column in columns):
+            if table_type != "table" or any(column["hidden"] for column in columns):
                 raise ValueError(f"{name} is not a plain table")
+            if str(name).lower() == _KIND_TABLE:
+                row = database.execute(f"SELECT name FROM {_KIND_TABLE}").fetchone()
+                named = all_kinds().get(str(row["name"])) if row else None
+    return named
 
 
-def _kind_in_table(database: sqlite3.Connection) -> DescriptorKind | None:
-    """The kind that `name_kind` wrote, if it did."""
-    if not database.execute("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?", (_KIND_TABLE,)).fetchone():
-        return None
-    row = database.execute(f"SELECT name FROM {_KIND_TABLE}").fetchone()
-    return all_kinds().get(str(row[0])) if row else None
-
-
-def _kind_in_database(
-    colmap_type: int, columns: int, named: DescriptorKind | None, path: Path
-) -> DescriptorKind | None:
+def _kind_in_database(colmap_type: int, columns: int, named: DescriptorKind | None) -> DescriptorKind | None:
     """The kind of descriptors of so many bytes, from COLMAP's number of their type; -1 if it has none."""
-    if colmap_type == -1 and columns == SIFT.columns:
-        return SIFT
-    if colmap_type == -1:
-        return _kind_by_columns(named, columns // 4, path) if columns and columns % 4 == 0 else None
-    kind = next((kind for kind in all_kinds().values() if kind.colmap_type == colmap_type), None)
+    if colmap_type == -1 and columns != SIFT.columns:
+        return _kind_by_columns(named, columns // 4) if columns and columns % 4 == 0 else None
+    kinds = [SIFT] if colmap_type == -1 else all_kinds().values()
+    kind = next((kind for kind in kinds if colmap_type in (-1, kind.colmap_type)), None)
     if kind is not None and not kind.in_bytes and columns not in (0, kind.columns):
-        problem = f"descriptors of {kind.name} take {kind.columns} bytes each"
-        raise MapError(problem, path=path, value=columns, fix="Extract features again, or give no database.")
+        raise ValueError(f"descriptors of {kind.name} take {kind.columns} bytes each, not {columns}")
     return kind if kind is not None and kind.columns == columns else None
 
 
@@ -271,11 +242,10 @@ def _open_hdf5(path: Path) -> Iterator[Callable[[str], _Features]]:
                 # hloc counts pixels from the centre of the top-left one, COLMAP from its corner
                 keypoints = _array(file[name]["keypoints"], name).astype(np.float64)[:, :2] + 0.5
                 descriptors = _array(file[name]["descriptors"], name).T
+                kind: DescriptorKind | None = SIFT
                 may_be_sift = descriptors.shape[1] == SIFT.dimension and named in (None, SIFT)
-                if may_be_sift and not (len(descriptors) and descriptors.min() < 0):
-                    kind: DescriptorKind | None = SIFT
-                else:
-                    kind = _kind_by_columns(named, descriptors.shape[1], path)
+                if not may_be_sift or (len(descriptors) and descriptors.min() < 0):
+                    kind = _kind_by_columns(named, descriptors.shape[1])
                 stored = None if kind is None else kind.store(unit_descriptors(descriptors))
                 return _Features(keypoints, stored, kind)
 
@@ -292,10 +262,9 @@ def _array(dataset: Any, name: str) -> NDArray[Any]:
 
     if not isinstance(dataset, h5py.Dataset) or dataset.shape is None or dataset.is_virtual or dataset.external:
         raise ValueError(f"{name} has no array of keypoints or descriptors in this file")
-    chunk = int(np.prod(dataset.chunks or (0,), dtype=float))
-    n_bytes = max(dataset.size, chunk) * dataset.dtype.itemsize
-    if n_bytes > max_expanded_bytes(dataset.id.get_storage_size()):
-        raise ValueError(f"the keypoints or descriptors of {name} would unfold to {n_bytes:,} bytes")
+    n_values = max(dataset.size, np.prod(dataset.chunks or (0,), dtype=float))
+    if n_values * dataset.dtype.itemsize > max_expanded_bytes(dataset.id.get_storage_size()):
+        raise ValueError(f"the keypoints or descriptors of {name} would expand to {n_values:,} numbers")
     return _checked(dataset[()], name)
 
 

@@ -183,7 +183,7 @@ def load_colmap_landmarks(
     kind = SIFT
     descriptors = None
     ambiguity = np.full(len(keep), np.nan, dtype=np.float32)
-    observations = None if database is None else read_descriptors(database, model_dir, reconstruction, model)
+    observations = None if database is None else read_descriptors(database, reconstruction, model)
     if observations is not None:
         kind, of_observations = observations
         descriptors = _mean_descriptors(model, of_observations, kind)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ from wheretolook.features.descriptors import DescriptorKind, unit_descriptors
 from wheretolook.features.registry import all_kinds
 from wheretolook.features.sift import SIFT
 from wheretolook.geometry.local_origin import local_origin
+from wheretolook.geometry.poses import Float
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, read_model
 from wheretolook.mapping.feature_files import read_descriptors
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 _BLOCK = 4096  # landmarks whose tracks are gathered at a time
 _PROGRESS_AFTER_S = 2.0
 _INTEGERS = ("ids", "track_length")  # arrays in a file; all others but descriptors are of floats
-_ROW_SHAPES = {"points": (3,), "mapping_direction": (3,)}  # of arrays in a file; all others have one number a landmark
+_VECTORS = ("points", "mapping_direction")  # arrays (N, 3) in a file; all others have one number a landmark
 _TILE = 512  # descriptors along a side of a product that fits into the cache
 
 
@@ -86,12 +87,11 @@ class Landmarks:
         half precision, and compresses: about 28 bytes a landmark. Such landmarks suffice for visibility, features and
         scorers, but not for localization.
         """
-        arrays = (f.name for f in fields(self) if f.name != "described_by")
-        values = {name: getattr(self, name) for name in arrays if getattr(self, name) is not None}
+        values = {name: value for name, value in vars(self).items() if value is not None and name != "described_by"}
         if compact:
             values.pop("descriptors", None)
             far = local_origin(self.points).any()
-            values = _floats(values, points=np.float64 if far else np.float32, others=np.float16)
+            values = _cast_floats(values, np.float64 if far else np.float32, np.float16)
         if self.described_by is not None:
             values["described_by"] = np.array(self.described_by)
         save_npz(Path(path), values, compress=compact)
@@ -100,8 +100,18 @@ class Landmarks:
     def load(cls, path: str | Path) -> Landmarks:
         """Read what `save` wrote, compact or not. Raises MapError if the file is missing or not valid."""
         try:
-            return cls(**_validated(load_npz(Path(path))))
-        except (ValueError, KeyError) as error:
+            values = load_npz(Path(path))
+            described_by = values.pop("described_by", None)
+            descriptors = values.pop("descriptors", None)
+            kind = SIFT if described_by is None else all_kinds()[str(described_by)]
+            arrays = _cast_floats(values, np.float64, np.float32)
+            landmarks = cls(**arrays, descriptors=descriptors, described_by=None if kind is SIFT else kind.name)
+            _check_shapes(arrays)
+            shape = (len(landmarks), kind.dimension)
+            if descriptors is not None and (descriptors.dtype != kind.stored_as or descriptors.shape != shape):
+                raise ValueError(f"the descriptors are not those of {kind.name}")
+            return landmarks
+        except (ValueError, KeyError, TypeError) as error:
             raise MapError(f"not a file of landmarks: {error}", path=path, fix="Run the map stage again.") from error
 
 
@@ -111,44 +121,27 @@ def read_feature_name(path: Path) -> str:
     Raises MapError if the file is missing or damaged.
     """
     try:
-        name = load_npz(path, ("described_by",)).get("described_by")
+        return str(load_npz(path, ("described_by",)).get("described_by", SIFT.name))
     except ValueError as error:
         raise MapError(str(error), path=path, fix="Run the map stage again.") from error
-    return SIFT.name if name is None else str(name)
 
 
-def _validated(values: dict[str, NDArray[Any]]) -> dict[str, Any]:
-    """Fields of `Landmarks` from the arrays of a file. Raises KeyError or ValueError if one is missing or not valid."""
-    described_by = str(values.pop("described_by", SIFT.name))
-    if described_by not in all_kinds():
-        raise ValueError(f"its features, {described_by}, are unknown; there are {', '.join(all_kinds())}")
-    kind = all_kinds()[described_by]
-    descriptors = values.pop("descriptors", None)
-    if descriptors is not None and not _has_shape_and_kind(
-        descriptors, (len(values["ids"]), kind.dimension), kind.in_bytes
-    ):
-        raise ValueError(f"the descriptors are not those of {kind.name}")
-    names = {f.name for f in fields(Landmarks)} - {"described_by", "descriptors"}
-    unexpected = (names - {"mapping_focal_px"} - {*values}) | ({*values} - names)
-    if unexpected:
-        raise ValueError(f"{', '.join(sorted(unexpected))} missing or unknown")
-    for name, value in values.items():
-        if not _has_shape_and_kind(value, (len(values["ids"]), *_ROW_SHAPES.get(name, ())), name in _INTEGERS):
+def _check_shapes(arrays: dict[str, NDArray[Any]]) -> None:
+    """Raise ValueError unless the arrays of a file have one row for each landmark, and points are finite."""
+    for name, value in arrays.items():
+        columns = (3,) if name in _VECTORS else ()
+        if value.shape != (len(arrays["ids"]), *columns) or value.dtype.kind not in (
+            "iu" if name in _INTEGERS else "f"
+        ):
             raise ValueError(f"{name} is an array of {value.dtype} and shape {value.shape}")
-    if not np.isfinite(values["points"]).all():
+    if not np.isfinite(arrays["points"]).all():
         raise ValueError("some points are not finite")
-    arrays = _floats(values, points=np.float64, others=np.float32)
-    return {**arrays, "descriptors": descriptors, "described_by": None if kind is SIFT else kind.name}
 
 
-def _has_shape_and_kind(array: NDArray[Any], shape: tuple[int, ...], integer: bool) -> bool:
-    return array.shape == shape and array.dtype.kind in ("iu" if integer else "f")
-
-
-def _floats(values: dict[str, NDArray[Any]], points: DTypeLike, others: DTypeLike) -> dict[str, NDArray[Any]]:
+def _cast_floats(values: dict[str, NDArray[Any]], points: DTypeLike, others: DTypeLike) -> dict[str, NDArray[Any]]:
     """Cast the points and all other arrays of floats to the given types; arrays of integers stay as they are."""
-    floats = {name: points if name == "points" else others for name, value in values.items() if value.dtype.kind == "f"}
-    return {name: value.astype(floats.get(name, value.dtype), copy=False) for name, value in values.items()}
+    types = {name: points if name == "points" else others for name, value in values.items() if value.dtype.kind == "f"}
+    return {name: value.astype(types.get(name, value.dtype), copy=False) for name, value in values.items()}
 
 
 def load_colmap_landmarks(
@@ -172,17 +165,22 @@ def load_colmap_landmarks(
     model = model_arrays(reconstruction)
     observed = np.diff(model.observation_start) > 0
     worst_px = np.inf if max_reprojection_error_px is None else max_reprojection_error_px
-    keep = np.flatnonzero(observed & (model.errors_px <= worst_px))
-    if len(keep) == 0:
+    keep = observed & (model.errors_px <= worst_px)
+    if not keep.any():
         problem = f"the model has no points with a track and a reprojection error of at most {worst_px:g} px"
         value = f"{len(observed)} points, {observed.sum()} with a track"
         fix = "Triangulate the model, raise max_reprojection_error_px, or check its intrinsics and poses."
         raise MapError(problem, path=model_dir, value=value, fix=fix)
-    _warn_of_omitted(observed, len(keep), worst_px, model_dir)
+    if not keep.all():
+        text = (
+            f"{model_dir}: {keep.sum():,} of {len(keep):,} points are landmarks; {(~observed).sum():,} that no image "
+        )
+        text += f"observes are omitted, and {(observed & ~keep).sum():,} with a mean error of more than {worst_px:g} px"
+        warnings.warn(text, MapWarning, stacklevel=2)
     model = _select_points(model, keep)
     kind = SIFT
     descriptors = None
-    ambiguity = np.full(len(keep), np.nan, dtype=np.float32)
+    ambiguity = np.full(len(model.points), np.nan, dtype=np.float32)
     observations = None if database is None else read_descriptors(database, reconstruction, model)
     if observations is not None:
         kind, of_observations = observations
@@ -200,17 +198,6 @@ def load_colmap_landmarks(
     )
 
 
-def _warn_of_omitted(observed: NDArray[np.bool_], n_kept: int, worst_px: float, model_dir: str | Path) -> None:
-    n_unobserved = int((~observed).sum())
-    n_inaccurate = len(observed) - n_unobserved - n_kept
-    if n_unobserved + n_inaccurate:
-        text = (
-            f"{model_dir}: {n_kept:,} of {len(observed):,} points are landmarks; omitted: {n_inaccurate:,} with a mean "
-        )
-        text += f"reprojection error of more than {worst_px:g} px, {n_unobserved:,} that no image observes"
-        warnings.warn(text, MapWarning, stacklevel=3)
-
-
 def max_cosine_to_other(descriptors: NDArray[Any], device: str = "cpu", progress: bool = True) -> NDArray[np.float32]:
     """Compute the cosine (N,) between each stored descriptor (N, D) and the nearest other one; NaN if N is 1.
 
@@ -218,73 +205,82 @@ def max_cosine_to_other(descriptors: NDArray[Any], device: str = "cpu", progress
     """
     import torch  # takes seconds to load, and most maps are read without it
 
+    from wheretolook.features.learned import one_thread
+
     n = len(descriptors)
-    threads = torch.get_num_threads()
     values = torch.as_tensor(descriptors, dtype=torch.float32, device=device)
     lengths = torch.as_tensor(np.linalg.norm(descriptors.astype(np.float64), axis=1), device=device)
     inverse = 1 / torch.where(lengths > 0, lengths, 1).float()
     best = torch.full((n,), -torch.inf, device=device)
-    torch.set_num_threads(1)  # products are small: several threads would mostly wait for one another
-    try:
-        tiles = tqdm(
-            range(0, n, _TILE), "landmarks: ambiguity", delay=_PROGRESS_AFTER_S, unit="block", disable=not progress
-        )
+    tiles = tqdm(range(0, n, _TILE), "landmarks: ambiguity", delay=_PROGRESS_AFTER_S, unit="tile", disable=not progress)
+    with one_thread():  # products are small: several threads would mostly wait for one another
         for i in tiles:
             for j in range(i, n, _TILE):  # each pair of tiles once: its product serves rows and columns
-                rows = slice(i, min(i + _TILE, n))
-                columns = slice(j, min(j + _TILE, n))
+                rows = slice(i, i + _TILE)
+                columns = slice(j, j + _TILE)
                 cosine = values[rows] @ values[columns].T
                 cosine *= inverse[rows, None] * inverse[columns]
                 if i == j:
                     cosine.fill_diagonal_(-torch.inf)
                 best[rows] = torch.maximum(best[rows], cosine.amax(1))
                 best[columns] = torch.maximum(best[columns], cosine.amax(0))
-    finally:
-        torch.set_num_threads(threads)
     return torch.where(best.isinf(), torch.nan, best).cpu().numpy()
 
 
-def _select_points(model: ModelArrays, keep: NDArray[np.int64]) -> ModelArrays:
-    lengths = np.diff(model.observation_start)[keep]
-    start = np.concatenate([[0], np.cumsum(lengths)])
-    rows = np.repeat(model.observation_start[keep] - start[:-1], lengths) + np.arange(start[-1])
-    points = {name: getattr(model, name)[keep] for name in ("point_ids", "points", "errors_px")}
-    observations = {name: getattr(model, name)[rows] for name in ("observation_image", "observation_keypoint")}
-    return replace(model, **points, **observations, observation_start=start)
+def _select_points(model: ModelArrays, keep: NDArray[np.bool_]) -> ModelArrays:
+    """Select the points (P,) of a model for which `keep` is true, with their observations."""
+    lengths = np.diff(model.observation_start)
+    rows = np.repeat(keep, lengths)
+    return replace(
+        model,
+        point_ids=model.point_ids[keep],
+        points=model.points[keep],
+        errors_px=model.errors_px[keep],
+        observation_start=np.concatenate([[0], np.cumsum(lengths[keep])]),
+        observation_image=model.observation_image[rows],
+        observation_keypoint=model.observation_keypoint[rows],
+    )
 
 
 def _viewing_geometry(model: ModelArrays) -> dict[str, NDArray[np.float32]]:
+    """Attributes of landmarks that follow from the positions of their mapping cameras."""
     start = model.observation_start
-    lengths = np.diff(model.observation_start)
+    lengths = np.diff(start)
+
+    def mean_of(values: Float) -> Float:
+        """Means over each landmark's observations (O,)."""
+        return np.asarray(np.add.reduceat(values, start[:-1]) / lengths)
+
     rays = np.repeat(model.points, lengths, axis=0) - model.image_centers[model.observation_image]
     distance = np.linalg.norm(rays, axis=1)
     rays /= np.maximum(distance, 1e-12)[:, None]
-    mean = np.add.reduceat(rays, start[:-1]) / lengths[:, None]
-    length = np.linalg.norm(mean, axis=1)
+    direction = np.add.reduceat(rays, start[:-1]) / lengths[:, None]
+    length = np.linalg.norm(direction, axis=1)
     angle = np.zeros(len(lengths))
     for n in np.unique(lengths):  # tracks of one length at a time, so that all pairs of rays are one product
         members = np.flatnonzero(lengths == n)
         for block in np.array_split(members, -(-len(members) * int(n) ** 2 // 4_000_000)):
             track = rays[start[block][:, None] + np.arange(n)]
             angle[block] = np.degrees(np.arccos(np.clip((track @ track.swapaxes(1, 2)).min((1, 2)), -1, 1)))
-    mean_distance = np.add.reduceat(distance, start[:-1]) / lengths
-    variance = np.add.reduceat((distance - np.repeat(mean_distance, lengths)) ** 2, start[:-1]) / lengths
-    log_focal = np.add.reduceat(np.log(model.image_focal_px[model.observation_image]), start[:-1]) / lengths
-    return {
-        "mapping_focal_px": np.exp(log_focal).astype(np.float32),
-        "triangulation_angle_deg": angle.astype(np.float32),
-        "mapping_direction": (mean / np.maximum(length, 1e-12)[:, None]).astype(np.float32),
-        "mapping_direction_spread": np.clip(1 - length, 0, 1).astype(np.float32),
-        "mapping_distance_m": mean_distance.astype(np.float32),
-        "mapping_distance_spread": (np.sqrt(variance) / np.maximum(mean_distance, 1e-12)).astype(np.float32),
+    mean_distance = mean_of(distance)
+    deviation = np.sqrt(mean_of((distance - np.repeat(mean_distance, lengths)) ** 2))
+    attributes = {
+        "mapping_focal_px": np.exp(mean_of(np.log(model.image_focal_px[model.observation_image]))),
+        "triangulation_angle_deg": angle,
+        "mapping_direction": direction / np.maximum(length, 1e-12)[:, None],
+        "mapping_direction_spread": np.clip(1 - length, 0, 1),
+        "mapping_distance_m": mean_distance,
+        "mapping_distance_spread": deviation / np.maximum(mean_distance, 1e-12),
     }
+    return {name: value.astype(np.float32) for name, value in attributes.items()}
 
 
 def _mean_descriptors(model: ModelArrays, observations: NDArray[Any], kind: DescriptorKind) -> NDArray[Any]:
+    """Mean descriptor (P, D) of each point's observations (O, D), of unit length, as its kind is stored."""
     start = model.observation_start
     mean = np.empty((len(start) - 1, observations.shape[1]), dtype=observations.dtype)
-    for i in range(0, len(mean), _BLOCK):
-        last = min(i + _BLOCK, len(mean))
-        track = unit_descriptors(observations[start[i] : start[last]])
-        mean[i:last] = kind.store(unit_descriptors(np.add.reduceat(track, start[i:last] - start[i])))
+    for first in range(0, len(mean), _BLOCK):
+        ends = start[first : first + _BLOCK + 1]
+        track = unit_descriptors(observations[ends[0] : ends[-1]])
+        mean[first : first + _BLOCK] = kind.store(unit_descriptors(np.add.reduceat(track, ends[:-1] - ends[0])))
     return mean

@@ -106,6 +106,11 @@ class ScaleConfig:
         """Whether the sizes of markers are known."""
         return self.marker_size_m > 0 or self.marker_table is not None
 
+    @property
+    def needs_markers(self) -> bool:
+        """Whether markers are to be detected, for their sizes or as ends of the distance."""
+        return self.has_marker_sizes or (self.distance is not None and len(self.distance.marker_ids) > 0)
+
 
 @dataclass(frozen=True)
 class PhotographsConfig:

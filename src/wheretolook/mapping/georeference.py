@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -68,15 +67,19 @@ class MapScale:
             return "scale UNKNOWN: no markers, distance or positions were given, so lengths are not in metres"
         if self.source == "model":
             return "scale as in the model, whose unit is assumed to be the metre"
-        text = f"scale from {self.source}"
+        parts = [f"scale from {self.source}"]
         if self.residuals:
             errors = np.abs(list(self.residuals.values()))
-            text += f", errors {np.median(errors):.3g} {self.unit} (median), {errors.max():.3g} {self.unit} (maximum)"
+            parts.append(
+                f"errors {np.median(errors):.3g} {self.unit} (median), {errors.max():.3g} {self.unit} (maximum)"
+            )
         if self.marker_error_px:
-            text += f", corners within {max(self.marker_error_px.values()):.2g} px"
+            parts.append(f"corners within {max(self.marker_error_px.values()):.2g} px")
         if self.marker_views and max(self.marker_views.values()) <= 2:
-            text += "; NOT CHECKED: no marker is seen in more than two photographs"
-        return text + (f"; not used: {', '.join(self.unused)}" if self.unused else "")
+            parts.append("NOT CHECKED: no marker is seen in more than two photographs")
+        if self.unused:
+            parts.append(f"not used: {', '.join(self.unused)}")
+        return "; ".join(parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +93,7 @@ class KnownScale:
     @staticmethod
     def read(config: ScaleConfig) -> KnownScale:
         """Read the tables. Raises ConfigError if one is not valid, or OpenCV lacks the markers' dictionary."""
-        if config.has_marker_sizes or (config.distance is not None and config.distance.marker_ids):
+        if config.needs_markers:
             marker_detector(config.dictionary)
         sizes = config.marker_size_m if config.marker_table is None else read_marker_table(config.marker_table)
         return KnownScale(config, sizes, {} if config.positions is None else read_positions(config.positions))
@@ -110,18 +113,22 @@ def find_scale(
     photographs, which are read by `read_photograph`. Raises MapError or ConfigError if there is no scale of the source
     that was requested.
     """
-    centers = {image.name: image.projection_center() for image in _posed_images(model)}
+    images = [image for _, image in sorted(model.images.items()) if image.has_pose]
+    centers = {image.name: image.projection_center() for image in images}
     config = known.config
     if known.positions:
         return scale_from_positions(centers, known.positions)
-    scale = MapScale()
     views: dict[int, list[MarkerView]] = {}
-    if config.has_marker_sizes or (config.distance is not None and config.distance.marker_ids):
-        views = _marker_views(model, photographs, config.dictionary, turned, progress)
+    if config.needs_markers:
+        if photographs is None:
+            fix = "Give the folder of the model's images, --images, or a distance between photographs, or positions."
+            raise ConfigError("markers are detected in photographs, and none were given", fix=fix)
+        for image in tqdm(images, "map: markers", disable=not progress, unit="image"):
+            for marker, view in _marker_views(image, photographs / image.name, config.dictionary, turned).items():
+                views.setdefault(marker, []).append(view)
+    scale = MapScale()
     if config.has_marker_sizes:
-        if not isinstance(known.sizes_m, float | int):
-            views = {marker: seen for marker, seen in views.items() if marker in known.sizes_m}
-        markers, unused = _place_markers(views)
+        markers, unused = _place_markers(views, known.sizes_m)
         scale = scale_from_markers(markers, known.sizes_m, unused)
     elif config.distance is not None:
         ends = (config.distance.first, config.distance.second)
@@ -214,14 +221,10 @@ def read_marker_table(path: Path) -> dict[int, float]:
 
     Raises ConfigError if the file is missing or not such a table, or a marker has two sizes.
     """
-    rows = _read_rows(path, ("id", "size_m"))
-    try:
-        sizes = {(int(row["id"]), float(row["size_m"])) for row in rows}
-    except ValueError as error:
-        raise ConfigError(f"not a marker's id and size: {error}", path=path, fix="Write 7,0.15.") from error
-    if len(dict(sizes)) < len(sizes) or not all(0 < size < np.inf for _, size in sizes):
-        raise ConfigError("each marker needs one positive size", path=path, value=sorted(sizes))
-    return dict(sizes)
+    rows = _read_table(path, "id", ["size_m"])
+    if not all(name.isdecimal() and size > 0 for name, (size,) in rows.items()):
+        raise ConfigError("not a table of markers' ids and positive sizes", path=path, fix="Write 7,0.15.")
+    return {int(name): float(size) for name, (size,) in rows.items()}
 
 
 def read_positions(path: Path) -> dict[str, Float]:
@@ -229,27 +232,27 @@ def read_positions(path: Path) -> dict[str, Float]:
 
     Raises ConfigError if the file is missing or not such a table, or a photograph has two positions.
     """
-    if path.suffix.lower() == ".json":
-        try:
-            rows = list(read_json_object(path).items())
-        except (OSError, ValueError) as error:
-            raise ConfigError(
-                f"not a file of positions: {error}", path=path, fix="Write {image: [x, y, z]}."
-            ) from error
-    else:
-        table = _read_rows(path, ("image", "x", "y", "z"))
-        rows = [(row["image"], [row["x"], row["y"], row["z"]]) for row in table]
-    positions: dict[str, Float] = {}
-    for name, values in rows:
-        try:
-            position = np.array(values, dtype=np.float64)
-        except (TypeError, ValueError):
-            position = np.zeros(0)
-        if position.shape != (3,) or not np.isfinite(position).all():
-            raise ConfigError("not a position", path=path, value=(name, values), fix="Give x, y, z in metres.")
-        if not np.array_equal(positions.setdefault(name, position), position):
-            raise ConfigError("a photograph has two positions", path=path, value=name)
-    return positions
+    return _read_table(path, "image", ["x", "y", "z"])
+
+
+def _read_table(path: Path, key: str, columns: list[str]) -> dict[str, Float]:
+    """Read numbers by name from a CSV or JSON file. Raises ConfigError if it is none, or a name has two values."""
+    import pandas as pd
+
+    try:
+        if path.suffix.lower() == ".json":
+            table = pd.DataFrame.from_dict(read_json_object(path), orient="index", columns=columns)
+        else:
+            table = pd.read_csv(path, dtype=str, skipinitialspace=True, keep_default_na=False, compression=None)
+            table = table.set_index(key)[columns]
+        table = table.astype(float).rename(index=str.strip)
+        if table.empty or not np.isfinite(table.to_numpy()).all():
+            raise ValueError("it is empty, or a number is missing or infinite")
+        if table.groupby(level=0).nunique().gt(1).any(axis=None):
+            raise ValueError("a name has different values")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"not a file of {key}, {', '.join(columns)}: {error}", path=path) from error
+    return dict(zip(table.index, table.to_numpy(), strict=True))
 
 
 def read_scale(map_dir: Path) -> MapScale | None:
@@ -267,42 +270,33 @@ def read_scale(map_dir: Path) -> MapScale | None:
         raise MapError(f"the map's report is damaged: {error}", path=path, fix="Run the map stage again.") from error
 
 
-def _posed_images(model: Any) -> list[Any]:
-    return [image for _, image in sorted(model.images.items()) if image.has_pose]
-
-
 def _are_on_a_line(points: Float) -> bool:
     spread = np.linalg.svd(points - points.mean(0), compute_uv=False)
     return bool(spread[1] <= _FLAT * max(spread[0], 1e-12))
 
 
-def _marker_views(
-    model: Any, folder: Path | None, dictionary: str, turned: bool, progress: bool
-) -> dict[int, list[MarkerView]]:
-    """Views of markers in photographs with a pose, by marker: detected at full size, in pixels of the map."""
-    if folder is None:
-        fix = "Give the folder of the model's images, --images, or a distance between photographs, or positions."
-        raise ConfigError("markers are detected in photographs, and none were given", value=dictionary, fix=fix)
-    views: dict[int, list[MarkerView]] = {}
-    for image in tqdm(_posed_images(model), "map: markers", disable=not progress, unit="image"):
-        camera = model.cameras[image.camera_id]
-        rgb = read_photograph(folder / image.name, turned)
-        reduction = np.array([camera.width, camera.height]) / rgb.shape[1::-1]
-        for marker, corners in detect_markers(rgb, dictionary, folder / image.name).items():
-            view = MarkerView(image.name, camera, image.cam_from_world().matrix(), corners * reduction)
-            views.setdefault(marker, []).append(view)
-    return dict(sorted(views.items()))
+def _marker_views(image: Any, path: Path, dictionary: str, turned: bool) -> dict[int, MarkerView]:
+    """Views of markers in the photograph of an image with a pose: detected at full size, in pixels of the map."""
+    camera = image.camera
+    rgb = read_photograph(path, turned)
+    reduction = np.array([camera.width, camera.height]) / rgb.shape[1::-1]
+    pose = image.cam_from_world().matrix()
+    corners = detect_markers(rgb, dictionary, path)
+    return {marker: MarkerView(image.name, camera, pose, at * reduction) for marker, at in corners.items()}
 
 
-def _place_markers(views: Mapping[int, list[MarkerView]]) -> tuple[list[Marker], dict[str, str]]:
-    """Markers placed in the map, and why others were not: one false detection must not stop the map."""
+def _place_markers(
+    views: Mapping[int, list[MarkerView]], sizes_m: Mapping[int, float] | float
+) -> tuple[list[Marker], dict[str, str]]:
+    """Markers of known size placed in the map, and why others were not: one false detection must not stop the map."""
     markers = []
     unused = {}
-    for marker, seen in views.items():
-        try:
-            markers.append(place_marker(marker, seen))
-        except MapError as error:
-            unused[f"marker {marker}"] = f"{error.problem}: {error.value}"
+    for marker, views_of_it in sorted(views.items()):
+        if isinstance(sizes_m, float | int) or marker in sizes_m:
+            try:
+                markers.append(place_marker(marker, views_of_it))
+            except MapError as error:
+                unused[f"marker {marker}"] = f"{error.problem}: {error.value}"
     return markers, unused
 
 
@@ -319,15 +313,3 @@ def _end_point(
         fix = "Name one that has a pose, relative to its folder; markers are written marker:7."
         raise MapError("the map has no such photograph", path=folder, value=end, fix=fix)
     return centers[end]
-
-
-def _read_rows(path: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
-    try:
-        with path.open(newline="") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            rows = [{name: (row[name] or "").strip() for name in columns} for row in reader]
-        if not rows:
-            raise ValueError("it is empty")
-    except (OSError, ValueError, KeyError, csv.Error) as error:
-        raise ConfigError(f"not a CSV file with the columns {', '.join(columns)}: {error}", path=path) from error
-    return rows

@@ -38,7 +38,7 @@ def test_what_ships_is_what_lies_in_the_project() -> None:
     assert "set.safetensors" in weights
     for name in [*shipped_configs(), *(f"{WEIGHTS}/{name}" for name in weights)]:
         assert fingerprint(shipped(name)) == fingerprint(ROOT / name)
-    with pytest.raises(ConfigError, match=r"configs/none\.yaml: this file does not ship"):
+    with pytest.raises(ConfigError, match=r"configs/none\.yaml: this file is not bundled"):
         shipped("configs/none.yaml")
 
 

@@ -37,7 +37,7 @@ class Check(OcclusionOptions, ScorerOptions):
 
     Metres: a photograph counts as localized within 5 cm and 0.4 degrees. Where metres are not known, it is 1 % of the
     median depth of the photograph instead of 5 cm, and the map is scored as if its median depth were 5 m. A map of this
-    project knows whether it is in metres; for another, --metres says so. A map whose cameras are on their side is
+    project knows whether it is in metres; for another, give --metres. A map whose cameras are on their side is
     turned upright first, unless it has a mesh.
 
     Results (--out):
@@ -166,7 +166,7 @@ class Check(OcclusionOptions, ScorerOptions):
         if mesh is None and scene is not None and rendered:
             mesh = scene.mesh
         if mesh is not None and not metric:
-            fix = "Say --metres if it is, or leave --mesh out."
+            fix = "Give --metres if it is, or leave --mesh out."
             raise ConfigError("a mesh is of use only for a map in metres", value=str(mesh), fix=fix)
         occlusion = ColmapEnvironment(
             ColmapFiles(model, mesh=mesh), occlusion=self.occlusion or "", device=device

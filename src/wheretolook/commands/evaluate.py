@@ -127,12 +127,12 @@ def evaluate_methods(
     several occlusion models `occlusion.png` compares them.
 
     The temperatures of learned methods are fitted on the labelled views of the val scenes, seen by the first occlusion
-    model, and hold for all rows; without val scenes, or when these are evaluated, they are not known.
+    model, and hold for all rows; without val scenes, or when these are evaluated, they are unknown.
 
-    The scenes need not be of the dataset the models were trained on. `models` are compared instead of those that
-    `config.weights` tells; `photographs` that were left out of their maps are views, too, with rows of their own;
-    `progress` shows a bar, and prints the table at the end unless `show` is off; `occlusion`
-    has the settings of the models that `config.occlusions` names. Returns the tables of
+    The scenes need not be of the dataset the models were trained on. `models` replace `config.weights`; `photographs`
+    that were held out of their maps are further views, with separate rows; `progress` shows a bar, and prints the table
+    at the end unless `show` is off; `occlusion` has the settings of the models that `config.occlusions` names. Returns
+    the tables of
     `wheretolook.evaluation.scores.score_table`, one below the other, with columns `occlusion` and `candidates`.
 
     Raises:
@@ -163,7 +163,7 @@ def evaluate_methods(
 
 
 def not_logged(dataset: Dataset) -> Path:
-    """A file that lies in a dataset's folder while its last evaluation is not logged."""
+    """Return the file that exists until a dataset's last evaluation is logged."""
     return dataset.root / "evaluation_not_logged.json"
 
 

@@ -25,7 +25,7 @@ Log = Callable[[str], None]
 """Receives one line about what a command has finished."""
 
 Progress = Callable[[float], None]
-"""Receives the work finished since the last call: 1 for each scene, or 1 for a command that does not go by scene."""
+"""Receives the work finished since the last call: 1 for each scene, or 1 for a command that does not loop over scenes."""
 
 
 def ignore_progress(work: float) -> None:
@@ -120,7 +120,7 @@ class MapUseOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneOptions(DatasetOptions):
-    """A dataset whose scenes are opened.
+    """How the scenes of a dataset are read.
 
     Args:
         occlusion: how occluded landmarks are recognized.

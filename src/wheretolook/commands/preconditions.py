@@ -1,4 +1,4 @@
-"""Preconditions of commands: whether the results of earlier commands exist, and by which settings."""
+"""Preconditions of commands: datasets, files and settings that earlier commands must have left."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 def load_dataset(
     options: DatasetOptions, required_stage: str, exempt: Callable[[SceneFolder], bool] = lambda scene: False
 ) -> Dataset:
-    """Load a command's dataset, for all scenes of which, but exempt ones, a stage has been run on their present input.
+    """Load a command's dataset, and check that a stage has been run on the present input of each scene but exempt ones.
 
     Raises ConfigError if it was made with another camera, or is a release where meshes and maps are needed; TableError
     if it does not exist, or the stage has not been run.
@@ -40,7 +40,7 @@ def load_dataset(
     unnamed = options.camera == CameraConfig()
     others = [scene.camera for scene in dataset.scenes if scene.camera != wanted and not (scene.own_camera and unnamed)]
     if others:
-        fix = "Run the scenes stage with this configuration, or give the experiment another name."
+        fix = "Run the scenes stage with this configuration, or give another --name."
         problem = "the dataset was made with another camera"
         raise ConfigError(problem, path=options.root, value=others[0], fix=fix)
     for scene in dataset.scenes:
@@ -62,7 +62,7 @@ def refuse_release(root: Path) -> None:
     """Raise ConfigError if a folder holds a release."""
     if (root / RELEASE_FILE).is_file():
         problem = "a release has no meshes and maps, and would be lost if they were made again"
-        fix = "Use it with train, evaluate and release alone, or give the experiment another name."
+        fix = "Use it with train, evaluate and release only, or give another --name."
         raise ConfigError(problem, path=root, fix=fix)
 
 
@@ -78,10 +78,10 @@ def naming_file(path: Path) -> Iterator[None]:
 
 
 def extractor_of(scene: SceneFolder, given: ExtractorConfig | None = None) -> ExtractorConfig:
-    """Return the keypoint extractor that the map was made with, which queries must use, too.
+    """Return the keypoint extractor that the map was made with; queries must use the same.
 
-    `given` of the same method may name other weights, as the map's may have moved. Raises MapError without the map's
-    report, or if its landmarks have no descriptors to match queries with; WeightsError if the weights are missing.
+    `given`, if of the same method, names the weights where they have moved. Raises MapError without the map's report, or
+    if its landmarks have no descriptors to match queries with; WeightsError if the weights are missing.
     """
     path = scene.map / "report.json"
     try:
@@ -90,13 +90,13 @@ def extractor_of(scene: SceneFolder, given: ExtractorConfig | None = None) -> Ex
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise MapError("the map's report is missing or damaged", path=path, fix="Run the map stage again.") from error
     if not report.get("has_descriptors", True):
-        fix = "Run the map stage again with --database, or with --images to triangulate anew."
+        fix = "Run the map stage again with --database, or with --images to triangulate again."
         raise MapError("the landmarks have no descriptors, so nothing can be localized", path=scene.map, fix=fix)
     if given is not None and given.weights and given.method == extractor.method:
         extractor = replace(extractor, weights=given.weights)
     if extractor.weights and not Path(extractor.weights).is_file():
-        fix = f"Say where they are: --map.extractor.method {extractor.method} --map.extractor.weights FILE."
-        raise WeightsError("the weights that this map was made with are not there", path=extractor.weights, fix=fix)
+        fix = f"Give their new path: --map.extractor.method {extractor.method} --map.extractor.weights FILE."
+        raise WeightsError("the weights that this map was made with are missing", path=extractor.weights, fix=fix)
     return extractor
 
 

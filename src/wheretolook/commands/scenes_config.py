@@ -12,12 +12,7 @@ from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.utils.confine import check_folder_name
 from wheretolook.utils.errors import ConfigError
 
-NOT_SCENES = (
-    "weights",
-    "results",
-    "adapted",
-    "all",
-)  # folders of a dataset that are no scenes, and what all scenes are called
+NOT_SCENES = ("weights", "results", "adapted", "all")  # other folders of a dataset, and the name of all scenes
 
 
 @dataclass(frozen=True)
@@ -86,5 +81,5 @@ class ScenesConfig:
             raise ConfigError("scenes.kinds are kinds of generated scenes", value=self.kinds, fix=fix)
 
     def kind_of(self, seed: int) -> SceneKind:
-        """The kind of the generated scene of a seed."""
+        """Return the kind of the generated scene of a seed."""
         return self.kinds[seed % len(self.kinds)]

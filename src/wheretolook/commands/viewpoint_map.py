@@ -19,7 +19,7 @@ class BuildViewpointMap(SceneOptions):
     """Score every direction at every free voxel of a scene, for planners to query. Needs no labels.
 
     Reads a scene's map and its mesh, as `scenes` and `map` leave them; a scene of photographs has no mesh, and is free
-    where scenes.mapped_space says. Without weights or a method, the best weights of the dataset, or else the bundled
+    according to scenes.mapped_space. Without weights or a method, the best weights of the dataset, or else the bundled
     ones, score the views. The folder holds plain arrays and LAYOUT.txt, which describes them; in Python:
 
       from wheretolook import ViewpointMap

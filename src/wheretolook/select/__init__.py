@@ -1,1 +1,1 @@
-"""The best views at places of one's own map: `wheretolook select`, and in Python `WhereToLook`."""
+"""The best views at locations of a COLMAP map: `wheretolook select`, and in Python `WhereToLook`."""

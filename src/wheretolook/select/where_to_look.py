@@ -99,7 +99,7 @@ class WhereToLook:
             database: the model's database, for descriptors and so the landmarks' ambiguity.
             directions: number of directions that are scored at each location.
             lattice: how they are distributed: "fibonacci" evenly; "yaw-pitch" 6 pitches x 18 yaws as in ActLoc.
-            max_reprojection_error_px: landmarks with a larger mean error are left out; None for the map's own default.
+            max_reprojection_error_px: landmarks with a larger mean error are dropped; None for the map's own default.
             device: "auto" for a GPU if there is one, "cpu", or "cuda:0".
             anywhere: whether weights that are adapted to another scene may score in this one.
 

@@ -77,12 +77,12 @@ _PURPOSES = {
 
 
 def experiment_name(stage: str, dataset: str) -> str:
-    """Name of the experiment of a stage's runs on a dataset, such as "release: evaluation"; "" for no dataset."""
+    """Return the name of the experiment of a stage's runs on a dataset, such as "release: evaluation"; "" for no dataset."""
     return ": ".join(filter(None, (dataset, _PURPOSES.get(stage, stage))))
 
 
 def run_name(what: str, stage: str, dataset: str) -> str:
-    """Name of a run; `what` is what was run, with its conditions (see `joined`)."""
+    """Return the name of a run; `what` is what was run, with its conditions (see `joined`)."""
     return f"{what} ({' '.join(filter(None, (stage, dataset)))})"
 
 
@@ -92,7 +92,7 @@ def joined(what: str, *conditions: str) -> str:
 
 
 def experiments(mlflow_client: MlflowClient, tracking: TrackingConfig) -> list[Experiment]:
-    """All experiments of this package in the store, also those logged before the store was moved."""
+    """Return all experiments of this package in the store, also those logged before the store was moved."""
     name = tracking.experiment
     tag, value = next(iter(_LAYOUT_TAGS.items()))
     return [
@@ -104,12 +104,12 @@ def experiments(mlflow_client: MlflowClient, tracking: TrackingConfig) -> list[E
 
 
 def experiment_ids(mlflow_client: MlflowClient, tracking: TrackingConfig) -> list[str]:
-    """Ids of `experiments`."""
+    """Return the ids of `experiments`."""
     return [str(experiment.experiment_id) for experiment in experiments(mlflow_client, tracking)]
 
 
 def experiment_id(mlflow_client: MlflowClient, tracking: TrackingConfig, stage: str, dataset: str = "") -> str:
-    """Id of the experiment for new runs of a stage on a dataset, which is created if missing.
+    """Return the id of the experiment for new runs of a stage on a dataset, which is created if missing.
 
     An experiment keeps the absolute path of its artifacts. In a store that was moved, new runs therefore go to another
     experiment, named after the new path; likewise if the experiment was deleted, since MLflow keeps its name.
@@ -232,7 +232,7 @@ def log_nested(tracking: TrackingConfig, parent: str, stage: str, runs: Iterable
 def newest_run(
     tracking: TrackingConfig, stage: str, tags: Tags = None, params: Tags = None, file: str = ""
 ) -> Run | None:
-    """The newest of `finished_runs`, or None."""
+    """Return the newest of `finished_runs`, or None."""
     return next(finished_runs(tracking, stage, tags, params, file), None)
 
 
@@ -261,13 +261,13 @@ def finished_runs(
 
 
 def fingerprint_of(params: Mapping[str, Any], *results: str) -> str:
-    """16 hexadecimal digits that change with any parameter of a run, as MLflow stores it, and any of its results."""
+    """Return 16 hexadecimal digits that change with any parameter of a run, as MLflow stores it, and any of its results."""
     texts = {str(name): str(value) for name, value in params.items()}
     return hashlib.sha256(json.dumps([sorted(texts.items()), *results]).encode()).hexdigest()[:16]
 
 
 def logged_last(tracking: TrackingConfig, stage: str, dataset: str, fingerprint: str, file: str) -> str | None:
-    """Id of the newest finished run of a stage on a dataset if it has this fingerprint and file, or None.
+    """Return the id of the newest finished run of a stage on a dataset if it has this fingerprint and file, or None.
 
     Then there is nothing new to log. An older run with the fingerprint does not count, since figures read the newest.
     """
@@ -278,7 +278,7 @@ def logged_last(tracking: TrackingConfig, stage: str, dataset: str, fingerprint:
 
 
 def newest_artifact(tracking: TrackingConfig, stage: str, file: str, dataset: str = "") -> Path:
-    """An artifact of the newest finished top-level run of a stage that has it, on a dataset or on any ("").
+    """Return an artifact of the newest finished top-level run of a stage that has it, on a dataset or on any ("").
 
     Raises MissingRunError if there is no such run.
     """
@@ -290,18 +290,18 @@ def newest_artifact(tracking: TrackingConfig, stage: str, file: str, dataset: st
 
 
 def artifact(tracking: TrackingConfig, run_id: str, path: str) -> Path:
-    """Local path of an artifact of a run, also after the store was moved."""
+    """Return the local path of an artifact of a run, also after the store was moved."""
     return Path(tracking.artifacts) / run_id / "artifacts" / path
 
 
 def ui_command(tracking: TrackingConfig) -> str:
-    """Shell command that opens MLflow's UI on the store."""
+    """Return the shell command that opens MLflow's UI on the store."""
     return f"{Path(sys.executable).with_name('mlflow')} ui --backend-store-uri {shlex.quote(tracking.uri)}"
 
 
 @cache
 def code_version() -> dict[str, str]:
-    """Version of this package and, in a checkout, the git commit ("+" appended when files differ from it)."""
+    """Return the version of this package and, in a checkout, the git commit ("+" appended when files differ from it)."""
     version = {"code_version": VERSION}
     here = Path(__file__).resolve().parents[1]
 

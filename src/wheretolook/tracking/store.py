@@ -44,7 +44,7 @@ def check_store(tracking: TrackingConfig) -> None:
 
 
 def client(tracking: TrackingConfig) -> MlflowClient:
-    """Client of the store, which is created if missing. Its methods raise TrackingError."""
+    """Return a client of the store, which is created if missing; its methods raise TrackingError."""
     return _client(tracking.root, tracking.uri)
 
 

@@ -1,1 +1,1 @@
-"""What every part needs and none owns: errors, files, processes, Warp, tracking."""
+"""Shared by all packages: errors, files, limits on reading, processes, devices."""

@@ -1,4 +1,4 @@
-"""Results kept in a folder together with the key of their inputs, so that a later run reuses or replaces them."""
+"""Results stored in a folder together with the key of their inputs, so that a later run reuses or replaces them."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class ArtifactCache:
         return self._keys().get(self.step)
 
     def is_current(self, *files: Path) -> bool:
-        """Whether the step was finished with this key and the files still exist."""
+        """Return whether the step was finished with this key and the files still exist."""
         return self.stored_key == self.key and all(file.exists() for file in files)
 
     def load(self, *names: str) -> dict[str, Any] | None:
@@ -65,14 +65,14 @@ class ArtifactCache:
     def store(self, results: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """Write named results, then the key; without results, files that the caller wrote. Returns the results."""
         if results:
-            self.clear()  # so that no key stands for files of different runs
+            self.clear()  # so that no key describes files of different runs
         for name, value in (results or {}).items():
             _write(self.folder / name, value)
         write_json(self.manifest, {**self._valid(self._keys()), self.step: self.key})
         return dict(results or {})
 
     def clear(self) -> None:
-        """Forget the key of this step and of later ones; files stay."""
+        """Remove the key of this step and of later ones; files stay."""
         keys = self._keys()
         valid = self._valid(keys)
         if valid != keys:

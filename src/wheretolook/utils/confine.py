@@ -1,4 +1,4 @@
-"""Paths made of names from files and options stay within their folder."""
+"""Turns names from files and options into paths within a folder."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ def check_folder_name(whose: str, name: str, reserved: tuple[str, ...] = ()) -> 
 
 
 def safe_child(folder: Path, name: object, whose: str) -> Path:
-    """Path of a name in a folder. Raises ConfigError if it would leave the folder or is in a subfolder of it."""
+    """Return the path of a name in a folder. Raises ConfigError if it would leave the folder or is in a subfolder of it."""
     if not isinstance(name, str) or name in ("", ".", "..") or "/" in name or "\0" in name:
         raise ConfigError(f"{whose} must be the name of a folder or file, without '/'", value=name)
     return folder / name
 
 
 def path_within(folder: Path, name: str, whose: str) -> Path:
-    """Path of a name such as "left/1.jpg" in a folder. Raises ConfigError if it is absolute or goes up."""
+    """Return the path of a name such as "left/1.jpg" in a folder. Raises ConfigError if it is absolute or goes up."""
     parts = PurePosixPath(name)
     if parts.is_absolute() or ".." in parts.parts or not parts.parts or "\0" in name:
         raise ConfigError(f"{whose} must be a path within its folder", path=folder, value=name)

@@ -1,4 +1,4 @@
-"""Which device there is to compute on."""
+"""Selects the device to compute on."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from wheretolook.utils.errors import ConfigError
 
 
 def usable_device(device: str) -> str:
-    """A device that can be computed on: the one given, or for "auto" a GPU if there is one, else the CPU.
+    """Return a usable device: the given one, or for "auto" a GPU if there is one, else the CPU.
 
     Where there is no GPU, the answer comes without loading PyTorch. Raises ConfigError if there is no such device.
     """
@@ -39,7 +39,7 @@ def check_device_name(device: str) -> None:
 
 @cache
 def _driver_gpus() -> int:
-    """GPUs that NVIDIA's driver shows to this process; it is asked directly, which takes milliseconds."""
+    """Count the GPUs that NVIDIA's driver shows to this process; asking it directly takes milliseconds."""
     try:
         driver = ctypes.CDLL("libcuda.so.1")
         count = ctypes.c_int()

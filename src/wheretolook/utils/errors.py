@@ -9,7 +9,7 @@ class WhereToLookError(Exception):
     """Base of all errors on bad input. The command line exits with code 2 on it.
 
     `problem` is one sentence. `path` is the file or folder, and `value` the value, that it is about, if there is one;
-    `fix` tells the user what to do.
+    `fix` is what the user can do.
     """
 
     def __init__(

@@ -113,17 +113,17 @@ def temporary_folder(suffix: str = "", parent: Path | None = None) -> Iterator[P
 
 
 def sha256(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal digits."""
+    """Return the SHA-256 of a file in hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def fingerprint(path: Path) -> str:
-    """First 16 hexadecimal digits of a file's SHA-256."""
+    """Return the first 16 hexadecimal digits of a file's SHA-256."""
     return sha256(path)[:16]
 
 
 def size_and_time(paths: Iterable[Path]) -> list[tuple[str, int, int]]:
-    """Path, size in bytes and time of the last change of files, which change when a file does."""
+    """Return path, size in bytes and time of the last change of each file, as an input of `cache_key`."""
     stats = [(path, path.stat()) for path in paths]
     return [(str(path), stat.st_size, stat.st_mtime_ns) for path, stat in stats]

@@ -20,7 +20,7 @@ MAX_DEPTH_PIXELS = 25_000_000
 
 
 def image_size(image: Path | bytes, at_most: int = MAX_PIXELS) -> tuple[int, int]:
-    """Width and height of an image file, or of its content.
+    """Return width and height of an image file, or of its content.
 
     Raises ValueError if it is no image or has more pixels than `at_most`, OSError if it is missing.
     """

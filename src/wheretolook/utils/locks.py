@@ -23,7 +23,7 @@ def hold(lock: Path, what: str, *, shared: bool = False, wait_s: float = 0.0) ->
     """Hold a lock (flock(2)) on a file within this block; the file is created if missing and removed at the end.
 
     Where nothing can be written, as in a read-only folder, the block runs without a lock; where the file system has no
-    locks, a warning says so. A lock does not nest.
+    locks, a warning is issued. A lock does not nest.
 
     Args:
         lock: path of the lock file. Its folder is created unless `shared`.
@@ -92,7 +92,7 @@ def _try_lock(lock: Path, shared: bool) -> int | None:
 
 
 def _is_current(lock: Path, file: int) -> bool:
-    """Whether the path still leads to the opened file."""
+    """Return whether the path still leads to the open file."""
     with suppress(FileNotFoundError):
         return os.path.samestat(os.stat(lock, follow_symlinks=False), os.fstat(file))
     return False

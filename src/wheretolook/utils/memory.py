@@ -1,4 +1,4 @@
-"""How much memory there is, to refuse at once what would not fit."""
+"""Available memory, so that what would not fit is rejected at once."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def available_bytes() -> int:
-    """Memory this machine can give without swapping; all it has, where the system does not say."""
+    """Return the memory available without swapping, in bytes; all of it where the system does not report it."""
     try:
         for line in Path("/proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):
@@ -18,5 +18,5 @@ def available_bytes() -> int:
 
 
 def fitting(bytes_each: int) -> int:
-    """How many things of so many bytes fit into 80 % of the memory that is available."""
+    """Return how many items of `bytes_each` fit into 80 % of the available memory."""
     return available_bytes() * 4 // 5 // bytes_each

@@ -1,4 +1,4 @@
-"""Which name a mistyped one was meant to be."""
+"""Suggests the known name that is nearest to a mistyped one."""
 
 from __future__ import annotations
 

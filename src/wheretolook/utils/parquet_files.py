@@ -38,7 +38,7 @@ def open_parquet(path: Path, **options: Any) -> Iterator[pq.ParquetFile]:
 
 
 def read_columns(file: pq.ParquetFile, path: Path, names: Sequence[str]) -> pa.Table:
-    """Read columns of an opened file in batches of rows.
+    """Read columns of an open file in batches of rows.
 
     Raises ValueError if they expand to far more than the file has bytes, or rows are missing. A batch of texts has so
     few rows that it stays below the limit even if each value is as long as all stored values together.

@@ -1,4 +1,4 @@
-"""Dividing work on rows among the cores of a CPU."""
+"""Divides work on rows among the cores of a CPU."""
 
 from __future__ import annotations
 

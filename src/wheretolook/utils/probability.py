@@ -8,5 +8,5 @@ from scipy.special import logit
 
 
 def finite_log_odds(probability: ArrayLike, margin: float) -> NDArray[np.float64]:
-    """Log-odds (...,) of probabilities (...,) in [0, 1], clipped to `margin` .. 1 - `margin` so that they are finite."""
+    """Return log-odds (...,) of probabilities (...,) in [0, 1], clipped to `margin` .. 1 - `margin` so that they are finite."""
     return np.asarray(logit(np.clip(probability, margin, 1 - margin)))

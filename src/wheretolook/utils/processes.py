@@ -30,7 +30,7 @@ _M_MMAP_THRESHOLD = -3
 class WorkerPool:
     """Runs functions in `workers` spawned processes of one thread each; with one worker, `map` runs in this process.
 
-    WorkerPool start when first needed. They end with the block, at once if it raises.
+    Processes start when first needed. They end with the block, at once if it raises.
     """
 
     def __init__(self, workers: int) -> None:
@@ -139,7 +139,7 @@ def ignoring_sigint() -> Iterator[None]:
 
 
 def in_main_thread() -> bool:
-    """Whether the caller runs in the main thread."""
+    """Return whether the caller runs in the main thread."""
     return threading.current_thread() is threading.main_thread()
 
 
@@ -147,7 +147,7 @@ _number = 0
 
 
 def worker_number() -> int:
-    """Number of this worker process in its pool, from 0."""
+    """Return the number of this worker process in its pool, from 0."""
     return _number
 
 

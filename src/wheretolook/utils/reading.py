@@ -22,7 +22,7 @@ FREE_BYTES = 128_000_000  # that any file of arrays may expand to
 
 
 def check_file(path: Path) -> os.stat_result:
-    """Status of a regular file. Raises ValueError for a folder, device or pipe, OSError if it is missing."""
+    """Return the status of a regular file. Raises ValueError for a folder, device or pipe, OSError if it is missing."""
     status = os.stat(path)
     if not stat.S_ISREG(status.st_mode):
         raise ValueError("this is no regular file")
@@ -30,7 +30,7 @@ def check_file(path: Path) -> os.stat_result:
 
 
 def max_expanded_bytes(n_bytes: int) -> int:
-    """Bytes that a file of arrays or a table of `n_bytes` may expand to in memory."""
+    """Return how many bytes a file of arrays or a table of `n_bytes` may expand to in memory."""
     return max(FREE_BYTES, MAX_RATIO * n_bytes)
 
 

@@ -1,4 +1,4 @@
-"""Reading settings back from records of results."""
+"""Reads settings back from records of results."""
 
 from __future__ import annotations
 

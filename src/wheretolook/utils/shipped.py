@@ -1,6 +1,6 @@
 """Finds the configurations and weights that are bundled with the package.
 
-They lie in `wheretolook/shipped/` under the names that they have in the project's folder, such as `configs/demo.yaml`:
+They are in `wheretolook/shipped/` under the names that they have in the project's folder, such as `configs/demo.yaml`:
 links to that folder in a checkout, copies in a wheel.
 """
 
@@ -10,22 +10,22 @@ from pathlib import Path
 
 from wheretolook.utils.errors import ConfigError
 
-WEIGHTS = "data/release/weights"  # folder of the weights that ship
+WEIGHTS = "data/release/weights"  # folder of the bundled weights
 
 
 def shipped(name: str | Path = "") -> Path:
-    """Path of a bundled file or folder, or of the folder of all. Raises ConfigError if there is none."""
+    """Return the path of a bundled file or folder, or of the folder of all. Raises ConfigError if there is none."""
     from importlib.resources import files
 
     root = Path(str(files("wheretolook"))) / "shipped"
     if not (root / name).exists():
-        problem = "this file does not ship with the package" if name else "the files that ship are missing"
+        problem = "this file is not bundled with the package" if name else "the bundled files are missing"
         raise ConfigError(problem, path=root / name, fix="Correct the name, or install the package again.")
     return root / name
 
 
 def or_shipped(path: str | Path) -> Path:
-    """The path, or if nothing exists there, the bundled file of this name, if there is one.
+    """Return the path, or if nothing exists there, the bundled file of this name, if there is one.
 
     So `configs/demo.yaml` and `data/release/weights/set.safetensors` can be given in any folder.
     """

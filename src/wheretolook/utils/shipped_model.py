@@ -28,7 +28,7 @@ class LogisticRegression:
     @classmethod
     @cache
     def bundled(cls) -> Self:
-        """The bundled model, fitted on validation scenes."""
+        """Return the bundled model, fitted on validation scenes."""
         return cls.load(cls.file)
 
     @classmethod
@@ -44,5 +44,5 @@ class LogisticRegression:
         return model
 
     def predict_proba(self, features: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-        """Probabilities (...,) for feature vectors (..., K) in the order of `names`."""
+        """Return probabilities (...,) for feature vectors (..., K) in the order of `names`."""
         return np.asarray(1 / (1 + np.exp(-np.clip(features @ np.asarray(self.weights) + self.bias, -60, 60))))

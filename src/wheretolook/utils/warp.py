@@ -52,5 +52,5 @@ def _without_driver_warning() -> Iterator[None]:
 
 
 def vec3_array(points: ArrayLike, device: str) -> wp.array:
-    """Points (N, 3) as a float32 array of vectors on a device."""
+    """Copy points (N, 3) to a float32 array of vectors on a device."""
     return wp.array(np.ascontiguousarray(points, dtype=np.float32).reshape(-1, 3), dtype=wp.vec3, device=device)

@@ -117,7 +117,7 @@ def load_scorer(
 
 
 def _self_scoring() -> set[str]:
-    """Names of the methods that score views with weights of their own."""
+    """Return the names of the methods that score views with their own weights."""
     return {name for name, method in scorers().items() if method.weights == name}
 
 

@@ -98,8 +98,21 @@ class Check(OcclusionOptions, ScorerOptions):
 
     def run(self) -> None:
         """Check the map, write the report to `out`, and print a summary."""
-        self._check_names()
         from wheretolook.dataset.layout import find_scene
+        from wheretolook.mapping.colmap_model import model_suffix
+        from wheretolook.scorers.registry import check_method
+
+        start = time.monotonic()
+        for method in filter(None, (self.method, *self.also)):
+            check_method(method)
+        scene = None if self.scene is None else find_scene(self.data, self.scene, self.name)
+        if self.scene is None:
+            name = ExistingModelConfig(model=self.map).scene_name
+        else:
+            name = "-".join(filter(None, (self.name, self.scene)))
+        if self.map is not None and self.mesh is None:  # with a mesh, missing metres are the first error
+            model_suffix(self.map)
+        # the imports above are light, those below take seconds
         from wheretolook.figures.style import save_figure
         from wheretolook.holdout.figure import check_figure
         from wheretolook.holdout.photo_map import WORK, folder_of_check
@@ -108,17 +121,10 @@ class Check(OcclusionOptions, ScorerOptions):
         from wheretolook.training.weights import read_training
         from wheretolook.utils.devices import usable_device
 
-        start = time.monotonic()
         device = usable_device(self.device)
         workers = self.workers or len(os.sched_getaffinity(0))
         scoring = Scoring(self.method, self.weights, self.also, self.anywhere)
         scoring.check()
-        if self.scene is None:
-            scene = None
-            name = ExistingModelConfig(model=self.map).scene_name
-        else:
-            scene = find_scene(self.data, self.scene, self.name)
-            name = "-".join(filter(None, (self.name, self.scene)))
         out = self.out or folder_of_check(self.data, name)
         try:
             with ExitStack() as locks:
@@ -139,16 +145,6 @@ class Check(OcclusionOptions, ScorerOptions):
                 "`wheretolook adapt` reports their measures on blocks that they were not trained on"
             )
         print(f"done in {time.monotonic() - start:.0f} s: {out}")
-
-    def _check_names(self) -> None:
-        """Raise an error for a scene, method or model that does not exist, before long imports."""
-        from wheretolook.mapping.colmap_model import model_suffix
-        from wheretolook.scorers.registry import check_method
-
-        for name in filter(None, (self.method, *self.also)):
-            check_method(name)
-        if self.map is not None and self.mesh is None:  # with a mesh, missing metres are the first error
-            model_suffix(self.map)
 
     def _open(
         self, scene: SceneFolder | None, work: Path, device: str, workers: int

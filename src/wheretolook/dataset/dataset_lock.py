@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from functools import wraps
+from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -14,16 +14,6 @@ from wheretolook.utils.locks import hold
 
 P = ParamSpec("P")
 R = TypeVar("R")
-
-
-def changes_dataset(stage: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorate a function of an experiment to hold the write lock. It raises InUseError if another stage runs."""
-    return _holding(stage, shared=False)
-
-
-def reads_dataset(stage: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorate a function of an experiment to hold the read lock. It raises InUseError if a stage changes the dataset."""
-    return _holding(stage, shared=True)
 
 
 @contextmanager
@@ -64,18 +54,27 @@ def _remove_leftovers(root: Path) -> None:
                     path.unlink()
 
 
-def _holding(stage: str, shared: bool) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def _decorator(
+    lock: Callable[[Path, str], AbstractContextManager[None]], stage: str
+) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorate `run` of a command, whose dataset is in `root`, to hold a lock of the dataset."""
+
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         @wraps(function)
         def locked(*args: P.args, **kwargs: P.kwargs) -> R:
-            experiment: Any = args[0] if args else kwargs["experiment"]
+            command: Any = args[0]
             try:
-                with (reading if shared else changing)(experiment.root, stage):
+                with lock(command.root, stage):
                     return function(*args, **kwargs)
             finally:
                 with suppress(OSError):  # made for the lock of a stage that then found nothing to work on
-                    experiment.root.rmdir()
+                    command.root.rmdir()
 
         return locked
 
     return decorate
+
+
+changes_dataset = partial(_decorator, changing)
+reads_dataset = partial(_decorator, reading)
+"""Decorators by the name of a stage. They raise InUseError as `changing` and `reading` do."""

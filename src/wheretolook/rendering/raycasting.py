@@ -69,8 +69,8 @@ class MeshRaycaster:
 
     def cast(self, origins: ArrayLike, directions: ArrayLike) -> RayHits:
         """First hits of rays from origins (R, 3) metres along directions (R, 3) of any length."""
+        origins, directions = np.broadcast_arrays(origins, directions)
         rays = [self.upload(origins), vec3_array(directions, self.device)]
-        _check_pairs(rays, "origins", "directions")
         outputs = self._launch(cast_kernel, rays[0].shape, rays, wp.float32, wp.int32, wp.bool)
         distance_m, triangle, front = (values.numpy() for values in outputs)
         return RayHits(distance_m, triangle, front.astype(np.bool_))
@@ -88,8 +88,7 @@ class MeshRaycaster:
         Where a segment runs parallel to a surface at about this distance it is tested every tenth of it, and may come
         closer by less than 0.2 %.
         """
-        segments = [self.upload(a), self.upload(b)]
-        _check_pairs(segments, "starts", "ends")
+        segments = [self.upload(ends) for ends in np.broadcast_arrays(a, b)]
         (clear,) = self._launch(clear_kernel, segments[0].shape, [*segments, clearance_m], wp.bool)
         return np.asarray(clear.numpy().astype(np.bool_))
 
@@ -102,13 +101,6 @@ class MeshRaycaster:
         outputs = [wp.empty(shape, dtype=dtype, device=self.device) for dtype in dtypes]
         wp.launch(kernel, shape, [self.warp_mesh.id, *inputs], outputs, device=self.device)
         return outputs
-
-
-def _check_pairs(arrays: list[Any], *names: str) -> None:
-    """Raise ValueError if the lengths of two arrays differ."""
-    if arrays[0].shape != arrays[1].shape:
-        lengths = [f"{array.shape[0]} {name}" for name, array in zip(names, arrays, strict=True)]
-        raise ValueError(" for ".join(lengths))
 
 
 def warp_mesh(mesh: TexturedMesh, device: str) -> wp.Mesh:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING
 
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.validation import check_choice
 
 if TYPE_CHECKING:
     from wheretolook.geometry.mesh import TexturedMesh
@@ -17,7 +17,6 @@ RENDERERS = {"warp": "wheretolook.rendering.warp_renderer:WarpRenderer"}
 
 def make_renderer(mesh: TexturedMesh, device: str = "cpu", name: str = "warp") -> Renderer:
     """Make a renderer of a mesh on "cpu" or a CUDA device. Raises ConfigError if there is none of that name."""
-    if name not in RENDERERS:
-        raise ConfigError("unknown renderer", value=name, fix=f"There are {', '.join(RENDERERS)}.")
+    check_choice("renderer", name, RENDERERS)
     renderer: Renderer = resolve_name(RENDERERS[name])(mesh, device)
     return renderer

@@ -33,29 +33,27 @@ class TexturePyramids:
 
 def build_pyramids(textures: tuple[NDArray[np.uint8], ...]) -> TexturePyramids:
     """Mip pyramids of textures (H, W, 3) uint8. Raises SceneError beyond 2^31 texels in all (8 GB)."""
-    n_levels = [max(texture.shape[:2]).bit_length() for texture in textures]
-    level_start = np.zeros((len(textures), max(n_levels)), dtype=np.int64)
-    total = 0
-    for k, texture in enumerate(textures):
-        for level in range(n_levels[k]):
-            level_start[k, level] = total
-            total += max(1, texture.shape[0] >> level) * max(1, texture.shape[1] >> level)
-    if total >= 2**31:
-        raise SceneError("the textures are too large", value=f"{total} texels", fix="Downscale them below 2^31 in all")
-
-    texels = np.zeros((total, 4), dtype=np.uint8)
-    for k, texture in enumerate(textures):
-        image: NDArray[np.uint8] = texture
-        for level in range(n_levels[k]):
-            height = max(1, texture.shape[0] >> level)
-            width = max(1, texture.shape[1] >> level)
+    sizes = [
+        [(max(1, t.shape[0] >> level), max(1, t.shape[1] >> level)) for level in range(max(t.shape[:2]).bit_length())]
+        for t in textures
+    ]
+    n_texels = sum(height * width for levels in sizes for height, width in levels)
+    if n_texels >= 2**31:
+        raise SceneError(
+            "the textures are too large", value=f"{n_texels} texels", fix="Downscale them below 2^31 in all"
+        )
+    texels = np.zeros((n_texels, 4), dtype=np.uint8)
+    level_start = np.zeros((len(textures), max(map(len, sizes))), dtype=np.int32)
+    start = 0
+    for k, (image, levels) in enumerate(zip(textures, sizes, strict=True)):
+        for level, (height, width) in enumerate(levels):
             if level > 0:
                 image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
-            start = level_start[k, level]
+            level_start[k, level] = start
             texels[start : start + width * height, :3] = image.reshape(-1, 3)
-    size = [(t.shape[1], t.shape[0], levels) for t, levels in zip(textures, n_levels, strict=True)]
-    flat = texels.view("<u4").reshape(-1).astype(np.uint32, copy=False)
-    return TexturePyramids(flat, level_start.astype(np.int32), np.array(size, dtype=np.int32))
+            start += width * height
+    size = np.array([(*levels[0][::-1], len(levels)) for levels in sizes], dtype=np.int32)
+    return TexturePyramids(texels.view("<u4").reshape(-1).astype(np.uint32, copy=False), level_start, size)
 
 
 def texel_gradients(mesh: TexturedMesh) -> NDArray[np.float32]:
@@ -73,10 +71,7 @@ def texel_gradients(mesh: TexturedMesh) -> NDArray[np.float32]:
     gram = edges @ np.swapaxes(edges, 1, 2)
     determinant = gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] ** 2
     flat = determinant <= 1e-12 * (gram[:, 0, 0] + gram[:, 1, 1]) ** 2
-    adjugate = np.empty_like(gram)
-    adjugate[:, 0, 0] = gram[:, 1, 1]
-    adjugate[:, 1, 1] = gram[:, 0, 0]
-    adjugate[:, 0, 1] = adjugate[:, 1, 0] = -gram[:, 0, 1]
+    adjugate = gram[:, ::-1, ::-1] * ((1, -1), (-1, 1))  # of a symmetric matrix
     inverse = adjugate / np.where(flat, 1.0, determinant)[:, None, None]
     gradients = np.swapaxes(changes, 1, 2) @ inverse @ edges
     gradients[flat] = 0.0

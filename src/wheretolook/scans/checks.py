@@ -19,9 +19,8 @@ _PAIRS = 40  # pairs of frames that are compared
 _MIN_PAIRS = 3
 _MIN_SHARED = 50  # readings that the two frames of a pair share
 _FACING = np.cos(np.radians(40.0))  # largest angle between the optical axes of a pair
-_STEPS = 83
-_FACTORS = np.geomspace(1 / 12, 12, _STEPS)  # candidate factors of depth, in steps of 6 %
-_FACTORS = np.concatenate([_FACTORS, *(power * np.geomspace(0.8, 1.25, 7) for power in (0.001, 0.01, 100, 1000))])
+_FACTORS = np.logspace(-3, 3, 361)  # candidate factors of depth, in steps of 4 %
+_MOST_READINGS = 1000  # of a frame, that are compared
 _MIN_AGREEMENT = 0.2  # share of the readings below which poses and depths do not belong together
 _CLEARLY = 0.15  # share of the readings by which another factor must agree better
 _UNIT_OFF = 1.25  # smallest factor that is attributed to the unit
@@ -60,14 +59,14 @@ def landmark_readings(frames: RgbdFrames, model: Any) -> Float:
 
     Takes the `pycolmap.Reconstruction` that gave the poses.
     """
-    found: list[Float] = [np.zeros((0, 2))]
+    pairs = [np.zeros((0, 2))]
     by_name = {image.name: image for image in model.images.values()}
-    for name, depth, pose in zip(frames.names_in_model, frames.survey_m, frames.cam_from_world, strict=True):
-        image: Any = by_name[name]
-        points = [model.points3D[seen.point3D_id].xyz for seen in image.points2D if seen.has_point3D()]
-        if points:
-            found.append(_readings_at(depth, frames.camera, np.array(points) @ pose[:, :3].T + pose[:, 3]))
-    return np.concatenate(found)
+    for name, survey_m, pose in zip(frames.names_in_model, frames.survey_m, frames.cam_from_world, strict=True):
+        points = [model.points3D[p.point3D_id].xyz for p in by_name[name].points2D if p.has_point3D()]
+        in_camera = np.reshape(points, (-1, 3)) @ pose[:, :3].T + pose[:, 3]
+        readings = _readings_at(survey_m, frames.camera, in_camera)
+        pairs.append(np.column_stack([in_camera[:, 2], readings])[np.isfinite(readings)])
+    return np.concatenate(pairs)
 
 
 def landmark_factor(readings: Float) -> float:
@@ -83,17 +82,17 @@ def pose_factor(survey_m: NDArray[np.float32], camera: PinholeCamera, cam_from_w
     agreements = []
     for i, j in _pairs(cam_from_world):
         row, column = np.nonzero(survey_m[i])
-        pixels = np.column_stack([column, row]) * SURVEY_STRIDE + SURVEY_STRIDE // 2 + 0.5
+        chosen = evenly(len(row), _MOST_READINGS)
+        pixels = np.column_stack([column, row])[chosen] * SURVEY_STRIDE + SURVEY_STRIDE // 2 + 0.5
         rays = camera.unproject(pixels)
-        points = rays / rays[:, 2:] * survey_m[i][row, column, None]
+        points = rays / rays[:, 2:] * survey_m[i][row, column][chosen, None]
         relative = cam_from_world[j] @ np.vstack([invert_poses(cam_from_world[i]), (0, 0, 0, 1)])
-        turned = points @ relative[:, :3].T
-        shares = []
-        for factor in _FACTORS:
-            both = _readings_at(survey_m[j], camera, turned + relative[:, 3] / factor)
-            agree = np.abs(both[:, 0] - both[:, 1]) < _AGREE * both[:, 1]
-            shares.append(agree.mean() if len(both) >= _MIN_SHARED else 0.0)
-        agreements.append(shares)
+        # a factor scales both frames' depths, so it is the same to divide the translation
+        moved = points @ relative[:, :3].T + relative[:, 3] / _FACTORS[:, None, None]
+        there = _readings_at(survey_m[j], camera, moved)  # (factors, readings)
+        n_shared = np.isfinite(there).sum(1)
+        n_agree = (np.abs(moved[..., 2] - there) < _AGREE * there).sum(1)
+        agreements.append(np.where(n_shared >= _MIN_SHARED, n_agree / np.maximum(n_shared, 1), 0.0))
     if len(agreements) < _MIN_PAIRS:
         return 1.0
     agreement = np.mean(agreements, axis=0)
@@ -101,17 +100,7 @@ def pose_factor(survey_m: NDArray[np.float32], camera: PinholeCamera, cam_from_w
     near_one = agreement[np.abs(np.log(_FACTORS)) < np.log(_UNIT_OFF)].max()
     if agreement[best] < _MIN_AGREEMENT:
         return float("nan")
-    return _peak(agreement, best) if agreement[best] > near_one + _CLEARLY else 1.0
-
-
-def _peak(agreement: Float, best: int) -> float:
-    """Maximum of a parabola through the best of `_FACTORS` and two on either side."""
-    if not 2 <= best < _STEPS - 2:
-        return float(_FACTORS[best])
-    steps = np.arange(-2, 3)
-    curve, slope, _ = np.polyfit(steps, agreement[best + steps], 2)
-    top = float(np.clip(-slope / (2 * curve), -1, 1)) if curve < 0 else 0.0
-    return float(_FACTORS[best] * (_FACTORS[1] / _FACTORS[0]) ** top)
+    return float(_FACTORS[best]) if agreement[best] > near_one + _CLEARLY else 1.0
 
 
 def _pairs(cam_from_world: Float) -> list[tuple[int, int]]:
@@ -130,14 +119,15 @@ def _pairs(cam_from_world: Float) -> list[tuple[int, int]]:
 
 
 def _readings_at(survey_m: NDArray[np.float32], camera: PinholeCamera, points_cam: Float) -> Float:
-    """Depth of points (N, 3) in a camera and its survey's readings there, (M, 2), where there is a reading."""
+    """A survey's readings (...) at points (..., 3) in its camera; NaN where there is none."""
     pixels = camera.project(points_cam)
-    z = points_cam[:, 2]
-    inside = (z > 0) & camera.in_image(pixels)
-    cell = (pixels[inside] // SURVEY_STRIDE).astype(np.int64)
+    inside = (points_cam[..., 2] > 0) & camera.in_image(pixels)
+    column, row = (pixels[inside] // SURVEY_STRIDE).astype(np.int64).T
     height, width = survey_m.shape
-    there = survey_m[np.minimum(cell[:, 1], height - 1), np.minimum(cell[:, 0], width - 1)]
-    return np.column_stack([z[inside], there])[there > 0]
+    readings = np.full(inside.shape, np.nan)
+    readings[inside] = survey_m[np.minimum(row, height - 1), np.minimum(column, width - 1)]
+    readings[readings == 0] = np.nan
+    return readings
 
 
 def _option(scale: float) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.validation import check_positive, check_range
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,8 @@ class FreeSpaceConfig:
     min_sight_m: float = field(default=1.0, init=False)
 
     def __post_init__(self) -> None:
-        if not self.clearance_m > 0 or not self.max_floor_drop_m > 0:
-            value = (self.clearance_m, self.max_floor_drop_m)
-            raise ConfigError("clearance and floor drop must be positive", value=value)
+        check_positive("clearance_m", self.clearance_m)
+        check_positive("max_floor_drop_m", self.max_floor_drop_m)
 
 
 @dataclass(frozen=True)
@@ -52,6 +51,5 @@ class MappedSpaceConfig:
     clearance_m: float = 0.25
 
     def __post_init__(self) -> None:
-        if not self.max_camera_distance_m > 0 or not self.clearance_m >= 0:
-            problem = "the distance to cameras must be positive, the clearance not negative"
-            raise ConfigError(problem, value=(self.max_camera_distance_m, self.clearance_m))
+        check_positive("max_camera_distance_m", self.max_camera_distance_m)
+        check_range("clearance_m", self.clearance_m, 0)

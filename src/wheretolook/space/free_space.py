@@ -59,7 +59,7 @@ class FreeSpace:
     def floor_below(self, points: ArrayLike) -> NDArray[np.float64]:
         """Height z (N,) of the floor below points (N, 3) metres; NaN where `is_free` would find none."""
         at = np.asarray(points, dtype=np.float64).reshape(-1, 3)
-        hits = self.raycaster.cast(at, np.broadcast_to((0.0, 0.0, -1.0), at.shape))
+        hits = self.raycaster.cast(at, (0.0, 0.0, -1.0))
         near = hits.distance_m <= self.config.max_floor_drop_m
         is_floor = near & self._level[hits.triangle] & (hits.front | self.two_sided)
         return np.where(is_floor, at[:, 2] - hits.distance_m, np.nan)

@@ -77,7 +77,6 @@ def test_invalid_scores(scores: object) -> None:
         best_sequence(scores, TurnLimit.of(np.eye(3)))
 
 
-@pytest.mark.parametrize("directions, limit", [(2 * np.eye(3), 30.0), (np.eye(3), np.nan)])
-def test_invalid_limits(directions: Float, limit: float) -> None:
+def test_a_limit_is_a_number() -> None:
     with pytest.raises(ValueError):
-        TurnLimit.of(directions, limit)
+        TurnLimit.of(np.eye(3), np.nan)

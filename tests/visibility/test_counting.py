@@ -11,8 +11,7 @@ from twins.visibility import count_plain
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, rotation_looking_along
-from wheretolook.utils.errors import ConfigError
-from wheretolook.visibility import counting
+from wheretolook.visibility import frustum
 from wheretolook.visibility.counting import FrustumCounter
 from wheretolook.visibility.field_of_view import cells_of, octahedral_directions, tabulate
 from wheretolook.visibility.occlusion import DevicePoints
@@ -104,20 +103,13 @@ def test_a_view_narrower_than_the_tables_cells_is_counted_too(camera: ColmapCame
     assert 300 < counts[0, 0] < 1000
 
 
-@pytest.mark.parametrize("invalid", [{"size": 0}, {"size": 7}, {"rotations": np.full((1, 3, 3), np.nan)}])
-def test_invalid_arguments(invalid: dict[str, object]) -> None:
-    arguments = {"camera": PinholeCamera(), "rotations": np.eye(3)[None], "n_points": 100, **invalid}
-    with pytest.raises(ConfigError):
-        FrustumCounter(**arguments)  # type: ignore[arg-type]
-
-
 def test_lists_for_the_camera_that_run_over_change_nothing(
     random_views: RandomViews, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     v = random_views
     rotations = rotation_looking_along(random_views.directions)
     expected = count(DISTORTED, rotations, v.locations, v.points, v.mask, device)
-    monkeypatch.setattr(counting, "ASKED_AT_ONCE", 7)
+    monkeypatch.setattr(frustum, "OFFSETS_AT_ONCE", 7)
     for entries in (1, 60):  # shorter than the list of one view, and than that of all
         short = {"scratch_bytes": 20 * entries}
         found = count(DISTORTED, rotations, v.locations, v.points, v.mask, device, **short)

@@ -119,7 +119,6 @@ def test_blocks_keep_to_the_memory_allowed(
         (SceneError, np.empty((0, 3)), np.ones((5, 3)), {}),
         (SceneError, [[0, np.nan, 0]], np.ones((5, 3)), {}),
         (ConfigError, np.zeros((1, 3)), np.ones((5, 3)), {"memory_bytes": 100}),
-        (ConfigError, np.zeros((1, 3)), np.ones((5, 3)), {"keep": -1}),
     ],
 )
 def test_invalid_input(error: type[Exception], locations: Float, points: Float, options: dict[str, int]) -> None:

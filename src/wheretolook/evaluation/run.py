@@ -17,11 +17,11 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.photographs import HeldOutPhotographs, photographs_set, score_photographs
 from wheretolook.evaluation.ranking import CandidateViews
 from wheretolook.evaluation.results import Evaluation, ScoredSet
-from wheretolook.evaluation.scores import choose, is_probability, score_table
+from wheretolook.evaluation.scores import choose, score_table
 from wheretolook.evaluation.scoring import Weights, check_unseen, choose_weights, score_scenes
 from wheretolook.evaluation.views import CandidateSet, candidate_sets, views_of
 from wheretolook.geometry.poses import Float
-from wheretolook.scorers.registry import methods_named, scorers
+from wheretolook.scorers.registry import is_probability, methods_named, scorers
 from wheretolook.training.provenance import TrainedModel
 from wheretolook.utils.errors import TableError
 from wheretolook.visibility.config import OcclusionConfig

@@ -22,7 +22,7 @@ from wheretolook.evaluation.ranking import (
     rank_views,
 )
 from wheretolook.geometry.poses import Float
-from wheretolook.scorers.registry import find
+from wheretolook.scorers.registry import find, is_probability
 from wheretolook.scorers.styles import ORACLE
 from wheretolook.utils.validation import check_choice
 
@@ -69,11 +69,6 @@ def reference_of(scores: pd.DataFrame) -> str:
 def is_random(method: str) -> bool:
     """Whether a method chooses at random, so that its rows hold exact expectations."""
     return bool(getattr(find(method), "is_random_baseline", False))
-
-
-def is_probability(method: str) -> bool:
-    """Whether a method's score is the probability that a view localizes."""
-    return bool(getattr(find(method), "probability", False))
 
 
 def choose(views: CandidateViews, scores: Mapping[str, Float], top_n: Sequence[int]) -> Choices:

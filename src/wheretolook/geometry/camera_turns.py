@@ -39,8 +39,8 @@ def pan_tilt_turns_deg(a: Float, b: Float) -> Float:
     The two axes of rotation are perpendicular, so an angle is the root of the sum of the squares of pan and tilt. It is
     never less than that of the direct rotation (`turns_deg`).
     """
-    (yaw_a, pitch_a) = pan_tilt_angles(a)
-    (yaw_b, pitch_b) = pan_tilt_angles(b)
+    yaw_a, pitch_a = pan_tilt_angles(a)
+    yaw_b, pitch_b = pan_tilt_angles(b)
     pan = np.abs(yaw_a[:, None] - yaw_b[None])
     return np.degrees(np.hypot(np.minimum(pan, 2 * np.pi - pan), pitch_a[:, None] - pitch_b[None]))
 
@@ -60,7 +60,7 @@ def turns_from_deg(current: ArrayLike, rotations: Float) -> Float:
     given: Float = np.asarray(current, dtype=np.float64)
     if given.shape == (3,):
         given = rotation_looking_along(check_axis(given))
-    if given.shape != (3, 3) or not np.allclose(given @ given.T, np.eye(3), atol=1e-6):
+    if given.shape != (3, 3) or not np.allclose(given @ given.T, np.eye(3), atol=1e-6) or np.linalg.det(given) < 0:
         raise ValueError(f"an orientation is an axis (3,) or a rotation (3, 3), got {given}")
     return _angles_deg(given.reshape(1, 9), rotations.reshape(-1, 9))[0]
 

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from wheretolook.evaluation.scores import is_probability
 from wheretolook.holdout.holdout import HoldoutResult, hold_out_blocks
 from wheretolook.holdout.holdout_blocks import VIEWS
 from wheretolook.holdout.metrics import measure
 from wheretolook.holdout.photo_map import MAX_ERROR_DEG, MAX_ERROR_M, MAX_ERROR_OF_DEPTH, PhotographedMap
 from wheretolook.holdout.scores import VISIBLE, Scoring, check_place, score_views
 from wheretolook.holdout.weak_regions import WeakPart, weak_parts
+from wheretolook.scorers.registry import is_probability
 from wheretolook.utils.files import write_json, write_text
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import OcclusionModel

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import inf, isfinite
+from math import isfinite
 from pathlib import Path
 from typing import Literal
 
@@ -11,6 +11,7 @@ from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.looks.selection import MAX_VIEWS
 from wheretolook.scorers.forward import ForwardScorer
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.validation import check_choice, check_positive, check_range
 
 FORWARD = ForwardScorer.name
 """The method that needs no map: the shortest path, looking ahead. Others are compared with it."""
@@ -25,9 +26,7 @@ class MappedLattice(ViewLattice):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.directions > MAX_DIRECTIONS:
-            problem = f"a viewpoint map holds at most {MAX_DIRECTIONS:,} directions"
-            raise ConfigError(problem, value=self.directions, fix=f"Give {MAX_DIRECTIONS} or fewer.")
+        check_range("the number of directions", self.directions, 1, MAX_DIRECTIONS)
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,7 @@ class ViewpointMapConfig(MappedLattice):
         weights: file of weights that the train stage wrote, for a learned method. Unless a method is named,
             the best of the dataset, or else of those that ship, for cameras with their field of view.
         out: folder to write; empty for `<data>/<name>/<scene>/viewpoint-map`. Only with a scene.
-        anywhere: let weights that are adapted to another scene score here, too.
+        anywhere: allow weights adapted to another scene.
     """
 
     scene: str = ""
@@ -70,9 +69,6 @@ class PathConfig:
         max_turn_deg_per_m: degrees that the camera turns at most while it moves by a metre.
         spacing_m: distance of the views along a path.
         time_s: seconds to plan; the path only gets better with time.
-
-    Attributes:
-        step_m: longest straight piece that the planner adds at once; longer ones seldom stay free indoors.
     """
 
     score_weight: float = 3.0
@@ -80,7 +76,6 @@ class PathConfig:
     pitch_deg: tuple[float, float] = (-40.0, 40.0)
     max_turn_deg_per_m: float = 150.0
     spacing_m: float = 0.2
-    step_m: float = field(default=1.0, init=False)
     time_s: float = 5.0
 
     def __post_init__(self) -> None:
@@ -88,19 +83,17 @@ class PathConfig:
         if not -90 < low <= high < 90:
             raise ConfigError("pitch_deg needs a range inside -90 to 90", value=self.pitch_deg)
         for name in ("max_turn_deg_per_m", "spacing_m", "time_s"):
-            if not 0 < getattr(self, name) < inf:
-                raise ConfigError(f"{name} must be positive and finite", value=getattr(self, name))
+            check_positive(name, getattr(self, name))
         for name in ("score_weight", "turn_weight_m"):
-            if not 0 <= getattr(self, name) < inf:
-                raise ConfigError(f"{name} must be finite and not negative", value=getattr(self, name))
+            check_range(name, getattr(self, name), 0)
 
 
 @dataclass(frozen=True)
 class StopConfig:
-    """Stops: where one look will not do, the camera stops and looks further, and all looks are localized together.
+    """Stops: where one view is not enough, the camera stops, rotates, and all views there are localized jointly.
 
     Args:
-        looks: most looks at a stop; 1 for no stops. That of the path is among them.
+        looks: greatest number of views at a stop, the path's own included; 1 for no stops.
         least_score: a view that scores less gets a stop. A probability.
     """
 
@@ -108,11 +101,9 @@ class StopConfig:
     least_score: float = 0.7
 
     def __post_init__(self) -> None:
-        if not 1 <= self.looks <= MAX_VIEWS:
-            raise ConfigError(f"stops.looks is a whole number of 1 to {MAX_VIEWS}", value=self.looks)
-        if not 0 < self.least_score <= 1:
-            fix = "Give a probability above 0, such as 0.7."
-            raise ConfigError("stops.least_score is a probability", value=self.least_score, fix=fix)
+        check_range("stops.looks", self.looks, 1, MAX_VIEWS)
+        check_positive("stops.least_score", self.least_score)
+        check_range("stops.least_score", self.least_score, 0, 1)
 
 
 @dataclass(frozen=True)
@@ -130,9 +121,9 @@ class PlanConfig(MappedLattice):
         against: further methods to plan by, drawn for comparison. Such as forward and fisher-trace-gp; in `methods.png`.
         film: kind of film to make: gif, mp4 or none.
         rerun: write a recording for the Rerun viewer too. Needs `pip install rerun-sdk`.
-        anywhere: let weights that are adapted to another scene score here, too.
+        anywhere: allow weights adapted to another scene.
         planner: costs and limits of the path, time to plan.
-        stops: where one look will not do.
+        stops: where one view is not enough.
     """
 
     scene: str = ""
@@ -150,9 +141,8 @@ class PlanConfig(MappedLattice):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.film not in ("gif", "mp4", "none"):
-            raise ConfigError("unknown kind of film", value=self.film, fix="Use gif, mp4 or none.")
+        check_choice("plan.film", self.film, ("gif", "mp4", "none"))
         for name in ("start", "goal"):
             point = getattr(self, name)
             if point is not None and not all(map(isfinite, point)):
-                raise ConfigError(f"plan.{name} must be finite", value=point, fix="Give x, y, z in metres.")
+                raise ConfigError(f"plan.{name} must be finite", value=point)

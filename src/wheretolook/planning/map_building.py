@@ -18,6 +18,7 @@ from wheretolook.planning.config import MAX_DIRECTIONS
 from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
 from wheretolook.scorers.base import Scorer
 from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.validation import check_range
 from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
 from wheretolook.visibility.survey import SurveyOptions, survey
 
@@ -47,11 +48,12 @@ def build_viewpoint_map(
     Raises:
         SceneError: no voxel is free, or the centre of one lies inside geometry.
         MapError: the map has no landmarks.
-        ConfigError: more than 65,536 directions, or ids outside the grid.
+        ConfigError: no directions or more than 65,536, or ids outside the grid.
         ValueError: directions that are not (D, 3), not finite or of length 0.
     """
     axes = _unit(directions)
-    rows = _ids(free)
+    given = np.asarray(free)
+    rows = np.flatnonzero(given) if given.dtype == bool else np.unique(given.astype(np.int64))
     if len(rows) == 0:
         raise SceneError("no voxel is free", value=len(grid), fix="Refine the grid, or check where it lies.")
     if rows[0] < 0 or rows[-1] >= len(grid):
@@ -61,8 +63,7 @@ def build_viewpoint_map(
     row_of_voxel[rows] = np.arange(len(rows))
     by_row = _score_and_count(scorer, grid.centers()[rows], axes, progress)
     digests = landmark_digests(landmarks)
-    origin = _origin(scorer, lattice, digests)
-    return ViewpointMap(grid, row_of_voxel, axes, *by_row, landmarks.ids, digests, origin)
+    return ViewpointMap(grid, row_of_voxel, axes, *by_row, landmarks.ids, digests, _origin(scorer, lattice, digests))
 
 
 def update_viewpoint_map(
@@ -89,11 +90,10 @@ def update_viewpoint_map(
     digests = landmark_digests(landmarks)
     origin = _origin(scorer, old.origin.lattice, digests)
     for name in ("scorer", "camera", "occlusion"):
-        now = getattr(origin, name)
         before = getattr(old.origin, name)
-        if now != before:
+        if getattr(origin, name) != before:
             fix = f"Use {before!r}, or build it again."
-            raise ConfigError(f"the viewpoint map was built with another {name}", value=now, fix=fix)
+            raise ConfigError(f"the viewpoint map was built with another {name}", value=getattr(origin, name), fix=fix)
     changed = _changed_landmarks(old, landmarks, digests)
     if changed is None or occlusion.landmarks_hide or not scorer.local:
         stale = np.ones(len(old.scores), dtype=bool)
@@ -150,23 +150,11 @@ def _score_exactly(scorer: Scorer, locations: Float, directions: Float) -> Float
     return scorer.score(poses).reshape(len(locations), len(directions))
 
 
-def _ids(free: ArrayLike) -> NDArray[np.int64]:
-    """Return the ids of free voxels, ascending, each once, from ids or a mask of all voxels."""
-    given = np.asarray(free)
-    return np.flatnonzero(given) if given.dtype == bool else np.unique(given.astype(np.int64))
-
-
 def _unit(directions: ArrayLike) -> Float:
-    axes = np.asarray(directions, dtype=np.float64)
-    if axes.ndim != 2 or axes.shape[1] != 3 or len(axes) == 0:
-        raise ValueError(f"directions must have shape (D, 3), got {axes.shape}")
-    if len(axes) > MAX_DIRECTIONS:
-        raise ConfigError(
-            f"a viewpoint map holds at most {MAX_DIRECTIONS:,} directions", value=len(axes), fix="Give fewer."
-        )
+    axes = np.asarray(directions, dtype=np.float64).reshape(-1, 3)
+    check_range("the number of directions", len(axes), 1, MAX_DIRECTIONS)
+    rotation_looking_along(axes)  # raises if one has no length or is not finite
     length = np.linalg.norm(axes, axis=1, keepdims=True)
-    if not np.all((length > 0) & (length < np.inf)):
-        raise ValueError("directions must be finite and of some length")
     return np.where(np.abs(length - 1) < 1e-12, axes, axes / length)  # unit vectors stay the same to the bit
 
 
@@ -189,14 +177,12 @@ def _any_unoccluded(
 ) -> NDArray[np.bool_]:
     """Whether at least one of the landmarks at some rows of points (N, 3) m is unoccluded from locations (L, 3) m."""
     unoccluded = np.zeros(len(locations), dtype=bool)
-    if len(rows) == 0:
-        return unoccluded
     columns: Any = slice(None)
     if isinstance(occlusion, StoredOcclusion):  # it holds results for all landmarks of its map
         columns = rows
     else:
         points = points[rows]
-    step = max(1, SIGHT_BYTES // len(points))
+    step = max(1, SIGHT_BYTES // max(1, len(points)))
     for begin in range(0, len(locations), step):
         block = slice(begin, begin + step)
         unoccluded[block] = occlusion.unoccluded(locations[block], points)[:, columns].any(axis=1)
@@ -210,10 +196,8 @@ def _check_unchanged(old: ViewpointMap, scorer: Scorer, rows: NDArray[np.int64])
     _, scores, n_visible = _score_and_count(scorer, old.locations[rows], old.directions, None)
     same_scores = np.allclose(scores, old.scores[rows], rtol=SCORE_TOLERANCE, atol=SCORE_TOLERANCE)
     if not (same_scores and np.array_equal(n_visible, old.n_visible[rows])):
-        problem = "a voxel that sees none of the added landmarks has other scores or counts than in the viewpoint map"
-        value = tuple(np.round(old.locations[rows[0]], 3).tolist())
-        fix = "Weights or the scene's geometry must have changed: build it again."
-        raise ConfigError(problem, value=value, fix=fix)
+        problem = "weights or geometry have changed: scores differ in a voxel that sees no new landmark"
+        raise ConfigError(problem, value=old.locations[rows[0]].tolist(), fix="Build the map again.")
 
 
 def _origin(scorer: Scorer, lattice: str, digests: NDArray[np.uint64]) -> MapOrigin:

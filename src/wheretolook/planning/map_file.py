@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -34,7 +33,6 @@ ARRAYS = {
 }
 """Little-endian type, shape and meaning of each array; each is a file `<name>.npy`."""
 
-_MAX_VOXELS = 2**40
 _WAIT_S = 120.0  # for another process that writes into the same folder
 
 REBUILD = "Build it again with `wheretolook viewpoint-map`, or get the folder again."
@@ -138,11 +136,7 @@ def _write(folder: Path, grid: VoxelGrid, origin: Mapping[str, Any], arrays: Map
     content = {
         "format": FORMAT,
         "version": VERSION,
-        "grid": {
-            "lower": [float(value) for value in grid.lower],
-            "upper": [float(value) for value in grid.upper],
-            "shape": [int(side) for side in grid.shape],
-        },
+        "grid": {name: np.asarray(getattr(grid, name)).tolist() for name in ("lower", "upper", "shape")},
         "sizes": {"V": len(grid), "L": n_rows, "D": n_directions, "N": len(arrays["landmark_ids"])},
         "origin": dict(origin),
         "sha256": checksums,
@@ -163,26 +157,23 @@ def read_map(folder: str | Path, mmap: bool = False) -> tuple[VoxelGrid, dict[st
         raise MapFormatError("there is no viewpoint map in this folder", path=folder, fix=REBUILD)
     try:
         content = read_json(path)
-        found = content.get("format"), content.get("version")
-    except (OSError, ValueError, AttributeError) as error:
-        raise MapFormatError(f"damaged description: {error}", path=path, fix=REBUILD) from error
-    if found != (FORMAT, VERSION):
-        raise MapFormatError(f"not a viewpoint map of version {VERSION}", path=path, value=found, fix=REBUILD)
-    try:
-        lower, upper, shape = (tuple(content["grid"][name]) for name in ("lower", "upper", "shape"))
-        grid = VoxelGrid(lower, upper, shape)
-        whole = all(type(side) is int for side in shape)
-        if not whole or {len(lower), len(upper), len(shape)} != {3} or math.prod(shape) > _MAX_VOXELS:
-            raise ValueError(f"a grid of shape {shape} between {lower} and {upper}")
+        if (content["format"], content["version"]) != (FORMAT, VERSION):
+            raise ValueError(f"not a viewpoint map of version {VERSION}")
+        bounds = np.array([content["grid"]["lower"], content["grid"]["upper"]], dtype=np.float64)
+        nx, ny, nz = (int(side) for side in content["grid"]["shape"])
+        grid = VoxelGrid.over(bounds, (nx, ny, nz))
         origin, sizes, checksums = (dict(content[name]) for name in ("origin", "sizes", "sha256"))
-        sides = {name: shape.split(", ") for name, (_, shape, _) in ARRAYS.items()}
-        expected = {name: tuple(int(sizes.get(side, side)) for side in sides[name]) for name in ARRAYS}
+        sizes["V"] = nx * ny * nz
+        shapes = {
+            name: tuple(int(sizes.get(side, side)) for side in text.split(", "))
+            for name, (_, text, _) in ARRAYS.items()
+        }
     except Exception as error:  # any value may be damaged
         raise MapFormatError(f"damaged description: {error}", path=path, fix=REBUILD) from error
     arrays: dict[str, NDArray[Any]] = {}
-    for name, dimensions in expected.items():
+    for name, shape in shapes.items():
         file = folder / f"{name}.npy"
-        arrays[name] = _read(file, ARRAYS[name][0], dimensions, mmap)
+        arrays[name] = _read(file, ARRAYS[name][0], shape, mmap)
         if not mmap and sha256(file) != checksums.get(file.name):
             raise MapFormatError("damaged: the checksum differs", path=file, fix=REBUILD)
     return grid, origin, arrays

@@ -11,14 +11,15 @@ from numpy.typing import ArrayLike
 
 from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset
-from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.geometry.poses import poses_looking_along, transform
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.planning.config import FORWARD, PlanConfig
 from wheretolook.planning.routes import PathView, PlannedPath
 from wheretolook.planning.rrt import check_ends, plan_path
-from wheretolook.planning.scene_map import check_methods, planner_map, planner_scorer
-from wheretolook.planning.stops import can_stop, check_stopping, stops_along, within_pitch
+from wheretolook.planning.scene_map import check_methods, planner_map, scene_scorer
+from wheretolook.planning.stops import check_stopping, stops_along, within_pitch
 from wheretolook.rendering.types import Renderer
+from wheretolook.scorers.registry import is_probability
 from wheretolook.weights.resolve import resolve_weights
 
 
@@ -56,19 +57,15 @@ def plan_by_methods(
             path = plan_path(start, goal, space, space.bounds, None, config.planner)
         else:
             weights = resolve_weights(method, config.weights, dataset=dataset)
-            scorer = planner_scorer(scene, dataset, method, weights, config.anywhere)
-            if stopping and number == len(methods):
-                check_stopping(scorer.name)
+            scorer = scene_scorer(scene, method, weights, config.anywhere)
             views = planner_map(scene, config, scorer)
             name = method or scorer.name
             path = plan_path(start, goal, space, space.bounds, views, config.planner)
             path = replace(path, scores=scorer.score(poses_looking_along(path.positions, path.axes)))
-            if stopping and can_stop(scorer.name):
-                directions = within_pitch(views.directions, config.planner)
-                stops = stops_along(
-                    scorer, path.positions, path.axes, directions, config.stops, config.planner, progress="stops"
-                )
-                path = replace(path, stops=stops)
+            if stopping and (is_probability(scorer.name) or number == len(methods)):
+                axes = within_pitch(views.directions, config.planner)
+                along = (path.positions, path.axes, axes, config.stops, config.planner)
+                path = replace(path, stops=stops_along(scorer, *along, progress="stops"))
         paths.pop(name, None)  # a method named twice comes where it was named last
         paths[name] = path
     return paths
@@ -89,21 +86,19 @@ def path_views(
     in_view = localization_map.landmarks_in_view(cam_from_world)
     images: Any = [None] * len(rows) if renderer is None else renderer.render(camera, cam_from_world).rgb
     n_looks = np.bincount(rows)
-    joint = path.scores_with_stops
-    views = []
-    for number, (row, pose) in enumerate(zip(rows.tolist(), cam_from_world, strict=True)):
-        points = localization_map.landmarks.points[in_view[number]]
-        views.append(
-            PathView(
-                position=path.positions[row],
-                axis=axes[number],
-                score=float(scores[number]),
-                pixels=camera.project(points @ pose[:, :3].T + pose[:, 3]),
-                size_px=(camera.width, camera.height),
-                rgb=images[number],
-                look=int(looks[number]),
-                n_looks=int(n_looks[row]),
-                together=float(joint[row]) if n_looks[row] > 1 else np.nan,
-            )
+    joint = np.where(n_looks > 1, path.scores_with_stops, np.nan)
+    points = localization_map.landmarks.points
+    return [
+        PathView(
+            position=path.positions[row],
+            axis=axes[number],
+            score=float(scores[number]),
+            pixels=camera.project(transform(cam_from_world[number], points[in_view[number]])),
+            size_px=(camera.width, camera.height),
+            rgb=images[number],
+            look=int(looks[number]),
+            n_looks=int(n_looks[row]),
+            together=float(joint[row]),
         )
-    return views
+        for number, row in enumerate(rows.tolist())
+    ]

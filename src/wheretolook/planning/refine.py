@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from wheretolook.geometry.camera_turns import angles_to_axis_deg
 from wheretolook.geometry.poses import Float, poses_looking_along
@@ -45,16 +45,13 @@ def refine_directions(
     distance works well as the first step. Raises ValueError if locations or axes are not finite, have no length or
     differ in number, or an angle is not positive.
     """
-    at, start = (np.asarray(values, dtype=np.float64).reshape(-1, 3) for values in (locations, axes))
-    length = np.linalg.norm(start, axis=1, keepdims=True)
-    if at.shape != start.shape or not np.isfinite(at).all() or not np.all((length > 0) & (length < np.inf)):
-        raise ValueError(f"locations and axes must be finite vectors, as many of both, got {at.shape}, {start.shape}")
     if not (max_angle_deg > 0 and first_step_deg > 0 and last_step_deg > 0):
         raise ValueError("angles must be positive")
-    start = start / length
+    at, start = (np.asarray(values, dtype=np.float64).reshape(-1, 3) for values in (locations, axes))
+    start_scores = scorer.score(poses_looking_along(at, start))  # raises on what is not finite
+    start = start / np.linalg.norm(start, axis=1, keepdims=True)
     current = start.copy()
     step_deg = np.full(len(start), float(min(first_step_deg, max_angle_deg)))
-    start_scores = scorer.score(poses_looking_along(at, start))
     scores = start_scores.copy()
     n_scored = len(start)
     while len(active := np.flatnonzero(step_deg >= last_step_deg)):
@@ -75,19 +72,16 @@ def refine_directions(
 
 def _neighbour_directions(axes: Float, step_deg: Float) -> Float:
     """Return eight unit vectors (B, 8, 3) at angles of `step_deg` (B,) around axes (B, 3)."""
-    smallest = np.eye(3)[np.abs(axes).argmin(axis=1)]  # a coordinate axis that is not parallel to the axis
-    u = np.cross(axes, smallest)
+    u = np.cross(axes, np.eye(3)[np.abs(axes).argmin(axis=1)])  # with a coordinate axis that is not parallel
     u /= np.linalg.norm(u, axis=1, keepdims=True)
-    v = np.cross(axes, u)
     angle = np.radians(step_deg)[:, None, None]
-    across = COMPASS[:, :1] * u[:, None] + COMPASS[:, 1:] * v[:, None]
+    across = COMPASS[:, :1] * u[:, None] + COMPASS[:, 1:] * np.cross(axes, u)[:, None]
     return np.asarray(np.cos(angle) * axes[:, None] + np.sin(angle) * across)
 
 
 def _within(candidates: Float, start: Float, max_angle_deg: float) -> Float:
     """Move candidates (B, 8, 3) that are too far from their start (B, 1, 3) back to the limit."""
-    angle = angles_to_axis_deg(candidates, start)[..., None]
-    outside: NDArray[np.bool_] = angle > max_angle_deg
+    outside = angles_to_axis_deg(candidates, start)[..., None] > max_angle_deg
     limit = np.radians(max_angle_deg)
     across = candidates - (candidates * start).sum(-1, keepdims=True) * start
     across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)

@@ -199,7 +199,7 @@ class RouteViews:
         at = between(samples.corners, places, samples.even)
         limit = self._limit(float(samples.even[-1]) / (len(samples.even) - 1))
         rows = self.map.rows(at)
-        scores = np.where((rows >= 0)[:, None] & self._inside, self.map.scores[rows], 0.0)
+        scores = np.where((rows >= 0)[:, None], self.map.scores[rows], 0.0)
         scores = np.where(self._inside, scores, -np.inf)
         try:
             if self.start_axis is None:

@@ -31,6 +31,7 @@ path. The rest is for improving the cheapest path."""
 
 AHEAD_SHARE = 0.5  # share of the time for finding a short path without a viewpoint map; the rest is for shortening it
 SAME_M = 1e-6  # points closer than this count as equal
+STEP_M = 1.0  # longest straight piece that the search adds at once; longer ones seldom stay free indoors
 STARTS = 12  # number of start orientations to choose from if none is given
 STEPS_M = (0.05, 1.0)  # range of the standard deviation by which a corner of a route is moved
 
@@ -108,12 +109,9 @@ def plan_path(
     """
     ends = np.asarray([start, goal], dtype=np.float64)
     request = PathRequest(ends, np.array(bounds, dtype=np.float64), space, config)
-    if not np.isfinite(ends).all():
-        raise ValueError(f"start and goal must be finite, got {ends.tolist()}")
     check_ends(ends, space, request.bounds)
     if viewpoint_map is None and start_axis is not None:
-        fix = "Give no start axis."
-        raise PlanningError("without a viewpoint map the camera looks ahead", value=start_axis, fix=fix)
+        raise PlanningError("a start axis needs a viewpoint map", value=start_axis)
     problem = _Problem(request, viewpoint_map)
     orientations = problem.start_orientations(start_axis)
     with tqdm(total=round(config.time_s, 1), desc="plan", unit="s", disable=not progress) as bar:
@@ -130,7 +128,7 @@ def plan_path(
 def plan_shortest(request: PathRequest, budget: _TimeBudget) -> PlannedPath:
     """Plan the shortest path, with the camera looking ahead; PlanningError if none was found."""
     route = _short_route(request, budget, AHEAD_SHARE, 1.0)
-    route = improve(route, _shorter, _length(route), request, budget.left_s, np.random.default_rng(0))
+    route = _shorten(route, request, budget.left_s, np.random.default_rng(0))
     samples = RouteSamples.of(route, request.config.spacing_m)
     axes = _forward(samples.positions, np.radians(request.config.pitch_deg))
     unknown = np.full(len(samples.positions), np.nan)
@@ -149,9 +147,12 @@ def plan_informed(
         if path is not None:
             candidates.append((replace(path, found_by=found_by), route))
 
+    def cheapest() -> tuple[PlannedPath, Float]:
+        return min(candidates, key=lambda candidate: candidate[0].cost)
+
     try:
         route = _short_route(request, budget, SHORT_SHARE, 1 - SEARCH_SHARE)
-        route = improve(route, _shorter, _length(route), request, budget.share(SHORTEN_SHARE), rng)
+        route = _shorten(route, request, budget.share(SHORTEN_SHARE), rng)
         add(views.best(route), route, SHORT_ROUTE)
     except PlanningError:
         pass  # the search below may find one
@@ -163,7 +164,7 @@ def plan_informed(
     except PlanningError:
         if not candidates:
             raise
-    cheapest, route = _cheapest(candidates)
+    best, route = cheapest()
 
     def cost_below(candidate: Float, limit: float) -> float | None:
         if views.least_cost(candidate) >= limit:
@@ -171,14 +172,10 @@ def plan_informed(
         path = views.best(candidate)
         return None if path is None or path.cost >= limit else path.cost
 
-    better = improve(route, cost_below, cheapest.cost, request, budget.left_s, rng)
+    better = improve(route, cost_below, best.cost, request, budget.left_s, rng)
     if better is not route:
         add(views.best(better), better, IMPROVEMENT)
-    return _cheapest(candidates)[0]
-
-
-def _cheapest(candidates: list[tuple[PlannedPath, Float]]) -> tuple[PlannedPath, Float]:
-    return min(candidates, key=lambda candidate: candidate[0].cost)
+    return cheapest()[0]
 
 
 def _short_route(request: PathRequest, budget: _TimeBudget, share: float, max_share: float) -> Float:
@@ -189,28 +186,28 @@ def _short_route(request: PathRequest, budget: _TimeBudget, share: float, max_sh
 
 def check_ends(ends: Float, space: Space, bounds: Float) -> None:
     """Raise a PlanningError unless start and goal (2, 3) m are different positions in free space."""
+    if not np.isfinite(ends).all():
+        raise ValueError(f"start and goal must be finite, got {ends.tolist()}")
     low, high = bounds
     for name, point in zip(("start", "goal"), ends, strict=True):
         if not ((point >= low) & (point <= high)).all() or not space.is_free(point[None])[0]:
-            fix = "Give a point where the camera can be, off walls and furniture"
             there = low + (high - low) * np.random.default_rng(0).random((4096, 3))
-            if (free := space.is_free(there)).any():
-                near = there[free][np.linalg.norm(there[free] - point, axis=1).argmin()]
-                fix += f"; one near by is [{', '.join(f'{x:.2f}' for x in near)}]"
-            fix += "."
+            free = there[space.is_free(there)]
+            near = free[np.linalg.norm(free - point, axis=1).argsort()[:1]].round(2).tolist()
+            fix = f"Give a point where the camera can be, such as {near}."
             raise PlanningError(f"the {name} is not in free space", value=tuple(point.tolist()), fix=fix)
     if np.linalg.norm(ends[1] - ends[0]) < SAME_M:
-        fix = "Ask the map for the best view there."
-        raise PlanningError("the start is the goal", value=tuple(ends[0].tolist()), fix=fix)
+        raise PlanningError("the start is the goal", value=tuple(ends[0].tolist()))
 
 
-def _length(route: Float) -> float:
-    return float(np.linalg.norm(np.diff(route, axis=0), axis=1).sum())
+def _shorten(route: Float, request: PathRequest, seconds: float, rng: np.random.Generator) -> Float:
+    """Shorten a free route (S, 3) m by `improve`."""
 
+    def length_below(candidate: Float, limit: float) -> float | None:
+        length = float(lengths_along(candidate)[-1])
+        return length if length < limit - 1e-9 else None
 
-def _shorter(route: Float, limit: float) -> float | None:
-    length = _length(route)
-    return length if length < limit - 1e-9 else None
+    return improve(route, length_below, float(lengths_along(route)[-1]), request, seconds, rng)
 
 
 def improve(
@@ -220,7 +217,6 @@ def improve(
     request: PathRequest,
     seconds: float,
     rng: np.random.Generator,
-    max_tries: int | None = None,
 ) -> Float:
     """Improve a free route (S, 3) m by shortcuts and by moving, adding and removing corners; returns the cheapest found.
 
@@ -233,12 +229,9 @@ def improve(
         request: space and bounds.
         seconds: time limit.
         rng: of the variations.
-        max_tries: limit on the routes tried.
     """
     end = time.monotonic() + seconds
-    tries = 0
-    while time.monotonic() < end and (max_tries is None or tries < max_tries):
-        tries += 1
+    while time.monotonic() < end:
         candidate, first, last = propose_route_change(route, request.bounds, rng)
         # only the changed segments need to be tested
         if not request.space.segments_are_free(candidate[first:last], candidate[first + 1 : last + 1]).all():
@@ -280,10 +273,9 @@ class _Problem:
 
     def __init__(self, request: PathRequest, viewpoint_map: ViewpointMap | None) -> None:
         self.request = request
-        self.space = request.space
-        self.config = config = request.config
+        self.config = request.config
         self.map = viewpoint_map
-        self.pitch = tuple(map(math.radians, config.pitch_deg))
+        self.pitch = tuple(map(math.radians, request.config.pitch_deg))
         if viewpoint_map is not None:
             self._score = viewpoint_map.scores.item
             self._table = _nearest_directions(viewpoint_map.directions)
@@ -299,10 +291,8 @@ class _Problem:
         yaw = math.atan2(y, x)
         pitch = math.asin(z)
         if not self.pitch[0] - 1e-6 <= pitch <= self.pitch[1] + 1e-6:
-            problem = "the start axis is beyond the limits of the pitch"
-            value = f"{math.degrees(pitch):.1f} deg"
-            fix = f"Start within {self.config.pitch_deg} degrees, or widen pitch_deg."
-            raise PlanningError(problem, value=value, fix=fix)
+            problem = f"the pitch of the start axis must be within {self.config.pitch_deg} degrees"
+            raise PlanningError(problem, value=round(math.degrees(pitch), 1))
         return [(yaw, min(max(pitch, self.pitch[0]), self.pitch[1]))]
 
     def motion_cost(self, a: tuple[float, ...], b: tuple[float, ...]) -> float:
@@ -338,7 +328,7 @@ class _Problem:
             # the sum of yaw and pitch is never less than the angle between the axes, so the limit holds
             if abs(_wrapped(b[3] - a[3])) + abs(b[4] - a[4]) > limit:
                 return False
-        return bool(self.space.segments_are_free([a[:3]], [b[:3]])[0])
+        return bool(self.request.space.segments_are_free([a[:3]], [b[:3]])[0])
 
     def solve(self, orientations: list[tuple[float, float]], time_s: float, max_s: float, bar: Any) -> Float:
         """Return the states (S, 5) of the best path found in `time_s`, or else of the first one found until `max_s`.
@@ -353,7 +343,7 @@ class _Problem:
         low, high = self.request.bounds
         space = _state_space(low, high, pitch, 0.2 if self.map is not None else 1e-6)
         information = base.SpaceInformation(space)
-        information.setStateValidityChecker(lambda state: bool(self.space.is_free([_numbers(state)[:3]])[0]))
+        information.setStateValidityChecker(lambda state: bool(self.request.space.is_free([_numbers(state)[:3]])[0]))
         possible = self.motion_is_possible
         cost_of = self.motion_cost
 
@@ -384,7 +374,7 @@ class _Problem:
         definition.setOptimizationObjective(objective)
         planner = geometric.RRTstar(information)
         planner.setProblemDefinition(definition)
-        planner.setRange(self.config.step_m)
+        planner.setRange(STEP_M)
         planner.setup()
         step = max(1e-3, min(0.25, time_s))
         spent = 0.0
@@ -427,13 +417,13 @@ def _forward(positions: Float, pitch: Float) -> Float:
 
     Where the path goes straight up or down, the yaw stays as before.
     """
-    steps = np.gradient(positions, axis=0)[:, :2] if len(positions) > 1 else np.array([[1.0, 0.0]])
+    steps = np.gradient(positions, axis=0)[:, :2]
     if not (np.linalg.norm(steps, axis=1) > 1e-9).any():
-        steps = np.tile([1.0, 0.0], (len(steps), 1))
+        steps[:] = (1.0, 0.0)
     length = np.linalg.norm(steps, axis=1)
     known = length > 1e-9
     last = np.maximum.accumulate(np.where(known, np.arange(len(steps)), int(np.argmax(known))))
-    level = (steps / np.maximum(length, 1e-9)[:, None])[last]
+    level = steps[last] / length[last, None]
     least = float(np.clip(0.0, *pitch))
     return np.column_stack([level * math.cos(least), np.full(len(level), math.sin(least))])
 

@@ -9,14 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from wheretolook.dataset.environment import SceneEnvironment
-from wheretolook.dataset.layout import Dataset
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.rrt import Space
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.registry import FALLBACK, find, make_scorer, members, methods_named, scorers
-from wheretolook.utils.errors import ConfigError
+from wheretolook.scorers.registry import FALLBACK, is_probability, make_scorer, methods_named, scorers
 from wheretolook.weights.resolve import load_scorer
 
 REACH = 2  # voxels along each axis from which views may be taken
@@ -50,18 +48,6 @@ def scene_viewpoint_map(scene: SceneEnvironment, views: ViewLattice, scorer: Sco
     return build_viewpoint_map(scorer, grid, free, views.axes(), views.lattice, f"viewpoint map {scene.name}")
 
 
-def planner_scorer(
-    scene: SceneEnvironment, dataset: Dataset, method: str = "", weights: Path | None = None, anywhere: bool = False
-) -> Scorer:
-    """Build the scorer for planning in a scene of a dataset, with weights from `resolve_weights`; see `scene_scorer`.
-
-    Raises a ConfigError that names the dataset where weights are missing.
-    """
-    if weights is None and any(known.weights for known in members(method, scorers())):
-        raise ConfigError(f"{method} needs weights", path=dataset.root, fix="Train it, or name weights.")
-    return scene_scorer(scene, method, weights, anywhere)
-
-
 def planner_map(scene: SceneEnvironment, views: ViewLattice, scorer: Scorer) -> ViewpointMap:
     """Build the map for planners: scores in [0, 1], and views wherever a camera can be.
 
@@ -69,8 +55,7 @@ def planner_map(scene: SceneEnvironment, views: ViewLattice, scorer: Scorer) -> 
     `scene_viewpoint_map`.
     """
     scored = scene_viewpoint_map(scene, views, scorer)
-    scored_by = find(scored.origin.scorer)
-    if scored_by is None or not scored_by.probability:
+    if not is_probability(scored.origin.scorer):
         scored = shares_below(scored)
     return fill_partially_free_voxels(scored, scene.space)
 

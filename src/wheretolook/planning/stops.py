@@ -16,6 +16,7 @@ from wheretolook.looks.selection import CANDIDATES, SEPARATION_DEG, Rotations, c
 from wheretolook.looks.set_score import SetScoreModel
 from wheretolook.planning.config import PathConfig, StopConfig
 from wheretolook.planning.routes import Stop, turning_deg
+from wheretolook.scorers.registry import is_probability
 from wheretolook.utils.errors import ConfigError, PlanningError
 from wheretolook.utils.probability import finite_log_odds
 
@@ -63,10 +64,8 @@ def stops_along(
     rows = np.flatnonzero(scores < config.least_score)
     for row in tqdm(rows.tolist(), desc=progress, unit="stop", disable=progress is None):
         view = _View(row, positions[row], axes[row], float(scores[row]), float(metres[row]))
-        stop = _best_stop(scorer, view, directions, config, planner)
-        if stop is not None:
-            stops.append(stop)
-    return tuple(stops)
+        stops.append(_best_stop(scorer, view, directions, config, planner))
+    return tuple(filter(None, stops))
 
 
 def within_pitch(directions: Float, planner: PathConfig) -> Float:
@@ -75,17 +74,9 @@ def within_pitch(directions: Float, planner: PathConfig) -> Float:
     return directions[(directions[:, 2] >= low) & (directions[:, 2] <= high)]
 
 
-def can_stop(method: str) -> bool:
-    """Whether a method's scores are probabilities."""
-    from wheretolook.scorers.registry import find
-
-    known = find(method)
-    return known is not None and known.probability
-
-
 def check_stopping(method: str) -> None:
-    """Raise a ConfigError if paths of a method cannot have stops (`can_stop`)."""
-    if not can_stop(method):
+    """Raise a ConfigError if paths of a method cannot have stops, which need scores that are probabilities."""
+    if not is_probability(method):
         fix = "Use a method such as set, or leave stops out."
         raise ConfigError("stops need scores that are probabilities", value=method, fix=fix)
 

@@ -32,16 +32,13 @@ class TurnLimit:
     def of(cls, directions: ArrayLike, max_turn_deg: float = MAX_TURN_DEG, pan_tilt: bool = False) -> TurnLimit:
         """Make the limit for a lattice of unit vectors (D, 3), such as `direction_lattice` gives.
 
-        Raises ValueError for directions of another shape or not of unit length, or a limit that is negative or NaN.
+        Raises ValueError for a limit that is negative or NaN.
         """
         axes = np.asarray(directions, dtype=np.float64)
-        if axes.ndim != 2 or axes.shape[1] != 3 or not np.allclose(np.linalg.norm(axes, axis=1), 1, atol=1e-6):
-            raise ValueError(f"directions must be unit vectors (D, 3), got an array of shape {axes.shape}")
         angles = turns.pan_tilt_turns_deg(axes, axes) if pan_tilt else turns.turns_deg(axes)
         reachable = turns.within(angles, max_turn_deg)
-        max_neighbours = int(reachable.sum(axis=1).max(initial=0))
-        ids = np.where(reachable, np.arange(len(axes)), len(axes))
-        return cls(axes, float(max_turn_deg), np.sort(ids, axis=1)[:, :max_neighbours], pan_tilt)
+        ids = np.sort(np.where(reachable, np.arange(len(axes)), len(axes)), axis=1)
+        return cls(axes, float(max_turn_deg), ids[:, : int(reachable.sum(axis=1).max(initial=0))], pan_tilt)
 
     def from_start(self, start: ArrayLike | None) -> NDArray[np.bool_]:
         """Return which directions (D,) the first waypoint may have: those within the limit of `start`, all if it is None.
@@ -114,10 +111,8 @@ def between(knots: Float, values: Float, at: Float) -> Float:
 def check_scores(scores: ArrayLike, limit: TurnLimit) -> Float:
     """Return scores (W, D) as an array; ValueError for another shape, NaN or +inf."""
     values = np.asarray(scores, dtype=np.float64)
-    if values.ndim != 2 or values.shape[1] != len(limit.directions) or len(values) < 1:
-        raise ValueError(f"scores must have shape (W, {len(limit.directions)}), W > 0, got {values.shape}")
-    if not np.all(values < np.inf):  # NaN is not less
-        raise ValueError("scores must be numbers below infinity")
+    if values.shape != (max(1, len(values)), len(limit.directions)) or not np.all(values < np.inf):  # NaN is not less
+        raise ValueError(f"scores must be (W, {len(limit.directions)}) numbers below infinity, got {values.shape}")
     return values
 
 

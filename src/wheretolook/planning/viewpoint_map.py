@@ -110,18 +110,17 @@ class ViewpointMap:
     origin: MapOrigin
 
     def __post_init__(self) -> None:
-        cells = (int(self.row_of_voxel.max(initial=-1)) + 1, len(self.directions))
-        for name in ("ranked", "scores", "n_visible"):
-            if getattr(self, name).shape != cells:
-                raise ValueError(f"{name} must be of shape {cells}, got {getattr(self, name).shape}")
-        length = np.linalg.norm(self.directions, axis=1)
-        if not (np.abs(length - 1) <= 1e-6).all() or (cells[0] and not cells[1]):
+        rows = self.row_of_voxel
+        cells = (int(rows.max(initial=-1)) + 1, len(self.directions))
+        shapes = {array.shape for array in (self.ranked, self.scores, self.n_visible)}
+        if shapes != {cells} or rows.shape != (len(self.grid),):
+            raise ValueError(
+                f"{cells} rows and directions of {len(self.grid)} voxels do not fit {shapes}, {rows.shape}"
+            )
+        if not np.allclose(np.linalg.norm(self.directions, axis=1), 1, rtol=0, atol=1e-6) or not cells[1]:
             raise ValueError("directions must be unit vectors, and not none")
-        if len(self.row_of_voxel) != len(self.grid):
-            raise ValueError(f"row_of_voxel must be of length {len(self.grid)}, got {len(self.row_of_voxel)}")
-        used = self.row_of_voxel[self.row_of_voxel >= 0]
-        in_order = self.origin.derived or np.array_equal(used, np.arange(len(used)))
-        if self.row_of_voxel.min(initial=-1) < -1 or not in_order:
+        in_order = self.origin.derived or np.array_equal(rows[rows >= 0], np.arange(cells[0]))
+        if rows.min(initial=-1) < -1 or not in_order:
             raise ValueError("row_of_voxel must be -1 or count up with voxels, using every row once")
 
     @classmethod
@@ -162,10 +161,7 @@ class ViewpointMap:
 
     def row(self, point: Point) -> int:
         """Return the row of the free voxel that contains a world point (3,) m; -1 if none does."""
-        x, y, z = point
-        x = float(x)  # faster than NumPy's scalars
-        y = float(y)
-        z = float(z)
+        x, y, z = map(float, point)  # faster than NumPy's scalars
         x0, y0, z0, x1, y1, z1, dx, dy, dz, nx, ny, nz, rows = self._hash
         if x0 <= x <= x1 and y0 <= y <= y1 and z0 <= z <= z1:
             i = int((x - x0) / dx)
@@ -188,10 +184,10 @@ class ViewpointMap:
     def best_n(self, point: Point, n: int) -> list[ViewChoice] | None:
         """Return the n best orientations at a world point (3,) m, or all if there are fewer, the best first.
 
-        Raises ValueError if n is no whole number of at least 1.
+        Raises ValueError if n is less than 1.
         """
-        if not isinstance(n, int | np.integer) or n < 1:
-            raise ValueError(f"n must be a whole number of at least 1, got {n!r}")
+        if n < 1:
+            raise ValueError(f"n must be at least 1, got {n}")
         row = self.row(point)
         return None if row < 0 else [self._choice(row, choice) for choice in self.ranked[row, :n].tolist()]
 
@@ -200,9 +196,8 @@ class ViewpointMap:
 
         Raises ValueError if the axis is not finite or has no length.
         """
-        row = self.row(point)
         inside = within(angles_to_axis_deg(self.directions, check_axis(axis)), half_angle_deg)
-        return self._best_of(row, inside)
+        return self._best_of(self.row(point), inside)
 
     def best_reachable(self, point: Point, current: ArrayLike, max_turn_deg: float) -> ViewChoice | None:
         """Return the best orientation that the camera reaches by a single rotation of at most `max_turn_deg`.
@@ -211,10 +206,7 @@ class ViewpointMap:
         roll, or a (3, 3) cam_from_world rotation. Returns None also if no direction of the lattice is in reach. Raises
         ValueError if `current` is not finite, an axis without length, or no rotation (such as a reflection).
         """
-        row = self.row(point)
-        if np.shape(current) == (3, 3) and not np.linalg.det(np.asarray(current, dtype=np.float64)) > 0:
-            raise ValueError(f"a rotation (3, 3) has a determinant of 1, got {np.asarray(current)}")
-        return self._best_of(row, within(turns_from_deg(current, self._rotations), max_turn_deg))
+        return self._best_of(self.row(point), within(turns_from_deg(current, self._rotations), max_turn_deg))
 
     def best_looks(
         self, point: Point, n: int, max_turn_deg: float | None = None, *, scorer: Scorer, start: ArrayLike | None = None
@@ -236,8 +228,7 @@ class ViewpointMap:
         if row < 0:
             return None
         at = np.asarray(point, dtype=np.float64)
-        scores = np.asarray(self.scores[row])
-        chosen = best_views(scorer, at, self.directions, scores, n, max_turn_deg, start)
+        chosen = best_views(scorer, at, self.directions, self.scores[row], n, max_turn_deg, start)
         return [self._choice(row, look) for look in chosen.rows]
 
     def best_many(self, points: ArrayLike) -> ViewChoices:
@@ -252,10 +243,8 @@ class ViewpointMap:
         Raises ValueError for points of another shape, or not finite.
         """
         at = np.asarray(points, dtype=np.float64)
-        if at.ndim != 2 or at.shape[1] != 3:
-            raise ValueError(f"points must have shape (N, 3), got {at.shape}")
-        if not np.isfinite(at).all():
-            raise ValueError("points must be finite")
+        if at.ndim != 2 or at.shape[1] != 3 or not np.isfinite(at).all():
+            raise ValueError(f"points must be finite and of shape (N, 3), got shape {at.shape}")
         ids = self.grid.location_ids(at)
         return np.where(ids >= 0, self.row_of_voxel[ids], -1).astype(np.int64)
 
@@ -272,9 +261,7 @@ class ViewpointMap:
         corners = low + _CORNERS
         weights = np.prod(np.where(_CORNERS == 1, at - low, 1 - (at - low)), axis=1)
         exists = ((corners >= 0) & (corners < self.grid.shape)).all(axis=1)
-        _, ny, nz = self.grid.shape
-        i, j, k = corners[exists].T
-        rows = self.row_of_voxel[(i * ny + j) * nz + k]
+        rows = self.row_of_voxel[np.ravel_multi_index(tuple(corners[exists].T), self.grid.shape)]
         weights = weights[exists][rows >= 0]
         # the voxel of the point is free and has at least an eighth of the weight
         return np.asarray(weights / weights.sum() @ self.scores[rows[rows >= 0]].astype(np.float64))
@@ -290,9 +277,8 @@ class ViewpointMap:
 
     def _choice(self, row: int, direction: int) -> ViewChoice:
         try:
-            score = self.scores.item(row, direction)
-            n_visible = self.n_visible.item(row, direction)
-            return ViewChoice(direction, self._axes[direction], score, n_visible)
+            axis = self._axes[direction]
+            return ViewChoice(direction, axis, self.scores.item(row, direction), self.n_visible.item(row, direction))
         except IndexError as error:
             raise _ranks_nothing(error) from error
 
@@ -318,11 +304,10 @@ class ViewpointMap:
         best = self.ranked[:, 0].astype(np.int64)
         at = np.arange(len(best)), best
         try:
-            scores = self.scores[at]
-            counts = self.n_visible[at].astype(np.int64)
+            scores = np.append(self.scores[at], np.float32(np.nan))
+            return np.append(best, -1), scores, np.append(self.n_visible[at].astype(np.int64), 0)
         except IndexError as error:
             raise _ranks_nothing(error) from error
-        return np.append(best, -1), np.append(scores, np.float32(np.nan)), np.append(counts, 0)
 
 
 def _ranks_nothing(error: IndexError) -> MapFormatError:

@@ -71,6 +71,11 @@ def find(name: str) -> Method | None:
     return all_methods().get(name.partition(" ")[0])
 
 
+def is_probability(name: str) -> bool:
+    """Whether the score of a table's row is the probability that a view localizes."""
+    return bool(getattr(find(name), "probability", False))
+
+
 def scorers() -> dict[str, Method]:
     """Return the methods that score views, by name."""
     return {name: method for name, method in all_methods().items() if method.build is not None}

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import inf
 
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.validation import check_positive, check_range
 
 DEFAULT_RADIUS = 50.0
 """Greatest mean F1 against the meshes of six mapped scenes (tests/benchmarks/bench_hidden_points.py). It is flat: from
@@ -63,11 +63,9 @@ class OcclusionConfig:
 
     def __post_init__(self) -> None:
         check_occlusion_names((self.model,))
-        if not 1 <= self.radius < inf:
-            raise ConfigError("occlusion.radius must be at least 1", value=self.radius)
-        for name in ("voxel_m", "max_depth_m"):
-            if not 0 < getattr(self, name) < inf:
-                raise ConfigError(f"occlusion.{name} must be positive", value=getattr(self, name))
+        check_range("occlusion.radius", self.radius, 1)
+        check_positive("occlusion.voxel_m", self.voxel_m)
+        check_positive("occlusion.max_depth_m", self.max_depth_m)
 
     def settings(self) -> dict[str, str | float]:
         """The model's name and the settings it reads; part of the keys of samples and labels."""

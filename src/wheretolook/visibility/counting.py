@@ -18,7 +18,6 @@ from wheretolook.visibility.sphere_cells import SphereCells, choose_size
 
 GPU_LANES = 16  # threads that share a location and an orientation on a GPU
 UNSURE_BYTES = 20  # of a landmark on the list of those that the table of a field of view cannot decide
-ASKED_AT_ONCE = 1 << 18  # landmarks of that list which a COLMAP camera projects at a time
 
 
 class FrustumCounter:
@@ -28,9 +27,9 @@ class FrustumCounter:
     view counts with all its landmarks; landmarks are tested one by one only in cells on the border of the view.
 
     `rotations` (D, 3, 3) are cam_from_world; `device` is "cpu" or a CUDA device. `n_points`, about how many landmarks
-    will be counted, sets the number of cells, unless `size` gives the cells along a side of the sphere's map.
+    will be counted, sets the number of cells, unless `size` gives the even number of cells along a side of the sphere's map.
     `scratch_bytes` is the memory for lists of landmarks that a COLMAP camera itself must project. Raises ConfigError if
-    there is no such device, the size is not even, or rotations are not finite or of another shape.
+    there is no such device.
     """
 
     def __init__(
@@ -45,10 +44,6 @@ class FrustumCounter:
         self.camera = camera
         self.scratch_bytes = scratch_bytes
         self.rotations = np.asarray(rotations, dtype=np.float32)
-        if self.rotations.shape[1:] != (3, 3) or not np.isfinite(self.rotations).all():
-            raise ConfigError("rotations must be finite and of shape (D, 3, 3)", value=self.rotations.shape)
-        if size is not None and (size < 2 or size % 2):
-            raise ConfigError("the sphere's map needs an even number of cells along a side", value=size)
         self.device = start_warp(device)
         wp.load_module(counting_kernel, device=self.device)  # only one thread may do that
         self.lanes = GPU_LANES if wp.get_device(self.device).is_cuda else 1
@@ -135,8 +130,7 @@ class FrustumCounter:
         first = 0
         block = n_views
         number: Any = wp.empty(1, dtype=wp.int32, device=device)
-        pairs: Any = wp.empty(capacity, dtype=wp.vec2i, device=device)
-        unsure: Any = wp.empty(capacity, dtype=wp.vec3, device=device)
+        pairs, unsure = self._unsure_lists(capacity)
         while first < n_views:
             block = min(block, n_views - first)
             number.zero_()
@@ -152,16 +146,20 @@ class FrustumCounter:
             views[first : first + block].zero_()
             if block == 1:
                 capacity = n
-                pairs, unsure = (wp.empty(n, dtype=dtype, device=device) for dtype in (wp.vec2i, wp.vec3))
+                pairs, unsure = self._unsure_lists(n)
             block = max(1, block * capacity // (2 * n))
         return counts
+
+    def _unsure_lists(self, capacity: int) -> tuple[Any, Any]:
+        """Room for the pairs of location and orientation, and the offsets, of landmarks that the table leaves open."""
+        pairs, unsure = (wp.empty(capacity, dtype=dtype, device=self.device) for dtype in (wp.vec2i, wp.vec3))
+        return pairs, unsure
 
     def _ask_camera(self, pairs: NDArray[np.int32], offsets: NDArray[np.float32], counts: Any) -> None:
         """Add the offsets (n, 3) that the camera sees to the counts of their pairs (n, 2), location and orientation."""
         assert isinstance(self.camera, ColmapCamera)
         more = np.zeros(counts.shape, dtype=np.int32)
-        for start in range(0, len(pairs), ASKED_AT_ONCE):
-            location, orientation = pairs[start : start + ASKED_AT_ONCE].T
-            seen = self.camera.sees(frustum.rotate(self.rotations[orientation], offsets[start : start + ASKED_AT_ONCE]))
-            np.add.at(more, (location[seen], orientation[seen]), 1)
+        location, orientation = pairs.T
+        seen = frustum.camera_sees(self.camera, self.rotations, orientation, offsets)
+        np.add.at(more, (location[seen], orientation[seen]), 1)
         wp.copy(counts, wp.array(counts.numpy() + more, dtype=wp.int32, device=self.device))

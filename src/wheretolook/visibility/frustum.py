@@ -24,6 +24,7 @@ from wheretolook.visibility.frustum_kernel import Views, collect_kernel
 
 MIN_DEPTH_M = 2.0**-10  # a pinhole sees nothing nearer to its image plane than this (about a millimetre), or behind it
 
+OFFSETS_AT_ONCE = 1 << 18  # landmarks that a COLMAP camera projects at a time
 SINGLE_ROUNDING = 5e-7  # bound on the relative error of a product of two vectors of three float32: 3 * 2^-24, and room
 
 
@@ -73,12 +74,10 @@ def frustum_sides(camera: PinholeCamera, rotations: ArrayLike) -> NDArray[np.flo
     with right and bottom is positive (pixel `width` is not), and its depth exceeds `MIN_DEPTH_M`.
     """
     right, down, forward = np.moveaxis(np.asarray(rotations, dtype=np.float64), -2, 0)
-    fx = camera.fx
-    fy = camera.fy
-    cx = camera.cx
-    cy = camera.cy
-    horizontal = [fx * right + cx * forward, (camera.width - cx) * forward - fx * right]
-    vertical = [fy * down + cy * forward, (camera.height - cy) * forward - fy * down]
+    across = camera.fx * right
+    along = camera.fy * down
+    horizontal = [across + camera.cx * forward, (camera.width - camera.cx) * forward - across]
+    vertical = [along + camera.cy * forward, (camera.height - camera.cy) * forward - along]
     return np.stack([*horizontal, *vertical, forward], axis=-2).astype(np.float32)
 
 
@@ -135,6 +134,17 @@ def pixels_of(camera: Camera, points_cam: Float) -> Float:
     if isinstance(camera, ColmapCamera):
         return camera.project(points_cam)
     return np.array([camera.fx, camera.fy]) * (points_cam[..., :2] / points_cam[..., 2:]) + (camera.cx, camera.cy)
+
+
+def camera_sees(
+    camera: ColmapCamera, rotations: NDArray[np.float32], rows: NDArray[np.integer[Any]], offsets: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Which offsets (n, 3) m a camera sees with the rotations (D, 3, 3) in these rows (n,), computed in blocks; (n,)."""
+    seen = np.empty(len(offsets), dtype=bool)
+    for begin in range(0, len(offsets), OFFSETS_AT_ONCE):
+        part = slice(begin, begin + OFFSETS_AT_ONCE)
+        seen[part] = camera.sees(rotate(rotations[rows[part]], offsets[part]))
+    return seen
 
 
 def landmarks_in_view(views: PosedViews, device: str = "cpu") -> LandmarkSets:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, cKDTree
 
 from wheretolook.geometry.poses import Float
-from wheretolook.utils.errors import ConfigError, MapError, SceneError
+from wheretolook.utils.errors import MapError, SceneError
+from wheretolook.utils.validation import check_range
 from wheretolook.visibility.config import DEFAULT_RADIUS
 from wheretolook.visibility.hull import hull_length, may_be_near_hull
 from wheretolook.visibility.occlusion import OcclusionInputs, OcclusionModel
@@ -63,13 +64,9 @@ class HiddenPointRemoval(OcclusionModel):
     landmarks_hide = True
 
     def __init__(self, radius: float = DEFAULT_RADIUS, margin_m: float = 0.05, threads: int = 0) -> None:
-        if not 1 <= radius < np.inf:
-            problem = "the radius of hidden-point removal must be at least 1, in distances of the farthest landmark"
-            raise ConfigError(problem, value=radius, fix=f"The default is {DEFAULT_RADIUS:g}.")
-        if not 0 <= margin_m < np.inf:
-            raise ConfigError("the margin must be a distance of at least 0 m", value=margin_m)
-        if threads < 0:
-            raise ConfigError("threads must be >= 0", value=threads)
+        check_range("radius", radius, 1)
+        check_range("margin_m", margin_m, 0)
+        check_range("threads", threads, 0)
         self.radius = float(radius)
         self.margin_m = float(margin_m)
         self.threads = threads
@@ -85,20 +82,18 @@ class HiddenPointRemoval(OcclusionModel):
         at = np.asarray(locations, dtype=np.float64)
         landmarks = np.asarray(points, dtype=np.float64)
         self.check(at, landmarks)
-        known = self._places_of(landmarks)
-        places = known.distinct
-        place = known.place
+        places = self._places_of(landmarks)
         free = np.empty((len(at), len(landmarks)), dtype=bool)
 
         def fill(row: int) -> None:
-            free[row] = self._free_from(at[row], places)[place]
+            free[row] = self._free_from(at[row], places.distinct)[places.place]
 
         with ThreadPoolExecutor(self.threads or len(os.sched_getaffinity(0))) as pool:
             list(pool.map(fill, range(len(at))))  # raises what a thread raised
         return free
 
     def check(self, locations: Float, points: Float) -> None:
-        """Refuse what cannot be answered, before any long work.
+        """Validate locations (L, 3) m and points (N, 3) m, before any long work.
 
         Raises a MapError if there are no landmarks, or one is not finite; a SceneError if a location is not finite, or
         a landmark is at it, so that a camera there would be inside geometry. Without a mesh, other locations inside
@@ -107,15 +102,13 @@ class HiddenPointRemoval(OcclusionModel):
         super().check(locations, points)
         bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
         if len(bad):
-            problem = f"{len(bad)} of {len(points)} landmarks are not finite, the first in row {bad[0]}"
-            raise MapError(problem, value=tuple(points[bad[0]].tolist()), fix="Triangulate the model again.")
+            raise MapError(f"{len(bad)} landmarks are not finite", value=points[bad[0]].tolist())
         tree = self._places_of(np.asarray(points, dtype=np.float64)).tree
         distance, _ = tree.query(locations, distance_upper_bound=2 * TOUCHING_M)
-        touching = distance <= TOUCHING_M
-        if touching.any():
+        touching = np.asarray(locations)[distance <= TOUCHING_M]
+        if len(touching):
             problem = "a landmark is at the location, which is on a surface or inside geometry"
-            at = tuple(np.asarray(locations)[touching][0].tolist())
-            raise SceneError(problem, value=at, fix="Choose locations in free space.")
+            raise SceneError(problem, value=touching[0].tolist(), fix="Choose locations in free space.")
 
     def _places_of(self, points: Float) -> _Places:
         with _LOCK:  # so that threads that ask about the same landmarks do not all sort them

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.geometry.camera import Camera, ColmapCamera
 from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.visibility import counting_kernel, frustum, frustum_kernel, listing_kernel
-from wheretolook.visibility.counting import ASKED_AT_ONCE, FrustumCounter
+from wheretolook.visibility.counting import FrustumCounter
 from wheretolook.visibility.field_of_view import tabulate
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 
@@ -48,7 +49,7 @@ def in_view_by_table(posed: PosedViews, points: Any, device: str = "cpu") -> Lan
     assert isinstance(posed.camera, ColmapCamera)
     wp.load_module(listing_kernel, device=device)
     field = tabulate(posed.camera)
-    (rotations, centers) = split_poses(posed.cam_from_world)
+    rotations, centers = split_poses(posed.cam_from_world)
     single = rotations.astype(np.float32)
     inputs = [
         wp.array(single, dtype=wp.mat33, device=device),
@@ -68,17 +69,32 @@ def in_view_by_table(posed: PosedViews, points: Any, device: str = "cpu") -> Lan
     first: Any = wp.array(starts[:-1], dtype=wp.int64, device=device)
     wp.launch(kernel, len(single), [*inputs, True, first], [lengths, found], device=device)
     indices = found.numpy()
-    unsure = np.flatnonzero(indices < 0)
-    indices[unsure] = -1 - indices[unsure]
-    of_view = np.searchsorted(starts, unsure, side="right") - 1
-    kept = np.ones(len(indices), dtype=bool)
-    for begin in range(0, len(unsure), ASKED_AT_ONCE):
-        part = unsure[begin : begin + ASKED_AT_ONCE]
-        views = of_view[begin : begin + ASKED_AT_ONCE]
-        offsets = (posed.points[indices[part]] - centers[views]).astype(np.float32)
-        kept[part] = posed.camera.sees(frustum.rotate(single[views], offsets))
-    lengths = np.diff(starts) - np.bincount(of_view[~kept[unsure]], minlength=len(single))
-    return LandmarkSets(np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32), indices[kept])
+
+    def sees(view: NDArray[np.int64], rows: NDArray[np.int32]) -> NDArray[np.bool_]:
+        offsets = (posed.points[rows] - centers[view]).astype(np.float32)
+        return frustum.camera_sees(posed.camera, single, view, offsets)
+
+    kept, starts = _decided(indices, starts, sees)
+    return LandmarkSets(starts.astype(np.int32), indices[kept])
+
+
+def _decided(
+    entries: NDArray[np.int32],
+    starts: NDArray[np.int64],
+    sees: Callable[[NDArray[np.int64], NDArray[np.int32]], NDArray[np.bool_]],
+) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Decide the entries (E,) of V views that the table left to the camera; these are -1 - row, and become rows.
+
+    `sees` returns which of such entries are in view, from their views and rows. Returns which entries are, (E,), and
+    the starts (V + 1,) of the views among them.
+    """
+    unsure = np.flatnonzero(entries < 0)
+    entries[unsure] = -1 - entries[unsure]
+    view = np.searchsorted(starts, unsure, side="right") - 1
+    kept = np.ones(len(entries), dtype=bool)
+    kept[unsure] = sees(view, entries[unsure])
+    n_lost = np.bincount(view[~kept[unsure]], minlength=len(starts) - 1)
+    return kept, np.concatenate([[0], np.cumsum(np.diff(starts) - n_lost)])
 
 
 def compile_kernels(device: str) -> None:
@@ -133,8 +149,17 @@ class FrustumLister(FrustumCounter):
         self._launch(
             candidates, views, True, first, wp.empty(len(views), dtype=wp.int64, device=self.device), entries, image
         )
-        listed = ListedViews(starts, entries, image)
-        return self._decided(listed, candidates, views) if isinstance(self.camera, ColmapCamera) else listed
+        camera = self.camera
+        if not isinstance(camera, ColmapCamera):
+            return ListedViews(starts, entries, image)
+        on_host = entries.numpy()
+
+        def sees(view: NDArray[np.int64], rows: NDArray[np.int32]) -> NDArray[np.bool_]:
+            return frustum.camera_sees(camera, self.rotations, views[view, 1], candidates.offsets.numpy()[rows])
+
+        kept, starts = _decided(on_host, starts, sees)
+        there: Any = wp.array(on_host[kept], dtype=wp.int32, device=self.device)
+        return ListedViews(starts, there, wp.array(image.numpy()[kept], dtype=wp.vec2, device=self.device))
 
     def _launch(
         self, candidates: Surroundings, views: Any, write: bool, first: Any, lengths: Any, entries: Any, image: Any
@@ -148,23 +173,3 @@ class FrustumLister(FrustumCounter):
         least = wp.float64(frustum.MIN_DEPTH_M)
         inputs = [asked, self._axes, self._sides, candidates.sorted, self._rounding, least, write, first]
         wp.launch(listing_kernel.list_kernel, len(views), inputs, outputs, device=self.device)
-
-    def _decided(self, listed: ListedViews, candidates: Surroundings, views: NDArray[np.integer[Any]]) -> ListedViews:
-        """Without the landmarks that the table left to the camera and the camera does not see."""
-        assert isinstance(self.camera, ColmapCamera)
-        entries = listed.entries.numpy()
-        unsure = np.flatnonzero(entries < 0)
-        if len(unsure) == 0:
-            return listed
-        entries[unsure] = -1 - entries[unsure]
-        of_view = np.searchsorted(listed.starts, unsure, side="right") - 1
-        offsets = candidates.offsets.numpy()
-        kept = np.ones(len(entries), dtype=bool)
-        for begin in range(0, len(unsure), ASKED_AT_ONCE):
-            part = slice(begin, begin + ASKED_AT_ONCE)
-            rotations = self.rotations[views[of_view[part], 1]]
-            kept[unsure[part]] = self.camera.sees(frustum.rotate(rotations, offsets[entries[unsure[part]]]))
-        lost = np.bincount(of_view[~kept[unsure]], minlength=len(views))
-        starts = np.concatenate([[0], np.cumsum(np.diff(listed.starts) - lost)])
-        there: Any = wp.array(entries[kept], dtype=wp.int32, device=self.device)
-        return ListedViews(starts, there, wp.array(listed.image.numpy()[kept], dtype=wp.vec2, device=self.device))

@@ -17,8 +17,9 @@ from scipy.spatial import cKDTree
 
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float
-from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError
+from wheretolook.utils.errors import MapError, SceneError, TableError
 from wheretolook.utils.npz_files import load_npz, save_npz
+from wheretolook.utils.validation import check_range
 from wheretolook.utils.warp import start_warp, vec3_array
 
 if TYPE_CHECKING:
@@ -126,15 +127,13 @@ class OcclusionModel(ABC):
         if len(points) == 0:
             raise MapError("the map has no landmarks", value=0, fix="Map the scene with more or sharper images.")
         at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
-        finite = np.isfinite(at).all(axis=-1)
-        if not finite.all():
-            first = tuple(at[~finite][0].tolist())
-            raise SceneError("a location is not finite", value=first, fix="Give locations in metres.")
-        inside = self.inside_geometry(at)
-        if inside.any():
-            first = tuple(np.round(at[inside][0], 3).tolist())
+        infinite = at[~np.isfinite(at).all(axis=-1)]
+        if len(infinite):
+            raise SceneError("a location is not finite", value=infinite[0].tolist())
+        inside = at[self.inside_geometry(at)]
+        if len(inside):
             fix = "Give locations in free space, as `FreeSpace.is_free` finds them."
-            raise SceneError("this location is inside geometry", value=first, fix=fix)
+            raise SceneError("this location is inside geometry", value=inside[0].round(3).tolist(), fix=fix)
 
 
 class NoOcclusion(OcclusionModel):
@@ -166,8 +165,7 @@ class MeshOcclusion(OcclusionModel):
     name = "mesh"
 
     def __init__(self, raycaster: MeshRaycaster, margin_m: float = 0.05, two_sided: bool = True) -> None:
-        if not 0 <= margin_m < np.inf:
-            raise ConfigError("the margin must be a distance of at least 0 m", value=margin_m)
+        check_range("margin_m", margin_m, 0)
         self.raycaster = raycaster
         self.margin_m = margin_m
         self.two_sided = two_sided
@@ -199,10 +197,9 @@ class MeshOcclusion(OcclusionModel):
 
     def _sides_seen(self, locations: Float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Which of 32 rays around each location (L, 3) m meet a front first, and which a back; each (L, 32)."""
-        rays = fibonacci_sphere(32)
-        hits = self.raycaster.cast(np.repeat(locations, len(rays), axis=0), np.tile(rays, (len(locations), 1)))
+        hits = self.raycaster.cast(np.repeat(locations, 32, axis=0), np.tile(fibonacci_sphere(32), (len(locations), 1)))
         hit = np.isfinite(hits.distance_m)
-        return (hit & hits.front).reshape(-1, len(rays)), (hit & ~hits.front).reshape(-1, len(rays))
+        return (hit & hits.front).reshape(-1, 32), (hit & ~hits.front).reshape(-1, 32)
 
 
 class StoredOcclusion(OcclusionModel):
@@ -238,12 +235,12 @@ class StoredOcclusion(OcclusionModel):
         """
         if len(points) != self.n_landmarks:
             problem = f"stored occlusion is of {self.n_landmarks} landmarks, the map has {len(points)}"
-            raise TableError(problem, fix="Run the sample stage again: the map has changed since.")
-        distance, row = self._tree.query(np.asarray(locations), distance_upper_bound=MATCH_M)
-        if not np.all(np.isfinite(distance)):
-            unknown = tuple(np.round(np.asarray(locations)[~np.isfinite(distance)][0], 3).tolist())
+            raise TableError(problem, fix="Run the sample stage again.")
+        distance, row = self._tree.query(locations, distance_upper_bound=MATCH_M)
+        unknown = np.asarray(locations)[~np.isfinite(distance)]
+        if len(unknown):
             fix = "Use a mesh for free locations, or sample this location first."
-            raise TableError("no stored occlusion for this location", value=unknown, fix=fix)
+            raise TableError("no stored occlusion for this location", value=unknown[0].tolist(), fix=fix)
         return self._unpack(row)
 
     def _unpack(self, rows: NDArray[np.integer[Any]] | slice) -> NDArray[np.bool_]:
@@ -259,16 +256,7 @@ class StoredOcclusion(OcclusionModel):
         """Read what `save` wrote. Raises TableError if the file is missing or damaged."""
         try:
             data = load_npz(path)
-            locations = data["locations"]
-            mask = data["mask"]
-            n_landmarks = data["n_landmarks"]
-            if locations.dtype.kind != "f" or locations.shape[1:] != (3,) or not np.isfinite(locations).all():
-                raise ValueError(
-                    f"locations of type {locations.dtype} and shape {locations.shape} are no places (L, 3)"
-                )
-            if mask.dtype != np.uint8 or n_landmarks.dtype.kind not in "iu" or n_landmarks.shape or n_landmarks < 0:
-                raise ValueError(f"a mask of type {mask.dtype} of {n_landmarks!s:.40} landmarks is none of packed bits")
-            return cls(locations, mask, int(n_landmarks), str(data.get("model", "mesh")))
+            return cls(data["locations"], data["mask"], int(data["n_landmarks"]), str(data.get("model", "mesh")))
         except (ValueError, KeyError, TypeError) as error:
             fix = "Run the sample stage again."
             raise TableError(f"cannot read stored occlusion: {error}", path=path, fix=fix) from error

@@ -45,10 +45,6 @@ class SurveyOptions:
     progress: str | None = None  # text of the progress bar; None shows none
     counter: type[FrustumCounter] = FrustumCounter  # what is counted
 
-    def __post_init__(self) -> None:
-        if self.keep < 0 or self.threads < 0:
-            raise ConfigError("keep and threads must not be negative", value=(self.keep, self.threads))
-
 
 def survey(
     camera: Camera,
@@ -111,9 +107,8 @@ def _check_counts(n_locations: int, n_directions: int) -> None:
     """Raise ConfigError if the counts of all views do not fit into memory."""
     most = fitting(4 + 4 + BYTES_TO_RANK)
     if n_locations * n_directions > most:
-        problem = f"{n_directions:,} directions at {n_locations:,} locations are more than there is memory for"
-        fix = f"{most // n_locations:,} directions would fit, or fewer locations."
-        raise ConfigError(problem, value=n_locations * n_directions, fix=fix)
+        problem = f"{n_directions:,} directions at {n_locations:,} locations do not fit into memory"
+        raise ConfigError(problem, fix=f"{most // n_locations:,} directions would fit, or fewer locations.")
 
 
 def _workers_and_block(
@@ -124,7 +119,7 @@ def _workers_and_block(
     required = per_location + counter.fixed_bytes
     if required > memory_bytes:
         problem = f"one location with {n_points:,} landmarks takes {required:,} bytes"
-        raise ConfigError(problem, value=memory_bytes, fix=f"Allow at least {required} bytes.")
+        raise ConfigError(problem, value=memory_bytes)
     workers = min(workers, memory_bytes // required)
     share = memory_bytes // workers - counter.fixed_bytes
     if counter.device == "cpu" and not occlusion.uses_all_cores:
@@ -141,11 +136,7 @@ def _each(work: Callable[[slice], int], blocks: list[slice], workers: int) -> It
         yield from map(work, blocks)
         return
     with ThreadPoolExecutor(workers) as pool:
-        try:
-            yield from pool.map(work, blocks)
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+        yield from pool.map(work, blocks)
 
 
 def _best(counts: Any, keep: int, on_gpu: bool) -> NDArray[np.int32]:

@@ -58,13 +58,13 @@ class ComparePaths(SceneOptions, LabelOptions):
 
         from wheretolook.localization.labeller import label_scenes
         from wheretolook.planning.scene_map import check_methods
-        from wheretolook.planning.stops import can_stop
+        from wheretolook.scorers.registry import is_probability
 
         with reading(self.root, "compare-paths", FOLDER):
             dataset = load_dataset(self, "map")
             config = self.paths
             check_methods(config.methods)
-            if config.stops.looks > 1 and not any(map(can_stop, config.methods)):
+            if config.stops.looks > 1 and not any(map(is_probability, config.methods)):
                 raise ConfigError("stops need a method whose scores are probabilities", value=config.methods)
             check_store(self.tracking)
             scenes = _comparisons(self, dataset, log)

@@ -11,8 +11,9 @@ from tqdm.auto import tqdm
 
 from wheretolook.dataset.viewpoint_table import pose_columns, poses
 from wheretolook.geometry.poses import Float, camera_centers, invert_poses, poses_looking_along, rotation_angle_deg
-from wheretolook.planning.stops import can_stop, stops_along, within_pitch
+from wheretolook.planning.stops import stops_along, within_pitch
 from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.registry import is_probability
 from wheretolook_paper.paths.config import PathsConfig
 
 KEY = ["pair", "task", "method"]
@@ -63,7 +64,7 @@ def localize_stops(
     `labels` are those of the views, followed by those of the further views at stops, with their matches.
     """
     result = _without_other_rules(views)
-    result = result[result["method"].map(can_stop)].copy()
+    result = result[result["method"].map(is_probability)].copy()
     places = pd.MultiIndex.from_frame(result[[*KEY, "waypoint"]])
     further = stop_views.groupby([*KEY, "waypoint"], sort=False)
     rows = result.index[places.get_indexer(pd.MultiIndex.from_tuples(list(further.indices)))].tolist()

@@ -18,8 +18,8 @@ from wheretolook.localization.joint_labels import label_sets
 from wheretolook.localization.labeller import MANIFEST, LabelTask
 from wheretolook.localization.shard import SceneJob
 from wheretolook.planning.config import FORWARD
-from wheretolook.planning.scene_map import planner_map, planner_scorer
-from wheretolook.planning.stops import can_stop
+from wheretolook.planning.scene_map import planner_map, scene_scorer
+from wheretolook.scorers.registry import is_probability
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.files import fingerprint
 from wheretolook.utils.reading import read_json_object
@@ -93,7 +93,7 @@ class SceneComparison:
         cached = cache.load("stops.parquet")
         if cached is not None:
             return cached["stops.parquet"]
-        chosen = choose_stop_views(views, self._scorers(can_stop), self.config, f"stops {self.scene.name}")
+        chosen = choose_stop_views(views, self._scorers(is_probability), self.config, f"stops {self.scene.name}")
         return cache.store({"stops.parquet": chosen})["stops.parquet"]
 
     def tasks(self) -> list[LabelTask]:
@@ -145,7 +145,7 @@ class SceneComparison:
 
     def _scorers(self, chosen: Callable[[str], bool]) -> dict[str, Any]:
         names = filter(chosen, self.config.methods)
-        return {name: planner_scorer(self.scene, self.dataset, name, self.weights[name]) for name in names}
+        return {name: scene_scorer(self.scene, name, self.weights[name]) for name in names}
 
     def _joint(self, name: str, key: list[Any], localize_views: Callable[[LocalizeSets], pd.DataFrame]) -> pd.DataFrame:
         cache = self._cache(f"{name}-together", cache_key(f"{name} together 1", key))

@@ -26,10 +26,10 @@ from wheretolook.dataset.viewpoint_table import CAMERA_ID, is_good, poses
 from wheretolook.evaluation.bootstrap import ClusterBootstrap
 from wheretolook.evaluation.calibration import expected_calibration_error
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.scores import is_probability
 from wheretolook.evaluation.scoring import score_scenes
 from wheretolook.geometry.camera import field_of_view_deg
 from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.scorers.registry import is_probability
 from wheretolook.training.weights import method_of_weights
 
 NARROW_DEG = 60

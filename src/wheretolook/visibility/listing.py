@@ -46,9 +46,10 @@ def in_view_by_table(posed: PosedViews, points: Any, device: str = "cpu") -> Lan
     The table takes a second to make, and the camera is asked only about landmarks near the border of the view. Points
     are those of `points_on_device`.
     """
-    assert isinstance(posed.camera, ColmapCamera)
+    camera = posed.camera
+    assert isinstance(camera, ColmapCamera)
     wp.load_module(listing_kernel, device=device)
-    field = tabulate(posed.camera)
+    field = tabulate(camera)
     rotations, centers = split_poses(posed.cam_from_world)
     single = rotations.astype(np.float32)
     inputs = [
@@ -72,7 +73,7 @@ def in_view_by_table(posed: PosedViews, points: Any, device: str = "cpu") -> Lan
 
     def sees(view: NDArray[np.int64], rows: NDArray[np.int32]) -> NDArray[np.bool_]:
         offsets = (posed.points[rows] - centers[view]).astype(np.float32)
-        return frustum.camera_sees(posed.camera, single, view, offsets)
+        return frustum.camera_sees(camera, single, view, offsets)
 
     kept, starts = _decided(indices, starts, sees)
     return LandmarkSets(starts.astype(np.int32), indices[kept])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -41,9 +41,8 @@ HEIGHT_BANDS_M = (0.5, 1.0, 2.0, 5.0, 10.0)
 MAX_HEIGHT_BANDS = 7
 """Possible widths of a height band; the narrowest with at most this many bands is used."""
 
-COINCIDE = 0.95
-NEARLY_COINCIDE = 0.8
-"""Of the coarsest threshold's positives, the shares that must also be positive at the finest for these verdicts."""
+LABELS = tuple(threshold_label(threshold_key(threshold)) for threshold in THRESHOLDS)
+"""The thresholds as text, from the finest to the coarsest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,48 +159,50 @@ def _histogram(views: pd.DataFrame, column: str, edges: Float) -> pd.DataFrame:
 def threshold_sentence(summary: LabelSummary) -> str:
     """A sentence on how much the labels depend on the threshold, from the numbers over all scenes."""
     row = summary.overall
-    labels = _labels()
-    if not row[POSITIVE[-1]]:
-        return f"No viewpoint is within {labels[-1]}: all are negative at every threshold."
-    verdicts = {COINCIDE: " all but coincide", NEARLY_COINCIDE: " differ little"}
-    verdict = next((text for limit, text in verdicts.items() if row["finest_of_coarsest"] >= limit), " differ")
+    coarsest = row[POSITIVE[-1]]
+    if not coarsest:
+        return f"No viewpoint is within {LABELS[-1]}: all are negative at every threshold."
     finer = [
-        f"{_percent(row[name] / row[POSITIVE[-1]])} % are within {label}"
-        for name, label in zip(POSITIVE[:-1], labels[:-1], strict=True)
+        f"{_percent(row[name] / coarsest)} % are within {label}"
+        for name, label in zip(POSITIVE[:-1], LABELS[:-1], strict=True)
     ]
     errors = f"Their median errors are {_median_error(row, 'within')}"
     if pd.notna(row["median_beyond_m"]):
-        errors += f"; those of the other poses found are {_median_error(row, 'beyond')}"
-    same = f"{_percent(row['same_label_share'])} % of the viewpoints have the same label at all {len(POSITIVE)}"
-    return f"The thresholds{verdict}: {same}. Of those within {labels[-1]}, {', '.join(finer)}. {errors}."
+        errors += f"; those of the other poses are {_median_error(row, 'beyond')}"
+    return (
+        f"{_percent(row['same_label_share'])} % of the viewpoints have the same label at all {len(POSITIVE)} "
+        f"thresholds. Of those within {LABELS[-1]}, {', '.join(finer)}. {errors}."
+    )
 
 
 def label_markdown(summary: LabelSummary, title: str = "Labels") -> str:
     """The summary as Markdown tables, under a title and `threshold_sentence`."""
     row = summary.overall
-    labels = _labels()
-    header = ["scene", "split", "views", "locations", *labels, "locations with a positive"]
-    header += ["localized", "too few matches", "no pose", "finest of coarsest", "same label", "Spearman"]
-    percents = [*POSITIVE, "locations_positive", *STATUSES, "finest_of_coarsest", "same_label_share"]
-    lines = []
-    for part in summary.shares.to_dict("records"):
-        counts = [f"{part['n_views']:,}", f"{part['n_locations']:,}"]
-        shares = [_percent(part[name]) for name in percents]
-        lines.append([part["scene"], part["split"], *counts, *shares, _or_dash(part["spearman"], ".2f")])
+    positives = dict(zip(LABELS, POSITIVE, strict=True))
+    shares = summary.shares.assign(
+        spearman=[f"{value:.2f}".replace("nan", "–") for value in summary.shares["spearman"]]
+    )
+    columns = {"scene": "scene", "split": "split", "views": "n_views", "locations": "n_locations", **positives}
+    columns |= {"locations with a positive": "locations_positive"}
+    columns |= {"localized": LOCALIZED, "too few matches": TOO_FEW_MATCHES, "no pose": NO_POSE}
+    columns |= {"finest of coarsest": "finest_of_coarsest", "same label": "same_label_share", "Spearman": "spearman"}
+    bands = {"views": "n_views", **positives}
+    heights = [f"{low:g}–{high:g}" for low, high in summary.by_height[["low", "high"]].to_numpy()]
+    visible = [_visible_label(low, high) for low, high in summary.by_visible[["low", "high"]].to_numpy()]
     sections = [
         f"# {title}",
         threshold_sentence(summary),
         f"{row['n_views']:,} viewpoints at {row['n_locations']:,} locations; shares in % of viewpoints. Positive at "
-        f"a threshold: localized with both errors under its limits; the label is that at the first, {labels[0]}, and a "
+        f"a threshold: localized with both errors under its limits; the label is that at the first, {LABELS[0]}, and a "
         "location with a positive has a viewpoint with this label. Finest of coarsest: how many of the last "
         "threshold's positives are positive at the first. Same label: equal at all thresholds. Spearman: the rank "
         "correlation of the first and the last label.",
-        markdown_table(header, lines),
+        _table(shares, columns),
         "## By height of the camera above its scene's lowest location",
-        _band_table("height (m)", summary.by_height, lambda low, high: f"{low:g}–{high:g}"),
+        _table(summary.by_height.assign(band=heights), {"height (m)": "band", **bands}),
         "## By number of visible landmarks",
-        _band_table("visible landmarks", summary.by_visible, _visible_label),
-        "## Errors of the poses found",
+        _table(summary.by_visible.assign(band=visible), {"visible landmarks": "band", **bands}),
+        "## Errors of the estimated poses",
         f"In % of all viewpoints; {_percent(row['without_pose'])} % have no pose at all. Disbelieved poses have too "
         "few inliers and count as not localized. Errors beyond the first and the last row count there.",
         _error_table("position error (m)", summary.errors_m, row["n_views"]),
@@ -217,27 +218,25 @@ def _visible_label(low: float, high: float) -> str:
     return f"{low:,.0f}" if high == low + 1 else f"{low:,.0f}–{high - 1:,.0f}"
 
 
-def _labels() -> list[str]:
-    """The thresholds as text, from the finest to the coarsest."""
-    return [threshold_label(threshold_key(threshold)) for threshold in THRESHOLDS]
-
-
-def _band_table(title: str, bands: pd.DataFrame, name: Callable[[float, float], str]) -> str:
-    lines = [
-        [name(band["low"], band["high"]), f"{band['n_views']:,}", *(_percent(band[column]) for column in POSITIVE)]
-        for band in bands.to_dict("records")
-    ]
-    return markdown_table([title, "views", *_labels()], lines)
-
-
 def _error_table(title: str, errors: pd.DataFrame, n_views: int) -> str:
     """Histogram bins, summed by decades."""
-    decade = np.arange(len(errors)) // BINS_PER_DECADE
-    lows = errors["low"].groupby(decade).first().tolist()
-    counts = errors[["localized", "disbelieved"]].groupby(decade).sum().to_numpy()
+    decades = errors.groupby(np.arange(len(errors)) // BINS_PER_DECADE)
+    lows = decades["low"].first().tolist()
     names = [f"{low:g}–{high:g}" for low, high in pairwise(lows)] + [f"≥ {lows[-1]:g}"]
-    lines = [[name, *(_percent(count / n_views) for count in row)] for name, row in zip(names, counts, strict=True)]
-    return markdown_table([title, "localized", "disbelieved"], lines)
+    shares = decades[["localized", "disbelieved"]].sum() / n_views
+    return _table(shares.assign(band=names), {title: "band", "localized": "localized", "disbelieved": "disbelieved"})
+
+
+def _table(frame: pd.DataFrame, columns: Mapping[str, str]) -> str:
+    """Markdown table of a frame's columns by their headers; floating-point numbers are shares."""
+    cells = [
+        [
+            f"{value:,}" if isinstance(value, int) else value if isinstance(value, str) else _percent(value)
+            for value in row
+        ]
+        for row in zip(*(frame[name].tolist() for name in columns.values()), strict=True)
+    ]
+    return markdown_table([*columns], cells)
 
 
 def _median_error(row: Mapping[str, Any], name: str) -> str:
@@ -248,8 +247,4 @@ def _median_error(row: Mapping[str, Any], name: str) -> str:
 
 
 def _percent(share: float) -> str:
-    return _or_dash(100 * share, ".1f")
-
-
-def _or_dash(value: float, form: str) -> str:
-    return "–" if pd.isna(value) else format(value, form)
+    return "–" if np.isnan(share) else f"{100 * share:.1f}"

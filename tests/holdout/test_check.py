@@ -19,9 +19,9 @@ from selection.room import WEIGHTS
 from wheretolook.cli import parse_command
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.holdout.holdout import without
-from wheretolook.holdout.holdout_blocks import KEPT, MIN_REST, choose_blocks, landmarks_kept, observation_matrix
+from wheretolook.holdout.holdout_blocks import KEPT, MIN_REST, choose_blocks, landmarks_kept
 from wheretolook.holdout.photo_map import open_map
-from wheretolook.mapping.colmap_model import model_arrays, read_model
+from wheretolook.mapping.colmap_model import model_arrays, observation_matrix, read_model
 from wheretolook.scorers.adapted.network import AdaptedNetwork
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.trained_network import TrainedNetwork
@@ -94,12 +94,12 @@ def test_blocks_share_out_all_photographs_and_grow(corridor: tuple[Path, Path]) 
     assert sorted(np.concatenate([block.held_out for block in parts]).tolist()) == [*range(N)]
     (alone,) = (block for block in parts if np.isin(ALONE, block.held_out).any())  # they share landmarks
     assert np.isin(ALONE, alone.held_out).all()
-    sees = observation_matrix(source)
+    sees = observation_matrix(source.arrays, source.frame)
     most = int((1 - MIN_REST) * N)
     grown = [block for block in blocks if not block.is_part]
     assert grown and max(len(block.held_out) for block in grown) <= most
     for block in grown:
-        kept = np.quantile(landmarks_kept(sees, source.moment[block.held_out]), 0.25)
+        kept = np.quantile(landmarks_kept(sees, source.frame[block.held_out]), 0.25)
         assert kept <= KEPT[0] or len(block.held_out) == most
     few = choose_blocks(source, views=3)
     assert max(len(block.tested) for block in few) == 3

@@ -13,7 +13,7 @@ from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.registry import all_kinds
 from wheretolook.geometry.camera import cameras_by_id
 from wheretolook.geometry.poses import pose_error
-from wheretolook.holdout.holdout import hold_out
+from wheretolook.holdout.holdout import hold_out_blocks
 from wheretolook.holdout.holdout_blocks import choose_blocks
 from wheretolook.holdout.photo_map import open_map
 from wheretolook.localization.config import LocalizerConfig
@@ -80,6 +80,6 @@ def test_held_out_photographs_of_a_map_of_learned_features_are_localized(corrido
     """As `check` does, by what the database holds: nothing is extracted."""
     source = open_map(corridor, corridor / "database.db", metric=True)
     block = min(choose_blocks(source), key=lambda block: len(block.held_out))
-    (found,) = hold_out(source, [block], tmp_path)
+    (found,) = hold_out_blocks(source, tmp_path, [block])
     assert found.landmarks.features == "aliked"
     assert found.views["good"].mean() > 0.5 and (found.views["n_matches"] > 20).any()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -17,9 +17,8 @@ from tqdm.auto import tqdm
 
 from wheretolook.dataset.viewpoint_table import LOCALIZED
 from wheretolook.features.keypoints import Keypoints
-from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, pose_error
-from wheretolook.holdout.holdout_blocks import VIEWS, Block, choose_blocks
+from wheretolook.holdout.holdout_blocks import Block, choose_blocks
 from wheretolook.holdout.photo_map import MAX_ERROR_DEG, PhotographedMap
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.labeller import versions
@@ -37,42 +36,14 @@ _LANDMARKS = "landmarks.npz"
 _VIEWS = "views.parquet"
 
 
-@dataclass(frozen=True)
-class HoldoutView:
-    """How one held-out photograph localized against the remaining map.
-
-    Attributes:
-        row: of the photograph in the map.
-        image: its name.
-        status: of the localizer.
-        good: whether it localized within the limits.
-        error_m, error_deg: pose error, NaN without a pose.
-        limit_m: limit of error_m.
-        n_matches, n_inliers: of the localizer.
-        n_observed: landmarks of the whole map that it observes.
-        n_kept: those of them that the remaining map still has.
-        n_landmarks: landmarks of the remaining map.
-    """
-
-    row: int
-    image: str
-    status: str
-    good: bool
-    error_m: float
-    error_deg: float
-    limit_m: float
-    n_matches: int
-    n_inliers: int
-    n_observed: int
-    n_kept: int
-    n_landmarks: int
-
-
 @dataclass(frozen=True, eq=False)
 class HoldoutResult:
     """A block that was held out, the landmarks (without descriptors) of the remaining map, and its localized views.
 
-    `views` has a row for each tested photograph, with the columns of `HoldoutView`.
+    `views` has a row for each tested photograph: row (of the photograph in the map), image (its name), status (of the
+    localizer), good (whether it localized within the limits), error_m and error_deg (NaN without a pose), limit_m (of
+    error_m), n_matches, n_inliers, n_observed (landmarks of the whole map that it observes), n_kept (those of them that
+    the remaining map still has), and n_landmarks (of the remaining map).
     """
 
     block: Block
@@ -84,40 +55,24 @@ class HoldoutResult:
 class _Job:
     """Inputs of holding out one block in a worker process."""
 
+    source: PhotographedMap  # without its model, which is in a folder
     model: Path
-    features: Path
     block: Block
-    names: list[str]  # of the tested photographs
-    cameras: list[Camera]
-    poses: Float
-    limits: Float
     cache: ArtifactCache
     device: str
 
 
 def hold_out_blocks(
-    source: PhotographedMap, work: Path, views: int = VIEWS, workers: int = 1, device: str = "cpu"
+    source: PhotographedMap, work: Path, blocks: Sequence[Block] | None = None, workers: int = 1, device: str = "cpu"
 ) -> list[HoldoutResult]:
-    """Hold out all blocks of a map, with a progress bar; finished ones are cached in `work`."""
-    blocks = choose_blocks(source, views)
-    results = []
-    total = sum(len(block.tested) for block in blocks)
-    with tqdm(total=total, desc="check: leave out, localize", unit="view") as bar:
-        for result in hold_out(source, blocks, work, workers, device):
-            results.append(result)
-            bar.update(len(result.views))
-    return results
-
-
-def hold_out(
-    source: PhotographedMap, blocks: Sequence[Block], work: Path, workers: int = 1, device: str = "cpu"
-) -> Iterator[HoldoutResult]:
-    """Hold out each block and localize its photographs against the rest; yields results in the order of the blocks.
+    """Hold out each block of a map and localize its photographs against the rest, with a progress bar.
 
     Observations of held-out photographs are removed from the tracks, and the affected landmarks are triangulated again
     (`without`). Landmarks, their attributes and descriptors then depend on the remaining photographs alone; poses and
-    intrinsics are the whole map's. Finished blocks are cached in `work`.
+    intrinsics are the whole map's. Finished blocks are cached in `work`. By default blocks are those of
+    `choose_blocks`.
     """
+    blocks = choose_blocks(source) if blocks is None else blocks
     work.mkdir(parents=True, exist_ok=True)
     limits = [source.limit_m.tolist(), MAX_ERROR_DEG, MIN_ANGLE_DEG, asdict(LocalizerConfig())]
     key = cache_key(_FORMAT, versions(), source.key, limits)
@@ -126,31 +81,28 @@ def hold_out(
         if old.is_dir() and old != folder:
             shutil.rmtree(old)
     model = folder / "model"
-    caches = {}
+    job_source = replace(source, model=None)
+    results = dict[int, HoldoutResult | None]()
     jobs = list[_Job]()
     for block in blocks:
-        rows = block.tested
-        place = folder / f"{block.number:02}"
-        cache = ArtifactCache(place, cache_key(key, block.held_out.tolist(), rows.tolist()))
-        caches[block.number] = cache
-        if _load(cache, block) is None:
-            names = [source.names[row] for row in rows]
-            cameras = [source.cameras[row] for row in rows]
-            inputs = (source.poses[rows], source.limit_m[rows], cache, device)
-            jobs.append(_Job(model, source.features, block, names, cameras, *inputs))
+        cache = ArtifactCache(
+            folder / f"{block.number:02}", cache_key(key, block.held_out.tolist(), block.tested.tolist())
+        )
+        results[block.number] = _load(cache, block)
+        if results[block.number] is None:
+            jobs.append(_Job(job_source, model, block, cache, device))
+    jobs.sort(key=lambda job: -len(job.block.tested))  # no process is left with the largest block at the end
     if jobs:
         write_model(source.model, model)
-    pending = {job.block.number for job in jobs}
-    jobs.sort(key=lambda job: -len(job.block.tested))  # no process is left with the largest block at the end
-    with WorkerPool(max(1, min(workers, len(jobs)))) as pool:
-        finished = pool.map(_run, jobs)
-        for block in blocks:
-            while block.number in pending:
-                pending.discard(next(finished))
-            result = _load(caches[block.number], block)
-            assert result is not None
-            yield result
+    total = sum(len(block.tested) for block in blocks)
+    left = sum(len(job.block.tested) for job in jobs)
+    bar = tqdm(total=total, initial=total - left, desc="check: hold out, localize", unit="view")
+    with bar, WorkerPool(max(1, min(workers, len(jobs)))) as pool:
+        for job, _ in zip(jobs, pool.map(_run, jobs), strict=True):
+            results[job.block.number] = _load(job.cache, job.block)
+            bar.update(len(job.block.tested))
     shutil.rmtree(model, ignore_errors=True)
+    return [result for result in results.values() if result is not None]
 
 
 def without(model: Any, image_ids: Sequence[int]) -> Any:
@@ -192,24 +144,27 @@ def _model(folder: Path) -> Any:
     return read_model(folder)
 
 
-def _run(job: _Job) -> int:
-    """Hold out a block, localize its photographs, and store the result; returns the block's number."""
+def _run(job: _Job) -> None:
+    """Hold out a block, localize its photographs, and store the result."""
     import torch
 
     torch.set_num_threads(1)
     whole = _model(job.model)
-    image_ids = np.array(sorted(number for number, image in whole.images.items() if image.has_pose))
+    image_ids = job.source.arrays.image_ids
     rest = without(whole, image_ids[job.block.held_out].tolist())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MapWarning)
-        landmarks = load_colmap_landmarks(job.model, job.features, None, job.device, rest, progress=False)
+        landmarks = load_colmap_landmarks(job.model, job.source.features, None, job.device, rest, progress=False)
     observed = [_observed(whole.images[int(number)]) for number in image_ids[job.block.tested]]
-    views = _localize(job, landmarks, observed)
+    views = _localize(job, landmarks).assign(
+        n_observed=[len(ids) for ids in observed],
+        n_kept=[int(np.isin(ids, landmarks.ids).sum()) for ids in observed],
+        n_landmarks=len(landmarks),
+    )
     job.cache.folder.mkdir(parents=True, exist_ok=True)
     job.cache.clear()
     replace(landmarks, descriptors=None).save(job.cache.folder / _LANDMARKS)
-    job.cache.store({_VIEWS: pd.DataFrame([asdict(view) for view in views])})
-    return job.block.number
+    job.cache.store({_VIEWS: views})
 
 
 def _observed(image: Any) -> NDArray[np.int64]:
@@ -217,34 +172,36 @@ def _observed(image: Any) -> NDArray[np.int64]:
     return np.unique([point.point3D_id for point in image.points2D if point.has_point3D()]).astype(np.int64)
 
 
-def _localize(job: _Job, landmarks: Landmarks, observed: Sequence[NDArray[np.int64]]) -> list[HoldoutView]:
+def _localize(job: _Job, landmarks: Landmarks) -> pd.DataFrame:
     """Localize the tested photographs of a block against the remaining landmarks."""
-    localizer = Localizer(landmarks, job.cameras[0], device=job.device)
-    views = []
-    kind, stored = read_features(job.features, job.names)
-    for number, (pixels, descriptors) in enumerate(stored):
+    source = job.source
+    rows = job.block.tested
+    names = [source.names[row] for row in rows]
+    cameras = [source.cameras[row] for row in rows]
+    localizer = Localizer(landmarks, cameras[0], device=job.device)
+    kind, stored = read_features(source.features, names)
+    estimates = []
+    for camera, (pixels, descriptors) in zip(cameras, stored, strict=True):
         keypoints = Keypoints(pixels, kind.restore(descriptors), np.ones(len(pixels), np.float32))
-        estimate = localizer.estimate(keypoints, *localizer.match([keypoints])[0], camera=job.cameras[number])
-        pose = np.full((3, 4), np.nan) if estimate.cam_from_world is None else estimate.cam_from_world
-        error_m, error_deg = (float(error) for error in pose_error(pose, job.poses[number]))
-        limit_m = float(job.limits[number])
-        views.append(
-            HoldoutView(
-                row=int(job.block.tested[number]),
-                image=job.names[number],
-                status=estimate.status,
-                good=estimate.status == LOCALIZED and error_m < limit_m and error_deg < MAX_ERROR_DEG,
-                error_m=error_m,
-                error_deg=error_deg,
-                limit_m=limit_m,
-                n_matches=len(estimate.matched_rows),
-                n_inliers=len(estimate.inlier_rows),
-                n_observed=len(observed[number]),
-                n_kept=int(np.isin(observed[number], landmarks.ids).sum()),
-                n_landmarks=len(landmarks),
-            )
-        )
-    return views
+        estimates.append(localizer.estimate(keypoints, *localizer.match([keypoints])[0], camera=camera))
+    no_pose: Float = np.full((3, 4), np.nan)
+    estimated = [no_pose if one.cam_from_world is None else one.cam_from_world for one in estimates]
+    error_m, error_deg = pose_error(estimated, source.poses[rows])
+    status = np.array([one.status for one in estimates])
+    limit_m = source.limit_m[rows]
+    return pd.DataFrame(
+        {
+            "row": rows,
+            "image": names,
+            "status": status,
+            "good": (status == LOCALIZED) & (error_m < limit_m) & (error_deg < MAX_ERROR_DEG),
+            "error_m": error_m,
+            "error_deg": error_deg,
+            "limit_m": limit_m,
+            "n_matches": [len(one.matched_rows) for one in estimates],
+            "n_inliers": [len(one.inlier_rows) for one in estimates],
+        }
+    )
 
 
 def _load(cache: ArtifactCache, block: Block) -> HoldoutResult | None:

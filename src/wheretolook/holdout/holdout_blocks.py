@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csr_array
 
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.holdout.photo_map import PhotographedMap
 from wheretolook.localization.config import LocalizerConfig
+from wheretolook.mapping.colmap_model import observation_matrix
 from wheretolook.utils.errors import MapError
 
 PARTS = 8  # blocks that partition the photographs
@@ -55,14 +56,14 @@ def choose_blocks(source: PhotographedMap, views: int = VIEWS) -> list[Block]:
 
     Raises MapError if fewer than two blocks leave a map.
     """
-    observes = observation_matrix(source)
+    observes = observation_matrix(source.arrays, source.frame)
     shared = np.asarray((observes @ observes.T).toarray(), dtype=np.float64)
     counts = np.maximum(np.diag(shared).copy(), 1)
     np.fill_diagonal(shared, 0)
     share = shared / counts[:, None]  # of a frame's landmarks, those that it shares with each other frame
     centers = camera_centers(source.poses)
-    sums = np.stack([np.bincount(source.moment, weights=axis) for axis in centers.T], axis=1).astype(np.float64)
-    places = sums / np.bincount(source.moment)[:, None]
+    sums = np.stack([np.bincount(source.frame, weights=axis) for axis in centers.T], axis=1).astype(np.float64)
+    places = sums / np.bincount(source.frame)[:, None]
     parts = _partition(share, places)
     walk = np.concatenate(parts)  # all frames, neighbours next to one another
     groups = [(part, True) for part in parts]
@@ -72,7 +73,7 @@ def choose_blocks(source: PhotographedMap, views: int = VIEWS) -> list[Block]:
         groups.append((order[: _block_size(observes, order, kept)], False))
     chosen = list[tuple[NDArray[np.int64], bool]]()
     for group, is_part in reversed(groups):  # of two that are the same, the one that is grown further is chosen
-        held_out = np.flatnonzero(np.isin(source.moment, group))
+        held_out = np.flatnonzero(np.isin(source.frame, group))
         leaves_map = _landmarks_without(observes, group) >= MIN_LANDMARKS
         if leaves_map and not any(_same(held_out, other) for other, _ in chosen):
             chosen.append((held_out, is_part))
@@ -80,26 +81,19 @@ def choose_blocks(source: PhotographedMap, views: int = VIEWS) -> list[Block]:
         problem = f"without a block of neighbouring photographs fewer than {MIN_LANDMARKS} landmarks are left"
         fix = "Take more photographs, each part of the scene from several sides, and map them all."
         raise MapError(problem, path=source.path, value=f"{len(source.poses)} photographs", fix=fix)
-    blocks = list[Block]()
-    for number, (held_out, is_part) in enumerate(reversed(chosen), 1):
-        tested = np.unique(np.linspace(0, len(held_out) - 1, min(views, len(held_out))).round().astype(int))
-        blocks.append(Block(number, held_out, held_out[tested], is_part))
-    return blocks
+    return [
+        Block(number, held_out, held_out[_spread(len(held_out), views)], is_part)
+        for number, (held_out, is_part) in enumerate(reversed(chosen), 1)
+    ]
+
+
+def _spread(n: int, max_count: int) -> NDArray[np.int64]:
+    """Return at most so many evenly spread rows of n."""
+    return np.unique(np.linspace(0, n - 1, min(max_count, n)).round().astype(int))
 
 
 def _same(one: NDArray[np.int64], other: NDArray[np.int64]) -> bool:
     return len(np.intersect1d(one, other)) >= SAME * len(np.union1d(one, other))
-
-
-def observation_matrix(source: PhotographedMap) -> csr_array:
-    """Return a sparse matrix with ones where rig frames (rows) observe landmarks of the map (columns)."""
-    arrays = source.arrays
-    point = np.repeat(np.arange(len(arrays.points)), np.diff(arrays.observation_start))
-    frame = source.moment[arrays.observation_image]
-    shape = (int(source.moment.max()) + 1, len(arrays.points))
-    observes = coo_array((np.ones(len(point), dtype=np.float32), (frame, point)), shape=shape).tocsr()
-    observes.data[:] = 1
-    return observes
 
 
 def _partition(share: Float, places: Float) -> list[NDArray[np.int64]]:

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from wheretolook.dataset.thresholds import THRESHOLDS
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import Camera, cameras_by_id
-from wheretolook.geometry.poses import Float, camera_centers, transform
+from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.localization.labeller import versions
 from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_arrays, read_model, registered_names
 from wheretolook.mapping.config import ExistingModelConfig, MapConfig, PhotographsConfig
@@ -27,7 +28,7 @@ from wheretolook.mapping.sources import find_features, find_photographs
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.confine import safe_child
 from wheretolook.utils.errors import MapError, MapWarning
-from wheretolook.utils.files import fingerprint
+from wheretolook.utils.files import fingerprint, size_and_time
 
 MAX_ERROR_M, MAX_ERROR_DEG = THRESHOLDS[0]  # below both, a photograph counts as localized
 MAX_ERROR_OF_DEPTH = 0.01  # instead of MAX_ERROR_M where metres are unknown: of the photograph's median depth
@@ -58,7 +59,7 @@ class PhotographedMap:
         features: COLMAP database or hloc's HDF5 file with keypoints and descriptors of the photographs.
         is_metric: whether the unit is known to be a metre.
         from_model: transform from the model's own frame.
-        moment: (I,) number, from 0, of the rig frame that each photograph belongs to.
+        frame: (I,) number, from 0, of the rig frame that each photograph belongs to.
         cameras: of each photograph.
         poses: (I, 3, 4) cam_from_world.
         own_centers: (I, 3) camera centres in the model's own frame and unit.
@@ -73,7 +74,7 @@ class PhotographedMap:
     features: Path
     is_metric: bool
     from_model: Similarity
-    moment: NDArray[np.int64]
+    frame: NDArray[np.int64]
     cameras: tuple[Camera, ...]
     poses: Float
     own_centers: Float
@@ -110,12 +111,7 @@ class PhotographedMap:
 
 
 def open_map(
-    model_dir: Path,
-    features: Path,
-    metric: bool,
-    name: str | None = "",
-    keep_frame: bool = False,
-    reconstruction: Any = None,
+    model_dir: Path, features: Path, metric: bool, name: str | None = "", keep_frame: bool = False
 ) -> PhotographedMap:
     """Open a COLMAP model and the features that it was built from as a map to check.
 
@@ -125,13 +121,12 @@ def open_map(
         metric: whether the model is in metres.
         name: for results; by default the model's.
         keep_frame: whether the model has z up, whatever its cameras look like.
-        reconstruction: the model if it has been read already; it is turned and scaled in place.
 
     Raises:
         MapError: the model or the features cannot be used or do not belong together, the features are of an unknown
             kind, or the model has fewer than `MIN_PHOTOGRAPHS` photographs.
     """
-    model = reconstruction or read_model(model_dir)
+    model = read_model(model_dir)
     _check_photographs(model, model_dir)
     if model.num_points3D() == 0:
         fix = "Triangulate it, or give the folder of its photographs: --images."
@@ -166,12 +161,12 @@ def open_map(
         features=features,
         is_metric=metric,
         from_model=to_frame,
-        moment=np.unique([image.frame_id for image in images], return_inverse=True)[1].reshape(-1).astype(np.int64),
+        frame=np.unique([image.frame_id for image in images], return_inverse=True)[1].reshape(-1).astype(np.int64),
         cameras=tuple(cameras[image.camera_id] for image in images),
         poses=poses,
         own_centers=own_centers,
         depth_m=_median_depths(arrays, poses),
-        key=cache_key(_fingerprints(model_dir), features.resolve(), _size_and_time(features), metric, keep_frame),
+        key=cache_key(_fingerprints(model_dir), size_and_time([features.resolve()]), metric, keep_frame),
     )
 
 
@@ -203,44 +198,26 @@ def features_of(
 ) -> tuple[Path, Path]:
     """Return the folder of a map's model, and the features of its photographs: given ones or those next to the model.
 
-    With the folder of the photographs alone both are made again in `work` (`extract_anew`). Raises MapError if neither
-    features nor photographs are known.
+    With the folder of the photographs alone, keypoints are extracted and the landmarks triangulated again in `work`.
+    Raises MapError if neither features nor photographs are known, or the photographs are not those of the model.
     """
     if images is None and database is None:
         database = find_features(model_dir)
         images = find_photographs(model_dir) if database is None else None
     if database is not None:
         return model_dir, database
+    model = read_model(model_dir)
     if images is None:
-        read_model(model_dir)  # reports a missing model first
         fix = "Give --database, the database.db that it was built from, or --images, the folder of its photographs."
         raise MapError("neither the features nor the photographs of this map are known", path=model_dir, fix=fix)
-    return extract_anew(model_dir, images, work, workers, device, extractor)
-
-
-def says_metric(model_dir: Path) -> bool:
-    """Whether the report next to a map states that it is in metres."""
-    scale = read_scale(model_dir)
-    return scale is not None and scale.is_metric
-
-
-def extract_anew(
-    model_dir: Path, images: Path, work: Path, workers: int, device: str, extractor: ExtractorConfig = ExtractorConfig()
-) -> tuple[Path, Path]:
-    """Extract keypoints of a model's photographs and triangulate its landmarks again; the result is cached in `work`.
-
-    Returns the folder of the new model and its database. Raises MapError if the photographs are not those of the model.
-    """
     from wheretolook.mapping.imported_map import map_existing
 
     out = work / "map"
-    database = out / DATABASE_FILE
-    model = read_model(model_dir)
-    files = [[name, *_size_and_time(images / name)] for name in registered_names(model).values()]
+    files = size_and_time(path for name in registered_names(model).values() if (path := images / name).is_file())
     key = cache_key(versions(), _fingerprints(model_dir), images.resolve(), files, extractor.record())
     cache = ArtifactCache(work, key, step="map", manifest="map.json")
-    if cache.is_current(database):
-        return out, database
+    if cache.is_current(out / DATABASE_FILE):
+        return out, out / DATABASE_FILE
     _check_photographs(model, model_dir)
     shutil.rmtree(out, ignore_errors=True)
     existing = ExistingModelConfig(model=model_dir)
@@ -251,25 +228,18 @@ def extract_anew(
         warnings.simplefilter("ignore", MapWarning)  # about the frame, which `open_map` corrects
         map_existing(config, out, work / "photographs", workers=workers, device=device, reconstruction=model)
     cache.store()
-    return out, database
+    return out, out / DATABASE_FILE
 
 
-def _size_and_time(path: Path) -> tuple[int, int]:
-    """Size in bytes and time of the last change; zeros if the file is missing, which is reported when it is read."""
-    try:
-        return path.stat().st_size, path.stat().st_mtime_ns
-    except OSError:
-        return 0, 0
+def says_metric(model_dir: Path) -> bool:
+    """Whether the report next to a map states that it is in metres."""
+    scale = read_scale(model_dir)
+    return scale is not None and scale.is_metric
 
 
 def _median_depths(arrays: ModelArrays, poses: Float) -> Float:
     """Median depth (I,) of the landmarks that each image observes, from poses (I, 3, 4); NaN where it observes none."""
-    point = np.repeat(np.arange(len(arrays.points)), np.diff(arrays.observation_start))
-    order = np.argsort(arrays.observation_image, kind="stable")
-    ends = np.searchsorted(arrays.observation_image[order], np.arange(len(poses) + 1))
-    depths = np.full(len(poses), np.nan)
-    for row, pose in enumerate(poses):
-        observed = point[order[ends[row] : ends[row + 1]]]
-        if len(observed):
-            depths[row] = np.median(transform(pose, arrays.points[observed])[:, 2])
-    return depths
+    point = np.repeat(arrays.points, np.diff(arrays.observation_start), axis=0)
+    axis = poses[arrays.observation_image, 2]
+    depth = pd.Series((axis[:, :3] * point).sum(1) + axis[:, 3])
+    return depth.groupby(arrays.observation_image).median().reindex(range(len(poses))).to_numpy()

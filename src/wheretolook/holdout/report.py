@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from wheretolook.holdout.holdout import HoldoutResult, hold_out_blocks
-from wheretolook.holdout.holdout_blocks import VIEWS
+from wheretolook.holdout.holdout_blocks import VIEWS, choose_blocks
 from wheretolook.holdout.metrics import measure
 from wheretolook.holdout.photo_map import MAX_ERROR_DEG, MAX_ERROR_M, MAX_ERROR_OF_DEPTH, PhotographedMap
 from wheretolook.holdout.scores import VISIBLE, Scoring, check_place, score_views
@@ -157,7 +157,7 @@ def check_map(
     block are localized. Raises MapError if blocks leave no map; WeightsError if weights cannot be used.
     """
     check_place(source, scoring, device)
-    results = hold_out_blocks(source, work, views, workers, device)
+    results = hold_out_blocks(source, work, choose_blocks(source, views), workers, device)
     method, scored = score_views(source, results, scoring, occlusion or HiddenPointRemoval(), device)
     methods = list(dict.fromkeys([method, *(name for name in scoring.also if name != VISIBLE), VISIBLE]))
     columns = ["score" if name == method else name for name in methods]

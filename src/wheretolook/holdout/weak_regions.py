@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from wheretolook.holdout.holdout import HoldoutResult
-from wheretolook.holdout.holdout_blocks import observation_matrix
 from wheretolook.holdout.photo_map import PhotographedMap
+from wheretolook.mapping.colmap_model import observation_matrix
 
 MIN_SHARED = 0.2
 """Two photographs show the same part if they share this fraction of the landmarks of the one that has fewer."""
@@ -57,7 +57,7 @@ def weak_parts(source: PhotographedMap, results: list[HoldoutResult], views: pd.
     good = tested["good"].to_numpy(dtype=bool)
     if good.all():
         return []
-    observes = observation_matrix(source)[source.moment[rows]]
+    observes = observation_matrix(source.arrays, source.frame)[source.frame[rows]]
     shared = np.asarray((observes @ observes.T).toarray())
     counts = np.maximum(np.diag(shared), 1)
     alike = shared >= MIN_SHARED * np.minimum(counts[:, None], counts)

@@ -67,7 +67,7 @@ def test_regret_is_of_places_where_another_view_was_better() -> None:
 
 def test_measure_compares_methods(views: pd.DataFrame) -> None:
     centers = np.random.default_rng(0).uniform(0, 2, (len(views), 3))
-    numbers = measure(views, ["set", "visible"], ["score", "visible"], centers, 0.5, True)
+    numbers = measure(views, {"set": "score", "visible": "visible"}, centers, 0.5, True)
     good, score = (views[name].to_numpy() for name in ("good", "score"))
     mine, other = (numbers["methods"][name] for name in ("set", "visible"))
     assert mine["auc"]["value"] == pytest.approx(roc_auc_score(good, score))
@@ -84,6 +84,6 @@ def test_measure_compares_methods(views: pd.DataFrame) -> None:
 
 
 def test_where_all_localize_there_is_no_auc(views: pd.DataFrame) -> None:
-    found = measure(views.assign(good=True), ["set", "visible"], ["score", "visible"], np.zeros((300, 3)), 0.5, True)
+    found = measure(views.assign(good=True), {"set": "score", "visible": "visible"}, np.zeros((300, 3)), 0.5, True)
     assert found["methods"]["set"]["auc"] == {"value": None, "low": None, "high": None}
     assert found["methods"]["set"]["regret"]["value"] == 0

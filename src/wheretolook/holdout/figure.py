@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -35,34 +36,23 @@ def check_figure(report: CheckReport) -> Figure:
         _draw_calibration(figure.add_subplot(grid[0, 1]), report)
         _draw_inliers(figure.add_subplot(grid[0, 2]), report)
         _draw_blocks(figure.add_subplot(grid[1, 1:]), report)
-        figure.suptitle(_title(report), fontsize=11)
+        figure.suptitle(textwrap.fill(f"{report.source.name}: {report.sentence()}", 120), fontsize=11)
         return figure
-
-
-def _title(report: CheckReport) -> str:
-    words = f"{report.source.name}: {report.sentence()}".split(" ")
-    lines = [""]
-    for word in words:
-        if len(lines[-1]) + len(word) > 120:
-            lines.append("")
-        lines[-1] += f" {word}" if lines[-1] else word
-    return "\n".join(lines)
 
 
 def _draw_map(axes: Axes, report: CheckReport) -> None:
     source = report.source
-    table = report.photographs
     points = source.arrays.points / source.from_model.scale
     centers = source.own_centers @ source.from_model.rotation.T
     looks = source.poses[:, 2, :3]
-    low, high = np.percentile(points[:, :2], (2, 98), axis=0)
-    low = np.minimum(low, centers[:, :2].min(0))
-    high = np.maximum(high, centers[:, :2].max(0))
+    ends = np.concatenate([np.percentile(points[:, :2], (2, 98), axis=0), centers[:, :2]])
+    low = ends.min(0)
+    high = ends.max(0)
     margin = 0.04 * (high - low).max()
     step = max(1, len(points) // _MAX_LANDMARKS)
     axes.scatter(points[::step, 0], points[::step, 1], s=1, color="#c4c4c4", linewidths=0, rasterized=True, zorder=1)
     length = 0.035 * float((high - low).max())
-    localized = table["localized"].to_numpy(dtype=float, na_value=np.nan)
+    localized = report.photographs["localized"].to_numpy(dtype=float, na_value=np.nan)
     kinds = [(np.isnan(localized), _UNTESTED, "not tested"), (localized == 1, _GOOD, "localized")]
     kinds.append((localized == 0, _BAD, "not localized"))
     for mask, color, label in kinds:

@@ -6,8 +6,7 @@ rather too narrow than too wide.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import numpy as np
 import pandas as pd
@@ -20,26 +19,6 @@ from wheretolook.evaluation.calibration import BINS, bins_of
 from wheretolook.geometry.poses import Float
 
 RESAMPLES = 2000
-
-
-@dataclass(frozen=True)
-class Measured:
-    """A value with its 95 % interval; NaN where unknown."""
-
-    value: float
-    low: float
-    high: float
-
-    def record(self) -> dict[str, float | None]:
-        """Return JSON values, None where unknown."""
-        named = {"value": self.value, "low": self.low, "high": self.high}
-        return {name: float(value) if np.isfinite(value) else None for name, value in named.items()}
-
-
-def measured(bootstrap: ClusterBootstrap, statistics: Float) -> Measured:
-    """Return value and interval of statistics (1 + R,) of the views and of each resample."""
-    low, high = bootstrap.interval(statistics[:, None])
-    return Measured(float(statistics[0]), float(low[0]), float(high[0]))
 
 
 def resampled_auc(bootstrap: ClusterBootstrap, good: NDArray[np.bool_], score: Float, within: bool = False) -> Float:
@@ -64,12 +43,10 @@ def resampled_auc(bootstrap: ClusterBootstrap, good: NDArray[np.bool_], score: F
     return divide(((times @ wins) * times).sum(1), ((times @ pairs) * times).sum(1))
 
 
-def resampled_calibration_error(
-    bootstrap: ClusterBootstrap, probability: Float, good: NDArray[np.bool_], bins: int = BINS
-) -> Float:
+def resampled_calibration_error(bootstrap: ClusterBootstrap, probability: Float, good: NDArray[np.bool_]) -> Float:
     """Compute expected calibration errors (1 + R,) of probabilities (B,) of views that localize or not (B,), per resample."""
-    gaps = np.zeros((len(good), bins))
-    gaps[np.arange(len(good)), bins_of(probability, bins)] = probability - good
+    gaps = np.zeros((len(good), BINS))
+    gaps[np.arange(len(good)), bins_of(probability)] = probability - good
     n_views = bootstrap.times @ bootstrap.sums(np.ones(len(good)))
     return divide(np.abs(bootstrap.times @ bootstrap.sums(gaps)).sum(1), n_views)
 
@@ -95,27 +72,21 @@ def regret_of_places(
     place: NDArray[np.int64], good: NDArray[np.bool_], score: Float
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
     """Return, for each place with several views, its first row, whether any view is good, and whether the best-scored is."""
-    firsts = []
-    possible = []
-    chosen = []
-    for number in np.flatnonzero(np.bincount(place) > 1):
-        rows = np.flatnonzero(place == number)
-        firsts.append(rows[0])
-        possible.append(good[rows].any())
-        chosen.append(good[rows[np.argmax(score[rows])]])
-    return np.array(firsts, dtype=np.int64), np.array(possible, dtype=bool), np.array(chosen, dtype=bool)
+    places = [np.flatnonzero(place == number) for number in np.flatnonzero(np.bincount(place) > 1)]
+    firsts = np.array([rows[0] for rows in places], dtype=np.int64)
+    possible = np.array([good[rows].any() for rows in places], dtype=bool)
+    chosen = np.array([good[rows[np.argmax(score[rows])]] for rows in places], dtype=bool)
+    return firsts, possible, chosen
 
 
 def measure(
-    views: pd.DataFrame, methods: Sequence[str], columns: Sequence[str], centers: Float, radius: float,
-    is_probability: bool,
-) -> dict[str, object]:  # fmt: skip
-    """Compute all metrics of a check, by name.
+    views: pd.DataFrame, columns: Mapping[str, str], centers: Float, radius: float, is_probability: bool
+) -> dict[str, object]:
+    """Compute all metrics of a check, by name; with an interval, as a dictionary of value, low and high.
 
     Args:
         views: results of all blocks, with the scores of the checked method in `score`.
-        methods: names of the methods; the last one is the baseline.
-        columns: of `views` with their scores.
+        columns: of `views` with the scores of the methods, by their names; the last method is the baseline.
         centers: (B, 3) camera centres.
         radius: of a place.
         is_probability: whether `score` is a probability.
@@ -126,22 +97,25 @@ def measure(
     bootstrap = ClusterBootstrap(blocks, RESAMPLES, seed=0)
 
     def record(statistics: Float) -> dict[str, float | None]:
-        return measured(bootstrap, statistics).record()
+        """Value and 95 % interval of statistics (1 + R,) of the views and of each resample; None where unknown."""
+        low, high = bootstrap.interval(statistics)
+        named = {"value": statistics[0], "low": low, "high": high}
+        return {name: float(value) if np.isfinite(value) else None for name, value in named.items()}
 
     place = places_of(centers, blocks, radius)
-    baseline_auc = resampled_auc(bootstrap, good, views[columns[-1]].to_numpy(np.float64))
+    scores = {method: views[column].to_numpy(np.float64) for method, column in columns.items()}
+    areas = {method: resampled_auc(bootstrap, good, score) for method, score in scores.items()}
+    baseline_auc = areas[[*areas][-1]]
     of_methods: dict[str, object] = {}
-    for method, column in zip(methods, columns, strict=True):
-        score = views[column].to_numpy(np.float64)
-        auc = resampled_auc(bootstrap, good, score)
+    for method, score in scores.items():
         rows, possible, chosen = regret_of_places(place, good, score)
         missed = np.zeros(len(views))
         has_choice = np.zeros(len(views))
         missed[rows] = possible & ~chosen
         has_choice[rows] = 1
         of_methods[method] = {
-            "auc": record(auc),
-            "auc_above_visible": record(auc - baseline_auc),
+            "auc": record(areas[method]),
+            "auc_above_visible": record(areas[method] - baseline_auc),
             "auc_within_blocks": record(resampled_auc(bootstrap, good, score, within=True)),
             "regret": record(bootstrap.ratios(100 * missed, has_choice)),
             "rank_correlation_with_inliers": _correlation(score, n_inliers),
@@ -164,7 +138,7 @@ def measure(
         "n_places_of_both_kinds": int(((n_good > 0) & (n_good < sizes)).sum()),
         "methods": of_methods,
         "ece": record(resampled_calibration_error(bootstrap, probability, good)) if is_probability else None,
-        "mean_probability": float(views["score"].mean()) if is_probability else None,
+        "mean_probability": float(probability.mean()) if is_probability else None,
         "share_localized": float(good.mean()),
         "inliers_found_over_expected": ratios,
         "share_in_range": float(views["in_range"].mean()),
@@ -173,6 +147,6 @@ def measure(
 
 def _correlation(a: Float, b: Float) -> float | None:
     """Compute Spearman's rank correlation; None where one of them is constant."""
-    if len(a) < 2 or np.ptp(a) == 0 or np.ptp(b) == 0:
+    if np.ptp(a) == 0 or np.ptp(b) == 0:
         return None
     return float(np.corrcoef(rankdata(a), rankdata(b))[0, 1])

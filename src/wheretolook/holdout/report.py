@@ -21,7 +21,7 @@ from wheretolook.utils.files import write_json, write_text
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import OcclusionModel
 
-MAX_PARTS_PRINTED = 5  # all are in the files
+MAX_PRINTED = 5  # all are in the files
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +50,6 @@ class CheckReport:
         """Write check.csv, blocks.csv, views.csv and check.json into a folder."""
         for name, table in (("check", self.photographs), ("blocks", self.blocks), ("views", self.views)):
             write_text(folder / f"{name}.csv", table.to_csv(index=False, float_format="%.6g"))
-        parts = []
-        for part in self.parts:
-            record = {name: value for name, value in vars(part).items() if name != "rows"}
-            parts.append({**record, "photographs": [self.source.names[row] for row in part.rows]})
         content = {
             "map": self.source.name,
             "model": str(self.source.path),
@@ -64,7 +60,7 @@ class CheckReport:
             "says": self.sentence(),
             "n_photographs": len(self.source.poses),
             **self.numbers,
-            "weak_parts": parts,
+            "weak_parts": [part.record(self.source.names) for part in self.parts],
         }
         write_json(folder / "check.json", content)
 
@@ -88,34 +84,27 @@ class CheckReport:
 
     def _auc(self, method: str, name: str = "auc") -> str:
         auc = self.numbers["methods"][method][name]
-        scaled = {key: None if value is None else 100 * value for key, value in auc.items()}
-        value, *interval = _with_interval(scaled, 0).split(" ", 1)
+        value, *interval = _with_interval(auc, 0, 100).split(" ", 1)
         return " ".join([value, "times in 100", *interval])
 
     def lines(self) -> list[str]:
         """Return the report for the screen: the sentence first."""
         numbers = self.numbers
         source = self.source
-        methods = numbers["methods"]
-        n_places = numbers["n_places"]
-        unit = source.unit
-        if numbers["n_places_of_both_kinds"]:
-            regret = f"{_with_interval(methods[self.method]['regret'], 1)} points"
-            if self.method != VISIBLE:
-                regret += f", by visible landmarks {_with_interval(methods[VISIBLE]['regret'], 1)}"
-            regret += f", at {n_places} places with several views ({numbers['n_places_of_both_kinds']} with a choice)"
-        else:
-            regret = f"unknown: none of {n_places} places with several views has a choice to make"
+        mine, visible = (numbers["methods"][name] for name in (self.method, VISIBLE))
         lines = [
             self.sentence(),
             f"{numbers['n_localized']} of {numbers['n_views']} views in {numbers['n_blocks']} blocks localize within "
             f"{self.limits()}; {len(source.poses)} photographs",
         ]
-        if methods[self.method]["auc_within_blocks"]["value"] is not None:
-            auc = self._auc(self.method, "auc_within_blocks")
-            baseline = self._auc(VISIBLE, "auc_within_blocks")
+        if mine["auc_within_blocks"]["value"] is not None:
+            auc, baseline = (self._auc(name, "auc_within_blocks") for name in (self.method, VISIBLE))
             lines.append(f"of two views of the same block: {auc}, counting visible landmarks {baseline}")
-        lines.append(f"regret: {regret}")
+        lines.append(
+            f"regret: {_with_interval(mine['regret'], 1)} points, by visible landmarks "
+            f"{_with_interval(visible['regret'], 1)}, at {numbers['n_places']} places with several views "
+            f"({numbers['n_places_of_both_kinds']} with a choice)"
+        )
         if numbers["ece"]:
             lines.append(
                 f"calibration error: {_with_interval(numbers['ece'], 3)}; {100 * numbers['mean_probability']:.0f} % "
@@ -133,12 +122,10 @@ class CheckReport:
             )
         if not self.parts:
             return [*lines, "no part of the map fails without its neighbours"]
-        lines.append(f"photograph again ({len(self.parts)} parts relocalize badly, {unit}):")
-        for part in self.parts[:MAX_PARTS_PRINTED]:
-            names = [source.names[row] for row in part.rows]
-            lines.append(f"  {part.number}. {part.describe(names, unit)}")
-        if len(self.parts) > MAX_PARTS_PRINTED:
-            lines.append(f"  and {len(self.parts) - MAX_PARTS_PRINTED} more: column part of check.csv")
+        lines.append(f"photograph again ({len(self.parts)} parts relocalize badly, {source.unit}):")
+        lines += [f"  {part.number}. {part.describe(source.names, source.unit)}" for part in self.parts[:MAX_PRINTED]]
+        if len(self.parts) > MAX_PRINTED:
+            lines.append(f"  and {len(self.parts) - MAX_PRINTED} more: column part of check.csv")
         return lines
 
 
@@ -159,10 +146,10 @@ def check_map(
     check_place(source, scoring, device)
     results = hold_out_blocks(source, work, choose_blocks(source, views), workers, device)
     method, scored = score_views(source, results, scoring, occlusion or HiddenPointRemoval(), device)
-    methods = list(dict.fromkeys([method, *(name for name in scoring.also if name != VISIBLE), VISIBLE]))
-    columns = ["score" if name == method else name for name in methods]
+    columns = {method: "score", **{name: name for name in (*scoring.also, VISIBLE) if name != method}}
+    columns[VISIBLE] = columns.pop(VISIBLE)  # the baseline comes last
     centers = (source.own_centers * source.from_model.scale)[scored["row"].to_numpy()]
-    numbers = measure(scored, methods, columns, centers, source.place_radius, is_probability(method))
+    numbers = measure(scored, columns, centers, source.place_radius, is_probability(method))
     parts = weak_parts(source, results, scored)
     photographs = _photographs(source, scored, parts)
     return CheckReport(source, method, scored, photographs, _blocks(source, results, scored), numbers, parts)
@@ -173,64 +160,62 @@ def _photographs(source: PhotographedMap, views: pd.DataFrame, parts: Sequence[W
 
     Results are empty for photographs that were not tested.
     """
-    table = pd.DataFrame({"photograph": source.names})
-    table[["x", "y", "z"]] = source.own_centers
+    rows = range(len(source.poses))
     axes = source.poses[:, 2, :3] @ source.from_model.rotation  # in the model's own frame
-    table[["look_x", "look_y", "look_z"]] = axes
-    times = views.groupby("row")["good"].agg(["size", "sum"]).reindex(range(len(table)), fill_value=0)
-    table["times_left_out"] = times["size"].astype(int)
-    table["times_localized"] = times["sum"].astype(int)
-    once = views[views["is_part"]].set_index("row").reindex(range(len(table)))
-    known = once["good"].notna()
-    table["block"] = once["block"].astype("Int64")
-    table["localized"] = once["good"].map({True: 1, False: 0}).where(known).astype("Int64")
-    table["score"] = once["score"]
-    table["in_range"] = once["in_range"].map({True: 1, False: 0}).where(known).astype("Int64")
-    table["error"] = once["error_m"] / source.from_model.scale
-    table["error_deg"] = once["error_deg"]
-    table["limit"] = source.limit_m / source.from_model.scale
-    for name in ("n_visible", "n_matches", "n_inliers", "n_observed", "n_kept"):
-        table[name] = once[name].astype("Int64")
-    table["expected_inliers"] = once["expected_inliers"]
-    table["part"] = 0
+    times = views.groupby("row")["good"].agg(["size", "sum"]).reindex(rows, fill_value=0).astype(int)
+    once = views[views["is_part"]].set_index("row").reindex(rows)
+    counts = once[["block", "good", "in_range", "n_visible", "n_matches", "n_inliers", "n_observed", "n_kept"]]
+    counts = counts.astype("Float64").astype("Int64")
+    part_of = np.zeros(len(rows), dtype=np.int64)
     for part in parts:
-        table.loc[part.rows, "part"] = part.number
-    return table
+        part_of[part.rows] = part.number
+    return pd.DataFrame(
+        {
+            "photograph": source.names,
+            **dict(zip("xyz", source.own_centers.T, strict=True)),
+            **{f"look_{name}": values for name, values in zip("xyz", axes.T, strict=True)},
+            "times_left_out": times["size"],
+            "times_localized": times["sum"],
+            "block": counts["block"],
+            "localized": counts["good"],
+            "score": once["score"],
+            "in_range": counts["in_range"],
+            "error": once["error_m"] / source.from_model.scale,
+            "error_deg": once["error_deg"],
+            "limit": source.limit_m / source.from_model.scale,
+            **counts[["n_visible", "n_matches", "n_inliers", "n_observed", "n_kept"]],
+            "expected_inliers": once["expected_inliers"],
+            "part": part_of,
+        }
+    )
 
 
 def _blocks(source: PhotographedMap, results: Sequence[HoldoutResult], views: pd.DataFrame) -> pd.DataFrame:
     """Tabulate the blocks: numbers of photographs and landmarks, predictions and results."""
     rows = []
     for one in results:
-        of_block = views[views["block"] == one.block.number]
-        x, y, z = np.median(source.own_centers[one.block.held_out], axis=0).tolist()
+        block = one.block
+        of_block = views[views["block"] == block.number]
+        medians = of_block[["n_kept", "n_inliers", "expected_inliers"]].median()
         rows.append(
             {
-                "block": one.block.number,
-                "kind": "part" if one.block.is_part else "grown",
-                "left_out": len(one.block.held_out),
+                "block": block.number,
+                "kind": "part" if block.is_part else "grown",
+                "left_out": len(block.held_out),
                 "looked_at": len(of_block),
                 "localized": int(of_block["good"].sum()),
-                "share_localized": float(of_block["good"].mean()),
-                "mean_score": float(of_block["score"].mean()),
+                "share_localized": of_block["good"].mean(),
+                "mean_score": of_block["score"].mean(),
                 "landmarks": len(one.landmarks),
-                "median_kept": float(of_block["n_kept"].median()),
-                "median_inliers": float(of_block["n_inliers"].median()),
-                "median_expected_inliers": float(of_block["expected_inliers"].median()),
-                "x": x,
-                "y": y,
-                "z": z,
-                "first": source.names[one.block.held_out[0]],
-                "last": source.names[one.block.held_out[-1]],
+                **{f"median_{name.removeprefix('n_')}": value for name, value in medians.items()},
+                **dict(zip("xyz", np.median(source.own_centers[block.held_out], axis=0), strict=True)),
+                "first": source.names[block.held_out[0]],
+                "last": source.names[block.held_out[-1]],
             }
         )
     return pd.DataFrame(rows)
 
 
-def _with_interval(measured: dict[str, float | None], digits: int) -> str:
-    if measured["value"] is None:
-        return "unknown"
-    text = f"{measured['value']:.{digits}f}"
-    if measured["low"] is not None:
-        text += f" [{measured['low']:.{digits}f}, {measured['high']:.{digits}f}]"
-    return text
+def _with_interval(measured: dict[str, float | None], digits: int, scale: float = 1) -> str:
+    value, low, high = ("unknown" if end is None else f"{scale * end:.{digits}f}" for end in measured.values())
+    return value if measured["low"] is None else f"{value} [{low}, {high}]"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -39,9 +40,17 @@ class WeakPart:
     center: tuple[float, float, float]
     target: tuple[float, float, float]
 
+    def record(self, names: list[str]) -> dict[str, Any]:
+        """JSON values; photographs by their names."""
+        record = {**vars(self), "photographs": [names[row] for row in self.rows]}
+        del record["rows"]
+        return record
+
     def describe(self, names: list[str], unit: str) -> str:
         """Describe the part in one sentence."""
-        listed = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+        listed = ", ".join(names[row] for row in self.rows[:4])
+        if len(self.rows) > 4:
+            listed += f" and {len(self.rows) - 4} more"
         near, look = (" ".join(f"{value:.2f}" for value in place) for place in (self.center, self.target))
         return (
             f"near ({near}) {unit}, looking at ({look}): {len(self.rows)} of {self.n_tested} photographs fail to "

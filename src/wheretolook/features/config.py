@@ -9,6 +9,7 @@ from typing import Any
 from wheretolook.features.registry import all_extractors, runnable_extractors
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import sha256
+from wheretolook.utils.validation import check_choice, check_positive, check_range
 
 
 @dataclass(frozen=True)
@@ -40,17 +41,12 @@ class ExtractorConfig:
     edge_threshold: float = field(default=10.0, init=False)
 
     def __post_init__(self) -> None:
-        if self.method not in runnable_extractors():
-            fix = f"Choose one of {', '.join(runnable_extractors())}."
-            raise ConfigError("unknown extractor method", value=self.method, fix=fix)
+        check_choice("extractor method", self.method, runnable_extractors())
         if self.weights and not all_extractors()[self.method].weights:
             raise ConfigError("this extractor has no weights", value=self.weights, fix="Leave extractor.weights out.")
-        if self.first_octave not in (-1, 0):
-            raise ConfigError("first_octave must be -1 or 0", value=self.first_octave)
-        if self.max_keypoints < 1:
-            raise ConfigError("max_keypoints must be positive", value=self.max_keypoints)
-        if not self.peak_threshold > 0:
-            raise ConfigError("peak_threshold must be positive", value=self.peak_threshold)
+        check_choice("first_octave", self.first_octave, (-1, 0))
+        check_range("max_keypoints", self.max_keypoints, 1)
+        check_positive("peak_threshold", self.peak_threshold)
 
     def record(self) -> dict[str, Any]:
         """Settings that decide the keypoints, as JSON values; weights by their checksum."""

@@ -69,3 +69,9 @@ class Extractor:
     build: Callable[[ExtractorSettings, str], Extraction] | None = None  # from settings and a device, "cpu" or CUDA
     weights: str = ""  # usual name of the file of a network's weights; "" for none
     lightglue: str = ""  # name of the extractor in kornia's LightGlue; "" if unsupported
+
+
+def check_image(rgb: NDArray[np.uint8]) -> None:
+    """Raise ValueError unless an image is (H, W, 3) uint8."""
+    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
+        raise ValueError(f"expected an (H, W, 3) uint8 image, got {rgb.shape} {rgb.dtype}")

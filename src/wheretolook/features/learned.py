@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from wheretolook.features.extractor import ExtractorSettings
+from wheretolook.features.extractor import ExtractorSettings, check_image
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.utils.errors import ConfigError, WeightsError
 
@@ -52,18 +52,16 @@ class LearnedExtraction(ABC):
     def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
         """Keypoints of images (H, W, 3) uint8 of one size, those of highest score first."""
         for rgb in images:
-            if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
-                raise ValueError(f"expected an (H, W, 3) uint8 image, got {rgb.shape} {rgb.dtype}")
-        if len(images) and min(images[0].shape[:2]) < MIN_SIDE_PX:
+            check_image(rgb)
+        if not len(images) or min(images[0].shape[:2]) < MIN_SIDE_PX:
             return [Keypoints.none(self.dimension) for _ in images]
         # on a CPU a batch takes as long, but several times the memory
         parts = [images] if self.batch > 1 else [[rgb] for rgb in images]
         keypoints: list[Keypoints] = []
         with torch.inference_mode(), one_thread():
             for part in parts:
-                if len(part):
-                    whole = torch.from_numpy(np.stack(part)).to(self.device)
-                    keypoints += self._keypoints(self.detect(whole.permute(0, 3, 1, 2).float() / 255))
+                whole = torch.from_numpy(np.stack(part)).to(self.device)
+                keypoints += self._keypoints(self.detect(whole.permute(0, 3, 1, 2).float() / 255))
         return keypoints
 
     def _keypoints(self, detections: list[Detection]) -> Iterator[Keypoints]:
@@ -71,11 +69,8 @@ class LearnedExtraction(ABC):
         joined = (torch.cat(values).float().cpu().numpy() for values in zip(*detections, strict=True))
         ends = np.cumsum([len(scores) for _, _, scores in detections])[:-1]
         for pixels, descriptors, scores in zip(*(np.split(values, ends) for values in joined), strict=True):
-            if len(pixels) == 0:
-                yield Keypoints.none(self.dimension)
-                continue
             keep = np.lexsort((pixels[:, 0], pixels[:, 1], -scores))[: self.config.max_keypoints]
-            yield Keypoints(pixels[keep], descriptors[keep], np.ones(len(keep), np.float32))
+            yield Keypoints(pixels[keep], descriptors[keep].reshape(-1, self.dimension), np.ones(len(keep), np.float32))
 
 
 @contextmanager
@@ -122,19 +117,15 @@ def load_state(
             from kornia.core.download import load_state_dict_from_url
 
             state = load_state_dict_from_url(list(urls), map_location="cpu", timeout=30)
-    except Exception as error:  # the unpickler and the network raise errors of many kinds
-        reason = str(error).strip().partition("\n")[0].partition(" Cache path:")[0].rstrip(".") or type(error).__name__
-        if isinstance(error, UnpicklingError):  # PyTorch's own text suggests an unsafe way
-            reason = "it holds more than tensors, or none"
-        problem = f"cannot read the weights: {reason}" if weights else f"{name} cannot be downloaded: {reason}"
-        raise WeightsError(problem, path=weights or None, fix=fix) from error
-    try:
         missing, unknown = network.load_state_dict(prepare(state), strict=False)
         if unknown or {*missing} & {name for name, _ in network.named_parameters()}:  # constants may be missing
             raise ValueError("other tensors")
-    except (RuntimeError, AttributeError, TypeError, ValueError, KeyError) as error:
-        problem = f"these weights are not those of {type(network).__name__} as in {name}"
+        if not all(bool(tensor.isfinite().all()) for tensor in network.state_dict().values()):
+            raise ValueError("some are not finite")
+    except Exception as error:  # the unpickler, the download and the network raise errors of many kinds
+        reason = str(error).strip().partition("\n")[0].partition(" Cache path:")[0].rstrip(".") or type(error).__name__
+        if isinstance(error, UnpicklingError):  # PyTorch's own text suggests an unsafe way
+            reason = "the file holds more than tensors, or none"
+        problem = f"cannot use weights of {type(network).__name__} as in {name}: {reason}"
         raise WeightsError(problem, path=weights or None, fix=fix) from error
-    if not all(bool(tensor.isfinite().all()) for tensor in network.state_dict().values()):
-        raise WeightsError("some weights are not finite", path=weights or None, fix=fix)
     return network

@@ -115,16 +115,13 @@ def match(matcher: DescriptorMatcher, descriptors: Sequence[NDArray[np.uint8]], 
     # squared distances between descriptors of length 512; rounding makes some a little longer, hence the maximum
     distance, next_distance = (np.maximum(2 * (512**2 - best), 0) for best in (nearest, second))
     passed = distance < max_ratio**2 * next_distance
-    ends = np.cumsum(lengths)
-    images = [slice(start, end) for start, end in zip(ends - lengths, ends, strict=True)]
-    return [_each_landmark_once(rows[image], distance[image], passed[image]) for image in images]
+    parts = (np.split(values, np.cumsum(lengths)[:-1]) for values in (rows, distance, passed))
+    return [_each_landmark_once(*of_image) for of_image in zip(*parts, strict=True)]
 
 
 def _each_landmark_once(rows: NDArray[np.int64], distance: NDArray[np.int64], passed: NDArray[np.bool_]) -> Matches:
     keypoints = np.flatnonzero(passed)
     landmarks = rows[keypoints]
     order = np.lexsort((keypoints, distance[keypoints], landmarks))
-    first = np.ones(len(order), dtype=bool)
-    first[1:] = np.diff(landmarks[order]) > 0
-    unique = np.sort(order[first])
+    unique = np.sort(order[np.unique(landmarks[order], return_index=True)[1]])
     return keypoints[unique], landmarks[unique]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.features.descriptors import DescriptorKind, unit_descriptors
-from wheretolook.features.extractor import Extraction, Extractor, ExtractorSettings
+from wheretolook.features.extractor import Extraction, Extractor, ExtractorSettings, check_image
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.utils.colmap import quiet_colmap
 
@@ -100,8 +100,7 @@ def grey_bitmap(rgb: NDArray[np.uint8]) -> Any:
     """Convert to grey as COLMAP does (Rec. 709 weights); with other weights other keypoints pass the thresholds."""
     import pycolmap
 
-    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
-        raise ValueError(f"expected an (H, W, 3) uint8 image, got {rgb.shape} {rgb.dtype}")
+    check_image(rgb)
     return pycolmap.Bitmap.from_array(np.ascontiguousarray(rgb)).clone_as_grey()
 
 

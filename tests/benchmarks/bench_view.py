@@ -128,7 +128,7 @@ def opening(model: Path) -> list[tuple[float, float]]:
                 client = connected(port)
         with client:
             client.send(camera_message())
-            for wanted in (b"/landmarks", b" places"):
+            for wanted in (b"/landmarks", b" locations"):
                 content = b""
                 while wanted not in content:
                     frame = client.recv(timeout=300)  # two lengths of eight bytes, then zstd
@@ -211,7 +211,7 @@ def main() -> int:
         while not viewer.sessions:
             time.sleep(0.01)
         session = next(iter(viewer.sessions.values()))
-        while " places" not in session.controls.status.content:
+        while " locations" not in session.controls.status.content:
             time.sleep(0.05)
         print_turns(session, options.turns)
         failed = run_clients(viewer, options.clients, options.seconds) if options.clients else 0

@@ -55,7 +55,7 @@ def test_a_location_is_clicked_a_path_plays_and_a_link_opens_the_same_view(
 ) -> None:
     monkeypatch.setattr("wheretolook.view.player.STEP_S", 1.0)  # a page without a GPU may skip shorter steps
     tab = browser.open(f"http://{viewer.address}")
-    tab.wait(lambda tab: "Click a place" in tab.text and " places" in tab.text)
+    tab.wait(lambda tab: "Click a location" in tab.text and " locations" in tab.text)
     (session,) = viewer.sessions.values()
     at = np.array([1.6, 2.1, session.scenery.floor_m])
     tab.click(*pixel_of(session.client.camera, at))
@@ -81,7 +81,7 @@ def test_views_and_an_image_are_saved_and_rings_turn_the_view(viewer: Viewer, br
     tab.wait(lambda tab: "landmarks in view" in tab.text)
     session = viewer.sessions[max(viewer.sessions)]
     tab.press("Waypoints")
-    tab.press("Add the place looked at")
+    tab.press("Add the selected location")
     tab.wait(lambda _: "1.60, 2.10, 1.50" in session.controls.waypoints.content)
     tab.press("Save with best views")
     tab.wait(lambda _: (tmp_path / "views.csv").is_file())
@@ -90,7 +90,7 @@ def test_views_and_an_image_are_saved_and_rings_turn_the_view(viewer: Viewer, br
     tab.wait(lambda _: (tmp_path / "wheretolook.png").is_file())
     with Image.open(tmp_path / "wheretolook.png") as picture:
         assert picture.width > 300
-    tab.press("Look")
+    tab.press("Scene")
     before = session.place.axis.copy()
     turn = poses_looking_along(at, before)[:, :3].T  # the rings have the camera's axes
     radius = 3.0 * session.viewed.marker_m * RING

@@ -13,7 +13,7 @@ from wheretolook.view.drawing import escape_markdown, legend
 from wheretolook.view.state import MAX_VIEWS, ViewState
 from wheretolook.view.viewed_map import STEP_M, ViewedMap
 
-HINT = "Click a place on the coloured floor: the score of every direction there, and the best views."
+HINT = "Click a location on the coloured floor for the score of every direction and the best views."
 LIMITS = {threshold_label(threshold_key(limits)): limits for limits in THRESHOLDS}
 FILES = {
     "CSV": ("csv", ".csv"),
@@ -31,11 +31,11 @@ class Controls:
 
     def __init__(self, gui: Any, viewed: ViewedMap, state: ViewState) -> None:
         tabs = gui.add_tab_group()
-        with tabs.add_tab("Look"):
+        with tabs.add_tab("Scene"):
             self._add_map(gui, viewed, state)
-            with gui.add_folder("Place"):
+            with gui.add_folder("Location"):
                 self._add_location(gui, state)
-            with gui.add_folder("Shown", expand_by_default=False):
+            with gui.add_folder("Layers", expand_by_default=False):
                 self._add_layers(gui, viewed, state)
         if viewed.paths:
             with tabs.add_tab("Path"):
@@ -52,20 +52,20 @@ class Controls:
         self.legend = gui.add_html(legend(0, 1))
         self.method = gui.add_dropdown("method", viewed.weights.methods, initial_value=state.method)
         self.weights = gui.add_markdown("")
-        self.occlusion = gui.add_dropdown("hidden by", viewed.occlusions, initial_value=state.occlusion)
-        self.height = _height_slider(gui, "floor at, m", viewed.bounds[:, 2], state.height)
+        self.occlusion = gui.add_dropdown("occlusion model", viewed.occlusions, initial_value=state.occlusion)
+        self.height = _height_slider(gui, "camera height, m", viewed.bounds[:, 2], state.height)
         threshold = min(max(state.threshold, 0.0), 1.0)
-        hint = "Places and views below are paler."
-        self.threshold = gui.add_slider("good from", 0.0, 1.0, 0.01, threshold, hint=hint)
+        hint = "Locations with lower scores are paler."
+        self.threshold = gui.add_slider("threshold", 0.0, 1.0, 0.01, threshold, hint=hint)
 
     def _add_location(self, gui: Any, state: ViewState) -> None:
         self.summary = gui.add_markdown(HINT)
         self.n = gui.add_slider("best views", 1, MAX_VIEWS, 1, state.n)
-        self.view = gui.add_slider("shown", 1, max(2, state.n), 1, 1)
-        self.yaw = gui.add_slider("yaw, °", -180.0, 180.0, 0.5, 0.0)
-        self.pitch = gui.add_slider("pitch, °", -90.0, 90.0, 0.5, 0.0)
-        hint = "Stand at the place: drag to turn, and the score follows."
-        self.inside = gui.add_checkbox("look through it", False, hint=hint)
+        self.view = gui.add_slider("selected view", 1, max(2, state.n), 1, 1)
+        self.yaw = gui.add_slider("yaw, degrees", -180.0, 180.0, 0.5, 0.0)
+        self.pitch = gui.add_slider("pitch, degrees", -90.0, 90.0, 0.5, 0.0)
+        hint = "Move to the selected view; drag to turn it."
+        self.inside = gui.add_checkbox("first-person view", False, hint=hint)
         self.picture = gui.add_image(_BLANK, visible=False)
         self.picture_caption = gui.add_markdown("")
 
@@ -81,7 +81,7 @@ class Controls:
             "cameras": gui.add_checkbox("cameras", False, disabled=viewed.mapping_poses is None),
             "labels": gui.add_checkbox("labels", False, disabled=not has_labels),
         }
-        self.limits = gui.add_dropdown("labels within", tuple(LIMITS), visible=has_labels)
+        self.limits = gui.add_dropdown("localized within", tuple(LIMITS), visible=has_labels)
         self.label_summary = gui.add_markdown("", visible=has_labels)
 
     def _add_paths(self, gui: Any, viewed: ViewedMap) -> None:
@@ -94,9 +94,9 @@ class Controls:
             self.path_pictures[name] = gui.add_image(_BLANK)
 
     def _add_waypoints(self, gui: Any) -> None:
-        self.placing = gui.add_checkbox("clicks set waypoints", False)
+        self.placing = gui.add_checkbox("add waypoints by clicks", False)
         self.waypoints = gui.add_markdown("No waypoints yet.")
-        self.add = gui.add_button("Add the place looked at")
+        self.add = gui.add_button("Add the selected location")
         self.clear = gui.add_button("Remove all")
         self.format = gui.add_dropdown("format", tuple(FILES))
         self.save = gui.add_button("Save with best views")

@@ -177,4 +177,4 @@ def describe(location: ScoredLocation, threshold: float) -> str:
     summary = f"At {x:.2f}, {y:.2f}, {z:.2f} m: best {location.best.score[0]:.3g}, median {median_text}"
     if location.scores.max() > 1:
         return f"{summary}."
-    return f"{summary}; {100 * np.mean(location.scores >= threshold):.0f} % of directions are good."
+    return f"{summary}; {100 * np.mean(location.scores >= threshold):.0f} % of directions reach {threshold:.2f}."

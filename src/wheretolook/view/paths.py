@@ -56,7 +56,8 @@ def read_paths(path: Path, pair: int = 0) -> Paths:
         problem = f"1 to {MAX_METHODS} methods can be played"
         raise TableError(problem, path=path, value=len(paths), fix="Correct --pair, or leave out methods.")
     for along in paths.values():
-        if not 2 <= len(along) <= MAX_POSES or not _is_rigid(along.cam_from_world):
+        finite = (np.abs(along.cam_from_world) < MAX_COORDINATE_M).all()  # False for NaN
+        if not 2 <= len(along) <= MAX_POSES or not finite:
             raise TableError(f"a path has 2 to {MAX_POSES} finite poses", path=path, value=len(along), fix=_FIX)
     if len(paths) == 1:
         (only,) = paths.values()
@@ -73,13 +74,6 @@ def looking_ahead(positions: Float) -> Float:
         return poses_looking_along(positions, np.tile((1.0, 0.0, 0.0), (len(positions), 1)))
     last = np.searchsorted(moving, np.arange(len(steps)), side="right") - 1  # the first direction before any motion
     return poses_looking_along(positions, steps[moving[np.maximum(last, 0)]])
-
-
-def _is_rigid(poses: Float) -> bool:
-    """Test whether all poses (W, 3, 4) are finite rigid transforms."""
-    rotations = poses[:, :, :3]
-    orthonormal = np.allclose(rotations @ np.swapaxes(rotations, 1, 2), np.eye(3), atol=1e-3)
-    return bool((np.abs(poses) < MAX_COORDINATE_M).all() and orthonormal)
 
 
 def _compared_paths(path: Path, pair: int) -> Paths:

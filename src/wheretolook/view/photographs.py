@@ -31,13 +31,10 @@ class Photographs:
         """Collect the registered images of a COLMAP model that exist in a folder; None if none does."""
         from wheretolook.mapping.colmap_model import read_model
 
-        images = [
-            image
-            for image in read_model(model).images.values()
-            if image.has_pose and _existing_file(folder, image.name) is not None
-        ]
-        poses = [image.cam_from_world().matrix() for image in images]
-        return cls(folder, tuple(image.name for image in images), np.array(poses)) if images else None
+        images = read_model(model).images.values()
+        shown = [image for image in images if image.has_pose and _exists(folder, image.name)]
+        poses = [image.cam_from_world().matrix() for image in shown]
+        return cls(folder, tuple(image.name for image in shown), np.array(poses)) if shown else None
 
     def nearest(self, pose: Float) -> int:
         """Return the number of the photograph nearest to a view (3, 4), by distance plus weighted rotation."""
@@ -49,25 +46,20 @@ class Photographs:
         """Read a photograph, (H, W, 3), W pixels wide. Raises ConfigError if its file cannot be read."""
         from PIL import Image
 
-        name = self.names[number]
-        path = _existing_file(self.folder, name)
+        path = self.folder / self.names[number]
         try:
-            if path is None:
-                raise FileNotFoundError(name)
             full_width, full_height = image_size(path)
             height = min(max(1, round(full_height * width / full_width)), MAX_ASPECT * width)
             with Image.open(path) as image:
                 image.draft("RGB", (width, height))
-                small = image if image.mode in ("P", "1") else image.resize((width, height))  # palettes do not mix
-                return np.asarray(small.convert("RGB").resize((width, height)))
+                return np.asarray(image.resize((width, height)).convert("RGB"))
         except (OSError, ValueError, Image.DecompressionBombError) as error:
-            raise ConfigError(f"the photograph cannot be read: {error}", path=self.folder, value=name) from error
+            raise ConfigError(f"the photograph cannot be read: {error}", path=path) from error
 
 
-def _existing_file(folder: Path, name: str) -> Path | None:
-    """Return the path of an image; None if it does not exist or its name leads out of the folder."""
+def _exists(folder: Path, name: str) -> bool:
+    """Test whether an image exists and its name stays in the folder."""
     try:
-        path = path_within(folder, name, "an image's name")
+        return path_within(folder, name, "an image's name").is_file()
     except ConfigError:
-        return None
-    return path if path.is_file() else None
+        return False

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.geometry.camera import Camera, PinholeCamera
+from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.utils.files import atomic_write
 from wheretolook.view import drawing
@@ -48,16 +48,10 @@ class Recording:
         """Add a camera pose (3, 4) with an image (H, W, 3) of any size; Rerun's cameras have no distortion."""
         rerun = self.rerun
         self.stream.log(entity, rerun.Transform3D(translation=camera_centers(pose), mat3x3=pose[:, :3].T))
-        focal_px = (camera.fx, camera.fy) if isinstance(camera, PinholeCamera) else camera.mean_focal_px
         height, width = (camera.height, camera.width) if image is None else image.shape[:2]
-        scale = width / camera.width
-        pinhole = rerun.Pinhole(
-            focal_length=np.multiply(focal_px, scale),
-            principal_point=np.multiply(camera.principal_point, scale),
-            width=width,
-            height=height,
-            camera_xyz=rerun.ViewCoordinates.RDF,
-        )
+        matrix = np.diag([width / camera.width, width / camera.width, 1.0]) @ camera.matrix
+        axes = rerun.ViewCoordinates.RDF
+        pinhole = rerun.Pinhole(image_from_camera=matrix, width=width, height=height, camera_xyz=axes)
         self.stream.log(entity, pinhole)
         if image is not None:
             self.stream.log(entity, rerun.Image(image).compress(jpeg_quality=85))
@@ -84,30 +78,46 @@ def record(viewed: ViewedMap, path: Path, state: ViewState = ViewState()) -> Non
     location is outside the map.
     """
     state = viewed.complete(state)
+    selector = viewed.selector(state.method, state.occlusion)
     with open_recording(path) as recording:
-        _record_scene(recording, viewed, state)
-        _record_floor(recording, viewed, state)
+        rerun = recording.rerun
+
+        def log_view(entity: str, pose: Float) -> None:
+            image, _ = viewed.picture(pose, viewed.visible_landmarks(state.method, state.occlusion, pose))
+            recording.log_camera(entity, pose, drawing.small_camera(viewed.camera), image)
+
+        if (mesh := viewed.mesh_glb(state.cut)) is not None:
+            recording.log("world/mesh", rerun.Asset3D(contents=mesh, media_type="model/gltf-binary"))
+        recording.log_landmarks(viewed.landmarks.points, 0.001 * viewed.size_m)
+        if viewed.mapping_poses is not None:
+            edges = drawing.frusta(viewed.camera, viewed.mapping_poses, viewed.marker_m)
+            recording.log("world/cameras", rerun.LineStrips3D(edges, colors=CAMERA_COLOR))
+        _log_floor(recording, viewed, state)
         if state.place is not None:
-            _record_location(recording, viewed, state, np.array(state.place))
+            location = score_location(selector, np.array(state.place), state.n)
+            points = location.position + viewed.marker_m * location.directions
+            colors = drawing.score_colors(location.scores)
+            recording.log("world/place/sphere", rerun.Points3D(points, colors=colors, radii=0.1 * viewed.marker_m))
+            edges = drawing.frusta(viewed.camera, location.best.cam_from_world, 2.2 * viewed.marker_m)
+            colors = np.repeat(drawing.score_colors(location.best.score), 8, axis=0)
+            recording.log("world/place/views", rerun.LineStrips3D(edges, colors=colors))
+            log_view("world/place/best", location.best.cam_from_world[0])
         for name, along in viewed.paths.items():
-            _record_path(recording, viewed, state, name, along.cam_from_world)
+            recording.log_line(f"world/path/{name}", camera_centers(along.cam_from_world))
+            scores = selector.scorer.score(along.cam_from_world)
+            for step, pose in enumerate(tqdm(along.cam_from_world, desc=name, unit="view")):
+                recording.stream.set_time("step", sequence=step)
+                log_view(f"world/path/{name}/camera", pose)
+                recording.log_score(f"score/{name}", float(scores[step]))
+            recording.stream.reset_time()
 
 
-def _record_scene(recording: Recording, viewed: ViewedMap, state: ViewState) -> None:
-    rerun = recording.rerun
-    if (mesh := viewed.mesh_glb(state.cut)) is not None:
-        recording.log("world/mesh", rerun.Asset3D(contents=mesh, media_type="model/gltf-binary"))
-    recording.log_landmarks(viewed.landmarks.points, 0.001 * viewed.size_m)
-    if viewed.mapping_poses is not None:
-        edges = drawing.frusta(viewed.camera, viewed.mapping_poses, viewed.marker_m)
-        recording.log("world/cameras", rerun.LineStrips3D(edges, colors=CAMERA_COLOR))
-
-
-def _record_floor(recording: Recording, viewed: ViewedMap, state: ViewState) -> None:
+def _log_floor(recording: Recording, viewed: ViewedMap, state: ViewState) -> None:
+    """Score the floor and record it with the best direction at each cell."""
     assert state.height is not None
     rerun = recording.rerun
     floor = viewed.floor(state.method, state.occlusion, state.height)
-    with tqdm(total=len(floor.cells), desc="floor", unit="place") as bar:
+    with tqdm(total=len(floor.cells), desc="floor", unit="location") as bar:
         while floor.score_next(8):
             bar.update(floor.n_scored - bar.n)
     if not len(floor.cells):
@@ -120,31 +130,3 @@ def _record_floor(recording: Recording, viewed: ViewedMap, state: ViewState) -> 
     recording.log("world/floor", boxes)
     arrows = rerun.Arrows3D(origins=floor.points, vectors=floor.axes * 0.8 * floor.cell_m, colors=colors)
     recording.log("world/best", arrows)
-
-
-def _record_location(recording: Recording, viewed: ViewedMap, state: ViewState, position: Float) -> None:
-    rerun = recording.rerun
-    location = score_location(viewed.selector(state.method, state.occlusion), position, state.n)
-    points = position + viewed.marker_m * location.directions
-    colors = drawing.score_colors(location.scores)
-    recording.log("world/place/sphere", rerun.Points3D(points, colors=colors, radii=0.1 * viewed.marker_m))
-    edges = drawing.frusta(viewed.camera, location.best.cam_from_world, 2.2 * viewed.marker_m)
-    colors = np.repeat(drawing.score_colors(location.best.score), 8, axis=0)
-    recording.log("world/place/views", rerun.LineStrips3D(edges, colors=colors))
-    _record_view(recording, viewed, state, "world/place/best", location.best.cam_from_world[0])
-
-
-def _record_path(recording: Recording, viewed: ViewedMap, state: ViewState, name: str, poses: Float) -> None:
-    recording.log_line(f"world/path/{name}", camera_centers(poses))
-    scores = viewed.selector(state.method, state.occlusion).scorer.score(poses)
-    for step, pose in enumerate(tqdm(poses, desc=name, unit="view")):
-        recording.stream.set_time("step", sequence=step)
-        _record_view(recording, viewed, state, f"world/path/{name}/camera", pose)
-        recording.log_score(f"score/{name}", float(scores[step]))
-    recording.stream.reset_time()
-
-
-def _record_view(recording: Recording, viewed: ViewedMap, state: ViewState, entity: str, pose: Float) -> None:
-    """Record a camera pose (3, 4) and its image with visible landmarks."""
-    image, _ = viewed.picture(pose, viewed.visible_landmarks(state.method, state.occlusion, pose))
-    recording.log_camera(entity, pose, drawing.small_camera(viewed.camera), image)

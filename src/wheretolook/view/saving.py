@@ -73,7 +73,7 @@ class WaypointList:
 
     def _add_selected(self) -> None:
         if self.session.location is None:
-            raise ConfigError("no place is selected", fix="Click one on the floor first.")
+            raise ConfigError("no location is selected", fix="Click one on the floor first.")
         self.add(self.session.location.position)
 
     def _clear(self) -> None:
@@ -88,7 +88,7 @@ class WaypointList:
 
     def _save(self) -> None:
         if not self.points:
-            fix = "Tick `clicks set waypoints` and click the floor, or add the selected place."
+            fix = "Tick `add waypoints by clicks` and click the floor, or add the selected location."
             raise ConfigError("there are no waypoints to save", fix=fix)
         format = str(value_of(self.session.controls.format))
         self.session.submit("save", SOON, self._save_views(np.array(self.points), format))

@@ -119,11 +119,13 @@ class Scenery:
         """Draw a floor and its colour scale, and report how much of it is good."""
         score_range = self.viewed.score_range(state.method, floor.scores)
         self.controls.legend.content = drawing.legend(*score_range)
-        status = f"**{state.method}**: {floor.n_scored:,} of {len(floor.cells):,} places"
+        status = f"**{state.method}**: {floor.n_scored:,} of {len(floor.cells):,} locations"
         threshold = None
         if self.viewed.is_probability(state.method):
             threshold = state.threshold
-            status += f", good at {100 * np.mean(floor.scores[: floor.n_scored] >= threshold):.0f} %"
+            status += (
+                f", at least {threshold:.2f} at {100 * np.mean(floor.scores[: floor.n_scored] >= threshold):.0f} %"
+            )
         self.controls.status.content = status
         image = drawing.floor_image(floor.raster(), *score_range, threshold)
         handle: Any = self.scene.get_handle_by_name("/floor")

@@ -61,7 +61,7 @@ class Estimate:
     def summary(self) -> str:
         """The result in a few words."""
         if self.cams_from_world is None:
-            return "no pose found"
+            return "no pose estimated"
         n_inliers = sum(map(len, self.pixels))
         if self.is_good:
             return f"{n_inliers} inliers, right, {100 * self.error_m:.1f} cm off"
@@ -72,7 +72,7 @@ class Estimate:
 
 
 Result = tuple[str, list[int], Estimate]
-"""What was localized in a word, the rows of its views, and the estimate."""
+"""What was localized in words, the rows of its views, and the estimate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +88,8 @@ class LookStory:
     @property
     def results(self) -> list[Result]:
         """The result of each view, then of all jointly."""
-        single = [(f"look {k + 1}", [k], estimate) for k, estimate in enumerate(self.single)]
-        return [*single, ("together", [*range(len(self.single))], self.joint)]
+        single = [(f"view {k + 1}", [k], estimate) for k, estimate in enumerate(self.single)]
+        return [*single, ("all views", [*range(len(self.single))], self.joint)]
 
 
 def localize_views(localizer: Localizer, camera: Camera, cam_from_world: ArrayLike, images: Pixels) -> LookStory:
@@ -159,7 +159,7 @@ def _draw_plan(axes: Axes, camera: Camera, house: Dollhouse, poses: Float, estim
     draw_house(axes, house, 0.45)
     width_m = house.rgb.shape[1] / house.camera.fx * float(np.median(house.depth_m[house.depth_m > 0]))
     depth_m = 0.09 * width_m
-    labels = [("where it is", BLUE)]
+    labels = [("true pose", BLUE)]
     if estimate.cams_from_world is not None:
         edges = frustum_segments(camera, estimate.cams_from_world, depth_m)
         if estimate.is_good:  # the true camera is drawn inside its lines
@@ -167,7 +167,7 @@ def _draw_plan(axes: Axes, camera: Camera, house: Dollhouse, poses: Float, estim
         else:
             draw_segments(axes, house, edges, colors="white", linewidths=3.5)
             draw_segments(axes, house, edges, colors=estimate.color, linewidths=1.8, linestyles=(0, (4, 2)))
-        labels.append(("where it believes to be", estimate.color))
+        labels.append(("estimated pose", estimate.color))
     edges = frustum_segments(camera, poses, depth_m)
     draw_segments(axes, house, edges, colors="white", linewidths=3.2)
     draw_segments(axes, house, edges, colors=BLUE, linewidths=1.8)

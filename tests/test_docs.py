@@ -13,20 +13,19 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pycolmap
 import pytest
 
-from box_scenes import ROOM, furnished_room
+from box_scenes import furnished_room
+from selection.room import write_room
 from wheretolook.cli import main, parse_command
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.mapping.colmap_model import colmap_poses
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import save_glb
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 NAMES = [path.name for path in PAGES]
-CAMERA = PinholeCamera(320, 240, 160.0)
 
 NOT_RUN = r"(?:<!-- not run: (?P<why>[^\n]+) -->\n)?"
 BLOCK = re.compile(NOT_RUN + r"^```(?P<language>\w*)\n(?P<code>.*?)^```$", re.M | re.S)
@@ -69,54 +68,21 @@ def test_links_lead_to_files_and_headings(page: Path) -> None:
             assert heading in slugs, f"{page.name}: {target}#{heading}"
 
 
-# --- Python blocks: they run on a room of boxes and the weights that ship
-
-
-def write_model(folder: Path, poses: Float, n_points: int = 400) -> None:
-    """A COLMAP model of points on the room's walls, each in all images (N, 3, 4) that it projects into."""
-    rng = np.random.default_rng(0)
-    points = rng.uniform((0, 0, 0), ROOM, (n_points, 3))
-    side = rng.integers(0, 3, n_points), rng.integers(0, 2, n_points)
-    points[np.arange(n_points), side[0]] = np.asarray(ROOM)[side[0]] * side[1]
-    in_camera = np.einsum("nij,pj->npi", poses[:, :, :3], points) + poses[:, None, :, 3]
-    depths = in_camera[..., 2]
-    pixels = CAMERA.project(in_camera)
-    seen = (depths > 0.1) & ((pixels >= 0) & (pixels < (CAMERA.width, CAMERA.height))).all(-1)
-    keypoints = [pixels[row][mask] for row, mask in enumerate(seen)]
-    model = pycolmap.Reconstruction()
-    params = [CAMERA.fx, CAMERA.cx, CAMERA.cy]
-    camera = pycolmap.Camera(
-        camera_id=1, model="SIMPLE_PINHOLE", width=CAMERA.width, height=CAMERA.height, params=params
-    )
-    model.add_camera_with_trivial_rig(camera)
-    for row, pose in enumerate(poses):
-        image = pycolmap.Image(name=f"{row:02}.png", camera_id=1, image_id=row + 1, keypoints=keypoints[row])
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]))
-    number = np.cumsum(seen, axis=1) - 1  # of a point among the keypoints of an image
-    for point in np.flatnonzero(seen.sum(0) > 1):
-        track = pycolmap.Track()
-        for row in np.flatnonzero(seen[:, point]):
-            track.add_element(int(row) + 1, int(number[row, point]))
-        model.add_point3D(points[point], track, np.zeros(3, np.uint8))
-    model.update_point_3d_errors()
-    folder.mkdir(parents=True)
-    model.write_binary(str(folder))
+# --- Python blocks: they run on a room of boxes and the bundled weights
 
 
 @pytest.fixture(scope="module")
 def users_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the pages take for granted in the user's folder: a model, a mesh, depth images, waypoints, the release."""
+    """Return a folder with what the pages expect: a model, a mesh, depth images, waypoints, the release."""
     folder = tmp_path_factory.mktemp("user")
     mesh = furnished_room()
     save_glb(mesh, folder / "scan.glb")
-    angles = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-    outward = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(16)])
-    poses = poses_looking_along((3.0, 2.5, 1.4) + 0.5 * outward, outward)
-    write_model(folder / "sparse" / "0", poses)
+    model = write_room(folder / "sparse" / "0")
     (folder / "depth").mkdir()
-    for row, depth in enumerate(WarpRenderer(mesh).render(CAMERA, poses).depth_m):
-        np.save(folder / "depth" / f"{row:02}.npy", depth)
-    (folder / "waypoints.csv").write_text("x,y,z\n1.0,2.0,1.5\n2.5,2.0,1.5\n")
+    depths = WarpRenderer(mesh).render(PinholeCamera(320, 240, 160.0), colmap_poses(model)).depth_m
+    for row, depth in enumerate(depths):
+        np.save(folder / "depth" / f"{row:03}.npy", depth)
+    (folder / "waypoints.csv").write_text("x,y,z\n2.0,2.0,1.5\n2.5,2.0,1.5\n")
     (folder / "data").mkdir()
     (folder / "data" / "release").symlink_to(ROOT / "data" / "release")
     return folder
@@ -258,28 +224,3 @@ def test_tables_hold_the_numbers_of_the_release(page: str, columns: list[str], h
     checked = {label: method for label, method in METHODS.items() if label in rows}
     wanted = {label: [known[method][column] for column in columns] for label, method in checked.items()}
     assert len(wanted) >= 6 and {label: rows[label] for label in wanted} == wanted
-
-
-def test_tables_by_camera_hold_the_numbers_of_the_release() -> None:
-    page = ROOT / "docs" / "results.md"
-    methods = ("set", "expected-inliers", "bins", "visible")
-    table = pd.read_csv(ROOT / "data" / "release" / "results" / "cameras.csv")
-    cells = {}
-    for row in table.to_dict("records"):
-        interval = f" [{row['regret_low']:.1f}, {row['regret_high']:.1f}]"
-        numbers = [f"{row['regret']:.1f}{between}; {row['auc']:.3f}" for between in ("", interval)]
-        cells[row["dataset"], row["group"], row["method"]] = numbers
-    header = "| regret in points [95 %]; AUC | set of landmarks | expected inliers | reprojections with bins |"
-    header += " most visible |"
-    groups = ["apartment", "building", "hall", "office", "court", "narrow", "wide"]
-    rows = [*rows_of(ROOT / "docs" / "research" / "cameras.md", header).values()]
-    for group, row in zip([*(f"all {name}" for name in groups), "mean"], rows, strict=True):
-        for method, cell in zip(methods, row, strict=True):
-            assert cell in cells["cameras", group, method]
-    header = "| field of view | six other scenes: set | expected inliers | bins | most visible |"
-    header += " two apartments: set | expected inliers | bins | most visible |"
-    for angle, row in rows_of(page, header).items():
-        where = [
-            (f"test-{angle[:-1]}", f"all {kind}", method) for kind in ("others'", "apartment") for method in methods
-        ]
-        assert row == [cells[place][0] for place in where]

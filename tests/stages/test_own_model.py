@@ -1,4 +1,4 @@
-"""A scene made from a COLMAP model of one's own, through the stages, with and without a mesh; and triangulated anew."""
+"""A scene made from a COLMAP model, through the stages, with and without a mesh; and triangulated again."""
 
 from __future__ import annotations
 
@@ -143,19 +143,16 @@ def test_one_of_several_cameras_is_chosen(tmp_path):
     assert scene.camera == named.camera.camera and not scene.own_camera
     with pytest.raises(ConfigError):
         run(Sample, experiment_of(folder, tmp_path / "data"))
-
-
-def test_scenes_of_models_keep_their_own_cameras(tmp_path):
-    for name, camera in (("first", LOOKS), ("second", OTHER)):
-        experiment = experiment_of(save(room_model(cameras=(camera,)), tmp_path / name), tmp_path / "data")
-        run(Map, experiment)
-    scenes = Dataset.load(tmp_path / "data" / "mine").scenes
-    assert [(scene.name, scene.camera) for scene in scenes] == [("first", LOOKS), ("second", OTHER)]
+    # each model that joins the dataset keeps its own camera
+    experiment = experiment_of(save(room_model(), tmp_path / "second"), tmp_path / "more")
+    run(Map, replace(experiment, map=experiment_of(folder, tmp_path / "more", camera_id=2).map))
+    scenes = run(Map, experiment).scenes
+    assert [(scene.name, scene.camera) for scene in scenes] == [("flat", OTHER), ("second", LOOKS)]
     run(Sample, experiment)
     assert all(len(scene.read_table()) for scene in scenes)
 
 
-def test_a_turned_and_scaled_model_is_doubted_and_mended(tmp_path):
+def test_a_turned_and_scaled_model_warns_and_is_aligned(tmp_path):
     model = room_model()
     centers = camera_centers(colmap_poses("", model))
     turn = pycolmap.Rotation3d(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
@@ -177,15 +174,15 @@ def test_a_turned_and_scaled_model_is_doubted_and_mended(tmp_path):
         map_existing(config, tmp_path / "map", tmp_path / "work")  # warnings are errors here
         report = json.loads((tmp_path / "map" / "report.json").read_text())
         assert report["scale"]["factor"] == pytest.approx(1 / 37)
-        mended = camera_centers(colmap_poses(tmp_path / "map"))
-        np.testing.assert_allclose(np.ptp(mended[:, 2]), 0, atol=1e-6)  # all at one height again
+        aligned = camera_centers(colmap_poses(tmp_path / "map"))
+        np.testing.assert_allclose(np.ptp(aligned[:, 2]), 0, atol=1e-6)  # all at one height again
         if scale.positions:
-            np.testing.assert_allclose(mended, centers, atol=1e-6)
+            np.testing.assert_allclose(aligned, centers, atol=1e-6)
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error::wheretolook.utils.errors.MapWarning")
-def test_landmarks_are_triangulated_anew_at_known_poses(tmp_path):
+def test_landmarks_are_triangulated_again_at_known_poses(tmp_path):
     """From poses alone, as of a robot or a phone: no points, photographs twice as large as the cameras say."""
     poses = hand_held_poses()
     model = pycolmap.Reconstruction()

@@ -1,4 +1,4 @@
-"""MLflow stores that cannot be used: one error within seconds, before work starts, and results that outlive them."""
+"""MLflow stores that cannot be used: one error within seconds, before work starts."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ import pytest
 from tests.disks import fill, read_only, small_disk
 
 from wheretolook.tracking.config import TrackingConfig
-from wheretolook.tracking.runs import artifact, experiment_id, finished_runs, log, start_run
-from wheretolook.tracking.store import check_store, client, kept_if_not_logged
-from wheretolook.utils.errors import TrackingError, TrackingWarning
+from wheretolook.tracking.runs import artifact, experiment_id, finished_runs, start_run
+from wheretolook.tracking.store import check_store, client
+from wheretolook.utils.errors import TrackingError
 
-SOON_S = 10.0
+SOON_S = 30.0
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -87,63 +87,23 @@ def test_a_store_of_another_version_of_mlflow_is_refused(store: TrackingConfig) 
     refused(store)
 
 
-def test_a_full_disk_is_found_before_work_starts(tmp_path: Path, made: bytes) -> None:
+def test_a_disk_without_room_is_found_before_work_starts_and_can_be_read(tmp_path: Path, made: bytes) -> None:
     with small_disk(tmp_path / "disk", 8 * 2**20) as disk:
         new = TrackingConfig(str(disk / "new"))
         old = TrackingConfig(str(disk / "old"))
+        old.root.mkdir()
+        (old.root / "mlflow.db").write_bytes(made)
         filler = fill(disk, leave=300_000)
-        refused(new)
+        for tracking in (new, old):
+            refused(tracking)
         assert not [*(disk / "new").rglob("*")]
         filler.unlink()
-        old.root.mkdir()
-        (old.root / "mlflow.db").write_bytes(made)
-        check_store(old)  # opened, and the disk is full only then
-        filler = fill(disk, leave=300_000)
-        refused(old)
-        filler.unlink()
-        check_store(old)
-
-
-def test_a_read_only_disk_is_found_before_work_starts_but_can_be_read(tmp_path: Path, made: bytes) -> None:
-    with small_disk(tmp_path / "disk", 8 * 2**20) as disk:
-        new = TrackingConfig(str(disk / "new"))
-        old = TrackingConfig(str(disk / "old"))
-        old.root.mkdir()
-        (old.root / "mlflow.db").write_bytes(made)
         with read_only(disk):
-            refused(new)
-            refused(old)
+            for tracking in (new, old):
+                refused(tracking)
             assert not list(finished_runs(old, "train"))
             assert [experiment.name for experiment in client(old).search_experiments()] == ["Default"]
-
-
-def test_results_outlive_a_store_that_fails_while_they_are_logged(tmp_path: Path, made: bytes) -> None:
-    note = tmp_path / "not_logged.json"
-    result = tmp_path / "result.bin"
-    result.write_bytes(bytes(2**20))
-    with small_disk(tmp_path / "disk", 6 * 2**20) as disk:
-        tracking = TrackingConfig(str(disk / "mlruns"))
-        tracking.root.mkdir()
-        (tracking.root / "mlflow.db").write_bytes(made)
-
-        def log_it() -> None:
-            with kept_if_not_logged("the result", note), start_run(tracking, "a", "train") as (mlflow, run):
-                log(mlflow, run, {"a": 1}, {"b": 2.0})
-                mlflow.log_artifact(run, str(result))
-
-        check_store(tracking)
-        for room in (2**19, 0):
-            filler = fill(disk, leave=room)
-            start = time.monotonic()
-            with pytest.warns(TrackingWarning):
-                log_it()
-            assert time.monotonic() - start < SOON_S and note.is_file()
-            assert not [path for path in disk.rglob("*") if path.name.startswith("result")]
-            filler.unlink()
-        log_it()
-        assert not note.exists()
-        (run,) = finished_runs(tracking, "train")
-        assert artifact(tracking, run.info.run_id, "result.bin").stat().st_size == 2**20
+        check_store(old)
 
 
 MAKE = """

@@ -77,6 +77,8 @@ def test_matches_are_read_on_request(matched: pd.DataFrame, tmp_path: Path) -> N
 def test_labels_are_strict_at_both_limits(table: pd.DataFrame) -> None:
     assert is_good(table).tolist() == [True, False, False, False, False]
     assert is_good(table, 0.25, 2).tolist() == [True, True, True, False, False]
+    with pytest.raises(TableError):
+        is_good(table.assign(status="unlabelled"))
 
 
 @pytest.fixture
@@ -143,8 +145,3 @@ def test_matches_that_are_not_stored(table: pd.DataFrame, matched: pd.DataFrame,
         write_table(content, path, compact)
         with pytest.raises(TableError):
             read_table(path, matches=True)
-
-
-def test_views_without_labels_are_neither_good_nor_bad(table: pd.DataFrame) -> None:
-    with pytest.raises(TableError):
-        is_good(table.assign(status="unlabelled"))

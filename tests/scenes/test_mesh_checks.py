@@ -5,10 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import json
-import os
 import struct
-import subprocess
-import sys
 import zlib
 from pathlib import Path
 
@@ -17,9 +14,8 @@ import pytest
 import trimesh
 from PIL import Image
 
-import wheretolook
 from box_scenes import random_texture
-from scenes.test_loading import FACES, VERTICES, ply, textured
+from scenes.test_loading import FACES, VERTICES, textured
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.utils import memory
 from wheretolook.utils.errors import SceneError
@@ -53,8 +49,6 @@ BROKEN = {
     "garbage in GLB": {"a.glb": b"garbage that is longer than a header"},
     "points without faces": {"a.obj": b"v 0 0 0\nv 1 1 1\n"},
     "more vertices than bytes": {"a.ply": BINARY_PLY.replace(b"vertex 4", b"vertex 300000000")},
-    "fewer than none": {"a.ply": BINARY_PLY.replace(b"vertex 4", b"vertex -1")},
-    "more vertices than lines": {"a.ply": ply().replace("vertex 4", "vertex 1000000000").encode()},
     "a header without end": {"a.ply": b"ply\nformat ascii 1.0\n" + b"comment x\n" * 300_000},
     "a vertex out of range": {"a.obj": obj(faces="f 1 2 99\n")},
     "too many parts": {"a.obj": obj(faces="".join(f"usemtl m{i}\nf 1 2 3\n" for i in range(20_000)))},
@@ -158,57 +152,8 @@ def test_invalid_trees_are_rejected(whole: Path, change) -> None:
         load_mesh(whole)
 
 
-@pytest.mark.parametrize(
-    "vertices",
-    [VERTICES * (1, 1, 0), 0 * VERTICES, np.where(VERTICES == 3, np.nan, VERTICES)],
-    ids=["flat", "point", "nan"],
-)
+@pytest.mark.parametrize("vertices", [VERTICES * (1, 1, 0), 0 * VERTICES, np.where(VERTICES == 3, np.nan, VERTICES)])
 def test_degenerate_geometry_is_rejected(tmp_path: Path, vertices: np.ndarray) -> None:
     textured(random_texture(np.random.default_rng(0), 4, 6), vertices).export(tmp_path / "a.glb")
     with pytest.raises(SceneError):
         load_mesh(tmp_path / "a.glb")
-
-
-def test_an_unreadable_embedded_texture_is_rejected(whole: Path) -> None:
-    content = whole.read_bytes()
-    assert content.count(b"\x89PNG") == 1
-    whole.write_bytes(content.replace(b"\x89PNG", b"\x00PNG"))
-    with pytest.raises(SceneError):
-        load_mesh(whole)
-
-
-FLIPS = """
-import random, resource, sys, warnings
-from pathlib import Path
-import numpy as np
-from wheretolook.scenes.loading import load_mesh
-from wheretolook.utils.errors import SceneError
-resource.setrlimit(resource.RLIMIT_AS, (4 << 30,) * 2)
-resource.setrlimit(resource.RLIMIT_CPU, (60, 60))
-warnings.simplefilter("ignore")
-draw, path, counts = random.Random(21), Path(sys.argv[1]), [0, 0]
-whole = path.read_bytes()
-for _ in range(400):
-    bit = draw.randrange(8 * len(whole))
-    flipped = bytearray(whole)
-    flipped[bit // 8] ^= 1 << bit % 8
-    path.write_bytes(flipped)
-    try:
-        assert np.isfinite(load_mesh(path).vertices).all()
-        counts[0] += 1
-    except SceneError as error:
-        assert Path(error.path) == path, (bit, error)
-        counts[1] += 1
-    except Exception as error:
-        raise AssertionError(bit) from error
-print(*counts)
-"""
-
-
-def test_flipped_bits_are_typed_errors_or_numbers(whole: Path) -> None:
-    env = {**os.environ, "PYTHONPATH": str(Path(wheretolook.__file__).parents[1])}
-    done = subprocess.run(
-        [sys.executable, "-c", FLIPS, str(whole)], capture_output=True, text=True, timeout=120, env=env
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    assert min(map(int, done.stdout.split())) > 50

@@ -189,18 +189,16 @@ def _with_poses_of(model: Any, path: Path | None, frames: list[FrameFiles], skip
     An image of the model has the name of the colour image, or its last part if one image of each has that.
     """
     poses = dict(zip(registered_names(model).values(), colmap_poses("", model), strict=True))
-    by_last: dict[str, list[str]] = {}
     recorded = Counter(_last(frame.name) for frame in frames)
-    for name in poses:
-        by_last.setdefault(_last(name), []).append(name)
+    mapped = Counter(map(_last, poses))
+    by_last = {_last(name): name for name in poses if mapped[_last(name)] == recorded[_last(name)] == 1}
     found = []
     for frame in frames:
-        alike = by_last.get(_last(frame.name), []) if recorded[_last(frame.name)] == 1 else []
-        names = [frame.name] if frame.name in poses else alike
-        if len(names) == 1:
-            found.append(replace(frame, cam_from_world=poses[names[0]], name_in_model=names[0]))
-        else:
+        name = frame.name if frame.name in poses else by_last.get(_last(frame.name))
+        if name is None:
             skipped["without a pose in the model"] += 1
+        else:
+            found.append(replace(frame, cam_from_world=poses[name], name_in_model=name))
     if not found:
         value = (next(iter(poses)), frames[0].name)
         fix = "Give the model that was made of these colour images."

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from trimesh.graph import connected_component_labels
 
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float
@@ -134,11 +133,9 @@ def _rounded(direction: Float) -> str:
 
 def _without_small_pieces(mesh: TexturedMesh) -> TexturedMesh:
     """Remove small disconnected pieces of a mesh, and unused vertices."""
-    n = len(mesh.vertices)
-    (a, b, c) = mesh.triangles.T
-    edges = coo_array((np.ones(2 * len(a), dtype=np.int8), (np.r_[a, b], np.r_[b, c])), shape=(n, n))
-    _, piece = connected_components(edges, directed=False)
-    piece_of = piece[a]
+    edges = np.concatenate([mesh.triangles[:, :2], mesh.triangles[:, 1:]])
+    piece = connected_component_labels(edges, len(mesh.vertices))
+    piece_of = piece[mesh.triangles[:, 0]]
     area_m2 = np.bincount(piece_of, np.linalg.norm(mesh.normals, axis=1) / 2)
     keep = area_m2[piece_of] >= _MIN_PIECE_M2
     if not keep.any():

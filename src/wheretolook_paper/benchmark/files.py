@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wheretolook.geometry.poses import Float, quaternion_from_rotation, rotation_from_quaternion
+from wheretolook.geometry.poses import Float
+from wheretolook.io.poses import pose_texts, poses_of_values, read_rows
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import write_text
 
@@ -23,12 +24,7 @@ class PoseFile:
 
     ids: tuple[str, ...]
     quaternions: Float  # (N, 4) wxyz, cam_from_world, as in the file
-    translations: Float  # (N, 3) metres, cam_from_world
-
-    @property
-    def cam_from_world(self) -> Float:
-        """(N, 3, 4)."""
-        return np.concatenate([rotation_from_quaternion(self.quaternions), self.translations[:, :, None]], axis=2)
+    cam_from_world: Float  # (N, 3, 4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +38,8 @@ class ErrorFile:
 
 def write_poses(path: Path, ids: Sequence[str], cam_from_world: ArrayLike) -> None:
     """Write poses (N, 3, 4) atomically, creating the folder if missing."""
-    poses = np.asarray(cam_from_world, dtype=np.float64).reshape(-1, 3, 4)
-    values = np.concatenate([quaternion_from_rotation(poses[:, :, :3]), poses[:, :, 3]], axis=1).tolist()
-    lines = [" ".join([name, *map(repr, row)]) for name, row in zip(ids, values, strict=True)]
-    write_text(path, "\n".join(["# id qw qx qy qz tx ty tz", *lines]) + "\n")
+    lines = [f"{name} {pose}\n" for name, pose in zip(ids, pose_texts(cam_from_world, exact=True), strict=True)]
+    write_text(path, "".join(["# id qw qx qy qz tx ty tz\n", *lines]))
 
 
 def read_poses(path: Path) -> PoseFile:
@@ -56,7 +50,7 @@ def read_poses(path: Path) -> PoseFile:
     if len(invalid):
         fix = "Write finite numbers and quaternions of length 1, or omit the pose."
         raise TableError("this is not a pose", path=path, value=ids[invalid[0]], fix=fix)
-    return PoseFile(ids, values[:, :4], values[:, 4:])
+    return PoseFile(ids, values[:, :4], poses_of_values(values))
 
 
 def write_errors(path: Path, ids: Sequence[str], metres: ArrayLike, degrees: ArrayLike) -> None:
@@ -77,12 +71,12 @@ def read_errors(path: Path) -> ErrorFile:
 
 def _read(path: Path, columns: str) -> tuple[tuple[str, ...], Float]:
     """Read the ids (N,) and numbers (N, C) of a file whose lines have the named columns."""
+    rows = [cells for _, cells in read_rows(path)]
+    ids = tuple(cells[0].removesuffix(IMAGE_ENDING) for cells in rows)
     try:
-        lines = [line.split() for line in path.read_text().splitlines() if line.strip() and line[0] != "#"]
-        ids = tuple(cells[0].removesuffix(IMAGE_ENDING) for cells in lines)
-        values = np.array([cells[1:] for cells in lines], dtype=np.float64)
-    except (OSError, ValueError) as error:
+        values = np.array([cells[1:] for cells in rows], dtype=np.float64)
+    except ValueError as error:
         raise TableError(f"its lines are not {columns!r}: {error}", path=path) from error
-    if values.shape != (len(ids), len(columns.split()) - 1) or not 0 < len(ids) == len({*ids}):
+    if values.shape[1:] != (columns.count(" "),) or len({*ids}) < len(ids):
         raise TableError(f"its lines are not {columns!r}, each id once", path=path)
     return ids, values

@@ -21,11 +21,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pandas as pd
 import pycolmap
-from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.features.config import ExtractorConfig
@@ -34,6 +32,7 @@ from wheretolook.geometry.poses import Float, camera_centers, invert_poses, pose
 from wheretolook.holdout.photo_map import open_map, says_metric
 from wheretolook.holdout.report import check_map
 from wheretolook.holdout.scores import Scoring
+from wheretolook.io.depth import read_depth
 from wheretolook.mapping.colmap_model import colmap_poses, holds_model
 from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG, MapConfig, PhotographsConfig
 from wheretolook.mapping.georeference import fit_similarity
@@ -48,6 +47,7 @@ from wheretolook.mapping.triangulation import (
     match_pairs,
     shrink_depth,
     surface_overlap,
+    write_matches,
 )
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.processes import WorkerPool
@@ -81,12 +81,6 @@ def triangulate(model: Any, database: Path) -> Any:
     return model
 
 
-def _depth_m(path: Path) -> NDArray[np.float32]:
-    """Read a depth image in millimetres, shrunk; unknown depths become 0 m."""
-    depth = shrink_depth(np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), dtype=np.float32))
-    return np.where(depth < 65535, depth * np.float32(1e-3), np.float32(0))
-
-
 def map_known_poses(
     folder: Path, work: Path, focal_px: float, extractor: ExtractorConfig, workers: int, device: str
 ) -> None:
@@ -99,7 +93,7 @@ def map_known_poses(
             (work / "images" / path.name).symlink_to(path.resolve())
     stems = [path.name.partition(".color.")[0] for path in colors]
     poses = invert_poses(np.stack([np.loadtxt(folder / f"{stem}.pose.txt")[:3] for stem in stems]))
-    depth_m = np.stack([_depth_m(folder / f"{stem}.depth.png") for stem in stems])
+    depth_m = np.stack([shrink_depth(read_depth(folder / f"{stem}.depth.png")) for stem in stems])
     with WorkerPool(workers) as processes:
         config = MapConfig(extractor=extractor, photographs=PhotographsConfig(max_side_px=0))
         run = MapRun(config, processes, device=device)
@@ -114,9 +108,7 @@ def map_known_poses(
         database.unlink(missing_ok=True)
         fill_database(database, model, stored, features.kind)
         found = match_pairs(stored, pairs, work, processes, kind=features.kind)
-        with pycolmap.Database.open(str(database)) as db:
-            for (i, j), matches in zip(pairs.tolist(), found, strict=True):
-                db.write_matches(i + 1, j + 1, matches)
+        write_matches(database, pairs, found)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)

@@ -4,10 +4,10 @@
     python tests/benchmarks/bench_features.py --work FOLDER ... --scenes 1 2 --locations 60 --directions 12
 
 Each scene is an apartment generated from its seed. All extractors map it along the same walk and localize the same
-random views. Keypoints are cached in --work, so an interrupted run resumes and other similarity limits (--similarities)
-are cheap. The table has, for each extractor, the share of views localized within 5 cm and 0.4 degrees, and the AUC and
-regret (in percentage points, over locations with a view that localizes) of the bundled scorer, of the scorer without
-the landmarks' ambiguity, of `bins` and of --weights, with 95 % bootstrap intervals over locations.
+random views. Keypoints are cached in --work, so that an interrupted run resumes. The table has, for each extractor, the
+share of views localized within 5 cm and 0.4 degrees, and the AUC and regret (in percentage points, over locations with
+a view that localizes) of the bundled scorer, of the scorer without the landmarks' ambiguity, and of `bins`, with 95 %
+bootstrap intervals over locations.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from wheretolook.features.keypoints import Keypoints
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.landmarks import Landmarks
@@ -99,17 +98,16 @@ def localize(
     return np.array(good), 1000 * spent / len(keypoints)
 
 
-def numbers(scores: NDArray[Any], good: NDArray[np.bool_], locations: NDArray[np.int64], seed: int = 0) -> str:
-    """Format AUC and regret of scores (L x D,) with intervals over the L locations."""
-    rng = np.random.default_rng(seed)
-    n = locations.max() + 1
+def numbers(scores: NDArray[Any], good: NDArray[np.bool_]) -> str:
+    """Format AUC and regret of scores (L, D) of views that localize or not, with intervals over the L locations."""
+    rng = np.random.default_rng(0)
+    n = len(good)
 
     def measure(rows: NDArray[np.int64]) -> tuple[float, float]:
-        s = scores.reshape(n, -1)[rows]
-        g = good.reshape(n, -1)[rows]
+        g = good[rows]
         possible = g.any(1)
-        chosen = np.take_along_axis(g, s.argmax(1)[:, None], axis=1)[:, 0]
-        auc = roc_auc_score(g.ravel(), s.ravel()) if 0 < g.mean() < 1 else np.nan
+        chosen = np.take_along_axis(g, scores[rows].argmax(1)[:, None], axis=1)[:, 0]
+        auc = roc_auc_score(g.ravel(), scores[rows].ravel()) if 0 < g.mean() < 1 else np.nan
         return auc, 100 * float(1 - chosen[possible].mean()) if possible.any() else np.nan
 
     auc, regret = measure(np.arange(n))
@@ -127,57 +125,49 @@ def main() -> None:
     add("--locations", type=int, default=60)
     add("--directions", type=int, default=12)
     add("--map-images", type=int, default=100)
-    add("--max-keypoints", type=int, default=2048)
-    add("--similarities", nargs="*", type=float, default=[], help="limits to try besides the extractor's own")
-    add("--weights", nargs="*", default=[], metavar="NAME=FILE", help="of other scorers to compare")
     add("--device", default="cpu")
     add("--work", type=Path, required=True, metavar="FOLDER", help="cache of maps and keypoints")
     args = parser.parse_args()
     use_one_thread()
 
-    rows: dict[tuple[str, float | None], list[Any]] = {}
+    parts: dict[str, list[Any]] = {}
     for seed in args.scenes:
         folder = args.work / f"scene-{seed}"
         mesh = folder / "mesh.glb"
         folder.mkdir(parents=True, exist_ok=True)
         scene = open_scene(mesh if mesh.is_file() else None, folder, seed, args.device)
-        poses = random_views(scene, args.locations, args.directions, seed)
+        views = random_views(scene, args.locations, args.directions, seed)
         occlusion = MeshOcclusion(scene.free_space.raycaster, two_sided=scene.free_space.two_sided)
         for each in args.features:
             name, _, weights = each.partition("=")
-            config = ExtractorConfig(name, max_keypoints=args.max_keypoints, weights=weights)
+            config = ExtractorConfig(name, max_keypoints=2048, weights=weights)
             map_folder = folder / name / "map"
             if not (map_folder / "landmarks.npz").is_file():
                 settings = MapConfig(n_images=args.map_images, extractor=config)
                 build_map(scene.mesh, WarpRenderer(scene.mesh, args.device), scene.free_space, CAMERA, settings, seed,
                           map_folder, scene.free_space.raycaster, workers=1, device=args.device)  # fmt: skip
             extractor = KeypointExtractor(config, args.device)
-            keypoints, seconds = keypoints_of(poses, scene, extractor, folder / name / "keypoints", args.device)
+            keypoints, seconds = keypoints_of(views, scene, extractor, folder / name / "keypoints", args.device)
             landmarks = Landmarks.load(map_folder / "landmarks.npz")
             full = LocalizationMap(landmarks, CAMERA, occlusion, args.device)
             without = replace(full, landmarks=replace(landmarks, ambiguity=np.full_like(landmarks.ambiguity, np.nan)))
             scorers = {"bundled": load_scorer(full), "without ambiguity": load_scorer(without)}
-            scorers |= {name: load_scorer(file, full) for name, _, file in (w.partition("=") for w in args.weights)}
             scorers["bins"] = make_scorer("bins", full)
-            scores = {scorer: one.score(poses) for scorer, one in scorers.items()}
-            limits: list[float | None] = [None, *(args.similarities if landmarks.features != "sift" else [])]
-            for limit in limits:
-                localizer = Localizer(landmarks, CAMERA, LocalizerConfig(min_similarity=limit), device=args.device)
-                good, match_ms = localize(localizer, keypoints, poses)
-                result = (good, scores, seconds, [len(one) for one in keypoints], len(landmarks), match_ms)
-                rows.setdefault((name, limit), []).append(result)
+            localizer = Localizer(landmarks, CAMERA, device=args.device)
+            good, match_ms = localize(localizer, keypoints, views)
+            sizes = [len(landmarks), np.median([len(one) for one in keypoints]), np.median(seconds), match_ms]
+            scores = [scorer.score(views) for scorer in scorers.values()]
+            parts.setdefault(name, []).append((good, np.array(scores), sizes))
 
     print("| features | landmarks | keypoints | s an image | ms to match | localize | scorer | AUC | regret |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
-    for (name, limit), parts in rows.items():
-        good = np.concatenate([part[0] for part in parts])
-        locations = np.repeat(np.arange(len(good) // args.directions), args.directions)
-        sizes = f"{np.mean([part[4] for part in parts]):,.0f} | {np.median(np.concatenate([p[3] for p in parts])):.0f}"
-        sizes += f" | {np.median(np.concatenate([p[2] for p in parts])):.2f} | {np.mean([p[5] for p in parts]):.0f}"
-        for scorer in parts[0][1]:
-            values = numbers(np.concatenate([part[1][scorer] for part in parts]), good, locations)
-            label = name if limit is None else f"{name}, from {limit}"
-            print(f"| {label} | {sizes} | {100 * good.mean():.1f} % | {scorer} | {values} |")
+    for name, of_scenes in parts.items():
+        good = np.concatenate([part[0] for part in of_scenes])
+        all_scores = np.concatenate([part[1] for part in of_scenes], axis=1)
+        sizes = " | ".join(f"{value:.3g}" for value in np.mean([part[2] for part in of_scenes], axis=0))
+        for scorer, scores in zip(("bundled", "without ambiguity", "bins"), all_scores, strict=True):
+            values = numbers(scores.reshape(-1, args.directions), good.reshape(-1, args.directions))
+            print(f"| {name} | {sizes} | {100 * good.mean():.1f} % | {scorer} | {values} |")
 
 
 if __name__ == "__main__":

@@ -123,18 +123,15 @@ def main() -> None:
     ):
         sets = LandmarkSets.from_mask(mask)
         few = max(1, repeats // 2)
-        timed(
-            f"  sums, {label}",
-            lambda s=sets: exact_information(PosedViews(camera, views, points, s, rows), device),
-            few,
-        )
+        posed = PosedViews(camera, views, points, sets, rows)
 
-        def all_rows(s: LandmarkSets = sets) -> None:
-            numbers = exact_information(PosedViews(camera, views, points, s, rows), device)
+        def all_metrics(posed: PosedViews = posed) -> None:
+            numbers = exact_information(posed, device)
             for metric in METRICS:
                 metric_of(numbers, metric, device)
 
-        timed(f"  the three metrics, {label}", all_rows, few)
+        timed(f"  sums, {label}", lambda p=posed: exact_information(p, device), few)
+        timed(f"  the three metrics, {label}", all_metrics, few)
         start = time.perf_counter()
         exact_information_plain(PosedViews(camera, views[:200], points, sets, rows[:200]))
         print(f"  {'  sums by NumPy, from 200 viewpoints':60} "

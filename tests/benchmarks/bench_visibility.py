@@ -266,7 +266,7 @@ def draw(args: argparse.Namespace) -> None:
         save_figure(scaling_figure(growth), folder / "visibility-scaling.png")
         growth.to_csv(folder / SCALING_CSV, index=False, float_format="%.6g", lineterminator="\n")
     if args.log:
-        log_runtimes(TrackingConfig(), sizes, growth)
+        log_runtimes(TrackingConfig(), folder)
 
 
 def main() -> None:

@@ -35,9 +35,9 @@ from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.weights import METADATA_KEY, method_of_weights, read_training
 from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, TableError, WeightsError
 from wheretolook.weights.resolve import load_scorer
-from wheretolook_paper.scorers.conv.config import ConvConfig
-from wheretolook_paper.scorers.sphere.config import SphereConfig
-from wheretolook_paper.scorers.trees.config import TreesConfig
+from wheretolook_paper.scorers.conv import ConvConfig
+from wheretolook_paper.scorers.sphere import SphereConfig
+from wheretolook_paper.scorers.trees import TreesConfig
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 

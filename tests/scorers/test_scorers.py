@@ -30,9 +30,9 @@ from wheretolook.utils.errors import CameraError, ConfigError, PoseError, Weight
 from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.scorers.conv.network import ConvNetwork, ConvSpec
 from wheretolook_paper.scorers.pooled_features import pool
-from wheretolook_paper.scorers.sphere.config import SphereConfig
+from wheretolook_paper.scorers.sphere import SphereConfig
 from wheretolook_paper.scorers.sphere.network import SphereNetwork
-from wheretolook_paper.scorers.trees.config import TreesConfig
+from wheretolook_paper.scorers.trees import TreesConfig
 from wheretolook_paper.scorers.trees.learn import BoostedTrees, PooledViews, fit_trees
 
 

@@ -19,7 +19,7 @@ from wheretolook.scorers.matchability.config import MatchabilityConfig
 from wheretolook.scorers.set.config import SetConfig
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.training.weights import read_weights
-from wheretolook_paper.scorers.trees.config import TreesConfig
+from wheretolook_paper.scorers.trees import TreesConfig
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 

@@ -17,14 +17,13 @@ SCALING_CSV = "scaling.csv"
 """Tables of `figures.runtimes`: times at the paper's size, and growth of time and memory."""
 
 
-def log_runtimes(
-    tracking: TrackingConfig, sizes: pd.DataFrame, growth: pd.DataFrame, tags: Tags = None, file: Path | None = None
-) -> str:
-    """Log measured times as a run of the stage "benchmark" with both tables and their figures; return its id.
+def log_runtimes(tracking: TrackingConfig, results: Path, tags: Tags = None) -> str:
+    """Log the measured times in a folder as a run of the stage "benchmark" with their figures; return its id.
 
-    `sizes` is the table of `runtime_figure`, `growth` that of `scaling_figure` (may be empty). The file from which
-    `sizes` were read, if given, is logged unchanged.
+    `RUNTIMES_CSV` is the table of `runtime_figure`, `SCALING_CSV`, which may be missing, that of `scaling_figure`.
     """
+    sizes = pd.read_csv(results / RUNTIMES_CSV)
+    scaling = results / SCALING_CSV
     metrics = {}
     for row in sizes.dropna(subset="median_s").to_dict("records"):
         name = f"{row['what']} {row['device'].split(':')[0]} {row['threads']} threads s"
@@ -35,13 +34,10 @@ def log_runtimes(
         start_run(tracking, "visibility check", "benchmark", {"machines": machines}, tags=tags) as (client, run),
     ):
         log(client, run, metrics=metrics)
-        if file is None:
-            sizes.to_csv(folder / RUNTIMES_CSV, index=False)
-        else:
-            copy_file(file, folder / RUNTIMES_CSV)
+        copy_file(results / RUNTIMES_CSV, folder / RUNTIMES_CSV)
         save_figure(runtime_figure(sizes), folder / "runtimes.png")
-        if len(growth):
-            growth.to_csv(folder / SCALING_CSV, index=False)
-            save_figure(scaling_figure(growth), folder / "visibility-scaling.png")
+        if scaling.is_file():
+            copy_file(scaling, folder / SCALING_CSV)
+            save_figure(scaling_figure(pd.read_csv(scaling)), folder / "visibility-scaling.png")
         client.log_artifacts(run, str(folder))
     return run

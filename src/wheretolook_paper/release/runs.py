@@ -43,7 +43,7 @@ from wheretolook.utils.files import temporary_folder, write_text
 from wheretolook.utils.locks import hold
 from wheretolook_paper.evaluation.looks import LOOKS_CSV, log_looks
 from wheretolook_paper.paths.path_report import PATHS_CSV, log_paths
-from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
+from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV, log_runtimes
 from wheretolook_paper.release.card import GENERALIZATION_CSV
 from wheretolook_paper.release.training_histories import TRAINING_CSV, read_histories, records, train_runs
 
@@ -249,10 +249,7 @@ def _log_looks(dataset: Dataset, tracking: TrackingConfig) -> str:
 
 
 def _log_benchmark(dataset: Dataset, tracking: TrackingConfig) -> str:
-    times = dataset.root / "results" / RUNTIMES_CSV
-    scaling = times.with_name(SCALING_CSV)
-    growth = pd.read_csv(scaling) if scaling.is_file() else pd.DataFrame()
-    return log_runtimes(tracking, pd.read_csv(times), growth, TAGS, times)
+    return log_runtimes(tracking, dataset.root / "results", TAGS)
 
 
 _LOGGED: dict[str, tuple[str, Callable[..., str]]] = {

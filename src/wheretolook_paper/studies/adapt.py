@@ -9,16 +9,17 @@ weights, of the adapted ones, and of bins.
 
 from __future__ import annotations
 
-import argparse
 import time
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from jsonargparse import auto_cli
 
 from wheretolook.commands.adapt import labelled_views
 from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.sampling_config import Split
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, poses
 from wheretolook.evaluation.adaptation import compare_log_odds
 from wheretolook.scorers.adapted.gp_correction import adapt
@@ -26,18 +27,21 @@ from wheretolook.scorers.registry import make_scorer
 from wheretolook.utils.shipped import WEIGHTS, shipped
 
 
-def main() -> None:
-    """Adapt the bundled weights to every scene, print and write the numbers."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path, help="a labelled dataset")
-    parser.add_argument("--split", default="test")
-    parser.add_argument("--scenes", nargs="*", default=[])
-    parser.add_argument("--seed", type=int, default=0, help="which half is trained on")
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
+def main(
+    data: Path, split: Split = "test", scenes: tuple[str, ...] = (), seed: int = 0, out: Path | None = None
+) -> None:
+    """Adapt the bundled weights to every scene, print and write the numbers.
+
+    Args:
+        data: a labelled dataset.
+        split: which of its scenes.
+        scenes: only these scenes.
+        seed: which half is trained on.
+        out: CSV file of the numbers.
+    """
     rows = []
-    for files in Dataset.load(options.data).split(options.split):
-        if options.scenes and files.name not in options.scenes:
+    for files in Dataset.load(data).split(split):
+        if scenes and files.name not in scenes:
             continue
         table = files.read_table()
         scene = SceneEnvironment(files, device="cpu")
@@ -48,7 +52,7 @@ def main() -> None:
             camera = files.cameras()[number] if CAMERA_ID in table else scene.camera
             at = numbers == number
             bins[at] = make_scorer("bins", files.localization_map(camera, "cpu")).score(poses(table)[at])
-        locations = np.random.default_rng(options.seed).permutation(np.unique(views.group))
+        locations = np.random.default_rng(seed).permutation(np.unique(views.group))
         training = np.isin(views.group, locations[: len(locations) // 2])
         start = time.monotonic()
         rest = views.rows(~training)
@@ -66,9 +70,9 @@ def main() -> None:
         print(pd.Series(row).to_frame().T.round(3).to_string(header=len(rows) == 1), flush=True)
     found = pd.DataFrame(rows)
     print(found.mean(numeric_only=True).round(3).to_string())
-    if options.out is not None:
-        found.to_csv(options.out, index=False)
+    if out is not None:
+        found.to_csv(out, index=False)
 
 
 if __name__ == "__main__":
-    main()
+    auto_cli(main)

@@ -15,7 +15,6 @@ keeps the rows of other scenes. `--work` caches maps and blocks. `wheretolook ad
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,6 +23,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pycolmap
+from jsonargparse import auto_cli
 from tqdm.auto import tqdm
 
 from wheretolook.features.config import ExtractorConfig
@@ -50,8 +50,10 @@ from wheretolook.mapping.triangulation import (
     write_matches,
 )
 from wheretolook.utils.colmap import quiet_colmap
+from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.processes import WorkerPool
 
+FOCAL_PX = 525.0  # initial focal length of photographs with poses
 PARTNERS = 20  # that each photograph with a pose is matched with
 ROUNDS = 3  # of triangulation and bundle adjustment
 MAP = MapConfig()
@@ -81,9 +83,7 @@ def triangulate(model: Any, database: Path) -> Any:
     return model
 
 
-def map_known_poses(
-    folder: Path, work: Path, focal_px: float, extractor: ExtractorConfig, workers: int, device: str
-) -> None:
+def map_known_poses(folder: Path, work: Path, extractor: ExtractorConfig, workers: int) -> None:
     """Map photographs in the layout of 7-Scenes into `work/map`, aligned to their poses."""
     colors = sorted(path for path in folder.glob("*.color.*") if path.suffix in SUFFIXES)
     for name in ("images", "photographs"):
@@ -96,11 +96,11 @@ def map_known_poses(
     depth_m = np.stack([shrink_depth(read_depth(folder / f"{stem}.depth.png")) for stem in stems])
     with WorkerPool(workers) as processes:
         config = MapConfig(extractor=extractor, photographs=PhotographsConfig(max_side_px=0))
-        run = MapRun(config, processes, device=device)
+        run = MapRun(config, processes)
         features = photograph_features(work / "images", work / "photographs", run)
         names = features.names
         stored = features.stored
-        pinhole = PinholeCamera(int(features.sizes[0][0]), int(features.sizes[0][1]), focal_px)
+        pinhole = PinholeCamera(int(features.sizes[0][0]), int(features.sizes[0][1]), FOCAL_PX)
         pairs = choose_pairs(surface_overlap(pinhole, poses, depth_m), PARTNERS)
         camera = pycolmap.Camera(camera_id=1, **pinhole.colmap.record())
         model = posed_model(camera, names, dict(enumerate(poses)), stored)
@@ -157,52 +157,54 @@ def _ends(column: str, measured: Mapping[str, Any]) -> dict[str, Any]:
     return {column + end: measured.get(key) for end, key in ends.items()}
 
 
-def main() -> None:
-    """Map the photographs, check the map, and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    source = parser.add_mutually_exclusive_group(required=True)
-    source.add_argument("--images", type=Path, help="folder of photographs to map")
-    source.add_argument("--poses", type=Path, help="folder of photographs, depth images and poses, as of 7-Scenes")
-    add = parser.add_argument
-    add("--name", help="scene name in the table (the folder's)")
-    add("--extractor", default="opencv", metavar="NAME[=WEIGHTS]", help="features of the map (default: %(default)s)")
-    add("--device", default="cpu")
-    add("--weights", type=Path, help="file or folder of weights (the bundled ones)")
-    add("--also", nargs="+", default=["expected-inliers", "bins"], help="other methods to compare")
-    add("--views", type=int, default=60, help="maximum of a block (default: %(default)s)")
-    add("--max-side-px", type=int, default=1600, help="longer side of --images (default: %(default)s)")
-    add("--focal-px", type=float, default=525.0, help="initial focal length for --poses (default: %(default)s)")
-    add("--workers", type=int, default=1, help="worker processes (default: %(default)s)")
-    add("--out", type=Path, help="CSV file of the table")
-    add("--work", type=Path, required=True, help="folder of maps and blocks")
-    args = parser.parse_args()
-    method, _, network = args.extractor.partition("=")
-    extractor = ExtractorConfig(method, weights=network)
-    work = args.work
+def main(
+    work: Path,
+    images: Path | None = None,
+    poses: Path | None = None,
+    extractor: str = "opencv",
+    weights: Path | None = None,
+    also: tuple[str, ...] = ("expected-inliers", "bins"),
+    workers: int = 1,
+    out: Path | None = None,
+) -> None:
+    """Map the photographs, check the map, and write the table.
+
+    Args:
+        work: folder of maps and blocks.
+        images: folder of photographs to map.
+        poses: instead, a folder of photographs, depth images and poses, as of 7-Scenes.
+        extractor: features of the map, NAME or NAME=WEIGHTS.
+        weights: file or folder of weights, by default the bundled ones.
+        also: other methods to compare.
+        workers: worker processes.
+        out: CSV file of the table.
+    """
+    source = poses or images
+    if source is None:
+        raise ConfigError("photographs are needed: --images or --poses")
+    method, _, network = extractor.partition("=")
+    features = ExtractorConfig(method, weights=network)
     model = work / "map"
-    if not holds_model(model) and args.poses:
-        map_known_poses(args.poses, work, args.focal_px, extractor, args.workers, args.device)
-    elif not holds_model(model):
-        photographs = PhotographsConfig(images=args.images, max_side_px=args.max_side_px)
-        settings = MapConfig(photographs=photographs, extractor=extractor)
-        map_photographs(settings, model, work / "photographs", workers=args.workers, device=args.device)
-    scene = args.name or (args.poses or args.images).resolve().name
-    metric = bool(args.poses) or says_metric(model)
-    photo_map = open_map(model, work / "photographs" / "database.db", metric, scene)
-    scoring = Scoring(weights=args.weights, also=tuple(args.also))
-    options = {"views": args.views, "workers": args.workers, "device": args.device}
-    result = check_map(photo_map, work / "check" / "work", scoring, **options)
+    if not holds_model(model):
+        if poses is not None:
+            map_known_poses(poses, work, features, workers)
+        else:
+            settings = MapConfig(photographs=PhotographsConfig(images=images), extractor=features)
+            map_photographs(settings, model, work / "photographs", workers=workers)
+    scene = source.resolve().name
+    photo_map = open_map(model, work / "photographs" / "database.db", poses is not None or says_metric(model), scene)
+    scoring = Scoring(weights=weights, also=also)
+    result = check_map(photo_map, work / "check" / "work", scoring, workers=workers)
     result.save(work / "check")
     print("\n".join(result.lines()))
     rows = pd.DataFrame(rows_of(scene, result.numbers, result.method))
     print(rows.to_string(index=False, float_format="{:.3f}".format))
-    if args.out:
-        if args.out.is_file():
-            others = pd.read_csv(args.out)
-            rows = pd.concat([others[others["scene"] != scene], rows], ignore_index=True)
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        rows.sort_values("scene", kind="stable").to_csv(args.out, index=False, float_format="%.4g")
+    if out is not None:
+        others = pd.read_csv(out) if out.is_file() else pd.DataFrame({"scene": []})
+        rows = pd.concat([others[others["scene"] != scene], rows], ignore_index=True)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        rows.sort_values("scene", kind="stable").to_csv(out, index=False, float_format="%.4g")
 
 
 if __name__ == "__main__":
-    main()
+    auto_cli(main, as_positional=False)

@@ -1,9 +1,9 @@
 """Compare learners on validation scenes: seeds, ablations and learning curves.
 
-    python -m wheretolook_paper.studies.scorers seeds --data data --dataset release --out study
-    python -m wheretolook_paper.studies.scorers attributes ...   the set network without each landmark attribute
-    python -m wheretolook_paper.studies.scorers options ...      the set network with other options
-    python -m wheretolook_paper.studies.scorers curves ...       with fewer training scenes and viewpoints
+    python -m wheretolook_paper.studies.scorers --dataset data/release --out study seeds
+    python -m wheretolook_paper.studies.scorers ... attributes   the set network without each landmark attribute
+    python -m wheretolook_paper.studies.scorers ... options      the set network with other options
+    python -m wheretolook_paper.studies.scorers ... curves       with fewer training scenes and viewpoints
 
 Options are chosen by the mean validation average precision over seeds; the learner with the best mean ships, trained
 by the train stage with the best seed. Test scenes are scored once, with the weights of every seed.
@@ -15,16 +15,16 @@ and curves start from; `--choices '[{"head": 96}, ...]'` are the options to try.
 
 from __future__ import annotations
 
-import argparse
-import json
 import shutil
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
+from jsonargparse import auto_cli
 
 from wheretolook.commands.train import train_methods as train
 from wheretolook.dataset.layout import Dataset
@@ -46,10 +46,10 @@ OF_NETWORKS = MlpConfig(epochs=100, batch_size=4096, noise_px=1.0, noise_m=0.02,
 """Options of the paper's network: those of configs/release.yaml with a third of the epochs."""
 
 
-CHOICES: list[dict[str, Any]] = [
+CHOICES: tuple[dict[str, Any], ...] = (
     {}, {"pooled": 0}, {"pooled": 16}, {"width": 96}, {"width": 24}, {"head": 96}, {"dropout": 0.3}, {"l2": 1e-4},
     {"learning_rate": 1e-3}, {"epochs": 16}, {"from_matchability": False}, {"landmarks": 96}, {"enlarged": 1.0},
-]  # fmt: skip
+)  # fmt: skip
 """Options of the set network to try."""
 
 
@@ -69,86 +69,98 @@ def add_row(path: Path, row: dict[str, Any], metrics: dict[str, float]) -> None:
     print(row, flush=True)
 
 
-def seeds(dataset: Dataset, args: argparse.Namespace, tracking: TrackingConfig) -> None:
-    """Train every learner with every seed."""
-    table = args.out / "seeds.csv"
-    for seed in args.seeds:
-        for method in args.methods:
+class Study:
+    """Trainings with several seeds on the train scenes of a dataset.
+
+    Args:
+        dataset: folder of the dataset.
+        out: folder of the tables and weights.
+        also: further datasets to train on, in the same folder.
+        numbers: seeds.
+        set: options of the set network that its studies start from.
+    """
+
+    def __init__(
+        self,
+        dataset: Path = Path("data/release"),
+        out: Path = Path("study"),
+        also: tuple[str, ...] = (),
+        numbers: tuple[int, ...] = (0, 1, 2, 3, 4),
+        set: dict[str, Any] = {},  # noqa: B006
+    ) -> None:
+        whole = with_also(Dataset.load(dataset), also)
+        self.dataset = Dataset(whole.root, (*whole.split("train"), *whole.split("val")))
+        self.out = out
+        self.numbers = numbers
+        self.set = SetConfig(**set)
+        self.tracking = TrackingConfig(folder=str(out / "mlruns"), experiment="study")
+
+    def seeds(self, methods: tuple[str, ...] = METHODS) -> None:
+        """Train every learner with every seed."""
+        table = self.out / "seeds.csv"
+        for seed, method in product(self.numbers, methods):
             if has_row(table, method=method, seed=seed):
                 continue
-            own = Dataset(args.out / f"{method}-{seed}", dataset.scenes)
-            start = weights_path(dataset, "matchability")
+            own = Dataset(self.out / f"{method}-{seed}", self.dataset.scenes)
+            start = weights_path(self.dataset, "matchability")
             if start.is_file():
                 (own.root / "weights").mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(start, own.root / "weights" / start.name)
             config = TrainConfig(methods=(method,), seed=seed, mlp=OF_NETWORKS)
-            (model,) = train(own, config, tracking, progress=args.progress)
+            (model,) = train(own, config, self.tracking)
             add_row(table, {"method": method, "seed": seed}, model.metrics)
 
-
-def of_set_network(dataset: Dataset, args: argparse.Namespace, tracking: TrackingConfig) -> None:
-    """Train the set network under other conditions, on views that are described once."""
-    table = args.out / f"{args.part}.csv"
-    log = RunLog(tracking, "")
-    task = TrainingJob(dataset, "set", TrainConfig(methods=("set",)), SetConfig(), "set", args.progress, log)
-    data = SetDataModule(task)
-    whole = data.train_rows
-    conditions: list[tuple[str, dict[str, Any], torch.Tensor]] = []
-    if args.part == "attributes":
+    def attributes(self) -> None:
+        """Train the set network with no, each single and all further attributes of landmarks."""
         groups = {"none": (), **{name: (name,) for name in ATTRIBUTES[3:]}, "all": ATTRIBUTES[3:]}
-        conditions = [(name, {"hidden": hidden}, whole) for name, hidden in groups.items()]
-    if args.part == "options":
-        conditions = [(" ".join(f"{k}={v}" for k, v in one.items()) or "default", one, whole) for one in args.choices]
-    if args.part == "curves":
-        train_rows = whole.numpy()
+        self._train_sets("attributes", [(name, {"hidden": hidden}, None) for name, hidden in groups.items()])
+
+    def options(self, choices: tuple[dict[str, Any], ...] = CHOICES) -> None:
+        """Train the set network with other options."""
+        names = [" ".join(f"{k}={v}" for k, v in one.items()) or "default" for one in choices]
+        self._train_sets("options", [(name, one, None) for name, one in zip(names, choices, strict=True)])
+
+    def curves(self) -> None:
+        """Train the set network with fewer scenes and with fewer views."""
+        data = self._views()
+        rows = data.train_rows.numpy()
         rng = np.random.default_rng(0)
-        scene = data.views.scene[train_rows]
+        scene = data.views.scene[rows]
         order = rng.permutation(np.unique(scene))
-        some = {f"{n} scenes": train_rows[np.isin(scene, order[:n])] for n in (1, 2, 3, 5, 7, 9) if n <= len(order)}
+        some = {f"{n} scenes": rows[np.isin(scene, order[:n])] for n in (1, 2, 3, 5, 7, 9) if n <= len(order)}
         for share in (0.01, 0.03, 0.1, 0.3):
-            some[f"{share:g} of the views"] = np.sort(
-                rng.choice(train_rows, int(share * len(train_rows)), replace=False)
-            )
-        conditions = [(name, {}, torch.from_numpy(chosen)) for name, chosen in some.items()]
-    for seed in args.seeds:
-        for name, options, rows in conditions:
+            some[f"{share:g} of the views"] = np.sort(rng.choice(rows, int(share * len(rows)), replace=False))
+        self._train_sets("curves", [(name, {}, torch.from_numpy(chosen)) for name, chosen in some.items()])
+
+    def _views(self) -> SetDataModule:
+        return SetDataModule(replace(self._job(), options=SetConfig()))
+
+    def _job(self, seed: int = 0, run: str = "") -> TrainingJob:
+        config = TrainConfig(methods=("set",), seed=seed)
+        return TrainingJob(self.dataset, "set", config, self.set, "set", True, RunLog(self.tracking, run))
+
+    def _train_sets(self, part: str, conditions: list[tuple[str, dict[str, Any], torch.Tensor | None]]) -> None:
+        """Train the set network under conditions, a name, changed options and the views used, described once."""
+        table = self.out / f"{part}.csv"
+        data = self._views()
+        whole = data.train_rows
+        for seed, (name, changes, rows) in product(self.numbers, conditions):
             if has_row(table, condition=name, seed=seed):
                 continue
-            data.train_rows = rows
-            settings = replace(SetConfig(**args.set), **options)
+            data.train_rows = whole if rows is None else rows
             # the same number of steps for any amount of data
-            epochs = min(200, round(settings.epochs * len(whole) / len(rows)))
-            config = replace(task.config, seed=seed)
-            own = replace(settings, epochs=epochs)
-            data.config = config
-            torch.manual_seed(seed)
+            options = replace(self.set, **changes)
+            options = replace(options, epochs=min(200, round(options.epochs * len(whole) / len(data.train_rows))))
             about = {"condition": name, "seed": seed}
-            with start_run(tracking, f"study {args.part} {name}", "train", about) as (_, run):
-                result = learn_set(replace(task, config=config, options=own, run_log=RunLog(tracking, run)), data)
-            file = f"{name.replace(' ', '_').replace('=', '-') or 'default'}-{seed}.safetensors"
-            result.model.save(args.out / args.part / file, {"method": "set", "condition": name, "seed": seed})
-            add_row(table, {**about, "views": len(rows)}, result.metrics)
-
-
-def main() -> None:
-    """Run one part of the study."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=("seeds", "attributes", "options", "curves"))
-    parser.add_argument("--data", type=Path, default=Path("data"))
-    parser.add_argument("--dataset", default="release")
-    parser.add_argument("--also", nargs="+", default=[], help="further datasets to train on")
-    parser.add_argument("--out", type=Path, default=Path("study"))
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
-    parser.add_argument("--methods", nargs="+", default=list(METHODS))
-    parser.add_argument("--set", type=json.loads, default={}, help="options of the set network, JSON")
-    parser.add_argument("--choices", type=json.loads, default=CHOICES, help="options to try, a list of JSON objects")
-    parser.add_argument("--progress", action="store_true")
-    args = parser.parse_args()
-    whole = with_also(Dataset.load(args.data / args.dataset), args.also)
-    dataset = Dataset(whole.root, (*whole.split("train"), *whole.split("val")))
-    part = seeds if args.part == "seeds" else of_set_network
-    part(dataset, args, TrackingConfig(folder=str(args.out / "mlruns"), experiment="study"))
+            with start_run(self.tracking, f"study {part} {name}", "train", about) as (_, run):
+                job = replace(self._job(seed, run), options=options)
+                data.config = job.config
+                torch.manual_seed(seed)
+                result = learn_set(job, data)
+            file = f"{name.replace(' ', '_').replace('=', '-')}-{seed}.safetensors"
+            result.model.save(self.out / part / file, {"method": "set", **about})
+            add_row(table, {**about, "views": len(data.train_rows)}, result.metrics)
 
 
 if __name__ == "__main__":
-    main()
+    auto_cli(Study, as_positional=False)

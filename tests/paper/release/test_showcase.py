@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -100,16 +102,13 @@ def test_the_scene_is_the_one_that_was_sampled(showcase: Showcase) -> None:
     assert "400 landmarks" in showcase.summary() and "12 images" in showcase.summary()
 
 
-def test_another_scene_than_the_one_that_was_labelled_is_refused(release: Dataset) -> None:
-    about = json.loads((release.root / "release.json").read_text())
-    original = (release.root / "release.json").read_text()
+def test_another_scene_than_the_one_that_was_labelled_is_refused(release: Dataset, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(release.root, tmp_path / "tiny"))
+    about = json.loads((copy / "release.json").read_text())
     about["settings"]["scenes"]["apartment"]["area_m2"] = 40
-    try:
-        (release.root / "release.json").write_text(json.dumps(about))
-        with pytest.raises(SceneError):
-            open_showcase(release)
-    finally:
-        (release.root / "release.json").write_text(original)
+    (copy / "release.json").write_text(json.dumps(about))
+    with pytest.raises(SceneError):
+        open_showcase(Dataset.load(copy))
     with pytest.raises(ConfigError):
         open_showcase(release, "apartment-004")
 
@@ -121,16 +120,11 @@ def test_pipeline_takes_the_best_views(showcase: Showcase) -> None:
     np.testing.assert_allclose(camera_centers(pipeline.chosen), showcase.center(location))
     rows = showcase.viewpoints(location)
     scores = scorer.score(poses(rows))
-    best = rows.iloc[int(np.argmax(scores))]
-    assert pipeline.chosen_score == scores.max() and pipeline.outcome == outcome_in_words(best)
-    assert pipeline.seen.sum() == best["n_visible"]
-    assert len(pipeline.locations) == len(np.intersect1d(showcase.layer(), showcase.free))
+    assert pipeline.chosen_score == scores.max()
+    assert pipeline.seen.sum() == rows.iloc[int(np.argmax(scores))]["n_visible"]
     # all directions are kept of so few, so that each location has the best of the lattice
     everywhere = 0.5 - 0.4 * showcase.directions[:, 2] + 0.05 * showcase.directions[:, 0]
     np.testing.assert_allclose(pipeline.best_scores, everywhere.max())
-    np.testing.assert_allclose(
-        pipeline.best_axes, showcase.directions[[np.argmax(everywhere)] * len(pipeline.locations)]
-    )
     assert pipeline.rgb.shape == (72, 96, 3) and pipeline.rgb.std() > 1
 
 

@@ -14,7 +14,7 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.visibility.occlusion import StoredOcclusion
-from wheretolook_paper.scorers.sphere.config import SphereConfig
+from wheretolook_paper.scorers.sphere import SphereConfig
 from wheretolook_paper.scorers.sphere.network import PITCHES, YAWS, SphereNetwork, on_lattice
 from wheretolook_paper.scorers.sphere.score import SphereScorer
 from wheretolook_paper.scorers.sphere.views import LocationDescriber

@@ -18,7 +18,7 @@ from wheretolook.tracking.config import TrackingConfig
 from wheretolook.training.weights import method_of_weights, read_training
 from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.scorers.pooled_features import POOLED
-from wheretolook_paper.scorers.trees.config import TreesConfig
+from wheretolook_paper.scorers.trees import TreesConfig
 from wheretolook_paper.scorers.trees.learn import BoostedTrees, PooledViews, fit_trees, load_pooled
 
 FEW = TreesConfig(max_trees=20, max_leaves=7, min_leaf=5)

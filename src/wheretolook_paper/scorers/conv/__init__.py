@@ -2,8 +2,34 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from wheretolook.scorers.method import Method, MethodStyle, imported, network_scorer
-from wheretolook_paper.scorers.conv.config import ConvConfig
+from wheretolook.training.config import FittingConfig, check_range
+from wheretolook.utils.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class ConvConfig(FittingConfig):
+    """Options of the convolutional network over the bins.
+
+    Args:
+        widths: channels after each convolution; every one but the first halves the sides of the grid.
+        dropout: share of pooled values dropped in training.
+        bins: bins along each side of the image.
+    """
+
+    widths: tuple[int, ...] = (32, 64, 128, 128)
+    dropout: float = 0.2
+    bins: int = 30
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.widths or min(self.widths) < 1:
+            raise ConfigError("there must be a convolution, and each at least one channel wide", value=self.widths)
+        check_range(self, "bins", at_least=1)
+        check_range(self, "dropout", at_least=0, below=1)
+
 
 METHODS = (
     Method(

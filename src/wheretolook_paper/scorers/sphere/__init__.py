@@ -2,8 +2,43 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from wheretolook.scorers.method import Method, MethodStyle, imported, network_scorer
-from wheretolook_paper.scorers.sphere.config import SphereConfig
+from wheretolook.training.config import FittingConfig, check_range
+from wheretolook.utils.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class SphereConfig(FittingConfig):
+    """Options of "sphere"; a batch holds whole locations with about `batch_size` viewpoints in all.
+
+    Args:
+        points: landmarks of a location at most, spread evenly over those in free sight.
+        cameras: mapping cameras at most, spread evenly over all.
+        width: of tokens and queries; a multiple of `heads`.
+        heads: of attention.
+        layers: blocks of attention among the tokens.
+        dropout: share of values dropped in the blocks of attention.
+    """
+
+    epochs: int = 30
+    batch_size: int = 1024
+    learning_rate: float = 5e-4
+    points: int = 512
+    cameras: int = 128
+    width: int = 96
+    heads: int = 4
+    layers: int = 2
+    dropout: float = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_range(self, "points", "cameras", "width", "heads", "layers", at_least=1)
+        check_range(self, "dropout", at_least=0, below=1)
+        if self.width % self.heads:
+            raise ConfigError("sphere needs a width that is a multiple of heads", value=(self.width, self.heads))
+
 
 METHODS = (
     Method(

@@ -17,7 +17,7 @@ from wheretolook.geometry.lattices import axes_of_angles, yaw_pitch_angles
 from wheretolook.training.config import FittingConfig
 from wheretolook.training.trained_network import StoredNetwork
 from wheretolook.utils.errors import WeightsError
-from wheretolook_paper.scorers.sphere.config import SphereConfig
+from wheretolook_paper.scorers.sphere import SphereConfig
 from wheretolook_paper.scorers.sphere.views import FEATURES, TOWARDS, TURNING
 
 PITCHES = 6  # rows and columns of the lattice, `wheretolook.geometry.lattices.yaw_pitch_angles`

@@ -23,7 +23,7 @@ from wheretolook.training.batches import Batch, IndexBatches, TensorViews
 from wheretolook.training.config import SharedConfig
 from wheretolook.training.data import ViewsDataModule, labelled_rows, labels_of
 from wheretolook.utils.errors import MapError
-from wheretolook_paper.scorers.sphere.config import SphereConfig
+from wheretolook_paper.scorers.sphere import SphereConfig
 
 _VECTORS = tuple(f"{name}_{axis}" for name in ("offset", "towards", "looks") for axis in "xyz")
 FEATURES = (*_VECTORS, "log_distance", "log_landmarks", "is_landmark", "is_camera")

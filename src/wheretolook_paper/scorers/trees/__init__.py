@@ -2,14 +2,42 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from wheretolook.scorers.method import Method, MethodStyle, ScorerOptions, imported
-from wheretolook_paper.scorers.trees.config import TreesConfig
+from wheretolook.utils.errors import ConfigError
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.scorers.base import Scorer
+
+
+@dataclass(frozen=True)
+class TreesConfig:
+    """Options of boosted trees (LightGBM's, Ke et al. 2017).
+
+    Args:
+        max_trees: rounds of boosting; those up to the best validation average precision are kept.
+        learning_rate: shrinkage of each tree.
+        max_leaves: leaves of a tree.
+        min_leaf: viewpoints of a leaf.
+        l2: penalty on the leaves' values.
+    """
+
+    max_trees: int = 400
+    learning_rate: float = 0.06
+    max_leaves: int = 31
+    min_leaf: int = 50
+    l2: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.max_trees < 1 or self.max_leaves < 2 or self.min_leaf < 1:
+            sizes = self.max_trees, self.max_leaves, self.min_leaf
+            raise ConfigError("trees need max_trees >= 1, max_leaves >= 2 and min_leaf >= 1", value=sizes)
+        if not self.learning_rate > 0 or not self.l2 >= 0:
+            value = self.learning_rate, self.l2
+            raise ConfigError("trees need a positive learning_rate and no negative l2", value=value)
 
 
 def _build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:

@@ -27,7 +27,7 @@ from wheretolook.training.training_range import TrainingRange, camera_quantities
 from wheretolook.training.weights import check_method_of_weights, read_weights, write_weights
 from wheretolook.utils.errors import ConfigError, WeightsError
 from wheretolook_paper.scorers.pooled_features import POOLED, pool
-from wheretolook_paper.scorers.trees.config import TreesConfig
+from wheretolook_paper.scorers.trees import TreesConfig
 
 if TYPE_CHECKING:
     from lightgbm import Booster

@@ -220,7 +220,7 @@ def test_a_pose_is_estimated_as_exactly_as_near_the_origin() -> None:
     pose = ROOM_POSES[0]
     pixels = CAMERA.project(transform(pose, points))
     rows = np.flatnonzero((transform(pose, points)[:, 2] > 0.1) & CAMERA.in_image(pixels))
-    keypoints = Keypoints(pixels.astype(np.float32), np.zeros((200, 128), np.float32), np.ones(200, np.float32))
+    keypoints = Keypoints(pixels.astype(np.float32), np.zeros((200, 128), np.float32))
     landmarks = replace(room_landmarks(200), points=points + SHIFT, descriptors=np.ones((200, 128), np.uint8))
     found = Localizer(landmarks, CAMERA).estimate(keypoints, rows, rows)
     assert found.status == "localized" and len(found.inlier_rows) == len(rows)

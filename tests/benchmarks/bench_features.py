@@ -75,8 +75,7 @@ def keypoints_of(
             descriptors = extracted.descriptors.astype(np.float16)
             save_npz(path, {"pixels": extracted.pixels, "descriptors": descriptors, "seconds": elapsed})
         cached = load_npz(path)
-        scales = np.ones(len(cached["pixels"]), np.float32)
-        keypoints.append(Keypoints(cached["pixels"], cached["descriptors"].astype(np.float32), scales))
+        keypoints.append(Keypoints(cached["pixels"], cached["descriptors"].astype(np.float32)))
         seconds.append(float(cached["seconds"]))
     return keypoints, seconds
 

@@ -24,17 +24,15 @@ def assert_same(first: list[Keypoints], second: list[Keypoints]) -> None:
     assert len(first) == len(second)
     for a, b in zip(first, second, strict=True):
         assert a.pixels.tobytes() == b.pixels.tobytes()
-        assert a.scales_px.tobytes() == b.scales_px.tobytes()
         assert a.descriptors.tobytes() == b.descriptors.tobytes()
 
 
 def best_match(a: Keypoints, b: Keypoints) -> np.ndarray:
-    """For each keypoint of a, the highest cosine to one of b at its place (0.1 px) and scale (2 %), or NaN."""
+    """For each keypoint of a, the highest cosine to one of b at its place (0.1 px), or NaN."""
     best = np.full(len(a), np.nan)
     for row, near in enumerate(KDTree(b.pixels).query_ball_point(a.pixels, 0.1)):
-        same = [k for k in near if abs(b.scales_px[k] / a.scales_px[row] - 1) < 0.02]
-        if same:
-            best[row] = (b.descriptors[same] @ a.descriptors[row]).max()
+        if near:
+            best[row] = (b.descriptors[near] @ a.descriptors[row]).max()
     return best
 
 

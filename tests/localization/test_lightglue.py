@@ -60,7 +60,7 @@ def test_a_query_is_localized_by_the_images_that_see_the_same(corridor, tmp_path
     model = read_model(corridor)
     camera = cameras_by_id(model.cameras, corridor)[1]
     _, ((pixels, descriptors),) = read_features(corridor / "database.db", ["010.jpg"])
-    query = Keypoints(pixels, KIND.restore(descriptors), np.ones(len(pixels), np.float32))
+    query = Keypoints(pixels, KIND.restore(descriptors))
     config = LocalizerConfig(lightglue=str(weights), lightglue_images=2)
     localizer = Localizer(landmarks, camera, config, map_dir=corridor)
     ((keypoints, rows),) = localizer.match([query])

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.descriptors import DescriptorKind
-from wheretolook.features.extractor import Extraction, Extractor, ExtractorSettings
+from wheretolook.features.extractor import Extraction, Extractor
 
 ALIKED = DescriptorKind("aliked", 128, "float16", min_similarity=0.8, colmap_type=1)
 
@@ -15,7 +16,7 @@ _URLS = (
 _LEAST_SCORE = 0.2  # of a keypoint, the authors' own
 
 
-def _build(config: ExtractorSettings, device: str) -> Extraction:
+def _build(config: ExtractorConfig, device: str) -> Extraction:
     from torch import Tensor, nn
 
     from wheretolook.features.aliked_batch import detect_and_describe
@@ -36,4 +37,4 @@ def _build(config: ExtractorSettings, device: str) -> Extraction:
     return Aliked(config, device)
 
 
-EXTRACTORS = (Extractor("aliked", "ALIKED n16rot, by kornia.", ALIKED, _build, weights=_FILE, lightglue="aliked"),)
+EXTRACTORS = (Extractor("aliked", ALIKED, _build, weights=_FILE, lightglue="aliked"),)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.descriptors import DescriptorKind
-from wheretolook.features.extractor import Extraction, Extractor, ExtractorSettings
+from wheretolook.features.extractor import Extraction, Extractor
 
 DISK = DescriptorKind("disk", 128, "float16", min_similarity=0.8)
 
@@ -14,7 +15,7 @@ _URLS = (
 )
 
 
-def _build(config: ExtractorSettings, device: str) -> Extraction:
+def _build(config: ExtractorConfig, device: str) -> Extraction:
     from torch import Tensor, nn
 
     from wheretolook.features.learned import Detection, LearnedExtraction, kornia_feature, load_state
@@ -33,4 +34,4 @@ def _build(config: ExtractorSettings, device: str) -> Extraction:
     return Disk(config, device)
 
 
-EXTRACTORS = (Extractor("disk", "DISK, by kornia.", DISK, _build, weights=_FILE, lightglue="disk"),)
+EXTRACTORS = (Extractor("disk", DISK, _build, weights=_FILE, lightglue="disk"),)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Iterable, Sequence
-from contextlib import nullcontext
 from functools import lru_cache
 from itertools import islice
 
@@ -23,11 +22,11 @@ class KeypointExtractor:
     Raises ConfigError if kornia, a network's weights or the device is missing.
     """
 
-    def __init__(self, config: ExtractorConfig | None = None, device: str = "cpu") -> None:
-        self.config = config or ExtractorConfig()
-        build = all_extractors()[self.config.method].build
+    def __init__(self, config: ExtractorConfig = ExtractorConfig(), device: str = "cpu") -> None:
+        self.config = config
+        build = all_extractors()[config.method].build
         assert build is not None  # as checked by ExtractorConfig
-        self._extraction: Extraction = build(self.config, device)
+        self._extraction: Extraction = build(config, device)
         self.on_gpu = self._extraction.batch > 1
 
     def batch_of(self, width: int, height: int) -> int:
@@ -46,24 +45,22 @@ class KeypointExtractor:
         return self._extraction.extract_batch(images)
 
     def extract_many(
-        self, images: Iterable[NDArray[np.uint8]], workers: int | WorkerPool = 1
+        self, images: Iterable[NDArray[np.uint8]], processes: WorkerPool
     ) -> Generator[Keypoints, None, None]:
         """Yield keypoints of many images (H, W, 3) uint8 in their order, from worker processes or GPU batches.
 
-        Only a few images are read ahead. `workers` is a pool or a number of processes (pycolmap's extractor holds the
-        interpreter lock, so threads do not help); 1 runs in this process. The result is the same.
+        Only a few images are read ahead. Processes, as pycolmap's extractor holds the interpreter lock; the result does
+        not depend on their number.
         """
         if self.on_gpu:
             source = iter(images)
             for first in source:
                 more = self.batch_of(first.shape[1], first.shape[0]) - 1
                 yield from self.extract_batch([first, *islice(source, more)])
-            return
-        with nullcontext(workers) if isinstance(workers, WorkerPool) else WorkerPool(workers) as processes:
-            if processes.workers <= 1:
-                yield from map(self.extract, images)
-            else:
-                yield from processes.map(_extract_in_worker, ((self.config, rgb) for rgb in images))
+        elif processes.workers <= 1:
+            yield from map(self.extract, images)
+        else:
+            yield from processes.map(_extract_in_worker, ((self.config, rgb) for rgb in images))
 
 
 _extractor_of = lru_cache(maxsize=1)(KeypointExtractor)

@@ -4,42 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.features.descriptors import DescriptorKind
 from wheretolook.features.keypoints import Keypoints
-
-
-class ExtractorSettings(Protocol):
-    """Settings of an extractor (`wheretolook.features.config.ExtractorConfig`, which depends on all extractors)."""
-
-    @property
-    def first_octave(self) -> int:
-        """-1 to double the image first."""
-        ...
-
-    @property
-    def max_keypoints(self) -> int:
-        """Largest number of keypoints for each image."""
-        ...
-
-    @property
-    def peak_threshold(self) -> float:
-        """Minimum contrast of SIFT keypoints."""
-        ...
-
-    @property
-    def edge_threshold(self) -> float:
-        """Maximum ratio of principal curvatures of SIFT keypoints."""
-        ...
-
-    @property
-    def weights(self) -> str:
-        """File of a network; empty for kornia's copy."""
-        ...
 
 
 class Extraction(Protocol):
@@ -64,9 +35,8 @@ class Extractor:
     """
 
     name: str  # in options: `map.extractor.method`
-    about: str  # one sentence
     descriptors: DescriptorKind
-    build: Callable[[ExtractorSettings, str], Extraction] | None = None  # from settings and a device, "cpu" or CUDA
+    build: Callable[[Any, str], Extraction] | None = None  # from an `ExtractorConfig` and a device, "cpu" or CUDA
     weights: str = ""  # usual name of the file of a network's weights; "" for none
     lightglue: str = ""  # name of the extractor in kornia's LightGlue; "" if unsupported
 

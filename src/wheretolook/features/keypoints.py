@@ -15,8 +15,6 @@ class Keypoints:
     pixels: NDArray[np.float32]  # (N, 2) (x, y) in pixels; (0.5, 0.5) is the centre of the top-left pixel
     # (N, D) of unit length; of SIFT (N, 128) RootSIFT (Arandjelovic and Zisserman, CVPR 2012)
     descriptors: NDArray[np.float32]
-    # (N,) standard deviation of the Gaussian of the keypoint's scale; 1 if the extractor has no scales
-    scales_px: NDArray[np.float32]
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -24,4 +22,4 @@ class Keypoints:
     @classmethod
     def none(cls, dimension: int = 128) -> Keypoints:
         """No keypoints, with descriptors of a dimension."""
-        return cls(np.zeros((0, 2), np.float32), np.zeros((0, dimension), np.float32), np.zeros(0, np.float32))
+        return cls(np.zeros((0, 2), np.float32), np.zeros((0, dimension), np.float32))

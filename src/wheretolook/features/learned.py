@@ -14,7 +14,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from wheretolook.features.extractor import ExtractorSettings, check_image
+from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import check_image
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.utils.errors import ConfigError, WeightsError
 
@@ -34,7 +35,7 @@ class LearnedExtraction(ABC):
 
     dimension: int
 
-    def __init__(self, config: ExtractorSettings, device: str) -> None:
+    def __init__(self, config: ExtractorConfig, device: str) -> None:
         self.config = config
         self.device = torch.device(device)
         # an H100 needs a sixth of the time per image in a batch of 16; larger batches gain nothing
@@ -70,7 +71,7 @@ class LearnedExtraction(ABC):
         ends = np.cumsum([len(scores) for _, _, scores in detections])[:-1]
         for pixels, descriptors, scores in zip(*(np.split(values, ends) for values in joined), strict=True):
             keep = np.lexsort((pixels[:, 0], pixels[:, 1], -scores))[: self.config.max_keypoints]
-            yield Keypoints(pixels[keep], descriptors[keep].reshape(-1, self.dimension), np.ones(len(keep), np.float32))
+            yield Keypoints(pixels[keep], descriptors[keep].reshape(-1, self.dimension))
 
 
 @contextmanager

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
-from types import MappingProxyType
 
 from wheretolook.features.descriptors import DescriptorKind
 from wheretolook.features.extractor import Extractor
@@ -18,7 +17,7 @@ MODULES = ("sift", "aliked", "disk", "xfeat", "superpoint")
 def all_extractors() -> Mapping[str, Extractor]:
     """Every extractor by its name."""
     modules = (import_module(f"wheretolook.features.{module}") for module in MODULES)
-    return MappingProxyType({extractor.name: extractor for module in modules for extractor in module.EXTRACTORS})
+    return {extractor.name: extractor for module in modules for extractor in module.EXTRACTORS}
 
 
 def runnable_extractors() -> tuple[str, ...]:
@@ -30,7 +29,7 @@ def runnable_extractors() -> tuple[str, ...]:
 def all_kinds() -> Mapping[str, DescriptorKind]:
     """Every kind of descriptors by its name."""
     kinds = (extractor.descriptors for extractor in all_extractors().values())
-    return MappingProxyType({kind.name: kind for kind in kinds})
+    return {kind.name: kind for kind in kinds}
 
 
 def kind_of(method: str) -> DescriptorKind:

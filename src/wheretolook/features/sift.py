@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.descriptors import DescriptorKind, unit_descriptors
-from wheretolook.features.extractor import Extraction, Extractor, ExtractorSettings, check_image
+from wheretolook.features.extractor import Extraction, Extractor, check_image
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.utils.colmap import quiet_colmap
 
@@ -21,7 +22,7 @@ class OpenCvSift:
 
     batch = 1
 
-    def __init__(self, config: ExtractorSettings) -> None:
+    def __init__(self, config: ExtractorConfig) -> None:
         import cv2
 
         # OpenCV divides its contrast threshold by the number of layers. Without the precise upscale, keypoints are
@@ -46,7 +47,7 @@ class OpenCvSift:
         descriptors = descriptors[keep]
         descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-12))
         # OpenCV puts (0, 0) at the centre of the top-left pixel.
-        return Keypoints(table[keep, :2] + np.float32(0.5), unit_descriptors(descriptors), table[keep, 2])
+        return Keypoints(table[keep, :2] + np.float32(0.5), unit_descriptors(descriptors))
 
 
 class ColmapSift:
@@ -54,7 +55,7 @@ class ColmapSift:
 
     batch = 1
 
-    def __init__(self, config: ExtractorSettings) -> None:
+    def __init__(self, config: ExtractorConfig) -> None:
         import pycolmap
 
         self.config = config
@@ -78,7 +79,7 @@ class ColmapSift:
         table = np.array([(k.x, k.y, k.compute_scale()) for k in keypoints], dtype=np.float32)
         # COLMAP returns whole scale levels, from the largest down, so there can be more than the limit.
         keep = np.argsort(-table[:, 2], kind="stable")[: self.config.max_keypoints]
-        return Keypoints(table[keep, :2], unit_descriptors(descriptors.data[keep]), table[keep, 2])
+        return Keypoints(table[keep, :2], unit_descriptors(descriptors.data[keep]))
 
 
 class GpuSift:
@@ -86,7 +87,7 @@ class GpuSift:
 
     batch = 8
 
-    def __init__(self, config: ExtractorSettings, device: str) -> None:
+    def __init__(self, config: ExtractorConfig, device: str) -> None:
         from wheretolook.features.warp_sift import WarpSift
 
         self._sift = WarpSift(config, device)
@@ -104,11 +105,8 @@ def grey_bitmap(rgb: NDArray[np.uint8]) -> Any:
     return pycolmap.Bitmap.from_array(np.ascontiguousarray(rgb)).clone_as_grey()
 
 
-def _opencv(config: ExtractorSettings, device: str) -> Extraction:
+def _opencv(config: ExtractorConfig, device: str) -> Extraction:
     return OpenCvSift(config) if device == "cpu" else GpuSift(config, device)
 
 
-EXTRACTORS = (
-    Extractor("opencv", "OpenCV's SIFT; on a GPU by Warp kernels, equal up to rounding.", SIFT, _opencv),
-    Extractor("colmap", "COLMAP's SIFT on a CPU.", SIFT, lambda config, device: ColmapSift(config)),
-)
+EXTRACTORS = (Extractor("opencv", SIFT, _opencv), Extractor("colmap", SIFT, lambda config, device: ColmapSift(config)))

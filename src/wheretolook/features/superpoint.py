@@ -8,6 +8,4 @@ from wheretolook.features.extractor import Extractor
 # hloc's "NN-superpoint" matches up to a distance of 0.7 between unit descriptors: 1 - 0.7^2 / 2
 SUPERPOINT = DescriptorKind("superpoint", 256, "float16", min_similarity=0.755)
 
-EXTRACTORS = (
-    Extractor("superpoint", "SuperPoint, as hloc's files of features hold it.", SUPERPOINT, lightglue="superpoint"),
-)
+EXTRACTORS = (Extractor("superpoint", SUPERPOINT, lightglue="superpoint"),)

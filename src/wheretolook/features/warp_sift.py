@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from wheretolook.features import warp_sift_description_kernels as kernels
 from wheretolook.features import warp_sift_kernels as scale_kernels
-from wheretolook.features.extractor import ExtractorSettings
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.warp_sift_kernels import BORDER, KEYS_OF_IMAGE, LAYERS, LEVELS, MAX_SIDE
 from wheretolook.utils.warp import start_warp
@@ -29,7 +29,7 @@ class WarpSift:
     "cpu" (one core and slow: for tests). Raises ConfigError if it is missing.
     """
 
-    def __init__(self, config: ExtractorSettings, device: str = "cuda", block_bytes: int = 1 << 30) -> None:
+    def __init__(self, config: ExtractorConfig, device: str = "cuda", block_bytes: int = 1 << 30) -> None:
         self.config = config
         self.device = start_warp(device)
         self.block_bytes = block_bytes
@@ -84,8 +84,7 @@ class WarpSift:
         descriptors = self._describe(space, places, place[order], angle[order])
         # OpenCV puts (0, 0) at the centre of the top-left pixel.
         pixels = table[place[order], :2] + np.float32(0.5)
-        scales = table[place[order], 2]
-        return [Keypoints(pixels[a:b], descriptors[a:b], scales[a:b]) for a, b in pairwise(ends)]
+        return [Keypoints(pixels[a:b], descriptors[a:b]) for a, b in pairwise(ends)]
 
     def _turn(
         self, space: ScaleSpace, keys: NDArray[np.int64]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.descriptors import DescriptorKind
-from wheretolook.features.extractor import Extraction, Extractor, ExtractorSettings
+from wheretolook.features.extractor import Extraction, Extractor
 
 XFEAT = DescriptorKind("xfeat", 64, "float16", min_similarity=0.82)
 
@@ -13,7 +14,7 @@ _FILE = "xfeat.pt"
 _URLS = ("https://github.com/verlab/accelerated_features/raw/main/weights/xfeat.pt",)
 
 
-def _build(config: ExtractorSettings, device: str) -> Extraction:
+def _build(config: ExtractorConfig, device: str) -> Extraction:
     from torch import Tensor, nn
 
     from wheretolook.features.learned import Detection, LearnedExtraction, kornia_feature, load_state
@@ -37,4 +38,4 @@ def _build(config: ExtractorSettings, device: str) -> Extraction:
     return XFeat(config, device)
 
 
-EXTRACTORS = (Extractor("xfeat", "XFeat, by kornia.", XFEAT, _build, weights=_FILE, lightglue="xfeat"),)
+EXTRACTORS = (Extractor("xfeat", XFEAT, _build, weights=_FILE, lightglue="xfeat"),)

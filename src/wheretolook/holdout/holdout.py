@@ -182,7 +182,7 @@ def _localize(job: _Job, landmarks: Landmarks) -> pd.DataFrame:
     kind, stored = read_features(source.features, names)
     estimates = []
     for camera, (pixels, descriptors) in zip(cameras, stored, strict=True):
-        keypoints = Keypoints(pixels, kind.restore(descriptors), np.ones(len(pixels), np.float32))
+        keypoints = Keypoints(pixels, kind.restore(descriptors))
         estimates.append(localizer.estimate(keypoints, *localizer.match([keypoints])[0], camera=camera))
     no_pose: Float = np.full((3, 4), np.nan)
     estimated = [no_pose if one.cam_from_world is None else one.cam_from_world for one in estimates]

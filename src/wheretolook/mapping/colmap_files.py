@@ -1,7 +1,7 @@
 """Checks of COLMAP's model files around pycolmap's readers, and fast access to the points in them.
 
-pycolmap trusts every count in a file and can loop for hours on a corrupt one, so counts are compared with the file's
-size before it reads, and values are checked afterwards. The formats are those of https://colmap.github.io/format.html.
+pycolmap trusts the counts in binary files and can loop for hours or run out of memory on a corrupt one, so these are
+compared with the file's size before it reads, and values are checked afterwards. The formats are those of https://colmap.github.io/format.html.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 from struct import Struct
 from struct import error as StructError
@@ -25,18 +24,17 @@ from wheretolook.utils.errors import MapError
 REBUILD = "Copy or build the model again."
 # A point without its track. The track's elements follow: image id and index of the keypoint, uint32 each.
 POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("n", "<u8")])
-_INT32 = Struct("<i")
 _UINT32 = Struct("<I")
 _UINT64 = Struct("<Q")
 _MAX_COORDINATE = 1e12  # of a point or a camera; its square is still finite in single precision
 _ROTATION_TOLERANCE = 0.01  # of the entries of R R^T: some tools write few decimals
 # Patterns in pycolmap's errors, and the file that they are about.
 _FILES_BY_ERROR = (
-    ("Camera model|VerifyParams", "cameras"),
+    ("Camera model|VerifyParams|cameras_", "cameras"),
     ("point2D.point3D_id|line_stream2|utf-8", "images"),
     ("Image with ID|vector::|point3D.xyz", "points3D"),
-    ("rig_from_world|num_data_ids|unordered_map", "frames"),
-    ("[Rr]ig|[Cc]amera", "rigs"),
+    ("rig_from_world|data_id|unordered_map", "frames"),
+    ("[Rr]ig|[Cc]amera|[Ss]ensor", "rigs"),
     ("[Ff]rame", "frames"),
 )
 
@@ -45,7 +43,7 @@ def check_binary(folder: Path) -> None:
     """Raise MapError if counts in a folder's binary model do not match the files' sizes, or a point is not finite."""
     for name, record_length in _RECORD_LENGTHS.items():
         path = folder / f"{name}.bin"
-        if path.is_file():  # models from before COLMAP 3.12 have no rigs and frames
+        if path.is_file():  # models from before COLMAP 3.12 have no frames
             data = path.read_bytes()
             starts = _record_starts(data, record_length, path)
             if name == "points3D":
@@ -76,16 +74,6 @@ def read_points(path: Path) -> tuple[NDArray[Any], NDArray[np.uint32]]:
     return points, _records(data, at, np.dtype(("<u4", 2)))
 
 
-def check_text_counts(folder: Path) -> None:
-    """Raise MapError if a line of a text model's rigs or frames announces more entries than it has words."""
-    for name, column in (("rigs", 1), ("frames", 9)):
-        path = folder / f"{name}.txt"
-        lines = path.read_text(errors="replace").splitlines() if path.is_file() else []
-        for words in (line.split() for line in lines if not line.startswith("#")):
-            if len(words) > column and not (words[column].isdecimal() and int(words[column]) < len(words)):
-                raise MapError("a line lacks entries", path=path, value=" ".join(words)[:100], fix=REBUILD)
-
-
 def check_text_complete(path: Path, n_read: int) -> None:
     """Raise MapError if fewer entries were read than the number that COLMAP writes at the top of a text file."""
     with path.open(errors="replace") as file:
@@ -97,18 +85,21 @@ def check_text_complete(path: Path, n_read: int) -> None:
 
 def check_cameras_and_images(model: Any, folder: Path, suffix: str) -> None:
     """Raise MapError, which names the file, if a `pycolmap.Reconstruction` has an impossible camera or pose."""
+    path = folder / f"cameras{suffix}"
+    n_bytes = 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
+    if suffix == ".bin" and n_bytes != path.stat().st_size:
+        raise MapError("the file is truncated or corrupt", path=path, value=f"not {n_bytes} bytes", fix=REBUILD)
     for number, camera in model.cameras.items():
         sides = (camera.width, camera.height)
         focal = camera.params[camera.focal_length_idxs()]
         if not (0 < min(sides) <= max(sides) <= MAX_SIDE_PX and np.isfinite(camera.params).all() and (focal > 0).all()):
             problem = f"camera {number} needs an image size, finite parameters and a positive focal length"
-            value = (*sides, *camera.params)
-            raise MapError(problem, path=folder / f"cameras{suffix}", value=value, fix="Correct the camera.")
+            raise MapError(problem, path=path, value=(*sides, *camera.params), fix="Correct the camera.")
     for number, image in model.images.items():
         _ = image.name  # raises UnicodeDecodeError if it is not in UTF-8
         if image.has_pose and not _is_pose(image.cam_from_world()):
-            name = "frames" if (folder / f"frames{suffix}").is_file() else "images"
-            path = folder / f"{name}{suffix}"
+            path = folder / f"frames{suffix}"
+            path = path if path.is_file() else folder / f"images{suffix}"
             raise MapError(f"the pose of image {number} is not a rotation and translation", path=path, fix=REBUILD)
 
 
@@ -138,9 +129,6 @@ def _record_starts(data: bytes, record_length: Callable[[bytes, int], int], path
     try:
         for _ in range(_UINT64.unpack_from(data)[0]):
             starts.append(starts[-1] + record_length(data, starts[-1]))
-    except KeyError as error:
-        fix = "Update pycolmap, or export the model with another camera."
-        raise MapError("a camera's model is unknown", path=path, value=error.args[0], fix=fix) from error
     except (StructError, IndexError, ValueError, OverflowError):
         starts.append(-1)
     if starts[-1] != len(data):
@@ -155,10 +143,6 @@ def model_error(error: Exception, folder: Path, suffix: str) -> MapError:
     return MapError(f"pycolmap cannot read the model: {error}", path=path, fix=REBUILD)
 
 
-def _camera_length(data: bytes, start: int) -> int:
-    return 24 + 8 * _parameter_counts()[_INT32.unpack_from(data, start + 4)[0]]
-
-
 def _image_length(data: bytes, start: int) -> int:
     name_end = data.index(b"\0", start + 64) + 1
     return name_end + 8 + 24 * int(_UINT64.unpack_from(data, name_end)[0]) - start
@@ -168,32 +152,8 @@ def _point_length(data: bytes, start: int) -> int:
     return POINT.itemsize + 8 * int(_UINT64.unpack_from(data, start + POINT.itemsize - 8)[0])
 
 
-def _rig_length(data: bytes, start: int) -> int:
-    n_sensors = _UINT32.unpack_from(data, start + 4)[0]
-    end = start + (16 if n_sensors else 8)  # the reference sensor has no pose
-    for _ in range(n_sensors - 1):
-        has_pose = data[end + 8]
-        end += 65 if has_pose else 9
-    return end - start
-
-
 def _frame_length(data: bytes, start: int) -> int:
     return 68 + 16 * int(_UINT32.unpack_from(data, start + 64)[0])
 
 
-_RECORD_LENGTHS = {
-    "cameras": _camera_length,
-    "images": _image_length,
-    "points3D": _point_length,
-    "rigs": _rig_length,
-    "frames": _frame_length,
-}
-
-
-@cache
-def _parameter_counts() -> dict[int, int]:
-    """Number of parameters of COLMAP's camera models by their ids."""
-    import pycolmap
-
-    models = [model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"]
-    return {int(model): len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params) for model in models}
+_RECORD_LENGTHS = {"images": _image_length, "points3D": _point_length, "frames": _frame_length}

@@ -19,7 +19,6 @@ from wheretolook.mapping.colmap_files import (
     check_cameras_and_images,
     check_coordinates,
     check_text_complete,
-    check_text_counts,
     model_error,
     read_points,
 )
@@ -85,7 +84,8 @@ def read_model(model_dir: str | Path) -> Any:
     bar = tqdm(total=2, desc=f"model of {n_bytes / 1e9:.1f} GB: read", unit="step", disable=n_bytes < _LARGE_BYTES)
     model = pycolmap.Reconstruction()
     with bar, quiet_colmap():
-        (check_binary if suffix == ".bin" else check_text_counts)(folder)
+        if suffix == ".bin":
+            check_binary(folder)
         bar.update()
         try:
             (model.read_binary if suffix == ".bin" else model.read_text)(str(folder))

@@ -83,27 +83,23 @@ def photograph_cameras(
     Takes width and height (I, 2) of each photograph as captured, upright, and as mapped. Raises ConfigError if COLMAP
     has no such camera model, or intrinsics are given for photographs of different sizes.
     """
-    given = len(config.camera_params) > 0
     different = np.unique(full_sizes, axis=0).tolist()
-    if given and len(different) > 1:
+    if config.camera_params and len(different) > 1:
         fix = "Omit camera_params, or map the photographs of each size separately."
         raise ConfigError("camera_params are for photographs of one size", path=folder, value=different, fix=fix)
-    if given:
-        width, height = full_sizes[0].tolist()
-        ColmapCamera(config.camera_model, width, height, config.camera_params)  # raises if they do not fit the model
-    keys: dict[Any, int] = {}
+    rows: dict[Any, int] = {}
     cameras: list[pycolmap.Camera] = []
     camera_of = []
-    for index, name in enumerate(names):
-        full = full_sizes[index].tolist()
-        reduced = sizes[index].tolist()
-        focal, is_known = (0.0, True) if given else _exif_focal(folder / name, config.camera_model)
-        shared = (str(Path(name).parent), *full, round(focal, 3)) if config.shared_camera else name
-        if shared not in keys:
-            keys[shared] = len(cameras)
-            cameras.append(_camera(len(cameras) + 1, full, reduced, focal, is_known, config))
-        camera_of.append(keys[shared])
-    return PhotographCameras(cameras, np.array(camera_of, dtype=np.int64), given)
+    for name, full, reduced in zip(names, full_sizes.tolist(), sizes.tolist(), strict=True):
+        camera = _camera(folder / name, full, config)
+        shared = (str(Path(name).parent), *full, round(camera.mean_focal_length(), 3))
+        row = rows.setdefault(shared if config.shared_camera else name, len(cameras))
+        camera_of.append(row)
+        if row == len(cameras):
+            camera.camera_id = len(cameras) + 1
+            camera.rescale(*reduced)
+            cameras.append(camera)
+    return PhotographCameras(cameras, np.array(camera_of, dtype=np.int64), len(config.camera_params) > 0)
 
 
 def photograph_pairs(n: int, exhaustive_up_to: int, overlap: int) -> NDArray[np.int64]:
@@ -118,30 +114,22 @@ def photograph_pairs(n: int, exhaustive_up_to: int, overlap: int) -> NDArray[np.
     return np.array([(i, i + step) for i in range(n) for step in steps if i + step < n], dtype=np.int64)
 
 
-def _camera(
-    camera_id: int, full: list[int], reduced: list[int], focal_px: float, is_known: bool, config: PhotographsConfig
-) -> pycolmap.Camera:
+def _camera(path: Path, size: list[int], config: PhotographsConfig) -> pycolmap.Camera:
+    """Initial intrinsics of a photograph at full size: given, or by the focal length in its EXIF data."""
     import pycolmap
 
+    model = config.camera_model
     if config.camera_params:
-        camera = pycolmap.Camera(model=config.camera_model, width=full[0], height=full[1], params=config.camera_params)
-        camera.camera_id = camera_id
-    else:
-        camera = pycolmap.Camera.create_from_model_name(camera_id, config.camera_model, focal_px, *full)
-    camera.rescale(*reduced)
-    camera.has_prior_focal_length = is_known
-    return camera
-
-
-def _exif_focal(path: Path, camera_model: str) -> tuple[float, bool]:
-    """Focal length in pixels of the photograph at full size, and whether it comes from its EXIF data."""
-    import pycolmap
-
-    if camera_model not in pycolmap.CameraModelId.__members__ or camera_model == "INVALID":
-        raise ConfigError("COLMAP has no such camera model", value=camera_model, fix="For instance SIMPLE_RADIAL.")
+        camera = pycolmap.Camera(**ColmapCamera(model, *size, config.camera_params).record())
+        camera.has_prior_focal_length = True
+        return camera
+    if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
+        raise ConfigError("COLMAP has no such camera model", value=model, fix="For instance SIMPLE_RADIAL.")
     try:
         with quiet_colmap():
-            camera = pycolmap.infer_camera_from_image(path, pycolmap.ImageReaderOptions(camera_model=camera_model))
+            inferred = pycolmap.infer_camera_from_image(path, pycolmap.ImageReaderOptions(camera_model=model))
     except (ValueError, RuntimeError) as error:
         raise MapError(f"cannot read this photograph: {error}", path=path, fix="Remove it.") from error
-    return float(camera.mean_focal_length()), bool(camera.has_prior_focal_length)
+    camera = pycolmap.Camera.create_from_model_name(0, model, inferred.mean_focal_length(), *size)
+    camera.has_prior_focal_length = inferred.has_prior_focal_length
+    return camera

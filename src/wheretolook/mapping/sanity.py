@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.utils.errors import MapWarning
 
@@ -41,9 +41,8 @@ def warn_of_frame(model: str | Path, mapping_distance_m: ArrayLike, cam_from_wor
 
 def frame_warnings(mapping_distance_m: ArrayLike, cam_from_world: ArrayLike) -> tuple[str, ...]:
     """Return the non-empty messages of `scale_warning` and `up_axis_warning`; arguments of `warn_of_frame`."""
-    poses = np.asarray(cam_from_world, dtype=np.float64)
-    messages = scale_warning(mapping_distance_m, camera_centers(poses)), up_axis_warning(poses)
-    return tuple(message for message in messages if message)
+    messages = scale_warning(mapping_distance_m, camera_centers(cam_from_world)), up_axis_warning(cam_from_world)
+    return tuple(filter(None, messages))
 
 
 def warn_of_mesh(mesh: str | Path, points: ArrayLike, raycaster: MeshRaycaster) -> None:
@@ -92,13 +91,9 @@ def up_axis_warning(cam_from_world: ArrayLike) -> str:
     if off_deg <= TILT_DEG[gravity.method] or poses[:, 2, 2].mean() < -_LOOKING_DOWN:
         return ""
     how = "upside down" if off_deg > 135 else "on their side" if off_deg > 45 else "askew"
-    up = " ".join(f"{value:.2f}" for value in _rounded(gravity.up))
+    up = " ".join(f"{value:.2f}" for value in np.round(gravity.up, 2) + 0.0)  # no -0.00
     return (
         f"the cameras are {how}: the up direction estimated from their orientations is ({up}), {off_deg:.0f} degrees from z, which is "
         "up here. `wheretolook map --model` turns it upright with --map.existing.level true, or give a model with z up "
         "(COLMAP's model_orientation_aligner). Ignore this warning if the cameras were held so"
     )
-
-
-def _rounded(up: Float) -> Float:
-    return np.asarray(np.round(up, 2) + 0.0)  # no -0.00

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -70,11 +70,7 @@ def photograph_features(
     stats = [(folder / name).stat() for name in names]
     files = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in zip(names, stats, strict=True)]
     key = cache_key(_VERSION, files, run.config.photographs.max_side_px, extractor.record(), turned)
-    cache = ArtifactCache(work, key, "features", _MANIFEST)
-    results = cache.load("features.npz")
-    if results is None:
-        results = cache.store({"features.npz": _extract(folder, names, turned, run)})
-    arrays = results["features.npz"]
+    arrays = _cached_arrays(work, key, "features", lambda: _extract(folder, names, turned, run))
     ends = np.cumsum(arrays["counts"])[:-1]
     pixels, descriptors, colors = (np.split(arrays[name], ends) for name in ("pixels", "descriptors", "colors"))
     stored = list(zip(pixels, descriptors, strict=True))
@@ -94,14 +90,14 @@ def map_incrementally(
     pairs = photograph_pairs(len(features.names), EXHAUSTIVE_UP_TO, run.config.photographs.overlap)
     key = cache_key(features.key, pairs.tolist())
     database = work / "database.db"
-    cache = ArtifactCache(work, key, "matches", _MANIFEST)
-    results = cache.load("matches.npz")
-    if results is None:
+
+    def match() -> dict[str, NDArray[Any]]:
         with storing_in_database(database):
             matches = list(match_pairs(features.stored, pairs, work, run.processes, run.progress, features.kind))
-        arrays = {"matches": np.concatenate(matches), "counts": np.array([*map(len, matches)])}
-        results = cache.store({"matches.npz": arrays})
-    matches = np.split(results["matches.npz"]["matches"], np.cumsum(results["matches.npz"]["counts"])[:-1])
+        return {"matches": np.concatenate(matches), "counts": np.array([*map(len, matches)])}
+
+    arrays = _cached_arrays(work, key, "matches", match)
+    matches = np.split(arrays["matches"], np.cumsum(arrays["counts"])[:-1])
     intrinsics = [camera.todict() for camera in cameras.cameras]
     key = cache_key(key, intrinsics, cameras.camera_of.tolist(), cameras.given, seed)
     folder = work / "sparse"
@@ -117,6 +113,15 @@ def map_incrementally(
             model_sizes = _reconstruct(database, folder, cameras, seed, run)
         results = cache.store({"sparse.json": {"model_sizes": model_sizes}})
     return MappedPhotographs(read_model(folder), database, results["sparse.json"]["model_sizes"])
+
+
+def _cached_arrays(
+    work: Path, key: str, step: str, compute: Callable[[], dict[str, NDArray[Any]]]
+) -> dict[str, NDArray[Any]]:
+    """Arrays of a step of work, read from its file or computed and written there."""
+    cache = ArtifactCache(work, key, step, _MANIFEST)
+    name = f"{step}.npz"
+    return (cache.load(name) or cache.store({name: compute()}))[name]
 
 
 def _extract(folder: Path, names: list[str], turned: bool, run: MapRun) -> dict[str, NDArray[Any]]:

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import os
 import sys
 from pathlib import Path
 
 import jupytext
 import nbformat
-import numpy as np
 import pytest
-from matplotlib.colors import to_rgb
 from nbclient import NotebookClient
-from pages import main, notebook_page, small_picture, small_table
-from PIL import Image
+from pages import main
 
 from synthetic_release import make_release
-from wheretolook.scorers.styles import MethodStyle, method_style
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import newest_run
 
@@ -127,57 +121,3 @@ def test_pages_are_small_and_whole(
     text = first.read_text()
     assert '<a href="01_one.html">One &amp; all</a>' in text and "02_broken" not in text
     assert text.count("data:image/webp;base64,") == 1
-
-
-def test_pictures_keep_their_colours_in_less_space() -> None:
-    colors = [tuple(round(255 * value) for value in to_rgb(style.color)) for style in known_styles()]
-    pixels = np.full((40, 20 * len(colors), 4), 255, np.uint8)
-    for number, color in enumerate(colors):
-        pixels[10:, 20 * number : 20 * (number + 1)] = (*color, 255)
-    pixels[:5] = 0  # transparent
-    small, n_bytes = shrunk(pixels)
-    assert [small.getpixel((20 * number + 10, 20)) for number in range(len(colors))] == colors
-    assert small.getpixel((10, 2)) == (255, 255, 255) and n_bytes[1] < n_bytes[0] / 20
-    x = np.linspace(0, 255, 900)
-    photograph = np.stack([x[:, None] * np.ones(900), np.ones((900, 1)) * x, np.full((900, 900), 128.0)], axis=-1)
-    photograph += np.random.default_rng(0).normal(0, 8, photograph.shape)
-    photograph = photograph.clip(0, 255).astype(np.uint8)
-    small, n_bytes = shrunk(photograph)
-    assert n_bytes[1] < n_bytes[0] / 10 and np.abs(np.asarray(small, dtype=float) - photograph).mean() < 8
-
-
-def known_styles() -> list[MethodStyle]:
-    names = ("oracle", "random", "forward", "visible", "bins", "max-visibility", "max-visibility-swapped", "set",
-             "trees", "conv", "sphere", "mlp-2d", "mlp-2d+z", "mlp-2d+3d", "expected-bins", "fisher-trace-gp",
-             "fisher-logdet-exact", "fisher-mineig-quadratic")  # fmt: skip
-    return [method_style(name) for name in names]
-
-
-def shrunk(pixels: np.ndarray) -> tuple[Image.Image, tuple[int, int]]:
-    """The picture, and its bytes before and after."""
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, "PNG", compress_level=0)
-    kind, _, content = small_picture(base64.b64encode(stream.getvalue()).decode()).partition(",")
-    assert kind == "data:image/webp;base64"
-    small = base64.b64decode(content)
-    return Image.open(io.BytesIO(small)).convert("RGB"), (len(stream.getvalue()), len(small))
-
-
-def test_cells_of_tables_keep_the_names_that_their_style_speaks_of() -> None:
-    style = "<style>#T_1 th.col_heading { color: red } #T_1_row0_col1 { font-weight: bold }</style>"
-    head = '<th id="T_1_a" class="col_heading level0" >a</th>'
-    cell = '<td id="T_1_b" class="data" >1</td>'
-    bold = '<td id="T_1_row0_col1" class="data col1" >2</td>'
-    assert small_table(f'{style}<table id="T_1"><tr class="x">{head}{cell}{bold}</tr></table>') == (
-        f'{style}<table id="T_1"><tr><th class="col_heading">a</th><td>1</td><td id="T_1_row0_col1">2</td></tr></table>'
-    )
-
-
-def test_a_page_shows_tables_once() -> None:
-    table = nbformat.v4.new_output("display_data", {"text/html": "<b>told</b>", "text/plain": "told"})
-    widget = {"application/vnd.jupyter.widget-view+json": {}, "text/plain": "plan: 0%"}
-    bar = nbformat.v4.new_output("display_data", widget)
-    cells = [nbformat.v4.new_code_cell("x", outputs=[bar, table])]
-    page = notebook_page(nbformat.v4.new_notebook(cells=[nbformat.v4.new_markdown_cell("# a page"), *cells]))
-    assert "plan: 0%" not in page
-    assert page.count("<b>told</b>") == page.count("told") == 1 and "<title>a page</title>" in page

@@ -57,16 +57,6 @@ def test_files_of_ones_own_come_first(elsewhere: Path) -> None:
     assert demo is not None and demo.name == "demo"
 
 
-@pytest.mark.parametrize("given", [["--config", "configs/small.yaml"], ["--config=configs/small.yaml"]])
-@pytest.mark.usefixtures("elsewhere")
-def test_the_commands_of_the_help_run_in_any_folder(given: list[str]) -> None:
-    named = ["--evaluate.weights", f"[{WEIGHTS}/mlp-2d+z.safetensors]"]
-    experiment = parse_command("evaluate", [*given, *named])
-    assert experiment is not None and experiment.name == "small"
-    assert experiment.evaluate.weights == (shipped(WEIGHTS) / "mlp-2d+z.safetensors",)
-    assert experiment.root == Path("data/small")  # in this folder
-
-
 @pytest.mark.usefixtures("elsewhere")
 def test_a_map_is_scored_by_the_weights_that_ship(localization_map: LocalizationMap) -> None:
     rng = np.random.default_rng(1)

@@ -111,8 +111,8 @@ _DIGITS = {"yaw_deg": ".3f", "pitch_deg": ".3f", "score": ".9g", "set_score": ".
 
 def _csv(views: SelectedViews) -> str:
     table = _table(views)
-    for name in table.select_dtypes("floating"):
-        pattern = f"{{:{_DIGITS.get(name, '.9f')}}}"
+    for name in [name for name, values in table.items() if values.dtype.kind == "f"]:
+        pattern = f"{{:{_DIGITS.get(str(name), '.9f')}}}"
         table[name] = table[name].map(pattern.format, na_action="ignore")
     table["quaternion_xyzw"] = table[["qx", "qy", "qz", "qw"]].agg(" ".join, axis=1)
     return str(table.to_csv(index=False, lineterminator="\n"))

@@ -45,7 +45,7 @@ def tum(mesh, tmp_path_factory):
 
 
 def scan(folder, **options):
-    return make_scan(RgbdConfig(folder=folder, **{"voxel_m": VOXEL_M, "max_depth_m": 5.0, **options}), progress=False)
+    return make_scan(RgbdConfig(folder=folder, **{"voxel_m": VOXEL_M, "max_depth_m": 5.0, **options}))
 
 
 def copied(folder, to, every=1):

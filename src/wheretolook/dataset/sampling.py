@@ -43,7 +43,7 @@ def sample_viewpoints(
     landmarks: Landmarks,
     cameras: Camera | Mapping[int, Camera],
     occlusion: OcclusionModel,
-    config: SampleConfig | None = None,
+    config: SampleConfig = SampleConfig(),
     device: str = "cpu",
     progress: str | None = None,
     split: Split = "train",
@@ -60,7 +60,6 @@ def sample_viewpoints(
         MapError: there are no landmarks.
         ConfigError: so many viewpoints do not fit into memory.
     """
-    config = config or SampleConfig()
     rng = np.random.default_rng(config.seed)
     ids = np.sort(_subset(np.asarray(location_ids, dtype=np.int64), config.max_locations, rng))
     locations = grid.centers()[ids]

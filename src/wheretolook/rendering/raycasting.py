@@ -16,6 +16,8 @@ from wheretolook.rendering import ray_kernels
 from wheretolook.rendering.ray_kernels import cast_kernel, clear_kernel, distance_kernel, unoccluded_kernel
 from wheretolook.utils.warp import start_warp, vec3_array
 
+BLOCK_RAYS = 1 << 28  # traced at a time by `occluded`, to bound the memory on the device
+
 
 @dataclass(frozen=True, eq=False)
 class RayHits:
@@ -29,12 +31,11 @@ class RayHits:
 class MeshRaycaster:
     """Answers ray and distance queries on a mesh, on "cpu" (one core) or a CUDA device such as "cuda" or "cuda:1".
 
-    `occluded` traces `block_rays` at a time, to bound the memory on the device. ConfigError if there is no such device.
+    Raises ConfigError if there is no such device.
     """
 
-    def __init__(self, mesh: TexturedMesh, device: str = "cpu", block_rays: int = 1 << 28) -> None:
+    def __init__(self, mesh: TexturedMesh, device: str = "cpu") -> None:
         self.device = start_warp(device)
-        self.block_rays = block_rays
         wp.load_module(ray_kernels, device=self.device)  # only one thread may do that
         self.warp_mesh = warp_mesh(mesh, self.device)
         self.origin = mesh.origin
@@ -50,7 +51,7 @@ class MeshRaycaster:
         n_points = points_on_device.shape[0]
         occluded = np.zeros((len(origins_at), n_points), dtype=np.bool_)
         threads = len(os.sched_getaffinity(0)) if self.device == "cpu" else 1
-        block = max(1, min(self.block_rays // max(n_points, 1), -(-len(origins_at) // threads)))
+        block = max(1, min(BLOCK_RAYS // max(n_points, 1), -(-len(origins_at) // threads)))
 
         def work(start: int) -> None:
             rows = slice(start, start + block)

@@ -44,7 +44,7 @@ class RgbdFrames:
     read, ConfigError for invalid intrinsics.
     """
 
-    def __init__(self, config: RgbdConfig, progress: bool = True) -> None:
+    def __init__(self, config: RgbdConfig) -> None:
         assert config.folder is not None
         self.folder = config.folder
         self.layout = find_layout(config.folder)
@@ -58,7 +58,7 @@ class RgbdFrames:
         self._set_cameras(config)
         self._files: list[FrameFiles] = []
         survey = []
-        for frame in tqdm(files, desc="read frames", unit="frame", disable=not progress):
+        for frame in tqdm(files, desc="read frames", unit="frame"):
             depth_m = _read(self._read_depth, frame)
             if depth_m is None or _read(read_image, frame.color, cv2.IMREAD_REDUCED_COLOR_8) is None:
                 self.skipped[_DAMAGED] += 1
@@ -87,7 +87,8 @@ class RgbdFrames:
         image = read_image(self._files[index].color, cv2.IMREAD_COLOR)
         rgb = np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
         if self._undistortion is not None:
-            rgb = np.asarray(cv2.remap(rgb, *self._undistortion, cv2.INTER_LINEAR), dtype=np.uint8)
+            across, down = self._undistortion
+            rgb = np.asarray(cv2.remap(rgb, across, down, cv2.INTER_LINEAR), dtype=np.uint8)
         return rgb
 
     def correct_depths(self, correction: DepthCorrection) -> None:

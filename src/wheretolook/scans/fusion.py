@@ -88,25 +88,25 @@ class Scan:
         write_model(model, folder)
 
 
-def make_scan(config: RgbdConfig, device: str = "cpu", progress: bool = True) -> Scan:
+def make_scan(config: RgbdConfig, device: str = "cpu") -> Scan:
     """Read, check and fuse the recording in `config.folder`.
 
     Issues a `MapWarning` if the given direction up seems wrong. Raises SceneError if the recording is incomplete, its
     depths are in another unit, or show no surface; MapError if the model cannot be read; ConfigError if the voxels do
     not fit into memory.
     """
-    frames = RgbdFrames(config, progress)
+    frames = RgbdFrames(config)
     check_depth_unit(frames)
     if frames.model is not None and config.correct_depth:
         correction = fit_depth_correction(*landmark_readings(frames, frames.model).T)
         if correction is not None:
             frames.correct_depths(correction)
     tsdf = TsdfConfig(config.voxel_m, TRUNCATION_VOXELS, config.max_depth_m)
-    volume = TsdfVolume.from_images(frames, tsdf, progress, colored=True)
+    volume = TsdfVolume.from_images(frames, tsdf, colored=True)
     mesh = _without_small_pieces(volume.surface(min(_MIN_READINGS, len(frames))))
     del volume
     if config.appearance == "texture":
-        mesh = textured(mesh, frames, device, progress)
+        mesh = textured(mesh, frames, device)
     up = _up(config, frames, mesh)
     rotation = rotation_to_z(up)
     turned = replace(mesh, vertices=(mesh.vertices @ rotation.T).astype(np.float32), origin=rotation @ mesh.origin)

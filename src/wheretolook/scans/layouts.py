@@ -128,7 +128,8 @@ def _list_tum(folder: Path, need_poses: bool) -> Iterator[_Listed]:
     if need_poses:
         others.append(_read_list(folder / "groundtruth.txt", "pose", 7))
     for other in others:
-        table = pd.merge_asof(table, other, on="time", direction="nearest", tolerance=_MAX_APART_S)
+        apart: Any = _MAX_APART_S  # the stubs of pandas know no floats here
+        table = pd.merge_asof(table, other, on="time", direction="nearest", tolerance=apart)
     for row in table.to_dict("records"):
         (name,) = row["color"]
         # without a counterpart, cells are NaN

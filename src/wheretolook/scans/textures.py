@@ -30,14 +30,14 @@ _GAINS = (0.5, 2.0)  # range of exposure correction
 _MIN_AREA_SHARE = 0.5  # of the largest area in pixels of a triangle in any photograph
 
 
-def textured(mesh: TexturedMesh, frames: RgbdFrames, device: str = "cpu", progress: bool = True) -> TexturedMesh:
+def textured(mesh: TexturedMesh, frames: RgbdFrames, device: str) -> TexturedMesh:
     """Texture a mesh with the photographs of frames; triangles that none shows get their vertex colours."""
     camera = frames.camera
     chosen = evenly(len(frames), MAX_PHOTOGRAPHS)
     poses = frames.cam_from_world[chosen]
     areas = np.zeros((len(chosen), len(mesh.triangles)), dtype=np.float16)
     renderer = make_renderer(mesh, device)
-    for row, pose in enumerate(tqdm(poses, desc="find textures", unit="photograph", disable=not progress)):
+    for row, pose in enumerate(tqdm(poses, desc="find textures", unit="photograph")):
         areas[row] = _areas_px(mesh, renderer, camera, pose)
     photograph = _cover(areas)
     textures: list[NDArray[np.uint8]] = []

@@ -117,7 +117,7 @@ def _parts(scene: trimesh.Scene) -> Iterator[_Part]:
     for node in sorted(scene.graph.nodes_geometry, key=lambda node: (order[scene.graph[node][1]], node)):
         matrix, name = scene.graph[node]
         part: Any = scene.geometry[name]
-        if isinstance(part, trimesh.Trimesh) and len(part.faces):
+        if isinstance(scene.geometry[name], trimesh.Trimesh) and len(part.faces):
             if part.visual.kind == "face":  # colours by face become colours by vertex
                 part = part.copy()
                 part.unmerge_vertices()

@@ -20,8 +20,8 @@ class FreeSpace:
     as a surface, and `raycaster` has the mesh, for rays and distances.
     """
 
-    def __init__(self, mesh: TexturedMesh, config: FreeSpaceConfig | None = None, device: str = "cpu") -> None:
-        self.config = config or FreeSpaceConfig()
+    def __init__(self, mesh: TexturedMesh, config: FreeSpaceConfig = FreeSpaceConfig(), device: str = "cpu") -> None:
+        self.config = config
         self.bounds = mesh.bounds
         self.raycaster = MeshRaycaster(mesh, device)
         normals = mesh.normals

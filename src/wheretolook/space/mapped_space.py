@@ -21,8 +21,10 @@ class MappedSpace:
     and landmarks (without the outermost per cent along each axis). Raises MapError without landmarks or cameras.
     """
 
-    def __init__(self, landmarks: ArrayLike, cameras: ArrayLike, config: MappedSpaceConfig | None = None) -> None:
-        self.config = config or MappedSpaceConfig()
+    def __init__(
+        self, landmarks: ArrayLike, cameras: ArrayLike, config: MappedSpaceConfig = MappedSpaceConfig()
+    ) -> None:
+        self.config = config
         points, centers = (np.asarray(values, dtype=np.float64).reshape(-1, 3) for values in (landmarks, cameras))
         if not len(points) or not len(centers):
             value = (len(points), len(centers))

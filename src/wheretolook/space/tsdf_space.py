@@ -37,11 +37,11 @@ class TsdfSpace(FreeSpace):
         self,
         volume: TsdfVolume,
         images: DepthImages,
-        config: FreeSpaceConfig | None = None,
+        config: FreeSpaceConfig = FreeSpaceConfig(),
         device: str = "cpu",
         progress: bool = True,
     ) -> None:
-        super().__init__(volume.surface(), replace(config or FreeSpaceConfig(), two_sided=False), device)
+        super().__init__(volume.surface(), replace(config, two_sided=False), device)
         self._step_m = volume.config.voxel_size_m
         cell_m = max(self._step_m, min(CELL_M, self.config.clearance_m / 2))
         nx, ny, nz = np.maximum(np.ceil((self.bounds[1] - self.bounds[0]) / cell_m), 1).astype(int).tolist()

@@ -27,7 +27,7 @@ class Tab:
 
         self._socket = connect(address, max_size=1 << 27)  # type: ignore[var-annotated]
         self._number = 0
-        self.errors = []
+        self.errors: list[str] = []
         for domain in ("Page", "Runtime", "Log"):
             self.call(f"{domain}.enable")
         self.call(
@@ -46,13 +46,11 @@ class Tab:
                 return message["result"]
 
     def _note(self, message: dict[str, Any]) -> None:
+        kind = message.get("method")
         params = message.get("params", {})
-        if message.get("method") == "Runtime.exceptionThrown":
-            self.errors.append(params["exceptionDetails"].get("text", "") + str(params["exceptionDetails"]))
-        if message.get("method") == "Runtime.consoleAPICalled" and params["type"] == "error":
-            self.errors.append(" ".join(str(part.get("value", part.get("description"))) for part in params["args"]))
-        if message.get("method") == "Log.entryAdded" and params["entry"]["level"] == "error":
-            self.errors.append(f"{params['entry']['text']} {params['entry'].get('url', '')}")
+        is_error = "error" in (params.get("type"), params.get("entry", {}).get("level"))
+        if kind == "Runtime.exceptionThrown" or (kind in ("Runtime.consoleAPICalled", "Log.entryAdded") and is_error):
+            self.errors.append(str(params))
 
     def go(self, url: str) -> None:
         self.call("Page.navigate", url=url)
@@ -92,13 +90,10 @@ class Tab:
 
     def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 10) -> None:
         """Drag the mouse from one pixel to another."""
-        ways = [tuple(a + (b - a) * k / steps for a, b in zip(start, end, strict=True)) for k in range(steps + 1)]
-        moves = [("mouseMoved", start), ("mousePressed", start), *(("mouseMoved", at) for at in ways)]
-        for kind, (x, y) in [*moves, ("mouseReleased", end)]:
-            held = (
-                {"button": "none"} if (kind, (x, y)) == moves[0] else {"button": "left", "clickCount": 1, "buttons": 1}
-            )
-            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **held)
+        way = [tuple(a + (b - a) * k / steps for a, b in zip(start, end, strict=True)) for k in range(steps + 1)]
+        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=start[0], y=start[1], button="none")
+        for kind, (x, y) in [("mousePressed", start), *(("mouseMoved", at) for at in way), ("mouseReleased", end)]:
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1, buttons=1)
             time.sleep(0.03)
 
     def downloads(self, folder: Path) -> None:
@@ -115,29 +110,13 @@ class Browser:
     def __init__(self, folder: Path, size: tuple[int, int] = (1280, 800)) -> None:
         program = chromium()
         assert program is not None
-        options = [
-            "--headless=new",
-            "--no-sandbox",
-            "--disable-dev-shm-usage",
-            "--use-angle=swiftshader",
-            "--enable-unsafe-swiftshader",
-            "--ignore-gpu-blocklist",
-            "--remote-debugging-port=0",
-            "--remote-allow-origins=*",
-            "--no-first-run",
-            "--hide-scrollbars",
-            "--disable-background-networking",
-            "--disable-renderer-backgrounding",
-            "--disable-background-timer-throttling",
-            "--disable-backgrounding-occluded-windows",
-        ]
-        self.size = size  # type: ignore[var-annotated]
-        self._tabs = []
-        self.process = subprocess.Popen(
-            [program, *options, f"--window-size={size[0]},{size[1]}", f"--user-data-dir={folder}", "about:blank"],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
+        options = "--headless=new --no-sandbox --disable-dev-shm-usage --use-angle=swiftshader --ignore-gpu-blocklist "
+        options += "--enable-unsafe-swiftshader --remote-debugging-port=0 --remote-allow-origins=* --no-first-run "
+        options += f"--hide-scrollbars --window-size={size[0]},{size[1]} --user-data-dir={folder} about:blank"
+        self.size = size
+        self._tabs: list[Tab] = []
+        null = subprocess.DEVNULL
+        self.process = subprocess.Popen([program, *options.split()], stdout=null, stderr=null)
         port = folder / "DevToolsActivePort"
         end = time.monotonic() + 60
         while not (port.is_file() and port.read_text().strip()):
@@ -158,8 +137,4 @@ class Browser:
         for tab in self._tabs:
             tab.close()
         self.process.terminate()
-        try:
-            self.process.wait(timeout=15)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
+        self.process.wait(timeout=15)

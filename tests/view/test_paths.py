@@ -23,7 +23,7 @@ STATE = ViewState("visible", "none", 3, 0.25, 1.4, 2.0, (1.0, 2.0, 1.5), -30.0, 
 
 
 def test_states_survive_text_and_link() -> None:
-    far = replace(STATE, place=(431207.125, 5412345.5, 312.046), eye=(431207.0, 5412345.5, 312.05), cut=1234.05)
+    far = replace(STATE, place=(431207.125, 5412345.5, 312.046), cut=1234.05)
     for state in (STATE, ViewState(), far):
         assert ViewState.parse(state.text()) == state
     link = STATE.link("localhost:8080")
@@ -55,12 +55,8 @@ def test_paths_of_poses(tmp_path: Path) -> None:
 
 def test_compared_paths_have_labels_if_there_are_any(tmp_path: Path) -> None:
     poses = looking_ahead(POINTS)
-    rows = [
-        pd.DataFrame({**pose_columns(poses), "method": method, "pair": pair, "task": "planned", "waypoint": range(4)})
-        for pair in (0, 1)
-        for method in ("forward", "set")
-    ]
-    table = pd.concat(rows)
+    rows = pd.DataFrame({**pose_columns(poses), "pair": 1, "task": "planned", "waypoint": range(4)})
+    table = pd.concat([rows.assign(method=method) for method in ("forward", "set")])
     scene = tmp_path / "paths" / "compared"
     scene.mkdir(parents=True)
     table.to_parquet(scene / "views.parquet")
@@ -80,12 +76,11 @@ def test_looking_ahead_follows_the_path_and_keeps_direction_where_it_stops() -> 
     np.testing.assert_allclose(axes, [(1, 0, 0), (1, 0, 0), (0, 1, 0), (0, 1, 0), (0, 1, 0)], atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["path.csv", "path.tum"])
-@pytest.mark.parametrize("text", ["", "1 2 3\n", "x,y\n1,2\n", "\0\0", "0 1 2 3 0 0 0 0\n" * 2, "0 " * 9_000_000])
-def test_invalid_text_files(name: str, text: str, tmp_path: Path) -> None:
-    (tmp_path / name).write_text(text)
+@pytest.mark.parametrize("text", ["", "0 1 2 3 0 0 0 1\n", "0 1 2 3 0 0 0 0\n" * 2])
+def test_invalid_trajectories(text: str, tmp_path: Path) -> None:
+    (tmp_path / "path.tum").write_text(text)
     with pytest.raises(TableError):
-        read_paths(tmp_path / name)
+        read_paths(tmp_path / "path.tum")
 
 
 @pytest.mark.parametrize("invalid", [{"tx": 1e300}, {"qw": np.nan}, {"method": [f"m{row}" for row in range(30)]}])

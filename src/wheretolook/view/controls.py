@@ -11,10 +11,11 @@ from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError
 from wheretolook.view.drawing import escape_markdown, legend
 from wheretolook.view.state import MAX_VIEWS, ViewState
-from wheretolook.view.viewed_map import STEP_M, ViewedMap
+from wheretolook.view.viewed_map import ViewedMap
 
 HINT = "Click a location on the coloured floor for the score of every direction and the best views."
 LIMITS = {threshold_label(threshold_key(limits)): limits for limits in THRESHOLDS}
+STEP_M = 0.05  # of heights
 FILES = {
     "CSV": ("csv", ".csv"),
     "JSON": ("json", ".json"),
@@ -53,7 +54,7 @@ class Controls:
         self.method = gui.add_dropdown("method", viewed.weights.methods, initial_value=state.method)
         self.weights = gui.add_markdown("")
         self.occlusion = gui.add_dropdown("occlusion model", viewed.occlusions, initial_value=state.occlusion)
-        self.height = _height_slider(gui, "camera height, m", viewed.bounds[:, 2], state.height)
+        self.height = _height_slider(gui, "height, m", viewed.bounds[:, 2], state.height)
         threshold = min(max(state.threshold, 0.0), 1.0)
         hint = "Locations with lower scores are paler."
         self.threshold = gui.add_slider("threshold", 0.0, 1.0, 0.01, threshold, hint=hint)
@@ -65,7 +66,7 @@ class Controls:
         self.yaw = gui.add_slider("yaw, degrees", -180.0, 180.0, 0.5, 0.0)
         self.pitch = gui.add_slider("pitch, degrees", -90.0, 90.0, 0.5, 0.0)
         hint = "Move to the selected view; drag to turn it."
-        self.inside = gui.add_checkbox("first-person view", False, hint=hint)
+        self.inside = gui.add_checkbox("first person", False, hint=hint)
         self.picture = gui.add_image(_BLANK, visible=False)
         self.picture_caption = gui.add_markdown("")
 

@@ -94,21 +94,21 @@ class LocationView:
             self.turn_to(location.best.axes[number])
 
     def _rings_dragged(self) -> None:
-        self.turn_to(rotation_from_quaternion(self._rings.wxyz)[:, 2], move_rings=False)
+        self.turn_to(rotation_from_quaternion(self._rings.wxyz)[:, 2], by="rings")
 
     def _sliders_moved(self) -> None:
         controls = self.session.controls
-        self.turn_to(axes_of_angles((value_of(controls.yaw), value_of(controls.pitch))), move_sliders=False)
+        self.turn_to(axes_of_angles((value_of(controls.yaw), value_of(controls.pitch))), by="sliders")
 
-    def turn_to(self, axis: Float, move_rings: bool = True, move_sliders: bool = True) -> None:
-        """Show the view along an axis (3,) at the location; the control that turned it is not moved."""
+    def turn_to(self, axis: Float, by: str = "") -> None:
+        """Show the view along an axis (3,) at the location; the "rings" or "sliders" that turned it are not moved."""
         location = self.session.location
         if location is None or not np.isfinite(axis).all() or np.linalg.norm(axis) < 1e-9:
             return
         self.axis = axis / np.linalg.norm(axis)
-        self.session.submit("view", NOW, self._show_view(location.position, self.axis, move_rings, move_sliders))
+        self.session.submit("view", NOW, self._show_view(location.position, self.axis, by))
 
-    def _show_view(self, position: Float, axis: Float, move_rings: bool, move_sliders: bool) -> Iterator[None]:
+    def _show_view(self, position: Float, axis: Float, by: str) -> Iterator[None]:
         """Report and draw a view: first its score, then its landmarks, then its image."""
         session = self.session
         c = session.controls
@@ -124,10 +124,10 @@ class LocationView:
         outside = not c.inside.value
         session.add_frustum("/view", pose, 3.0, drawing.FALSE_POSITIVE, thickness=4, visible=outside)
         session.client.flush()
-        if move_rings and self._rings is not None:
+        if by != "rings" and self._rings is not None:
             self._rings.wxyz = quaternion_from_rotation(pose[:, :3].T)
         yaw, pitch = (float(np.degrees(angle)) for angle in pan_tilt_angles(axis))
-        if move_sliders:
+        if by != "sliders":
             c.yaw.value = round(yaw * 2) / 2
             c.pitch.value = round(pitch * 2) / 2
         session.update(yaw=round(yaw, 1), pitch=round(pitch, 1))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache, cached_property, lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,7 +39,6 @@ MAX_FLOORS = 64
 MAX_MESHES = 4
 DIRECTIONS = 500  # scored at a location, as by `wheretolook select`
 OCCLUSION_BYTES = 1 << 26  # memory for cached lines of sight
-STEP_M = 0.05  # heights of floors and cuts are multiples of it
 
 
 class ViewedMap:
@@ -76,10 +75,6 @@ class ViewedMap:
         self.usual_m = float((low + high) / 2)  # median height of the mapping cameras
         if self.mapping_poses is not None and len(self.mapping_poses):
             self.usual_m = float(np.clip(np.median(camera_centers(self.mapping_poses)[:, 2]), low, high))
-        self._map = cache(self._make_map)
-        self._selector = lru_cache(MAX_SCORERS)(self._make_selector)
-        self._floor = lru_cache(MAX_FLOORS)(self._make_floor)
-        self._mesh = lru_cache(MAX_MESHES)(self._make_mesh)
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
@@ -112,40 +107,37 @@ class ViewedMap:
         """Return the ends of the colour scale: 0 and 1 for probabilities, else those of the finite scores."""
         return (0.0, 1.0) if self.is_probability(method) else (float(np.nanmin(scores)), float(np.nanmax(scores)))
 
+    # caches are shared by all maps of a process: usually it shows one
+
+    @lru_cache(MAX_SCORERS)  # noqa: B019
     def selector(self, method: str, occlusion: str, directions: int = DIRECTIONS) -> WhereToLook:
         """Return the view selector of a method and an occlusion model.
 
         Scorers cache what depends on the directions, so each number of directions has its own. Raises ConfigError for
         an unknown method or occlusion model, WeightsError if the weights cannot be used.
         """
-        return self._selector(method, occlusion, directions)
-
-    def _make_selector(self, method: str, occlusion: str, directions: int) -> WhereToLook:
         from wheretolook.scorers.registry import check_method, make_scorer
         from wheretolook.select.where_to_look import WhereToLook
 
         weights = self.weights.files.get(check_method(method).weights)
-        scorer = make_scorer(method, self._map(occlusion), weights=weights)
+        scorer = make_scorer(method, self._localization_map(occlusion), weights=weights)
         return WhereToLook(scorer, direction_lattice(directions), self.space)
 
-    def _make_map(self, occlusion: str) -> LocalizationMap:
+    @lru_cache(MAX_SCORERS)  # noqa: B019
+    def _localization_map(self, occlusion: str) -> LocalizationMap:
         from wheretolook.inputs.localization_map import LocalizationMap
 
         model = self.environment.occlusion_model(occlusion)
         return LocalizationMap(self.landmarks, self.camera, model, self.environment.device, self.mapping_poses)
 
+    @lru_cache(MAX_FLOORS)  # noqa: B019
     def floor(self, method: str, occlusion: str, height_m: float) -> Floor:
         """Return the floor at a height, one object for all clients."""
-        return self._floor(method, occlusion, round(height_m / STEP_M) * STEP_M)
-
-    def _make_floor(self, method: str, occlusion: str, height_m: float) -> Floor:
         return floor_at(self.selector(method, occlusion, FLOOR_DIRECTIONS), height_m)
 
+    @lru_cache(MAX_MESHES)  # noqa: B019
     def mesh_glb(self, cut_m: float | None) -> bytes | None:
         """Return the mesh below a height as GLB; None without a mesh."""
-        return self._mesh(None if cut_m is None else round(cut_m / STEP_M) * STEP_M)
-
-    def _make_mesh(self, cut_m: float | None) -> bytes | None:
         return None if self.mesh is None else drawing.mesh_glb(self.mesh, cut_m)
 
     def visible_landmarks(self, method: str, occlusion: str, pose: Float) -> drawing.VisibleLandmarks:

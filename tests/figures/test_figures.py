@@ -29,14 +29,14 @@ def test_label_figure_draws_shares_and_errors(tmp_path: Path) -> None:
     dataset = make_dataset(tmp_path, ("test", "train", "val"), n_locations=6, n_directions=10, n_landmarks=200)
     tables = {scene.name: scene.read_table() for scene in dataset.scenes}
     summary = label_summary(tables, {scene.name: scene.split for scene in dataset.scenes})
-    scenes, errors = label_figure(summary).axes
+    figure: Any = label_figure(summary)
+    scenes, errors = figure.axes
     names = [label.get_text() for label in scenes.get_yticklabels()]
     assert names == ["scene 0 (test)", "scene 1 (train)", "scene 2 (val)", "all scenes"]
-    bars: Any = scenes.patches
     for shade, column in zip(SHADES, (POSITIVE[0], POSITIVE[-1]), strict=True):
-        widths = [bar.get_width() for bar in bars if to_hex(bar.get_facecolor()) == shade]
+        widths = [bar.get_width() for bar in scenes.patches if to_hex(bar.get_facecolor()) == shade]
         np.testing.assert_allclose(widths, 100 * summary.shares.iloc[[0, 1, 2, -1]][column])
-    heights = [bar.get_height() for bar in errors.patches]  # type: ignore[attr-defined]
+    heights = [bar.get_height() for bar in errors.patches]
     assert sum(heights) == pytest.approx(100) and heights[-1] == pytest.approx(100 * summary.overall["without_pose"])
 
 
@@ -52,7 +52,7 @@ def marks(axes: Any) -> dict[str, float]:
 
 def test_score_figure_draws_the_best_methods_first() -> None:
     scores = make_scores(EVERY_METHOD, reference="")
-    figure = score_figure(scores)
+    figure: Any = score_figure(scores)
     rows = first_rows(scores)
     fisher = [name for name in rows.index if name in FISHER][:3]
     rows = rows.loc[[name for name in rows.index if name in fisher or not name.startswith("fisher")]]
@@ -60,7 +60,7 @@ def test_score_figure_draws_the_best_methods_first() -> None:
     assert [text.get_text().replace("\n", " ") for text in figure.axes[0].get_yticklabels()] == names
     for axes, key in zip(figure.axes, (KEYS[0], KEYS[-1]), strict=True):
         assert marks(axes) == pytest.approx(dict(zip(names, 100 * rows[f"normalized_{key}"], strict=True)))
-        whiskers: Any = [lines.get_segments()[0][:, 0] for lines in axes.collections]  # type: ignore[attr-defined]
+        whiskers = [lines.get_segments()[0][:, 0] for lines in axes.collections]
         np.testing.assert_allclose(whiskers, 100 * rows[[f"normalized_low_{key}", f"normalized_high_{key}"]])
 
 

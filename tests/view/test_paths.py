@@ -11,10 +11,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from selection.room import POINTS, write_room
+from selection.room import POINTS
 from wheretolook.dataset.viewpoint_table import pose_columns
-from wheretolook.geometry.poses import camera_centers
-from wheretolook.select.where_to_look import WhereToLook
+from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.io.poses import tum_text
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.view.paths import FORWARD, looking_ahead, read_paths
 from wheretolook.view.state import ViewState
@@ -40,16 +40,14 @@ def test_invalid_states(text: str) -> None:
         ViewState.parse(text)
 
 
-def test_paths_of_poses(tmp_path: Path) -> None:
-    sparse = write_room(tmp_path / "sparse")
-    views = WhereToLook.from_colmap(sparse, method="visible", occlusion="none", directions=60).best(POINTS)
-    views.save(tmp_path / "views.csv")
-    views.save(tmp_path / "views.tum")
-    pd.DataFrame({"score": 0.5, **pose_columns(views.cam_from_world)}).to_csv(tmp_path / "path.csv", index=False)
-    for name, method in (("views.csv", "views"), ("views.tum", "views"), ("path.csv", "planned"), ("", "planned")):
+def test_a_path_is_shown_next_to_a_camera_that_looks_ahead(tmp_path: Path) -> None:
+    poses = poses_looking_along(POINTS, np.tile((-1.0, -0.5, 0.0), (4, 1)))
+    pd.DataFrame({"score": 0.5, **pose_columns(poses)}).to_csv(tmp_path / "path.csv", index=False)
+    (tmp_path / "way.tum").write_text(tum_text("0123", poses))
+    for name, method in (("", "planned"), ("way.tum", "way")):
         paths = read_paths(tmp_path / name)
         assert [*paths] == [FORWARD, method] and paths[method].localized is None
-        np.testing.assert_allclose(paths[method].cam_from_world, views.cam_from_world, atol=1e-5)
+        np.testing.assert_allclose(paths[method].cam_from_world, poses, atol=1e-5)
         np.testing.assert_allclose(camera_centers(paths[FORWARD].cam_from_world), POINTS, atol=1e-5)
 
 

@@ -37,12 +37,12 @@ def random_views(n_locations: int = 30, n_directions: int = 12, seed: int = 0, s
     log_odds = rng.normal(0, 2, len(centers))
     wrong = (centers[:, 0] > 0) & (axes[:, 0] > 0)
     good = rng.random(len(centers)) < expit(np.where(wrong, -4, log_odds) + shift)
-    return LocalizedViews(log_odds, good, centers, axes, np.repeat(np.arange(n_locations), n_directions))
+    return LocalizedViews.rendered(log_odds, good, centers, axes, np.repeat(np.arange(n_locations), n_directions))
 
 
 def test_the_correction_is_scikit_learns_gaussian_process() -> None:
     views = random_views()
-    flat = LocalizedViews(np.zeros(len(views)), views.good, views.centers, views.axes, views.group)
+    flat = LocalizedViews.rendered(np.zeros(len(views)), views.good, views.centers, views.axes, views.group)
     # without log-odds, offset and correction are one process, of both kernels; its reach covers the room
     kernel = ConstantKernel(3.0) * RBF(2.0) + ConstantKernel(1 / PRIOR[1])
     theirs = GaussianProcessClassifier(kernel, optimizer=None, max_iter_predict=100).fit(views.centers, views.good)
@@ -76,7 +76,7 @@ def test_adapting_corrects_the_scorer_where_it_is_wrong() -> None:
 def test_noise_is_not_fitted() -> None:
     views = random_views(60)
     good = np.random.default_rng(3).random(len(views)) < expit(views.log_odds)
-    honest = LocalizedViews(views.log_odds, good, views.centers, views.axes, views.group)
+    honest = LocalizedViews.rendered(views.log_odds, good, views.centers, views.axes, views.group)
     assert log_losses(adapt(honest).held_out, good).mean() < log_losses(views.log_odds, good).mean() + 0.01
 
 

@@ -298,7 +298,7 @@ def labelled_views(files: SceneFolder, scene: SceneEnvironment, table: pd.DataFr
             log_odds[rows] = log_odds_of(scorer.score(cam_from_world[rows]))
     axes = cam_from_world[:, 2, :3]
     group = table["location_id"].to_numpy(np.int64)
-    return LocalizedViews(log_odds, is_good(table), camera_centers(cam_from_world), axes, group)
+    return LocalizedViews.rendered(log_odds, is_good(table), camera_centers(cam_from_world), axes, group)
 
 
 def _check_enough(views: LocalizedViews, source: Path) -> None:

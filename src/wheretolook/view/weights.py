@@ -86,11 +86,11 @@ def _if_adapted_to(path: Path, landmarks: Landmarks) -> Path | None:
         return None
     from safetensors import SafetensorError, safe_open
 
-    from wheretolook.scorers.adapted.place import LEAST_SAME, share_of_place
+    from wheretolook.scorers.adapted.place import MIN_SHARE, share_of_place
 
     try:
         with safe_open(path, framework="np") as file:
             place = file.get_tensor("place")
     except (SafetensorError, OSError):
         return None
-    return path if share_of_place(place, landmarks.points) >= LEAST_SAME else None
+    return path if share_of_place(place, landmarks.points) >= MIN_SHARE else None

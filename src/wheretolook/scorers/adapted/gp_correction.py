@@ -9,7 +9,7 @@ was wrong at nearby views; far from localized views g is 0.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from itertools import product
 
 import numpy as np
@@ -26,11 +26,13 @@ SHARPNESS = 4.0
 """Kernels that are tried: lengths, and variances of g. Chosen on the val scenes of configs/cameras.yaml, as was the
 sharpness."""
 PRIOR = np.array([5.0, 0.1])  # precision of scale (about 1) and offset (about 0)
-MAX_SUPPORT = 2000  # views that g stands on, finally and while kernels are tried; evenly spread
+MAX_SUPPORT = 2000  # views that support g, finally and while kernels are tried; evenly spread
 TRIED_SUPPORT = 800
 FOLDS = 5
-STEPS = 30  # of Newton's method: steps at most, and what one gains in log-likelihood at least
-TOLERANCE = 1e-4
+STEPS = 30  # of Newton's method at most
+TOLERANCE = 1e-4  # smallest gain in log-likelihood of a step
+
+Kernel = tuple[float, float]  # length in metres and variance of g
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,15 +45,15 @@ class LocalizedViews:
     axes: Float  # (B, 3) unit optical axes
     group: NDArray[np.int64]  # (B,) views of a group, such as a location, are held out together
     # (B,) index of the view's photograph, which may be held out with several blocks; -1 for rendered views
-    photograph: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    # (B,) index of the view's location, of whose views one is chosen; the group by default
-    place: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    photograph: NDArray[np.int64]
+    place: NDArray[np.int64]  # (B,) index of the view's location, of whose views one is chosen
 
-    def __post_init__(self) -> None:
-        if len(self.photograph) != len(self.good):
-            object.__setattr__(self, "photograph", np.full(len(self.good), -1))
-        if len(self.place) != len(self.good):
-            object.__setattr__(self, "place", self.group)
+    @classmethod
+    def rendered(
+        cls, log_odds: Float, good: NDArray[np.bool_], centers: Float, axes: Float, location: NDArray[np.int64]
+    ) -> LocalizedViews:
+        """Return rendered views, which are held out by location (B,)."""
+        return cls(log_odds, good, centers, axes, location, np.full(len(good), -1), location)
 
     def __len__(self) -> int:
         return len(self.good)
@@ -67,13 +69,11 @@ class LocalizedViews:
 
     def joined(self, other: LocalizedViews) -> LocalizedViews:
         """Return these views and others of the same scene, with separate groups and locations."""
-        shifts = {"group": 0, "place": 0}
-        for name in shifts if len(self) else ():
-            shifts[name] = int(getattr(self, name).max()) + 1
-        parts = [
-            np.concatenate([getattr(self, part.name), getattr(other, part.name) + shifts.get(part.name, False)])
-            for part in fields(self)
-        ]
+        parts = []
+        for part in fields(self):
+            values = getattr(self, part.name)
+            shift = int(values.max()) + 1 if part.name in ("group", "place") and len(self) else False
+            parts.append(np.concatenate([values, getattr(other, part.name) + shift]))
         return LocalizedViews(*parts)
 
 
@@ -91,24 +91,25 @@ class Adaptation:
 
     def log_odds(self, views: LocalizedViews) -> Float:
         """Return adapted log-odds (B,)."""
-        found = self.scale * views.log_odds + self.offset
-        if len(self.weights):
-            correction = Correction(self.centers, self.axes, self.weights, self.length_m, self.sharpness)
-            found = found + correction.at(views.centers, views.axes)
-        return found
+        correction = Correction(self.centers, self.axes, self.weights, self.length_m, self.sharpness)
+        return self.scale * views.log_odds + self.offset + correction.at(views.centers, views.axes)
 
 
 def fit(
-    views: LocalizedViews, length_m: float, amplitude: float, sharpness: float = SHARPNESS, most: int = MAX_SUPPORT
+    views: LocalizedViews, length_m: float, amplitude: float, sharpness: float = SHARPNESS, limit: int = MAX_SUPPORT
 ) -> Adaptation:
-    """Return the most likely adaptation of views for a kernel of this length and variance; 0 calibrates only."""
-    training = evenly(views, most) if amplitude else views
-    y = training.good.astype(np.float64)
-    fixed = np.column_stack([training.log_odds, np.ones(len(training))])
-    if not amplitude or not len(training):
+    """Return the most likely adaptation of views for a kernel of this length and variance; 0 calibrates only.
+
+    At most `limit` views support the correction, evenly spread.
+    """
+    if amplitude and len(views) > limit:
+        views = views.rows(np.arange(limit, dtype=np.int64) * len(views) // limit)
+    y = views.good.astype(np.float64)
+    fixed = np.column_stack([views.log_odds, np.ones(len(views))])
+    if not amplitude or not len(views):
         scale, offset = _calibration(fixed, y)
         return Adaptation(scale, offset, length_m, sharpness, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-    poses = training.centers, training.axes
+    poses = views.centers, views.axes
     kernel = amplitude * nearness(*poses, *poses, length_m, sharpness)
     residual = _most_likely(fixed @ (1.0, 0.0), kernel + (fixed / PRIOR) @ fixed.T, y)
     scale, offset = (1.0, 0.0) + fixed.T @ residual / PRIOR
@@ -118,7 +119,7 @@ def fit(
 def _most_likely(mean: Float, covariance: Float, y: Float) -> Float:
     """Return the residual a (N,) that maximizes the posterior of log-odds mean + covariance a, given labels (N,).
 
-    Newton's method (Rasmussen and Williams, Algorithm 3.1), whose steps are halved until they gain.
+    Newton's method (Rasmussen and Williams, Algorithm 3.1), whose steps are cut in two until they gain.
     """
 
     def objective(a: Float, shift: Float) -> float:
@@ -132,47 +133,33 @@ def _most_likely(mean: Float, covariance: Float, y: Float) -> Float:
         root = np.sqrt(p * (1 - p))
         target = root**2 * shift + y - p
         factor = cho_factor(np.eye(len(y)) + root[:, None] * covariance * root, check_finite=False)
-        full = target - root * cho_solve(factor, root * (covariance @ target), check_finite=False)
-        step = 1.0
-        full_shift = covariance @ full
-        while (
-            gained := objective(a + step * (full - a), shift + step * (full_shift - shift)) - known
-        ) < 0 and step > 1e-4:
-            step /= 2
-        a = a + step * (full - a)
-        shift = shift + step * (full_shift - shift)
-        known = known + gained
-        if gained < TOLERANCE:
+        best = target - root * cho_solve(factor, root * (covariance @ target), check_finite=False)
+        step = best - a
+        step_shift = covariance @ best - shift
+        size = 1.0
+        while (gain := objective(a + size * step, shift + size * step_shift) - known) < 0 and size > 1e-4:
+            size /= 2
+        a = a + size * step
+        shift = shift + size * step_shift
+        known = known + gain
+        if gain < TOLERANCE:
             break
     return a
 
 
 def _calibration(fixed: Float, y: Float) -> tuple[float, float]:
     """Return scale and offset of log-odds (Platt scaling) with a prior."""
-    at = np.array([1.0, 0.0])
     prior = np.array([1.0, 0.0])
+    at = prior
     for _ in range(STEPS):
         p = expit(fixed @ at)
         gradient = fixed.T @ (p - y) + PRIOR * (at - prior)
         step = np.linalg.solve(fixed.T @ (fixed * (p * (1 - p))[:, None]) + np.diag(PRIOR), gradient)
-        at = at - step * min(1.0, 2.0 / max(1e-12, float(np.abs(step).max())))
-        if np.abs(step).max() < 1e-8:
+        largest = float(np.abs(step).max())
+        at = at - step * min(1.0, 2.0 / max(1e-12, largest))
+        if largest < 1e-8:
             break
     return float(at[0]), float(at[1])
-
-
-def evenly(views: LocalizedViews, most: int) -> LocalizedViews:
-    """Return at most so many of the views, evenly spread over their order."""
-    if len(views) <= most:
-        return views
-    return views.rows(np.arange(most, dtype=np.int64) * len(views) // max(most, 1))
-
-
-def folds_of(group: NDArray[np.int64], count: int = FOLDS, seed: int = 0) -> NDArray[np.int64]:
-    """Return the fold (B,) of each view; groups stay together."""
-    names, row = np.unique(group, return_inverse=True)
-    order = np.random.default_rng(seed).permutation(len(names))
-    return np.asarray(order[row.reshape(-1)] % min(count, max(2, len(names))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,39 +178,35 @@ def adapt(views: LocalizedViews, seed: int = 0) -> Adapted:
     Photographs alone calibrate only: they are few, and a correction by pose did not improve held-out blocks
     (docs/adapt.md).
     """
-    rendered = (views.photograph < 0).any()
-    best = _choose_kernel(views, seed) if rendered else (1.0, 0.0)
-    found = np.zeros(len(views))
-    for out, training in splits(views, seed):
-        found[out] = fit(training, *best).log_odds(views.rows(out))
-    return Adapted(fit(views, *best), *best, found)
+    parts = list(splits(views, seed))
+
+    def held_out(kernel: Kernel, limit: int = MAX_SUPPORT) -> Float:
+        log_odds = np.zeros(len(views))
+        for out, training in parts:
+            log_odds[out] = fit(training, *kernel, limit=limit).log_odds(views.rows(out))
+        return log_odds
+
+    best: Kernel = (1.0, 0.0)
+    if (views.photograph < 0).any():
+        kernels = [best, *product(LENGTHS_M, AMPLITUDES)]
+        best = min(kernels, key=lambda kernel: log_losses(held_out(kernel, TRIED_SUPPORT), views.good).mean())
+    return Adapted(fit(views, *best), *best, held_out(best))
 
 
 def splits(views: LocalizedViews, seed: int = 0) -> Iterator[tuple[NDArray[np.bool_], LocalizedViews]]:
     """Yield held-out views (B,), each view once, and the training views.
 
-    Locations are held out in `FOLDS` parts; photographs alone, one block after the other. A held-out photograph is not
-    in the training views, whatever its block.
+    Groups are held out in `FOLDS` parts; those of photographs alone, one after the other. A held-out photograph is not
+    in the training views, whatever its group.
     """
-    rendered = (views.photograph < 0).any()
-    fold = folds_of(views.group, FOLDS if rendered else len(views), seed)
+    names, row = np.unique(views.group, return_inverse=True)
+    n_folds = FOLDS if (views.photograph < 0).any() else len(views)
+    order = np.random.default_rng(seed).permutation(len(names))
+    fold = order[row.reshape(-1)] % min(n_folds, max(2, len(names)))
     for number in np.unique(fold):
         out = fold == number
         again = (views.photograph >= 0) & np.isin(views.photograph, views.photograph[out])
         yield out, views.rows(~out & ~again)
-
-
-def _choose_kernel(views: LocalizedViews, seed: int) -> tuple[float, float]:
-    """Return length and variance of the kernel with the least held-out loss."""
-    parts = list(splits(views, seed))
-
-    def loss(kernel: tuple[float, float]) -> float:
-        found = np.zeros(len(views))
-        for out, training in parts:
-            found[out] = fit(training, *kernel, most=TRIED_SUPPORT).log_odds(views.rows(out))
-        return float(log_losses(found, views.good).mean())
-
-    return min([(1.0, 0.0), *product(LENGTHS_M, AMPLITUDES)], key=loss)
 
 
 def log_losses(log_odds: Float, good: NDArray[np.bool_]) -> Float:

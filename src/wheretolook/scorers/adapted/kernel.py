@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from wheretolook.geometry.poses import Float
@@ -25,10 +24,7 @@ def nearness(
 
 
 class Correction:
-    """The sum over N views of their weights (N,), each times its kernel with the query view.
-
-    `grid` computes the distances of many directions at the same locations once.
-    """
+    """The sum over N views of their weights (N,), each times its kernel with the query view."""
 
     def __init__(self, centers: Float, axes: Float, weights: Float, length_m: float, sharpness: float) -> None:
         self.centers = centers
@@ -36,34 +32,24 @@ class Correction:
         self.weights = weights
         self.length_m = length_m
         self.sharpness = sharpness
-        self._tree = cKDTree(centers) if len(centers) else None
+        self._tree = cKDTree(centers)
 
     def at(self, centers: Float, axes: Float) -> Float:
         """Return the correction (B,) of views at centers (B, 3) m with optical axes (B, 3)."""
         values = np.zeros(len(centers))
-        _, row = np.unique(centers, axis=0, return_inverse=True)
-        order = np.argsort(row.reshape(-1), kind="stable")
-        for rows in np.split(order, np.flatnonzero(np.diff(row.reshape(-1)[order])) + 1):
-            if len(rows):
-                values[rows] = self._at_location(centers[rows[0]], axes[rows])
+        locations, row, counts = np.unique(centers, axis=0, return_inverse=True, return_counts=True)
+        rows_by_location = np.split(np.argsort(row.reshape(-1), kind="stable"), np.cumsum(counts)[:-1])
+        for location, rows in zip(locations, rows_by_location, strict=False):
+            values[rows] = self._at_location(location, axes[rows])
         return values
 
     def grid(self, locations: Float, directions: Float) -> Float:
         """Return the correction (L, D) of views at locations (L, 3) m along each of directions (D, 3)."""
-        values = np.empty((len(locations), len(directions)))
-        for row, location in enumerate(locations):
-            values[row] = self._at_location(location, directions)
-        return values
+        values = [self._at_location(location, directions) for location in locations]
+        return np.array(values).reshape(len(locations), len(directions))
 
     def _at_location(self, location: Float, axes: Float) -> Float:
-        near = self._near(location)
-        if not len(near):
-            return np.zeros(len(axes))
+        near = np.array(self._tree.query_ball_point(location, REACH * self.length_m), dtype=np.int64)
         squared = ((self.centers[near] - location) ** 2).sum(1) / self.length_m**2
         by_distance = self.weights[near] * np.exp(-squared / 2)
         return np.asarray(np.exp(self.sharpness * (axes @ self.axes[near].T - 1)) @ by_distance)
-
-    def _near(self, location: Float) -> NDArray[np.int64]:
-        if self._tree is None:
-            return np.zeros(0, dtype=np.int64)
-        return np.array(self._tree.query_ball_point(location, REACH * self.length_m), dtype=np.int64)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import inf, isfinite
 from typing import Any, Self
 
 import torch
 
 from wheretolook.scorers.set.network import SetNetwork
-from wheretolook.training.trained_network import StoredNetwork
+from wheretolook.training.trained_network import StoredNetwork, finite
 
 MAX_SUPPORT = 1_000_000  # of views and landmarks: more are no weights of this program
 
@@ -51,17 +50,9 @@ class AdaptedNetwork(StoredNetwork):
     def of_description(cls, stored: Mapping[str, Any]) -> Self:
         """See `StoredNetwork.of_description`."""
         base = stored["base"]
-        kernel = stored["kernel"]
+        calibration = finite(base["scale"]), finite(base["offset"])
+        length_m, sharpness = kernel = [finite(stored["kernel"][name]) for name in ("length_m", "sharpness")]
         sizes = int(stored["support"]), int(stored["place"])
-        if not all(0 <= size <= MAX_SUPPORT for size in sizes):
-            raise ValueError(f"there are at most {MAX_SUPPORT:,} views and landmarks, not {sizes}")
-        length_m = float(kernel["length_m"])
-        sharpness = float(kernel["sharpness"])
-        if not (0 < length_m < inf and 0 <= sharpness < inf):
-            raise ValueError(f"no length and sharpness of a kernel: {length_m}, {sharpness}")
-        scale = float(base["scale"])
-        offset = float(base["offset"])
-        if not (isfinite(scale) and isfinite(offset)):
-            raise ValueError(f"scale {scale} and offset {offset} are not finite")
-        network = SetNetwork.of_description(base["network"])
-        return cls(network, scale, offset, length_m, sharpness, *sizes)
+        if length_m <= 0 or sharpness < 0 or not all(0 <= size <= MAX_SUPPORT for size in sizes):
+            raise ValueError(f"invalid kernel {stored['kernel']}, or numbers of views and landmarks {sizes}")
+        return cls(SetNetwork.of_description(base["network"]), *calibration, *kernel, *sizes)

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 from wheretolook.geometry.poses import Float
 
 SAME_M = 0.05
-LEAST_SAME = 0.5
+MIN_SHARE = 0.5
 """A map is of the scene if this share of the stored landmarks has one of the map's within this distance. A map with
 other filters, or reconstructed again in the same frame, still is."""
 

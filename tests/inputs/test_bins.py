@@ -46,12 +46,15 @@ def test_bins_counted_by_hand(bin_function) -> None:  # type: ignore[no-untyped-
     assert np.all(binned.means[:, :, binned.counts[0] == 0] == 0)
 
 
-def test_counted_bins_are_those_that_the_plain_twin_fills(random_views: RandomViews, device: str) -> None:
+def test_counted_bins_are_those_that_the_plain_twin_fills(
+    random_views: RandomViews, device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     v = random_views
     arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
     plain = bin_views_plain(arguments, bins=12)
     for block_bytes in (1 << 30, 3 * 12 * 12 * 4):  # all at once, and three views at a time
-        n_visible, n_filled = count_bins(arguments, bins=12, device=device, block_bytes=block_bytes)
+        monkeypatch.setattr("wheretolook.inputs.bins.BLOCK_BYTES", block_bytes)
+        n_visible, n_filled = count_bins(arguments, bins=12, device=device)
         np.testing.assert_array_equal(n_visible, plain.n_visible)
         np.testing.assert_array_equal(n_filled, plain.n_filled)
     distorted = ColmapCamera("RADIAL", 320, 240, (150.0, 165.0, 118.0, -0.15, 0.02))
@@ -110,10 +113,11 @@ def test_a_mean_with_an_unknown_value_is_unknown_and_nothing_else_is(random_view
     assert unknown.sum() == unknown[ALL_CHANNELS.index("ambiguity")]
 
 
-def test_blocks_do_not_change_the_bins(random_views: RandomViews) -> None:
+def test_blocks_do_not_change_the_bins(random_views: RandomViews, monkeypatch: pytest.MonkeyPatch) -> None:
     v = random_views
     arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
     whole = bin_views(arguments, bins=6)
-    blocks = bin_views(arguments, bins=6, block_bytes=7 * 36 * 24)
+    monkeypatch.setattr("wheretolook.inputs.bins.BLOCK_BYTES", 7 * 36 * 24)
+    blocks = bin_views(arguments, bins=6)
     np.testing.assert_array_equal(whole.means, blocks.means)
     np.testing.assert_array_equal(whole.counts, blocks.counts)

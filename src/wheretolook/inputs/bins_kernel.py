@@ -85,7 +85,7 @@ def count_bins_kernel(
     views: Views,
     grid: BinGrid,
     lanes: wp.int32,
-    taken: wp.array2d[wp.int32],  # 0 where no landmark has been seen in a bin yet
+    occupied: wp.array2d[wp.int32],  # 0 where no landmark has been seen in a bin yet
     n_in_view: wp.array[wp.int32],
     n_filled: wp.array[wp.int32],
 ):
@@ -99,7 +99,7 @@ def count_bins_kernel(
         if in_view(views.sides, view, offset, views.min_depth):
             seen += 1
             # whichever lane comes first fills the bin, so the numbers do not depend on the lanes' order
-            if wp.atomic_max(taken, view, cell_of(grid, pixel_in(grid, view, offset)), 1) == 0:
+            if wp.atomic_max(occupied, view, cell_of(grid, pixel_in(grid, view, offset)), 1) == 0:
                 filled += 1
     wp.atomic_add(n_in_view, view, seen)
     wp.atomic_add(n_filled, view, filled)

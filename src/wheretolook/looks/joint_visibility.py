@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from wheretolook.scorers.base import Scorer
 
 N_SUMS = 1 + N_NUMBERS  # landmarks expected to be detected, and their information on the pose
-MAX_ENTRIES = 12_000  # visible landmarks of all views that are described; of more, an even share stands for all
+MAX_ENTRIES = 12_000  # visible landmarks of all views that are described; of more, an even share represents all
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,14 +36,11 @@ class CandidateViews:
     def __len__(self) -> int:
         return len(self.p_detect)
 
-    def sums_with_each(self, p_missed: NDArray[np.float32] | None = None) -> Float:
-        """Return the sums (D, N_SUMS) of a set with each view added, in single precision.
-
-        `p_missed` (U,) is the probability that the set misses each landmark; None for an empty set.
-        """
-        if p_missed is None:
-            return np.asarray((self.p_detect @ self.terms.astype(np.float32)).astype(np.float64))
-        left = p_missed.astype(np.float64)[:, None] * self.terms
+    def sums_with_each(self, views: Sequence[int] = ()) -> Float:
+        """Return the sums (D, N_SUMS) of a set of views with each view added, in single precision."""
+        left = self.terms
+        if len(views):
+            left = self.p_missed(views).astype(np.float64)[:, None] * self.terms
         return np.asarray(self.terms.sum(0) - left.sum(0) + self.p_detect @ left.astype(np.float32))
 
     def p_missed(self, views: Sequence[int]) -> NDArray[np.float32]:
@@ -78,28 +75,26 @@ def candidate_views(
     rows = indices.cpu().numpy().astype(np.int64)
     view = np.repeat(np.arange(len(poses)), n_visible)
     stride = max(1, -(-len(rows) // MAX_ENTRIES))
-    if stride > 1:  # the same landmarks for every view, so that views still share them
-        kept = rows % stride == 0
-        rows = rows[kept]
-        view = view[kept]
+    kept = rows % stride == 0  # the same landmarks for every view, so that views still share them
+    rows = rows[kept]
+    view = view[kept]
     landmarks, column = np.unique(rows, return_inverse=True)
     offsets = localization_map.landmarks.points[landmarks] - location
     terms = np.concatenate([np.ones((len(landmarks), 1)), bearing_numbers(offsets)], axis=1)
     p_detect = np.zeros((len(poses), len(landmarks)), dtype=np.float32)
     p_detect[view, column] = 1
-    known = None
-    if not certain and len(rows):
-        ends = np.concatenate([[0], np.bincount(view, minlength=len(poses)).cumsum()])
-        known = scorer.landmark_probabilities(poses, LandmarkSets(ends, rows.astype(np.int32)))
-    if known is not None:
-        p_detect[view, column] = known.p_detect
-        precision = np.ones(len(landmarks))
-        precision[column] = known.precision  # the same from every view: it depends on the distance
-        terms[:, 1:] *= precision[:, None]
     p_single = np.zeros(len(poses))
-    method = find(scorer.name)
-    if scores is not None and not certain and method is not None and method.probability:
-        p_single = np.clip(np.asarray(scores, dtype=np.float64), 0, 1)
+    if not certain:
+        ends = np.concatenate([[0], np.bincount(view, minlength=len(poses)).cumsum()])
+        known = scorer.landmark_probabilities(poses, LandmarkSets(ends, rows.astype(np.int32))) if len(rows) else None
+        if known is not None:
+            p_detect[view, column] = known.p_detect
+            precision = np.ones(len(landmarks))
+            precision[column] = known.precision  # the same from every view: it depends on the distance
+            terms[:, 1:] *= precision[:, None]
+        method = find(scorer.name)
+        if scores is not None and method is not None and method.probability:
+            p_single = np.clip(np.asarray(scores, dtype=np.float64), 0, 1)
     return CandidateViews(p_detect, terms * stride, n_visible, p_single)
 
 

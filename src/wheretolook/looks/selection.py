@@ -111,21 +111,18 @@ def candidates(
         axis = np.asarray(start, dtype=np.float64)
         # a camera that does not roll rotates at least by the angle of its axis
         order = order[directions[order] @ axis / np.linalg.norm(axis) >= _cosine(max_turn_deg)]
-    taken: list[int] = []
+    rows: list[int] = []
     free = np.ones(len(directions), dtype=bool)
     near = np.cos(np.radians(SEPARATION_DEG))
-    for row in order:
-        if free[row]:
-            taken.append(int(row))
+    for row in order.tolist():
+        if free[row] and len(rows) < limit:
+            rows.append(row)
             free &= directions @ directions[row] < near
-            if len(taken) == limit:
-                break
     if max_turn_deg is not None and len(order):
-        close = order[directions[order] @ directions[order[0]] >= _cosine(max_turn_deg)][:limit]
-        taken += [int(row) for row in close]
-    if len(taken) < limit:  # so few directions, or so close to one another
-        taken += order[:limit].tolist()
-    return np.array(list(dict.fromkeys(taken)), dtype=np.int64)
+        rows += order[directions[order] @ directions[order[0]] >= _cosine(max_turn_deg)][:limit].tolist()
+    if len(rows) < limit:  # so few directions, or so close to one another
+        rows += order[:limit].tolist()
+    return np.array(list(dict.fromkeys(rows)), dtype=np.int64)
 
 
 def _cosine(limit_deg: float) -> float:
@@ -157,42 +154,42 @@ def select_views(
     if max_turn_deg is not None and not 0 <= max_turn_deg < np.inf:
         raise ConfigError("a limit on rotation is degrees of at least 0", value=max_turn_deg)
     limit = np.inf if max_turn_deg is None else max_turn_deg + TOLERANCE_DEG
-    first = _with_each(views, set_score, []) if single is None else np.asarray(single, dtype=np.float64)
-    begun = [] if required is None else [required]
-    chosen = _greedy(views, set_score, rotations, np.full(n, limit), first, begun)
-    if chosen is None:  # the best view may be so far off that no rotation is left for the others
-        chosen = _greedy(views, set_score, rotations, limit * np.arange(1, n + 1) / n, first, begun)
+    fixed = [] if required is None else [required]
+
+    def best_addition(rows: list[int], limit: float) -> tuple[int, float] | None:
+        values = _with_each(views, set_score, rows) if rows or single is None else np.asarray(single)
+        allowed = rotations.with_one_more(rows) <= limit
+        allowed[rows] = False
+        best = int(np.where(allowed, values, -np.inf).argmax())
+        return (best, float(values[best])) if allowed.any() else None
+
+    def greedy(limits: Float) -> list[int] | None:
+        chosen = list(fixed)
+        for limit in limits[len(fixed) :]:
+            addition = best_addition(chosen, limit)
+            if addition is None:
+                return None
+            chosen.append(addition[0])
+        return chosen
+
+    # the best view may be so far off that no rotation remains for the others
+    chosen = greedy(np.full(n, limit)) or greedy(limit * np.arange(1, n + 1) / n)
     if chosen is None:
         fix = "Raise the limit on rotation, or offer more directions."
         raise PlanningError(f"no {n} looks can be reached", value=max_turn_deg, fix=fix)
     score = score_of_set(views, set_score, chosen)
     for _ in range(exchanges if n > 1 else 0):
         before = score
-        for k in range(len(begun), n):
+        for k in range(len(fixed), n):
             others = chosen[:k] + chosen[k + 1 :]
-            values = _with_each(views, set_score, others)
-            best = _best(values, rotations.with_one_more(others) <= limit, others)
-            if best is not None and values[best] > score + 1e-9:
-                chosen = [*others[:k], best, *others[k:]]
-                score = float(values[best])
+            addition = best_addition(others, limit)
+            if addition is not None and addition[1] > score + 1e-9:
+                chosen = [*others[:k], addition[0], *others[k:]]
+                score = addition[1]
         if score <= before:
             break
     total, order = rotations.shortest(chosen)
     return ViewSet(order, score, total)
-
-
-def _greedy(
-    views: CandidateViews, set_score: SetScore, rotations: Rotations, limits: Float, first: Float, begun: list[int]
-) -> list[int] | None:
-    """Return views added one by one to those begun with, the first k within the k-th limit; None if there are none."""
-    chosen = list(begun)
-    for limit in limits[len(begun) :]:
-        values = _with_each(views, set_score, chosen) if chosen else first
-        best = _best(values, rotations.with_one_more(chosen) <= limit, chosen)
-        if best is None:
-            return None
-        chosen.append(best)
-    return chosen
 
 
 def score_of_set(views: CandidateViews, set_score: SetScore, rows: list[int]) -> float:
@@ -202,11 +199,4 @@ def score_of_set(views: CandidateViews, set_score: SetScore, rows: list[int]) ->
 
 def _with_each(views: CandidateViews, set_score: SetScore, rows: list[int]) -> Float:
     """Return the score (D,) of a set with each view added."""
-    p_missed = views.p_missed(rows) if rows else None
-    return set_score(views.sums_with_each(p_missed), views.p_none(rows) * (1 - views.p_single))
-
-
-def _best(values: Float, allowed: NDArray[np.bool_], taken: list[int]) -> int | None:
-    free = allowed.copy()
-    free[taken] = False
-    return int(np.where(free, values, -np.inf).argmax()) if free.any() else None
+    return set_score(views.sums_with_each(rows), views.p_none(rows) * (1 - views.p_single))

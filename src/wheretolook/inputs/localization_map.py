@@ -16,7 +16,7 @@ from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
 from wheretolook.mapping.colmap_source import open_colmap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.sanity import warn_of_mesh
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.validation import check_positive
 from wheretolook.visibility import frustum
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews, landmarks_in_view
 from wheretolook.visibility.listing import in_view_by_table
@@ -26,9 +26,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 SAME_LOCATION_DECIMALS = 6  # camera centres that agree to this many decimals of a metre share one visibility test
-
-
-WORTH_A_TABLE = 1_000_000
+MIN_LINES_FOR_TABLE = 1_000_000
 """Lines of sight from which on a COLMAP camera's field of view is tabulated, which takes about a second."""
 
 
@@ -36,8 +34,8 @@ WORTH_A_TABLE = 1_000_000
 class LocalizationMap:
     """A map to localize against, for everything that scores viewpoints."""
 
-    landmarks: Landmarks  # what a camera may recognize
-    camera: Camera  # the one that will look: a pinhole, or any COLMAP model
+    landmarks: Landmarks
+    camera: Camera  # the one to localize: a pinhole, or any COLMAP model
     occlusion: OcclusionModel = NoOcclusion()  # which landmarks have a free line of sight from a location
     device: str = "cpu"  # where kernels run, "cpu" or a CUDA device
     mapping_poses: Float | None = None  # cam_from_world (M, 3, 4) of the images the map was made from, if known
@@ -53,15 +51,15 @@ class LocalizationMap:
         device: str = "cpu",
         database: str | Path | None = None,
     ) -> LocalizationMap:
-        """From any COLMAP model (version 3 or 4, binary or text) in metres, z up.
+        """Open any COLMAP model (version 3 or 4, binary or text) in metres, z up.
 
         A `MapWarning` says which points are left out, if the model seems not to be in metres or not to have z up, and
         if the mesh seems to be in another frame.
 
         Args:
             model: folder of the model.
-            camera: the camera that will look, which need not be one that mapped: a camera, or the camera_id of one of
-                the model. None for the model's own, with its distortion, if it has but one.
+            camera: the camera to localize, which may differ from the mapping cameras: a camera, or the camera_id of one
+                of the model. None for the model's own, with its distortion, if it has but one.
             mesh: a mesh of the scene, for true occlusion.
             occlusion: another model, such as `HiddenPointRemoval()` where there is nothing but the landmarks, or
                 `TsdfOcclusion` where there are depth images. With neither, landmarks are seen through walls.
@@ -77,13 +75,9 @@ class LocalizationMap:
             SceneError: the mesh cannot be used.
             ConfigError: the largest reprojection error is not positive.
         """
-        worst_px = max_reprojection_error_px
-        if worst_px is not None and not worst_px > 0:
-            raise ConfigError(
-                "the largest reprojection error is positive", value=worst_px, fix="Give pixels, such as 2."
-            )
-        landmarks, camera, poses = open_colmap(model, camera, database, worst_px, device)
-        occlusion = occlusion or NoOcclusion()
+        if max_reprojection_error_px is not None:
+            check_positive("max_reprojection_error_px", max_reprojection_error_px)
+        landmarks, camera, poses = open_colmap(model, camera, database, max_reprojection_error_px, device)
         if mesh is not None:
             from wheretolook.scenes.loading import load_mesh
             from wheretolook.space.free_space import FreeSpace
@@ -92,50 +86,48 @@ class LocalizationMap:
             space = FreeSpace(load_mesh(Path(mesh), colored=False), device=device)
             occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
             warn_of_mesh(mesh, landmarks.points, space.raycaster)
-        return cls(landmarks, camera, occlusion, device, poses)
+        return cls(landmarks, camera, occlusion or NoOcclusion(), device, poses)
 
     def of_camera(self, camera: Camera) -> LocalizationMap:
-        """The same map, looked at with another camera."""
+        """Return the same map for another camera."""
         if camera == self.camera:
             return self
         other = replace(self, camera=camera)
-        if "_points_on_device" in vars(self):
-            vars(other)["_points_on_device"] = self._points_on_device
+        vars(other)["_points_on_device"] = self._points_on_device
         return other
 
     def bin_views(self, cam_from_world: Float, bins: int = 30, landmark_channels: bool = False) -> BinnedViews:
-        """Bin the landmarks that views (B, 3, 4) see, in bins x bins cells of the image.
+        """Bin the visible landmarks of views (B, 3, 4) in bins x bins cells of the image.
 
         Bins have `CHANNELS`, or with `landmark_channels` also the landmarks' attributes, `ALL_CHANNELS`. Here as in
         the other methods, views at the same location share its occlusion test, and poses of another shape or with
         entries that are not finite raise ValueError.
         """
         described = self.landmarks if landmark_channels else None
-        return bin_views(self._views(cam_from_world), bins=bins, device=self.device, landmarks=described)
+        return bin_views(self._views(cam_from_world), bins, self.device, described)
 
     def count_bins(self, cam_from_world: Float, bins: int = 30) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """How many landmarks the views (B, 3, 4) see, and how many bins have one in them, (B,) each."""
-        return count_bins(self._views(cam_from_world), bins=bins, device=self.device)
+        """Return the visible landmarks of views (B, 3, 4), and the bins that have at least one, (B,) each."""
+        return count_bins(self._views(cam_from_world), bins, self.device)
 
     def landmarks_in_view(self, cam_from_world: Float) -> LandmarkSets:
-        """The landmarks that each of the views (B, 3, 4) sees."""
+        """Return the visible landmarks of each of the views (B, 3, 4)."""
         return landmarks_in_view(self._views(cam_from_world), self.device)
 
     def in_view_on_device(self, cam_from_world: Float) -> tuple[NDArray[np.int64], Tensor]:
-        """What `landmarks_in_view` gives, starts (B + 1,) int64 and indices int32; the latter on the map's device."""
+        """Return the visible landmarks of views (B, 3, 4) as starts (B + 1,) and indices int32 on the map's device."""
         import torch  # takes seconds to load
         import warp as wp
 
         views = self._views(cam_from_world)
-        if isinstance(self.camera, ColmapCamera):
-            lines = int(np.diff(views.unoccluded.starts)[views.location_rows].sum())
-            by_table = lines >= WORTH_A_TABLE
-            seen = (
-                in_view_by_table(views, self._points_on_device, self.device) if by_table else landmarks_in_view(views)
-            )
-            return seen.starts.astype(np.int64), torch.from_numpy(seen.indices).to(self.device)
-        starts, indices = frustum.in_view_on_device(views, self._points_on_device, self.device)
-        return starts.astype(np.int64), wp.to_torch(indices)
+        if not isinstance(self.camera, ColmapCamera):
+            starts, indices = frustum.in_view_on_device(views, self._points_on_device, self.device)
+            return starts.astype(np.int64), wp.to_torch(indices)
+        if int(np.diff(views.unoccluded.starts)[views.location_rows].sum()) >= MIN_LINES_FOR_TABLE:
+            sets = in_view_by_table(views, self._points_on_device, self.device)
+        else:
+            sets = landmarks_in_view(views)
+        return sets.starts.astype(np.int64), torch.from_numpy(sets.indices).to(self.device)
 
     @cached_property
     def _points_on_device(self) -> Any:
@@ -150,12 +142,11 @@ class LocalizationMap:
 
 
 def shared_locations(cam_from_world: Float) -> tuple[Float, NDArray[np.int64]]:
-    """Distinct locations (L, 3) m of poses (B, 3, 4), and each pose's row among these, (B,)."""
+    """Return the distinct locations (L, 3) m of poses (B, 3, 4), and each pose's row among these, (B,)."""
     centers = np.round(camera_centers(cam_from_world), SAME_LOCATION_DECIMALS)
-    if len(centers) == 0:
-        return centers, np.empty(0, dtype=np.int64)
-    # views at a location mostly follow one another, so look at the first of each run only
-    first = np.concatenate([[True], (centers[1:] != centers[:-1]).any(axis=1)])
+    # views at a location mostly follow one another: compare the first of each run only
+    first = np.ones(len(centers), dtype=bool)
+    first[1:] = (centers[1:] != centers[:-1]).any(axis=1)
     if first.sum() == 1:
         return centers[:1], np.zeros(len(centers), dtype=np.int64)
     locations, rows = np.unique(centers[first], axis=0, return_inverse=True)

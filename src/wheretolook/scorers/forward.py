@@ -31,17 +31,13 @@ class ForwardScorer(Scorer):
     def __init__(self, localization_map: LocalizationMap, heading: ArrayLike | None = None, seed: int = 0) -> None:
         super().__init__(localization_map)
         self.seed = seed
-        self._starts = np.empty((0, 3))
-        self._legs = np.empty((0, 3))
-        if heading is not None:
-            given = np.asarray(heading, dtype=np.float64)
-            legs = given[None] if given.ndim == 1 else np.diff(given, axis=0)
-            lengths = np.linalg.norm(legs, axis=-1)
-            usable = len(legs) and np.all((lengths > 0) & (lengths < np.inf))
-            if given.shape[-1:] != (3,) or given.ndim > 2 or not usable:
-                raise ValueError(f"a heading is a direction (3,) of finite length, or a path (W, 3) of such: {given}")
-            self._starts = np.zeros((1, 3)) if given.ndim == 1 else given[:-1]
-            self._legs = legs
+        given = np.empty((0, 3)) if heading is None else np.asarray(heading, dtype=np.float64)
+        path = np.stack([np.zeros(3), given]) if given.shape == (3,) else given
+        self._starts = path[:-1]
+        self._legs = np.diff(path, axis=0)
+        lengths = np.linalg.norm(self._legs, axis=-1)
+        if path.shape[1:] != (3,) or len(path) == 1 or not ((lengths > 0) & (lengths < np.inf)).all():
+            raise ValueError(f"a heading is a direction (3,) of finite length, or a path (W, 3) of such: {given}")
 
     def headings(self, centers: ArrayLike) -> Float:
         """Return the headings (B, 3), of unit length, at camera centres (B, 3)."""
@@ -62,7 +58,7 @@ class ForwardScorer(Scorer):
 
 
 def _build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
-    heading = None if not options.heading else options.heading[0] if len(options.heading) == 1 else options.heading
+    heading = options.heading[0] if len(options.heading) == 1 else options.heading or None
     return ForwardScorer(localization_map, heading, options.seed)
 
 

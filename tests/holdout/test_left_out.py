@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -55,9 +56,8 @@ def test_underconfident_weights_are_adapted_by_photographs(
     checked: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     sparse, database, data = checked
-    timid = TrainedNetwork.load(SET, SetNetwork, "set")
-    timid.offset -= 4
-    timid.save(tmp_path / "timid.safetensors", read_training(SET))
+    bundled = TrainedNetwork.load(SET, SetNetwork, "set")
+    replace(bundled, offset=bundled.offset - 4).save(tmp_path / "timid.safetensors", read_training(SET))
     before = {path: path.stat().st_mtime_ns for path in data.glob(f"checks/corridor/{WORK}/*/*/views.parquet")}
     assert adapt(checked, tmp_path, "--weights", str(tmp_path / "timid.safetensors")) == 0
     said = capsys.readouterr().out

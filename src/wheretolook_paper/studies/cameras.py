@@ -1,7 +1,7 @@
 """Choose the scorer for any camera: regret, AUC and calibration over different scenes and fields of view.
 
-    python -m wheretolook_paper.studies.cameras data/cameras --split val --weights data/release/weights --out a.csv
-    python -m wheretolook_paper.studies.cameras data/test-45 data/test-60 ... --split test --weights ...
+    python -m wheretolook_paper.studies.cameras --datasets '[data/cameras]' --weights data/release/weights --out a.csv
+    python -m wheretolook_paper.studies.cameras --datasets '[data/test-45, data/test-60]' --split test --weights ...
 
 Datasets are labelled. The first line chooses on the val scenes of `configs/cameras.yaml`, the second tests by angle on
 datasets of the same scenes and maps made with `--camera.fov_deg 45 --map.camera '{fov_deg: 90}'` and so on. Scenes of
@@ -12,12 +12,12 @@ resampled together; differences to the first method are paired.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from jsonargparse import auto_cli
 from sklearn.metrics import roc_auc_score
 
 from wheretolook.dataset.layout import Dataset
@@ -125,27 +125,34 @@ def _mean(draws: pd.Series) -> Float:
     return np.mean(np.stack(draws.to_list()), 0)
 
 
-def main() -> None:
-    """Score the datasets, print and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("datasets", nargs="+", type=Path)
-    parser.add_argument("--split", default="val")
-    parser.add_argument("--weights", type=Path, default=Path("data/release/weights"), help="folder of weights")
-    parser.add_argument("--methods", nargs="+", default=["set", "expected-inliers", "bins", "visible"])
-    parser.add_argument("--out", type=Path, help="CSV file for the table")
-    args = parser.parse_args()
-    paths = [path for path in sorted(args.weights.glob("*.safetensors")) if not path.stem.startswith("mlp")]
+def main(
+    datasets: tuple[Path, ...],
+    split: Split = "val",
+    weights: Path = Path("data/release/weights"),
+    methods: tuple[str, ...] = ("set", "expected-inliers", "bins", "visible"),
+    out: Path | None = None,
+) -> None:
+    """Score the datasets, print and write the table.
+
+    Args:
+        datasets: labelled datasets.
+        split: the scenes that are scored.
+        weights: folder of weights.
+        methods: what is compared; differences are to the first.
+        out: CSV file of the table.
+    """
+    paths = [path for path in sorted(weights.glob("*.safetensors")) if not path.stem.startswith("mlp")]
     tables = []
-    for root in args.datasets:
-        table = summary(scored(root, args.split, tuple(args.methods), paths), args.methods)
+    for root in datasets:
+        table = summary(scored(root, split, methods, paths), list(methods))
         table.insert(0, "dataset", root.name)
         tables.append(table)
-        print(f"\n{root.name}, {args.split}")
+        print(f"\n{root.name}, {split}")
         shown = table[(table["group"] == "mean") | table["group"].str.startswith("all ")]
         print(shown.drop(columns=["dataset"]).to_string(index=False, float_format=lambda x: f"{x:.3f}"))
-        if args.out:
-            pd.concat(tables).round(4).to_csv(args.out, index=False)
+        if out is not None:
+            pd.concat(tables).round(4).to_csv(out, index=False)
 
 
 if __name__ == "__main__":
-    main()
+    auto_cli(main, as_positional=False)

@@ -1,6 +1,6 @@
 """Fit the bundled models of view sets: the confidence of a joint pose, and the score of a set.
 
-    python -m wheretolook_paper.studies.fit_looks SCENE_FOLDER... [--places 60] [--sets 4]
+    python -m wheretolook_paper.studies.fit_looks --scenes '[FOLDER, ...]' [--places 60] [--draws 4]
 
 The scenes are validation scenes with one camera whose labels store pixels (`--label.store_pixels true`). At each
 location, sets of 1, 2, 3 and 5 views are drawn with probabilities that grow with their scores, and localized jointly.
@@ -11,12 +11,12 @@ together.
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from jsonargparse import auto_cli
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import log_loss, roc_auc_score
 
@@ -73,15 +73,15 @@ def report(name: str, inputs: np.ndarray, sets: pd.DataFrame) -> LogisticRegress
     return LogisticRegression().fit(inputs, good)
 
 
-def main() -> None:
-    """Draw sets, fit both models and print them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", type=Path, nargs="+")
-    parser.add_argument("--places", type=int, default=60)
-    parser.add_argument("--sets", type=int, default=4)
-    options = parser.parse_args()
-    scenes = [SceneFolder(folder, "val") for folder in options.scenes]
-    sets = pd.concat([drawn_sets(scene, options.places, options.sets) for scene in scenes], ignore_index=True)
+def main(scenes: tuple[Path, ...], places: int = 60, draws: int = 4) -> None:
+    """Draw sets, fit both models and print them.
+
+    Args:
+        scenes: scene folders.
+        places: locations in each scene.
+        draws: sets of each number of views at a location.
+    """
+    sets = pd.concat([drawn_sets(SceneFolder(folder, "val"), places, draws) for folder in scenes], ignore_index=True)
     accepted = sets[sets["n_inliers"] >= 10]
     names = ("n_inliers", "n_matches", "elsewhere", "own", "rival_own", "deviation_deg")
     fitted = report("confidence", confidence.confidence_features(*(accepted[name] for name in names)), accepted)
@@ -97,4 +97,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    auto_cli(main, as_positional=False)

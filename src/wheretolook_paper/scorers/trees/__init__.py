@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from wheretolook.scorers.method import Method, MethodStyle, ScorerOptions, imported
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.validation import check_positive, check_range
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
@@ -32,12 +32,11 @@ class TreesConfig:
     l2: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.max_trees < 1 or self.max_leaves < 2 or self.min_leaf < 1:
-            sizes = self.max_trees, self.max_leaves, self.min_leaf
-            raise ConfigError("trees need max_trees >= 1, max_leaves >= 2 and min_leaf >= 1", value=sizes)
-        if not self.learning_rate > 0 or not self.l2 >= 0:
-            value = self.learning_rate, self.l2
-            raise ConfigError("trees need a positive learning_rate and no negative l2", value=value)
+        check_range("max_trees", self.max_trees, 1)
+        check_range("max_leaves", self.max_leaves, 2)
+        check_range("min_leaf", self.min_leaf, 1)
+        check_positive("learning_rate", self.learning_rate)
+        check_range("l2", self.l2, 0)
 
 
 def _build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:

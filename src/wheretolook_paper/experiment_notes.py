@@ -20,7 +20,7 @@ class View:
     ascending: bool = True
 
     def state(self) -> str:
-        """As MLflow's interface shares a view, in a tag of the experiment."""
+        """Return the view as MLflow's interface shares it, in a tag of the experiment."""
         columns = [_column(name) for name in (*self.columns, f"metrics.{self.sort}")]
         sort = {"orderByKey": _column(f"metrics.{self.sort}"), "orderByAsc": self.ascending}
         facets = {"searchFilter": self.only, "startTime": "ALL", "lifecycleFilter": "Active"}
@@ -56,8 +56,8 @@ _FIRST = f"""\
 PURPOSES = {
     "evaluate": Purpose(
         f"""\
-How well methods choose where to look. One run is one evaluation; its own numbers are those of the best method that has
-to choose (tag `best`). Open it (+) to compare: in it is a run for each `method` × `occlusion` × `candidates`.
+Scores of methods that choose views. One run is one evaluation; its own numbers are those of the best method that has
+to choose (tag `best`). Open it (+) to compare: it contains a run for each `method` × `occlusion` × `candidates`.
 
 {_FIRST}
 - `top-1/…`, `top-5/…`, `top-10/…`: of the best 1, 5 and 10 views of a location, at each limit of the error, `regret`,
@@ -65,7 +65,7 @@ to choose (tag `best`). Open it (+) to compare: in it is a run for each `method`
 
 Keep two of the three parameters fixed to see what the third changes. All methods alike:
 `params.occlusion = "mesh" and params.candidates = "all"`; inputs of the paper's network: `params.method LIKE "mlp-%"`.
-All other numbers lie in the artifact `scores.csv`.""",
+All other numbers are in the artifact `scores.csv`.""",
         {
             "methods": View("all methods, the best first", REGRET, _CHOICES, _ALL),
             "inputs": View("inputs of the paper's network", REGRET, _CHOICES, f"{_ALL} AND params.method LIKE 'mlp-%'"),
@@ -83,7 +83,7 @@ Sets of looks from a place, localized together. Open the run (+) to compare: in 
     ),
     "train": Purpose(
         """\
-What was trained, a run for each time. Compare the last epoch kept by `kept_val_average_precision`, highest first, with
+Trained methods, one run per training. Compare the last epoch kept by `kept_val_average_precision`, highest first, with
 `method` next to it; the charts of `val_bce` and `train_bce` by step show overfitting. Weights
 and `history.csv` are artifacts.""",
         {"trained": View("what was trained, the best first", _KEPT, ("params.method", f"metrics.{AUC}"), "", False)},
@@ -96,7 +96,7 @@ the lowest mean regret (tag `best`). Open it (+) to compare: in it is a run for 
 - `{REGRET}`, `{AUC}`: on the test scenes; **sort by the first, lowest first**
 - `regret_others`, `average_precision_others`: on scenes by others; `…_validation`: what one may choose a learner by
 
-Runs that differ only by `seed` show the spread by chance.""",
+Runs that differ only by `seed` show the random spread.""",
         {"learners": View("all learners, the best first", REGRET, _LEARNERS, "params.learner LIKE '%'")},
     ),
     "adapt": Purpose(
@@ -118,7 +118,7 @@ Planned paths whose views were rendered and localized. Open the run (+) to compa
     ),
     "label": Purpose(
         """\
-How the labels came out, a run for each time. `positive_…` are the shares of viewpoints that localize within a limit;
+Statistics of labels, one run per labelling. `positive_…` are the shares of viewpoints that localize within a limit;
 with `train_` or `test_` in front, of that split. `seconds_…` is the time of each step; `labels.md` is an artifact."""
     ),
     "benchmark": Purpose(
@@ -128,7 +128,7 @@ with `train_` or `test_` in front, of that split. `seconds_…` is the time of e
 
 
 def experiment_tags(stage: str, experiment_id: str) -> dict[str, str]:
-    """Tags in which MLflow keeps the description and the saved views of an experiment of a stage's runs."""
+    """Return the MLflow tags with the description and the saved views of the experiment of a stage's runs."""
     if stage not in PURPOSES:
         return {}
     purpose = PURPOSES[stage]

@@ -56,7 +56,7 @@ def connected(port: int) -> Any:
 
 
 class Client(threading.Thread):
-    """A client that reads everything it is sent for some seconds and, unless told not to, clicks at random."""
+    """A client that reads all messages for some seconds and clicks at random if asked to."""
 
     def __init__(self, port: int, seconds: float, seed: int, clicks: bool = True) -> None:
         super().__init__(daemon=True)
@@ -196,7 +196,7 @@ def main() -> int:
     parser.add_argument("--clients", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--occlusion", default="")
-    parser.add_argument("--repeat", type=int, default=1, help="how often the map is opened")
+    parser.add_argument("--repeat", type=int, default=1, help="repeats of opening the map")
     parser.add_argument("--turns", type=int, default=20)
     options = parser.parse_args()
     errors = ErrorCounter()

@@ -9,7 +9,7 @@ from wheretolook.geometry import pose_information
 from wheretolook.geometry.pose_information import N_NUMBERS, bearing_numbers
 from wheretolook.geometry.poses import Float
 from wheretolook.visibility.frustum import offsets_from
-from wheretolook_paper.fisher.field_sums import NEAREST_M
+from wheretolook_paper.fisher.field import NEAREST_M
 from wheretolook_paper.fisher.soft_visibility import SoftVisibility
 
 

@@ -47,7 +47,7 @@ LOCALIZER = LocalizerConfig(max_error_px=12.0)  # RANSAC's threshold in match_an
 
 @dataclass(frozen=True)
 class RoundConfig:
-    """How views are selected and localized."""
+    """Options of selecting and localizing views."""
 
     weights: Path | None = None  # file or folder; None for the bundled ones
     directions: int = 500

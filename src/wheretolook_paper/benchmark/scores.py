@@ -29,7 +29,7 @@ PLAN_TURN_DEG = 30.0
 PLAN = f"plan_{threshold_key(PLAN_THRESHOLD)}_turn{PLAN_TURN_DEG:g}deg"
 
 Successes = dict[str, NDArray[np.bool_]]
-"""Which poses (N,) count as a success, by measure: the thresholds of evaluate_loc, and `PLAN` of evaluate_plan."""
+"""Masks (N,) of poses that count as a success, by measure: the thresholds of evaluate_loc, `PLAN` of evaluate_plan."""
 
 
 @dataclass(frozen=True, eq=False)

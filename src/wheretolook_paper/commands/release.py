@@ -108,7 +108,7 @@ def _finish(options: Release, dataset: Dataset, log: Log, progress: Progress) ->
 
 
 def release_settings(options: Experiment) -> dict[str, Any]:
-    """Settings that decide what a dataset holds, as JSON values. Meshes go by name: paths mean nothing elsewhere."""
+    """Return the settings that decide the contents of a dataset, as JSON values, with meshes by name instead of path."""
     meshes = [{"name": mesh.scene_name, "split": mesh.split, "up": mesh.up} for mesh in options.scenes.meshes]
     settings = {name: _record(getattr(options, name)) for name in ("scenes", "map", "occlusion", "sample")}
     settings = {"camera": options.camera.camera.record(), **settings}

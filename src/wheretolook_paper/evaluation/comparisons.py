@@ -36,7 +36,7 @@ def comparisons_markdown(scores: pd.DataFrame) -> str:
 
 
 def _comparison(scores: pd.DataFrame, column: str, name: str, about: str) -> list[str]:
-    """Average precision and score of every method by the values of a column, if there are several."""
+    """Format average precision and score of every method by the values of a column; empty if it has one value."""
     values = list(scores[column].unique()) if column in scores else []
     if len(values) < 2:
         return []

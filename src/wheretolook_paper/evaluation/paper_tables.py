@@ -22,7 +22,7 @@ NOTE = (
     "The paper's numbers were measured on other scenes (12 Habitat-Matterport meshes) and divided by one constant, "
     f"{RELEASED_DIVISOR}, at all thresholds: they can be compared with ours in kind, not in size."
 )
-"""Said with every table."""
+"""Note below every table."""
 
 
 @dataclass(frozen=True)
@@ -73,9 +73,9 @@ _SOURCES = ("normalized", "normalized_low", "normalized_high", "released")
 
 
 def paper_tables(scores: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """The paper's tables, "vs_others" and "input_variants", with this project's numbers next to the printed ones.
+    """Return the paper's tables, "vs_others" and "input_variants", with this project's numbers next to the printed ones.
 
-    Of a score table (`wheretolook.evaluation.scores.score_table`) the rows over all scenes with N = 1 are taken, those
+    Uses the rows of a score table (`wheretolook.evaluation.scores.score_table`) over all scenes with N = 1, those
     of the first occlusion model and the first set of candidates.
 
     A row for each of the paper's in its order: `paper_row` (its name there), `method` (its name here) and for each
@@ -108,7 +108,7 @@ def paper_tables(scores: pd.DataFrame) -> dict[str, pd.DataFrame]:
 
 
 def _is_network(method: str) -> bool:
-    """Whether a method is of the family of the paper's proposal."""
+    """Return whether a method is of the family of the paper's proposal."""
     known = find(method)
     proposed = find(PROPOSED)
     return known is not None and proposed is not None and known.family == proposed.family
@@ -140,7 +140,7 @@ _ABOUT = (
 
 
 def paper_markdown(table: pd.DataFrame, title: str) -> str:
-    """A table of `paper_tables` in Markdown, two thresholds abreast."""
+    """Format a table of `paper_tables` in Markdown, two thresholds side by side."""
     parts = [f"# {title}", _ABOUT, NOTE]
     for begin in range(0, len(KEYS), 2):
         keys = KEYS[begin : begin + 2]
@@ -152,7 +152,7 @@ def paper_markdown(table: pd.DataFrame, title: str) -> str:
 
 
 def paper_latex(table: pd.DataFrame, title: str, label: str) -> str:
-    r"""A table of `paper_tables` for a document that loads booktabs: a float over the full width, intervals as indices.
+    r"""Format a table of `paper_tables` in LaTeX with booktabs: a float over the full width, intervals as indices.
 
     The title begins the caption, the label is for `\ref`.
     """
@@ -188,7 +188,7 @@ method & {kinds} \\
 def _cells(
     table: pd.DataFrame, keys: Sequence[str], with_interval: Callable[[float, float, float], str], unknown: str
 ) -> list[list[str]]:
-    """For each row the paper's name, ours, and three numbers for each threshold."""
+    """Return the cells of each row: the paper's name, the name here, and three numbers for each threshold."""
     lines = []
     for row in table.to_dict("records"):
         line = [row["paper_row"], row["method"]]
@@ -212,5 +212,5 @@ _SPECIAL = {"%": r"\%", "&": r"\&", "#": r"\#", "_": r"\_", "°": r"$^\circ$", "
 
 
 def _escaped(text: str) -> str:
-    """Text for LaTeX."""
+    """Escape a text for LaTeX."""
     return "".join(_SPECIAL.get(letter, letter) for letter in text)

@@ -16,7 +16,7 @@ from wheretolook.geometry.poses import Float
 def covering_radius_deg(directions: Float) -> float:
     """Return the largest angle in degrees from any direction to the nearest of (n, 3) unit vectors.
 
-    Exact: the farthest direction is the normal of a face of the convex hull. The vectors must not all lie in one
+    Exact: the farthest direction is the normal of a face of the convex hull. Not all vectors may be in one
     half-space.
     """
     return float(np.degrees(np.arccos(np.clip(-ConvexHull(directions).equations[:, 3].max(), -1, 1))))

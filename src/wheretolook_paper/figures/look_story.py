@@ -64,7 +64,7 @@ class Estimate:
             return "no pose estimated"
         n_inliers = sum(map(len, self.pixels))
         if self.is_good:
-            return f"{n_inliers} inliers, right, {100 * self.error_m:.1f} cm off"
+            return f"{n_inliers} inliers, correct, {100 * self.error_m:.1f} cm off"
         off = f"{self.error_deg:.1f}°"
         if self.error_m > MAX_ERROR_M:
             off = f"{self.error_m:.1f} m" if self.error_m >= 1 else f"{100 * self.error_m:.0f} cm"
@@ -72,7 +72,7 @@ class Estimate:
 
 
 Result = tuple[str, list[int], Estimate]
-"""What was localized in words, the rows of its views, and the estimate."""
+"""A result: its label, the rows of its views, and the estimate."""
 
 
 @dataclass(frozen=True, eq=False)

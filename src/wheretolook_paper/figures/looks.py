@@ -13,7 +13,7 @@ from wheretolook.figures.style import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, RC
 from wheretolook_paper.evaluation.looks import TOGETHER
 
 _STYLES: dict[str, tuple[str, str, str]] = {
-    TOGETHER: ("chosen together", BLUE, "o"),
+    TOGETHER: ("chosen jointly", BLUE, "o"),
     "one-by-one": ("one by one, 40° apart", ORANGE, "s"),
     "fisher": ("Fisher information of all", GREEN, "^"),
     "visible": ("most landmarks in view", PURPLE, "D"),
@@ -39,8 +39,8 @@ def looks_figure(table: pd.DataFrame) -> Figure:
         panels = figure.subplots(1, len(splits), sharey=True, squeeze=False)[0]
         for axes, (title, rows) in zip(panels, splits, strict=True):
             _draw(axes, rows)
-            axes.set(title=f"{title}, {rows['n_locations'].iloc[0]} places" if title else "", xlabel="looks")
-        panels[0].set_ylabel("places localized, all looks together (%)")
+            axes.set(title=f"{title}, {rows['n_locations'].iloc[0]} locations" if title else "", xlabel="views")
+        panels[0].set_ylabel("locations localized jointly (%)")
         shown = {text: line for axes in panels for line, text in zip(*axes.get_legend_handles_labels(), strict=True)}
         figure.legend(shown.values(), shown.keys(), loc="outside right center")
         return figure
@@ -64,5 +64,5 @@ def _draw(axes: Axes, table: pd.DataFrame) -> None:
                 axes.axhline(value, color=INK, linestyle="--", linewidth=1, label=f"any of the {n} alone")
             one = rows[rows["n_looks"] == 1]
             for value in 100 * one["good"]:
-                axes.axhline(value, color=VERMILION, linewidth=0.9, linestyle=":", label="one look")
+                axes.axhline(value, color=VERMILION, linewidth=0.9, linestyle=":", label="one view")
     axes.set_xticks(sorted(table["n_looks"].unique()))

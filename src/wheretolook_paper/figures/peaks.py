@@ -84,4 +84,4 @@ def _draw_sphere(
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.2), ncols=2, columnspacing=1.2, handletextpad=0.2)
     axes.set(xticklabels=[], yticklabels=[])
     bar = figure.colorbar(dots, ax=axes, orientation="horizontal", shrink=0.7, pad=0.08, aspect=25)
-    bar.set_label("predicted probability to localize")
+    bar.set_label("predicted probability of localization")

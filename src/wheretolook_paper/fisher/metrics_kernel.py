@@ -16,7 +16,7 @@ MOST_STEPS = wp.constant(200)  # about ten are needed; without a bound, the loop
 
 @wp.func
 def symmetric(numbers: wp.array2d[wp.float64], row: wp.int32, first: wp.int32) -> wp.mat33d:
-    """Symmetric matrix of xx, xy, xz, yy, yz and zz from number `first` on."""
+    """Return the symmetric matrix of xx, xy, xz, yy, yz and zz from number `first` on."""
     matrix = wp.mat33d()
     number = first
     for i in range(3):
@@ -47,7 +47,7 @@ def information_matrix(numbers: wp.array2d[wp.float64], row: wp.int32, pivot: wp
 
 @wp.func
 def tridiagonal(matrix: mat66d) -> mat66d:
-    """A tridiagonal matrix with the same eigenvalues, by Householder reflections."""
+    """Return a tridiagonal matrix with the same eigenvalues, by Householder reflections."""
     m = matrix
     for k in range(4):
         v = vec6d()
@@ -69,14 +69,14 @@ def tridiagonal(matrix: mat66d) -> mat66d:
 
 @wp.func
 def eigenvalues(matrix: mat66d) -> vec6d:
-    """Eigenvalues of a symmetric matrix, in no order.
+    """Return the eigenvalues of a symmetric matrix, in no order.
 
     The root-free implicit QL iteration of Pal, Walker and Kahan with Wilkinson's shift (Parlett, The Symmetric
     Eigenvalue Problem, Sec. 8.15), which is LAPACK's too.
     """
     m = tridiagonal(matrix)
     d = vec6d()
-    squares = vec6d()  # of the elements beside the diagonal; the last is zero
+    squares = vec6d()  # of the elements next to the diagonal; the last is zero
     size = wp.float64(0.0)
     for i in range(6):
         d[i] = m[i, i]

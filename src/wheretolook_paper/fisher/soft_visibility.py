@@ -28,11 +28,11 @@ class SoftVisibility(ABC):
 
     @abstractmethod
     def of_axes(self, axes: Float) -> Float:
-        """a(z) of optical axes (D, 3) of unit length; (D, F)."""
+        """Return a(z) (D, F) of unit optical axes (D, 3)."""
 
     @abstractmethod
     def of_bearings(self, bearings: Float) -> Float:
-        """What is summed over landmarks with bearings (N, 3) of unit length, (N, F): b(f), after `finish`."""
+        """Return the summand (N, F) of landmarks with unit bearings (N, 3): b(f), after `finish`."""
 
     def finish(self, sums: Float) -> Float:
         """Turn sums (..., F, K) over `of_bearings` into sums over b(f): linear, so it can be applied at the end."""
@@ -65,13 +65,13 @@ class QuadraticVisibility(SoftVisibility):
         return float(k1), float(k2), float(k3)
 
     def of_axes(self, axes: Float) -> Float:
-        """(D, 10)."""
+        """Return a(z), (D, 10)."""
         k1, k2, k3 = self.coefficients
         weights = np.array([k1, 2 * k1, 2 * k1, k1, 2 * k1, k1, k2, k2, k2, k3])  # mixed products come twice in c^2
         return np.asarray(self.of_bearings(axes) * weights)
 
     def of_bearings(self, bearings: Float) -> Float:
-        """(N, 10): xx, xy, xz, yy, yz, zz, the bearing, one."""
+        """Return b(f), (N, 10): xx, xy, xz, yy, yz, zz, the bearing, one."""
         x, y, z = bearings.T
         return np.stack([x * x, x * y, x * z, y * y, y * z, z * z, x, y, z, np.ones_like(x)], axis=-1)
 
@@ -91,7 +91,7 @@ class GaussianProcessVisibility(SoftVisibility):
 
     @classmethod
     def fitted(cls, half_angle_rad: float, n_factors: int = 70, steepness: float = 15.0) -> GaussianProcessVisibility:
-        """The process whose length l maximizes the marginal likelihood of the step at the axes, for many bearings."""
+        """Return the process whose length l maximizes the marginal likelihood of the step at the axes, for many bearings."""
         return _fitted(float(half_angle_rad), n_factors, float(steepness))
 
     @cached_property
@@ -105,23 +105,23 @@ class GaussianProcessVisibility(SoftVisibility):
         return np.asarray(np.linalg.inv(self.of_axes(self.axes) + JITTER * np.eye(self.n_factors)))
 
     def of_axes(self, axes: Float) -> Float:
-        """k(z, Z), (D, F)."""
+        """Return k(z, Z), (D, F)."""
         return np.asarray(np.exp((axes @ self.axes.T - 1) / self.length**2))  # |z - z'|^2 = 2 - 2 z . z'
 
     def of_bearings(self, bearings: Float) -> Float:
-        """s(Z . f), (N, F); `finish` multiplies by K^-1."""
+        """Return s(Z . f), (N, F); `finish` multiplies by K^-1."""
         return self.step(bearings @ self.axes.T)
 
     def finish(self, sums: Float) -> Float:
-        """K^-1 times sums (..., F, K)."""
+        """Return K^-1 times sums (..., F, K)."""
         return np.asarray(self.inverse @ sums)
 
     def step(self, cosines: Float) -> Float:
-        """s(c) of cosines between axis and bearing."""
+        """Return s(c) of cosines between axis and bearing."""
         return np.asarray(0.5 * (1 + np.tanh(0.5 * self.steepness * (cosines - np.cos(self.half_angle_rad)))))
 
     def held_out_error(self) -> float:
-        """Root mean square of v(z, f) - s(z . f) over random bearings and axes that the fit was not made with."""
+        """Return the root mean square of v(z, f) - s(z . f) over random bearings and axes not used in the fit."""
         rng = np.random.default_rng(1)
         bearings, axes = (_unit(rng.normal(size=(1000, 3))) for _ in range(2))
         predicted = self.of_axes(axes) @ self.finish(self.of_bearings(bearings).T)

@@ -12,7 +12,7 @@ from wheretolook.utils.validation import check_positive, check_range
 
 @dataclass(frozen=True)
 class PathsConfig(MappedLattice):
-    """How methods are compared by planned paths.
+    """Options of the comparison of methods by planned paths.
 
     Args:
         scenes: names of the scenes; none for all of the test split.
@@ -24,17 +24,17 @@ class PathsConfig(MappedLattice):
             --list-methods`. Scores that are no probabilities enter by their ranks.
         weights: file of weights of a learned method. By default, and for methods of another kind, the best of each
             method in the dataset, or else of those that ship.
-        max_turn_deg: along a path that is given, the camera turns by no more from one waypoint to the next.
+        max_turn_deg: greatest rotation from a waypoint to the next along a given path.
         max_error_m: a view is good if it localizes with a smaller error of its position.
-        max_error_deg: and with a smaller error of its orientation.
-        resamples: of the pairs, for 95 % intervals.
+        max_error_deg: likewise of its orientation.
+        resamples: number of resamples of the pairs for 95 % intervals.
         planner: costs and limits of the paths, time to plan each.
-        stops: where one look will not do; adds rows "METHOD with stops" for methods whose scores are probabilities.
-        last_views: views along the way localized as one rig. The present one and those before it; adds rows "METHOD
-            last N together". 1 for none.
-        odometry_m_per_m: how well the rig knows how far it went from view to view. One standard deviation along each
-            axis, in metres for each metre.
-        odometry_deg_per_deg: and how far it turned. Degrees for each degree.
+        stops: further views at waypoints with a low score; adds rows "METHOD with stops" for methods whose scores are
+            probabilities.
+        last_views: views localized as one rig, the current one and those before it; adds rows "METHOD last N together".
+            1 for none.
+        odometry_m_per_m: standard deviation of the rig's translation along each axis, in metres per metre.
+        odometry_deg_per_deg: standard deviation of its rotation, in degrees per degree.
     """
 
     scenes: tuple[str, ...] = ()

@@ -97,7 +97,7 @@ class SceneComparison:
         return cache.store({"stops.parquet": chosen})["stops.parquet"]
 
     def tasks(self) -> list[LabelTask]:
-        """The labelling tasks of the scene: the views of paths, and the further views at stops."""
+        """Return the labelling tasks of the scene: the views of paths, and the further views at stops."""
         manifest = self._manifest("shards")
         job = replace(self.job, store_pixels=self.config.is_joint or bool(manifest.get("store_pixels")))
         tables = {"shards": self.planned.views, "stop-shards": self.stop_views}

@@ -1,1 +1,1 @@
-"""What ships and what shows it: the compact copy, its card and runs, the catalog of figures."""
+"""The release: its compact copy of a dataset, card and runs, and the catalog of figures."""

@@ -277,7 +277,7 @@ def _inputs(source: Source) -> Figure:
     return inputs_figure(_walkthrough(source).image)
 
 
-@item("peaks", "", "what the network looks at", "04_training", **_SET)
+@item("peaks", "", "directions with high and low scores", "04_training", **_SET)
 def _peaks(source: Source) -> Figure:
     return peaks_figure(*peaks_of(*_shown(source)))
 
@@ -287,13 +287,13 @@ def _training(source: Source) -> Figure:
     return training_figure(histories(source.tracking, source.dataset.name))
 
 
-item("calibration", "", "whether probabilities mean what they say", "04_training", file=CALIBRATION_CSV)(
+item("calibration", "", "reliability of predicted probabilities", "04_training", file=CALIBRATION_CSV)(
     _table_figure(calibration_figure, CALIBRATION_CSV, read_calibration)
 )
 item("scores", "", "all methods at all thresholds", "05_tables")(_table_figure(score_figure))
 
 
-@item("score_table", "", "all that an evaluation tells", "05_tables")
+@item("score_table", "", "all numbers of an evaluation", "05_tables")
 def _score_table(source: Source) -> Texts:
     scores = read_scores(source.file(SCORES_CSV))
     return {"md": f"{score_markdown(scores)}\n{comparisons_markdown(scores)}", "csv": scores.to_csv(index=False)}

@@ -89,7 +89,7 @@ def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> D
 
 @dataclass(frozen=True)
 class Choice:
-    """Which weights in a release's folder ship, by validation average precision."""
+    """The weights in a release's folder that ship, chosen by validation average precision."""
 
     network: Path  # the best of the paper's networks
     best: Path  # the best of all, the default; may be the network

@@ -29,7 +29,7 @@ class MaxVisibilityScorer(Scorer):
     name = "max-visibility"
 
     def score(self, cam_from_world: Float) -> Float:
-        """(B,) in [0, 1]."""
+        """Return (B,) in [0, 1]."""
         # Warp takes seconds to load
         from wheretolook.visibility.frustum import LandmarkSets, PosedViews, landmarks_in_view
 
@@ -63,7 +63,7 @@ class SwappedMaxVisibilityScorer(Scorer):
         self._count = MaxVisibilityScorer(localization_map)
 
     def score(self, cam_from_world: Float) -> Float:
-        """(B,) in [0, 1]: half of one plus the cosine between the two axes."""
+        """Return (B,) in [0, 1]: half of one plus the cosine between the two axes."""
         from wheretolook.inputs.localization_map import shared_locations
 
         poses = check_poses(cam_from_world)

@@ -1,4 +1,4 @@
-"""Views of compared paths localized together: the looks of a stop, and the last views as odometry tells them."""
+"""Views of compared paths localized jointly: those of a stop, and the last views linked by odometry."""
 
 from __future__ import annotations
 

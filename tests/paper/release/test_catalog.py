@@ -27,7 +27,7 @@ from wheretolook_paper.release.showcase_figures import planned_views
 
 RELEASE = Path(__file__).parents[3] / "data" / "release"
 OF_SCENES = {"pipeline", "learning", "viewpoint_generation", "planning", "inputs", "peaks"}
-"""What needs a scene that can be made anew from its seed, which the tiny release has not."""
+"""Items that need a scene generated from a seed, which the tiny release lacks."""
 
 NOT_THERE = {"training", "visibility_scaling"} | OF_SCENES
 

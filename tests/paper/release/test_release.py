@@ -166,7 +166,7 @@ def test_the_card_holds_scores_settings_and_an_example_that_runs(folder: Path, m
     weights = next((root / "weights").glob("*.safetensors"))
     for said in (release.fingerprint(), releases.sha256(weights), "numpy 2.9.9", "seeds 70 to 73", "method opencv"):
         assert said in card, said
-    # its example runs where the release lies
+    # its example runs in the folder of the release
     monkeypatch.chdir(folder)
     example = re.search(r"```python\n(.*?)```", card, re.DOTALL)
     assert example is not None
@@ -228,7 +228,7 @@ def test_the_shipped_card_is_of_what_ships(shipped: Dataset) -> None:
     assert sum(releases.sizes(shipped.root).values()) < releases.MAX_BYTES
     tables = [scene.read_table() for scene in shipped.split("train")]
     assert sum(map(len, tables)) > 200_000
-    weights = releases.trained_weights(shipped)  # else someone has trained anew and not released it yet
+    weights = releases.trained_weights(shipped)  # otherwise newly trained weights were not released
     assert [path.name for path in weights] == ["mlp-2d+z.safetensors", "set.safetensors"]
     for path, least in zip(weights, (0.86, 0.88), strict=True):  # the scorer's is of harder scenes
         record = json.loads(path.with_suffix(".json").read_text())

@@ -1,4 +1,4 @@
-"""A scene of a release is made anew from its seed, and what figures are given is what the parts of the project say."""
+"""A scene of a release is generated again from its seed, and the data of figures are those of the scene."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ def test_probes_look_away_from_the_landmarks() -> None:
         scores = scorer.score(poses)
         assert np.all((scores >= 0) & (scores <= 1))
         best = DIRECTIONS[scores.reshape(5, -1).argmax(1)]
-        # a probe tells one axis: the others' scores fall with the angle from it
+        # a probe defines one axis: the others' scores fall with the angle from it
         cosines = np.einsum("li,di->ld", best, DIRECTIONS)
         assert np.all([np.corrcoef(c, s)[0, 1] > 0.99 for c, s in zip(cosines, scores.reshape(5, -1), strict=True)])
         assert np.all(best[:, :2].sum(1) < 0)

@@ -14,7 +14,7 @@ class ConvConfig(FittingConfig):
     """Options of the convolutional network over the bins.
 
     Args:
-        widths: channels after each convolution; every one but the first halves the sides of the grid.
+        widths: channels after each convolution; all but the first have stride 2.
         dropout: share of pooled values dropped in training.
         bins: bins along each side of the image.
     """

@@ -1,4 +1,4 @@
-"""A small convolutional network over the grid of bins: the paper's input kept as the image that it is."""
+"""A small convolutional network over the grid of bins, the paper's input."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class ConvSpec:
 class ConvNetwork(BinnedNetwork):
     """Convolutions of 3 x 3 bins with ReLU between, the mean and the maximum over the image, one logit out.
 
-    It looks at its channels, standardized, and at which bins are filled. Nothing is normalized on the way: how much
-    there is to see is what matters most, and a normalization would hide it.
+    Inputs are the standardized channels and which bins are filled. There are no normalization layers, because the
+    number of landmarks in view matters most and a normalization would hide it.
     """
 
     scored_at_once = 512  # the first convolution of one view takes 115 kB
@@ -47,7 +47,7 @@ class ConvNetwork(BinnedNetwork):
         self.last = nn.Linear(2 * spec.widths[-1], 1)
 
     def forward(self, means: Tensor, filled: Tensor) -> Tensor:
-        """Logits (B,), not calibrated, of its channels' means (B, C, bins, bins) and filled bins (B, bins, bins)."""
+        """Return uncalibrated logits (B,) of the channels' means (B, C, bins, bins) and filled bins (B, bins, bins)."""
         values = torch.cat([self.standard(means, filled), filled[:, None].to(means.dtype)], dim=1)
         for convolution in self.convolutions:
             values = relu(convolution(values))
@@ -56,11 +56,11 @@ class ConvNetwork(BinnedNetwork):
         return logits.squeeze(-1)
 
     def description(self) -> dict[str, Any]:
-        """The fields of `ConvSpec`."""
+        """Return the fields of `ConvSpec`."""
         return asdict(self.spec) | {"statistics": statistics_record(self.statistics)}
 
     @classmethod
     def of_description(cls, stored: Mapping[str, Any]) -> ConvNetwork:
-        """The untrained network of a description; ValueError if it names an unknown channel of the bins."""
+        """Return the untrained network of a description; ValueError if it names an unknown channel of the bins."""
         widths = tuple(stored["widths"])
         return cls(ConvSpec(statistics_of_record(stored), int(stored["bins"]), widths, float(stored["dropout"])))

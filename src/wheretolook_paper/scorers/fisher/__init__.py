@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 Approximation = Literal["exact", "quadratic", "gp"]
 
 METRICS = {"mineig": ("min. eigenvalue", "P"), "logdet": ("log det", "X"), "trace": ("trace", "h")}
-"""Metrics of the information: name for people, marker."""
+"""Metrics of the information: label, marker."""
 
 APPROXIMATIONS: dict[Approximation, tuple[str, str, Any]] = {
     "exact": ("exact", "#5E2750", "-"),
     "quadratic": ("quadratic", "#B65C93", (0, (5, 1))),
     "gp": ("GP", "#DDA3C6", (0, (2, 1))),
 }
-"""How the sum over landmarks is taken: name for people, shade of one colour (the exact one darkest), line style."""
+"""Approximations of the sum over landmarks: label, shade of one colour (the exact one darkest), line style."""
 
 
 def _metric(metric: str, approximation: Approximation, about_origin: bool) -> Method:

@@ -30,7 +30,7 @@ STEP_DEG = 20.0
 
 
 def on_lattice(values: Tensor, rows: Tensor, axes: Tensor) -> Tensor:
-    """Values (B,) of lattices `rows` (B,) among (L, PITCHES, YAWS), interpolated at directions (B, 3), world axes.
+    """Interpolate values (B,) of lattices `rows` (B,) among (L, PITCHES, YAWS) at directions (B, 3), world axes.
 
     Yaw wraps, pitch ends at the outer rows. The directions need not be of unit length.
     """
@@ -76,7 +76,7 @@ class SphereNetwork(StoredNetwork):
         self.register_buffer("lattice", lattice, persistent=False)
 
     def encode(self, tokens: Tensor, padding: Tensor | None = None) -> Tensor:
-        """Logits (L, PITCHES, YAWS) of all directions at locations of tokens (L, T, len(FEATURES)).
+        """Return logits (L, PITCHES, YAWS) of all directions at locations of tokens (L, T, len(FEATURES)).
 
         The padding (L, T) is True where there is no token; None if all are.
         """
@@ -89,7 +89,7 @@ class SphereNetwork(StoredNetwork):
         return logits
 
     def forward(self, tokens: Tensor, padding: Tensor, rows: Tensor, axes: Tensor) -> Tensor:
-        """Logits (B,) of views with optical axes (B, 3), world, at the locations `rows` (B,) of `encode`."""
+        """Return logits (B,) of views with optical axes (B, 3), world, at the locations `rows` (B,) of `encode`."""
         if not len(rows):  # one process's share of a small batch
             return axes.sum(1) + 0 * sum(parameter.sum() for parameter in self.parameters())
         return on_lattice(self.encode(tokens, padding), rows, axes)
@@ -106,12 +106,12 @@ class SphereNetwork(StoredNetwork):
         return turned, padding, rows, torch.einsum("bij,bj->bi", turn[rows], axes)
 
     def description(self) -> dict[str, Any]:
-        """The features of tokens, and the options."""
+        """Return the features of tokens, and the options."""
         return {"features": list(FEATURES), "options": asdict(self.config)}
 
     @classmethod
     def of_description(cls, stored: Mapping[str, Any]) -> SphereNetwork:
-        """The untrained network of a description; a WeightsError if it was trained on other tokens."""
+        """Return the untrained network of a description; a WeightsError if it was trained on other tokens."""
         if stored.get("features") != list(FEATURES):
-            raise WeightsError("these weights ask for other tokens")
+            raise WeightsError("these weights were trained on other features of tokens")
         return cls(SphereConfig(**stored["options"]))

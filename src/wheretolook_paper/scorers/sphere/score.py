@@ -44,7 +44,7 @@ class SphereScorer(Scorer):
         return np.asarray(logits.sigmoid().cpu().numpy())
 
     def _log_odds(self, tokens: Tensor) -> Tensor:
-        """Calibrated log-odds (PITCHES, YAWS) float64 of all directions at the location of tokens (T, len(FEATURES)).
+        """Return calibrated log-odds (PITCHES, YAWS) float64 of all directions at the location of tokens (T, len(FEATURES)).
 
         Locations are encoded one by one, because batching changes the last digits of logits.
         """

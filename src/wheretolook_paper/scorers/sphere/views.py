@@ -1,4 +1,4 @@
-"""Locations as a network of the whole sphere sees them, and batches of their labelled viewpoints."""
+"""Tokens of locations, the input of the sphere network, and batches of their labelled viewpoints."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from wheretolook_paper.scorers.sphere import SphereConfig
 
 _VECTORS = tuple(f"{name}_{axis}" for name in ("offset", "towards", "looks") for axis in "xyz")
 FEATURES = (*_VECTORS, "log_distance", "log_landmarks", "is_landmark", "is_camera")
-"""Of a token: the offset from the location, world axes, in units of `OFFSET_M`, and its unit direction; the viewing
+"""Features of a token: the offset from the location, world axes, in units of `OFFSET_M`, and its unit direction; the viewing
 direction of a camera; log(1 + distance in metres); log(1 + landmarks with a free line of sight from the location); and
 what it is. The first token of a location is neither: it stands for all landmarks and holds their number."""
 
 TOWARDS = slice(3, 6)  # the features that are the unit direction
 TURNING = 9  # the first features, three vectors, which turn with the world
 OFFSET_M = 4.0  # unit of offsets: ActLoc crops the world at so many metres
-BLOCK = 256  # locations whose lines of sight are asked for at a time
+BLOCK = 256  # locations whose lines of sight are computed at a time
 
 
 class LocationDescriber:
     """Describes locations to a network: their landmarks with a free line of sight, and the mapping cameras.
 
-    Of more landmarks or cameras than the configuration wants, evenly spread ones are taken, in the order of their ids.
+    If there are more landmarks or cameras than configured, evenly spread ones are used, in the order of their ids.
     Raises a MapError, which names the path, if the map has no mapping cameras.
     """
 
@@ -49,14 +49,14 @@ class LocationDescriber:
     ) -> None:
         if localization_map.mapping_poses is None:
             fix = "Run the map stage again, copy the release again, or use `LocalizationMap.from_colmap`."
-            raise MapError("it is not known where the map's images were taken from", path=path, fix=fix)
+            raise MapError("the poses of the map's images are unknown", path=path, fix=fix)
         self.localization_map = localization_map
         self.config = config
         rotations, self._centers = split_poses(_spread(localization_map.mapping_poses, config.cameras))
         self._looks = rotations[:, 2]
 
     def describe(self, locations: Float) -> Iterator[Tensor]:
-        """Tokens (T, len(FEATURES)) float32, on the CPU, of each location (L, 3) m in turn; T differs, but is not 0."""
+        """Yield the tokens (T, len(FEATURES)) float32, on the CPU, of each location (L, 3) m; T differs, but is not 0."""
         points = self.localization_map.landmarks.points
         for begin in range(0, len(locations), BLOCK):
             block = np.asarray(locations, dtype=np.float64)[begin : begin + BLOCK]
@@ -80,7 +80,7 @@ class LocationDescriber:
 
 
 def _spread(rows: Float, at_most: int) -> Float:
-    """So many rows at most, evenly spread."""
+    """Return at most `at_most` rows, evenly spread."""
     if len(rows) <= at_most:
         return rows
     return rows[np.linspace(0, len(rows) - 1, at_most).round().astype(np.int64)]
@@ -178,5 +178,5 @@ class SphereDataModule(ViewsDataModule):
         self.val_rows = np.flatnonzero(held_out)
 
     def batches(self, rows: NDArray[np.int64], shuffle_seed: int | None = None) -> LocationBatches:
-        """See `ViewsDataModule.batches`; all are of one size here."""
+        """Return batches of rows, see `ViewsDataModule.batches`; all are of one size here."""
         return LocationBatches(self.views, rows, self.batch_size, shuffle_seed, self.share)

@@ -62,7 +62,7 @@ class Environment(ABC):
     """
 
     name: str
-    camera: Camera  # the one that will look
+    camera: Camera  # of the views
 
     def __init__(self, config: EnvironmentConfig, device: str, progress: bool) -> None:
         self.config = config
@@ -373,7 +373,7 @@ class ColmapEnvironment(Environment):
 
     @property
     def camera(self) -> Camera:  # type: ignore[override]
-        """The camera that will look."""
+        """The camera of the views."""
         return self._map.camera
 
     @property

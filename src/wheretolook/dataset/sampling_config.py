@@ -9,7 +9,7 @@ from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.validation import check_range
 
-Split = Literal["train", "val", "test"]  # what a scene is for: to learn from, to choose by, to report on
+Split = Literal["train", "val", "test"]  # scenes for training, validation and testing
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class SampleConfig(ViewLattice):
         max_directions: kept directions of each location to take at most, drawn at random; 0 takes all. One number, or
             one for each split, such as `{train: 50, val: 50, test: 100}`.
         seed: seed of what is drawn at random.
-        cameras: cameras that look in a scene, each at its own locations: drawn from the scene's seed over fields of
-            view, sizes and proportions, to learn from all of them; with 0 the experiment's camera looks.
+        cameras: number of cameras of a scene, each used at its own locations, with fields of view, sizes and aspect
+            ratios drawn from the scene's seed; 0 uses the experiment's camera everywhere.
 
     Attributes:
         distinct_pixels: recorded with samples; landmarks are counted, and `wheretolook_paper.visibility` counts pixels.

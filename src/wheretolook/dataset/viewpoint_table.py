@@ -38,17 +38,15 @@ COMPACT_SCHEMA = pa.schema([field.with_name(_COMPACT_NAMES.get(field.name, field
 (metres), which the viewpoints of a location share. The translation follows: t = -R c."""
 
 MATCH_FIELDS = pa.schema([("matched_rows", pa.list_(pa.int32())), ("inlier_rows", pa.list_(pa.int32()))])
-"""Two ragged columns that a table may have in addition to `SCHEMA`, if labelling was asked for them: the landmarks that
-were matched in each view, and the inliers among them, as rows of the scene's `landmarks.npz`, ascending. A view without
-matches has two empty lists. Compact tables leave them out."""
+"""Two optional ragged columns: the landmarks matched in each view, and the inliers among them, as ascending rows of the
+scene's `landmarks.npz`. A view without matches has two empty lists. Compact tables leave them out."""
 
 PIXEL_FIELD = pa.schema([("matched_pixels", pa.list_(pa.float32()))])
-"""A ragged column that a table with `MATCH_FIELDS` may have besides: x and y in turn of the pixel at which each of
-`matched_rows` was found, in their order. With it several views of a place can be localized together (`looks/`)."""
+"""An optional ragged column of a table with `MATCH_FIELDS`: x and y, alternating, of the pixels of `matched_rows`, in
+their order. With it several views of a location can be localized together (`looks/`)."""
 
 CAMERA_FIELD = pa.schema([("camera_id", pa.int32())])
-"""A column that a table may have in addition to `SCHEMA`, where a scene's viewpoints look with several cameras: the
-number of the camera in the scene's `cameras.txt`."""
+"""An optional column of a scene whose viewpoints have several cameras: the camera's number in `cameras.txt`."""
 
 (CAMERA_ID,) = CAMERA_FIELD.names
 (PIXELS,) = PIXEL_FIELD.names

@@ -1,4 +1,7 @@
-"""Warp kernel of `WarpRenderer` that traces and shades rays, one thread per pixel. `Open3DRenderer` is its twin."""
+"""Warp kernel of `WarpRenderer` that traces and shades rays, one thread per pixel.
+
+`tests/twins/open3d_renderer.py` computes the same in NumPy.
+"""
 
 # mypy: ignore-errors
 # Warp's kernel language is not Python's type system.
@@ -66,7 +69,7 @@ def _bilinear(a: Appearance, texture: wp.int32, level: wp.int32, uv: wp.vec2):
 def shade(
     a: Appearance, face: int, weights: wp.vec3, depth_m: float, normal: wp.vec3, direction: wp.vec3, to_ray: wp.mat33
 ):
-    """Colour of a hit, filtered over the pixel's footprint; `Open3DRenderer` does the same in NumPy."""
+    """Colour of a hit, filtered over the pixel's footprint."""
     uv = weights[0] * a.corner_uvs[face, 0] + weights[1] * a.corner_uvs[face, 1] + weights[2] * a.corner_uvs[face, 2]
     texture = a.triangle_texture[face]
 

@@ -87,7 +87,7 @@ def pose_factor(survey_m: NDArray[np.float32], camera: PinholeCamera, cam_from_w
         rays = camera.unproject(pixels)
         points = rays / rays[:, 2:] * survey_m[i][row, column][chosen, None]
         relative = cam_from_world[j] @ np.vstack([invert_poses(cam_from_world[i]), (0, 0, 0, 1)])
-        # a factor scales both frames' depths, so it is the same to divide the translation
+        # scaling the depths of both frames by a factor is the same as dividing the translation by it
         moved = points @ relative[:, :3].T + relative[:, 3] / _FACTORS[:, None, None]
         there = _readings_at(survey_m[j], camera, moved)  # (factors, readings)
         n_shared = np.isfinite(there).sum(1)

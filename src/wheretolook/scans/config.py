@@ -26,15 +26,15 @@ class RgbdConfig:
             mesh is then in its frame, turned upright, and depths are checked against its landmarks.
         depth_scale: units of a depth image in a metre; 0 for the layout's, 1000 in 7-Scenes and 5000 in TUM.
         camera: fx, fy, cx, cy of the colour images in pixels; the layout's if empty.
-        depth_camera: the same of the depth images, where they are not registered to the colour images.
-        color_from_depth_m: where the depth camera is in the colour camera's frame; x right, y down, z forward.
+        depth_camera: fx, fy, cx, cy of the depth images, if they are not registered to the colour images.
+        color_from_depth_m: position of the depth camera in the colour camera's frame; x right, y down, z forward.
         correct_depth: with a model, bring depths to those of its landmarks: a structured-light camera is wrong
             by centimetres at far ones.
         up: direction up in its world. `auto`, x, y, z, one of these with a minus sign, or three numbers
             such as "0 -0.9 -0.4". `auto` estimates it from how the camera was held and from the surfaces.
         voxel_m: distance between two samples of the distance field. Finer ones need more memory and triangles.
         max_depth_m: farther readings are ignored, as depth cameras are too noisy there.
-        max_frames: of more frames, so many are taken, evenly.
+        max_frames: greatest number of frames; a longer recording is subsampled evenly.
         appearance: `texture` projects the sharpest colour image on each triangle, `colors` averages all at the
             vertices.
     """

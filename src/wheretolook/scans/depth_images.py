@@ -13,12 +13,11 @@ from wheretolook.utils.validation import check_positive
 
 
 def read_depth_images(model: Path, folder: Path, scale: float = 1000.0) -> list[DepthImage]:
-    """Depth images of a COLMAP model's images, from a folder of PNG or TIFF (integers, `scale` a metre; floats, metres)
-    or NPY files (metres).
+    """Read the depth images of a COLMAP model's images from a folder (see `read_depth` for formats and `scale`).
 
-    A depth image has the name of the image it belongs to but for the ending, in which "depth" may stand for "color" or
-    "rgb". Its pixels lie on the image's: another size is that of the scaled camera, which must have no distortion.
-    Raises a SceneError if there are none or one cannot be read, a ConfigError if the camera has distortion.
+    A depth image has the name of its image, apart from the ending and with "depth" in place of "color" or "rgb" if
+    need be. It is registered to the image and may have another size; the camera must have no distortion. Raises a
+    SceneError if there are none or one cannot be read, a ConfigError if the camera has distortion.
     """
     check_positive("the number of units of depth images in a metre", scale)
     reconstruction = read_model(model)

@@ -25,9 +25,9 @@ class ApartmentConfig:
         repetition: share of large surfaces with a strong pattern that repeats, 0 to 1. Every 0.6 to 2 m, as in games:
             such views are full of features and yet hard to localize.
         dark_rooms: share of rooms whose lamp is off, some with their curtains closed. Higher is harder.
-        enlarged: how many times as large everything is, furniture and patterns too: halls with few, far landmarks.
-        vary: whether every apartment draws its own size and difficulty. Its area and the five numbers above come from
-            its seed, whatever they are set to: rooms unlike each other, to learn from.
+        enlarged: scale factor of everything, furniture and patterns included: halls with few, far landmarks.
+        vary: draw the area and the five numbers above from each apartment's seed, whatever they are set to, so that
+            training scenes differ in size and difficulty.
         texels_per_m: texture resolution of large surfaces; lowered if the atlas would not fit.
         texture_size: greatest width and height of the texture in texels.
         light_spacing_m: distance between light samples in metres.

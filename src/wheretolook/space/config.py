@@ -40,7 +40,7 @@ class FreeSpaceConfig:
 
 @dataclass(frozen=True)
 class MappedSpaceConfig:
-    """What counts as free where there is no mesh. Landmarks do not say what is empty, but cameras were where they were.
+    """What counts as free without a mesh: landmarks do not show free space, but positions of mapping cameras do.
 
     Args:
         max_camera_distance_m: greatest distance to the nearest position of a mapping camera.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
@@ -90,7 +90,8 @@ def _sample(scene: SceneEnvironment, config: SampleConfig, log: Log) -> None:
         cameras = _cameras(scene, config)
         visible = (scene.landmarks, cameras, scene.occlusion)
         title = f"sample {scene.name}"
-        table, occlusion = sample_viewpoints(grid, free, *visible, config, scene.device, title, files.split)
+        config = replace(config, max_directions=config.directions_of(files.split))
+        table, occlusion = sample_viewpoints(grid, free, *visible, config, scene.device, title)
     files.stage_cache("sample").clear()
     files.cameras_file.unlink(missing_ok=True)
     if isinstance(cameras, dict):

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.dataset.sampling_config import SampleConfig, Split
+from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED, pose_columns
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import VoxelGrid
@@ -46,13 +46,12 @@ def sample_viewpoints(
     config: SampleConfig = SampleConfig(),
     device: str = "cpu",
     progress: str | None = None,
-    split: Split = "train",
 ) -> tuple[pd.DataFrame, StoredOcclusion]:
     """Choose the viewpoints that see most landmarks at locations (L,) of the grid, and return them with the occlusion.
 
     At every location all directions of the lattice are ranked by the number of landmarks in view (descending, then by
     direction id), and the best K are kept. Several cameras, by number, are assigned to the locations in turn.
-    `progress` is the text of a progress bar. The table is unlabelled and sorted by viewpoint id: location id times the
+    `progress` is the text of a progress bar; `config.max_directions` that of the scene's split. The table is unlabelled and sorted by viewpoint id: location id times the
     number of directions, plus direction id.
 
     Raises:
@@ -78,10 +77,9 @@ def sample_viewpoints(
         if len(rows)
     ]
     seen = _joined(parts, np.concatenate(groups), locations)
-    kept = []
-    for row, best in enumerate(seen.best):
-        visible = best[seen.counts[row, best] >= config.min_visible]
-        kept.append(np.sort(_subset(visible, config.directions_of(split), rng)))
+    most = config.directions_of("train")
+    visible = (best[counts[best] >= config.min_visible] for counts, best in zip(seen.counts, seen.best, strict=True))
+    kept = [np.sort(_subset(directions_seen, most, rng)) for directions_seen in visible]
     location = np.repeat(np.arange(len(ids)), [len(chosen) for chosen in kept])
     direction = np.concatenate(kept)
     _check_number(len(direction), len(ids), int(seen.counts.max(initial=0)), len(landmarks.points), config)

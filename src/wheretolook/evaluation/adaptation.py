@@ -77,31 +77,24 @@ def compare_log_odds(
         low, high = bootstrap.ratio_interval(values[:, None], counts[:, None])
         return float(values.sum() / max(1e-12, counts.sum())), float(low[0]), float(high[0])
 
-    def missed(log_odds: Float) -> Float:
-        """1 at locations (L,) with a choice whose best-scored view does not localize although another does."""
+    def measure(log_odds: Float) -> tuple[dict[str, float], Float, Float]:
+        """Metrics, losses (B,), and 1 at locations (L,) whose best-scored view fails although another localizes."""
+        losses = log_losses(log_odds, good)
         order = np.lexsort((-log_odds, row))
         chosen = order[np.flatnonzero(np.diff(row[order], prepend=-1))]
-        return (localizes_somewhere & ~good[chosen]) * has_choice
-
-    metrics = []
-    losses = []
-    misses = []
-    for log_odds in (before, after):
-        loss = log_losses(log_odds, good)
-        miss = missed(log_odds)
-        auc = float(roc_auc_score(good, log_odds)) if 0 < good.sum() < len(good) else float("nan")
-        regret = 100 * float(miss.sum() / max(1.0, has_choice.sum()))
+        missed = (localizes_somewhere & ~good[chosen]) * has_choice
+        auc = float(roc_auc_score(good, log_odds)) if 0 < good.sum() < len(good) else np.nan
+        regret = 100 * float(missed.sum() / max(1.0, has_choice.sum()))
         error = expected_calibration_error(expit(log_odds), good)
-        metrics.append({"log_loss": float(loss.mean()), "auc": auc, "regret": regret, "calibration_error": error})
-        losses.append(loss)
-        misses.append(miss)
-    decrease = np.bincount(row, weights=losses[0] - losses[1]).astype(np.float64)
-    return Gain(
-        metrics[0],
-        metrics[1],
-        mean_with_interval(decrease, n_views.astype(np.float64)),
-        mean_with_interval(100 * (misses[0] - misses[1]), has_choice),
-    )
+        metrics = {"log_loss": float(losses.mean()), "auc": auc, "regret": regret, "calibration_error": error}
+        return metrics, losses, missed
+
+    metrics_before, losses_before, missed_before = measure(before)
+    metrics_after, losses_after, missed_after = measure(after)
+    decrease = np.bincount(row, weights=losses_before - losses_after)
+    log_loss_less = mean_with_interval(decrease, n_views.astype(np.float64))
+    regret_less = mean_with_interval(100 * (missed_before - missed_after), has_choice)
+    return Gain(metrics_before, metrics_after, log_loss_less, regret_less)
 
 
 def gain_markdown(gain: Gain) -> str:

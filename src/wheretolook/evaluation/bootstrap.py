@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from wheretolook.geometry.poses import Float
 
 _PERCENTILES = (2.5, 97.5)  # ends of a 95 % interval
-_SIGNS = 1  # separates the random numbers of the sign flips from those of the resamples
 
 
 class ClusterBootstrap:
@@ -39,8 +38,7 @@ class ClusterBootstrap:
         seed: int,
         strata: NDArray[np.integer[Any]] | None = None,
     ) -> None:
-        if strata is None:
-            strata = np.zeros_like(clusters)
+        strata = np.zeros_like(clusters) if strata is None else strata
         pairs, cluster = np.unique(np.stack([strata, clusters], axis=1), axis=0, return_inverse=True)
         self.cluster = cluster.reshape(-1)
         self.times = np.ones((1 + resamples, len(pairs)))
@@ -98,8 +96,8 @@ class ClusterBootstrap:
         """
         if self.n_clusters == 0:
             return np.full(differences.shape[1:], np.nan)
-        shape = (len(self.times) - 1, self.n_clusters)
-        signs = 1 - 2.0 * np.random.default_rng([self._seed, 0, _SIGNS]).integers(0, 2, shape, dtype=np.int8)
+        rng = np.random.default_rng([self._seed, 0, 1])  # other numbers than those of the resamples
+        signs = 1 - 2.0 * rng.integers(0, 2, self.times[1:].shape, dtype=np.int8)
         by_cluster = self.sums(differences)
         # sums that are equal up to rounding count as equal
         observed = np.abs(by_cluster.sum(0)) - 1e-9 * np.abs(by_cluster).sum(0)

@@ -147,22 +147,23 @@ def score_table(
     rows: list[dict[str, object]] = []
     for name, locations in pools:
         inside = locations[views.location]
-        blocks = views.location_block[locations]
-        bootstrap = ClusterBootstrap(blocks, config.resamples, config.seed, strata=views.location_scene[locations])
+        strata = views.location_scene[locations]
+        bootstrap = ClusterBootstrap(views.location_block[locations], config.resamples, config.seed, strata)
         good = views.good[inside, 0]
-        metrics = {ORACLE: {"average_precision": 1.0, "roc_auc": 1.0, **_CALIBRATION}}
+        metrics = {}
         for method, values in scores.items():
-            temperature = (temperatures or {}).get(method, float("nan"))
+            temperature = (temperatures or {}).get(method, np.nan)
             metrics[method] = _ranking_metrics(good, values[inside])
             metrics[method] |= _calibration_metrics(method, good, values[inside], temperature)
+        metrics[ORACLE] = {"average_precision": 1.0, "roc_auc": 1.0, **_CALIBRATION}
         shares = {}
         for n in config.top_n:
             tops = {method: top.only(locations) for (method, number), top in choices.items() if number == n}
             shares[n] = _share_columns(tops, reference, bootstrap, config)
-        for method in [*scores, ORACLE]:
+        for method, of_method in metrics.items():
             for n in config.top_n:
                 row = {"method": method, "top_n": n, "scene": name}
-                rows.append(row | shares[n][method] | {"reference": reference} | metrics[method])
+                rows.append(row | shares[n][method] | {"reference": reference} | of_method)
     return pd.DataFrame(rows)
 
 

@@ -49,8 +49,8 @@ def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[Tr
     else:
         paths = list(config.weights) or own_weights(dataset)
     weights = {path: method_of_weights(path) for path in paths}
-    available = set(weights.values())
-    missing = [name for name, of_name in kinds.items() if "" not in of_name and not of_name & available]
+    available = {"", *weights.values()}
+    missing = [name for name, of_name in kinds.items() if not of_name & available]
     # the default asks for all methods, and takes those that have been trained
     if missing and (not weights or config.methods != EvaluateConfig().methods):
         fix = f"Run the train stage first, name weights, or leave {', '.join(missing)} out of the methods."
@@ -177,8 +177,8 @@ def scorers_of(
         paths = [path for path, kind in weights.items() if kind == method.weights]
         for path in paths if method.weights else [None]:
             options = (config.seed, path, config.heading, anywhere or config.anywhere)
-            scorer = make_scorer(method.name, localization_map, *options)
             # files of the same method are distinguished by their names
             which = BUNDLED if path is not None and path.parent == shipped(WEIGHTS) else path
-            by_name[f"{method.name} {which}" if method.name in by_name else method.name] = scorer
+            name = f"{method.name} {which}" if method.name in by_name else method.name
+            by_name[name] = make_scorer(method.name, localization_map, *options)
     return by_name

@@ -21,11 +21,8 @@ def within(angles_deg: Float, limit_deg: float) -> NDArray[np.bool_]:
 
 def check_axis(axis: ArrayLike) -> Float:
     """An axis (3,) of any length as a unit vector; raises a ValueError if it is not finite or has no length."""
-    given = np.asarray(axis, dtype=np.float64)
-    length = np.linalg.norm(given)
-    if given.shape != (3,) or not 0 < length < np.inf:
-        raise ValueError(f"an axis is a finite vector (3,) of some length, got {given}")
-    return np.asarray(given / length)
+    x, y, z = np.asarray(axis, dtype=np.float64)
+    return rotation_looking_along((x, y, z))[2]
 
 
 def pan_tilt_angles(axes: Float) -> tuple[Float, Float]:

@@ -64,14 +64,9 @@ class _TimeBudget:
         self.bar = bar
         self._end = time.monotonic() + total_s
 
-    @property
-    def left_s(self) -> float:
-        """Seconds left."""
-        return self._end - time.monotonic()
-
-    def share(self, share: float) -> float:
+    def share(self, share: float = 1.0) -> float:
         """Seconds of a share of the whole, at most those left."""
-        return min(self.left_s, share * self.total_s)
+        return min(self._end - time.monotonic(), share * self.total_s)
 
 
 def plan_path(
@@ -128,7 +123,7 @@ def plan_path(
 def plan_shortest(request: PathRequest, budget: _TimeBudget) -> PlannedPath:
     """Plan the shortest path, with the camera looking ahead; PlanningError if none was found."""
     route = _short_route(request, budget, AHEAD_SHARE, 1.0)
-    route = _shorten(route, request, budget.left_s, np.random.default_rng(0))
+    route = _shorten(route, request, budget.share(), np.random.default_rng(0))
     samples = RouteSamples.of(route, request.config.spacing_m)
     axes = _forward(samples.positions, np.radians(request.config.pitch_deg))
     unknown = np.full(len(samples.positions), np.nan)
@@ -158,7 +153,9 @@ def plan_informed(
         pass  # the search below may find one
     try:
         search_s = max(1e-3, budget.share(SEARCH_SHARE))
-        states = problem.solve(orientations, search_s, search_s if candidates else max(1e-3, budget.left_s), budget.bar)
+        states = problem.solve(
+            orientations, search_s, search_s if candidates else max(1e-3, budget.share()), budget.bar
+        )
         add(problem.path(states, views), states[:, :3], SEARCH)
         add(views.best(states[:, :3]), states[:, :3], SEARCH)
     except PlanningError:
@@ -172,7 +169,7 @@ def plan_informed(
         path = views.best(candidate)
         return None if path is None or path.cost >= limit else path.cost
 
-    better = improve(route, cost_below, best.cost, request, budget.left_s, rng)
+    better = improve(route, cost_below, best.cost, request, budget.share(), rng)
     if better is not route:
         add(views.best(better), better, IMPROVEMENT)
     return cheapest()[0]

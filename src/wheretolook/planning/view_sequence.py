@@ -60,11 +60,6 @@ class ViewSequence:
     direction_ids: NDArray[np.int64]
     scores: Float
 
-    @property
-    def total(self) -> float:
-        """Sum of the scores."""
-        return float(self.scores.sum())
-
 
 def best_sequence(scores: ArrayLike, limit: TurnLimit, start: ArrayLike | None = None) -> ViewSequence:
     """Find the sequence with the greatest sum of scores among all that keep the limit, exactly.
@@ -83,14 +78,14 @@ def best_sequence(scores: ArrayLike, limit: TurnLimit, start: ArrayLike | None =
     n, d = values.shape
     before = np.zeros((n, d), dtype=np.int64)  # best direction at the previous waypoint
     total = np.where(limit.from_start(start), values[0], -np.inf)
-    check_reached(total, 0, limit, start)
+    check_reached(total, 0, limit)
     rows = np.arange(d)
     for waypoint in range(1, n):
         candidates = np.append(total, -np.inf)[limit.neighbours]  # being neighbours is symmetric
         chosen = candidates.argmax(axis=1)
         before[waypoint] = limit.neighbours[rows, chosen]
         total = candidates[rows, chosen] + values[waypoint]
-        check_reached(total, waypoint, limit, start)
+        check_reached(total, waypoint, limit)
     ids = np.empty(n, dtype=np.int64)
     ids[-1] = total.argmax()
     for waypoint in range(n - 1, 0, -1):
@@ -116,10 +111,9 @@ def check_scores(scores: ArrayLike, limit: TurnLimit) -> Float:
     return values
 
 
-def check_reached(values: Float, waypoint: int, limit: TurnLimit, start: ArrayLike | None) -> None:
+def check_reached(values: Float, waypoint: int, limit: TurnLimit) -> None:
     """Raise a PlanningError if no direction of a waypoint has a finite value (D,)."""
     if np.isneginf(values).all():
-        from_where = "the start" if waypoint == 0 and start is not None else f"waypoint {waypoint - 1}"
-        reach = f" within {limit.max_turn_deg:g} degrees of {from_where}" if waypoint or start is not None else ""
         fix = "Raise the limit, put waypoints closer, allow more directions, or use a finer lattice."
-        raise PlanningError(f"waypoint {waypoint} has no direction that is allowed{reach}", value=waypoint, fix=fix)
+        problem = f"waypoint {waypoint} has no direction that is allowed within {limit.max_turn_deg:g} degrees"
+        raise PlanningError(problem, value=waypoint, fix=fix)

@@ -28,7 +28,6 @@ class CachedOcclusion(OcclusionModel):
         self.uses_all_cores = model.uses_all_cores
         self.landmarks_hide = model.landmarks_hide
         self._known: dict[tuple[float, ...], NDArray[np.uint8]] = {}
-        self._bytes = 0
 
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
         """Mask (L, N) of the model, from the cache where possible."""
@@ -38,15 +37,13 @@ class CachedOcclusion(OcclusionModel):
         mask = np.empty((len(at), len(points)), dtype=bool)
         if new:
             mask[new] = self.model.unoccluded(at[new], points)
-        known = [row for row, key in enumerate(keys) if key in self._known]
-        for row in known:
-            mask[row] = np.unpackbits(self._known[keys[row]], count=len(points)).view(bool)
+        for row, key in enumerate(keys):
+            if key in self._known:
+                mask[row] = np.unpackbits(self._known[key], count=len(points)).view(bool)
         for row, packed in zip(new, np.packbits(mask[new], axis=1), strict=True):
-            if self._bytes + packed.nbytes > self.max_bytes:
+            if (len(self._known) + 1) * packed.nbytes > self.max_bytes:
                 self._known = {}
-                self._bytes = 0
             self._known[keys[row]] = packed
-            self._bytes += packed.nbytes
         return mask
 
     def unoccluded_on_device(self, locations: Float, points: DevicePoints) -> Any | None:

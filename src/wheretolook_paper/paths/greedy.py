@@ -38,7 +38,7 @@ def greedy_sequence(scores: ArrayLike, limit: TurnLimit) -> ViewSequence:
             near = limit.neighbours[ids[waypoint - 1]]
             allowed = np.bincount(near, minlength=d + 1)[:d] > 0
             value = np.where(allowed, value - penalty[ids[waypoint - 1]], -np.inf)
-        check_reached(value, waypoint, limit, None)
+        check_reached(value, waypoint, limit)
         ids[waypoint] = value.argmax()
     return ViewSequence(ids, values[np.arange(n), ids])
 

@@ -91,7 +91,7 @@ def compare_log_odds(
 
     metrics_before, losses_before, missed_before = measure(before)
     metrics_after, losses_after, missed_after = measure(after)
-    decrease = np.bincount(row, weights=losses_before - losses_after)
+    decrease = np.bincount(row, weights=losses_before - losses_after).astype(np.float64)
     log_loss_less = mean_with_interval(decrease, n_views.astype(np.float64))
     regret_less = mean_with_interval(100 * (missed_before - missed_after), has_choice)
     return Gain(metrics_before, metrics_after, log_loss_less, regret_less)

@@ -29,7 +29,7 @@ def test_greedy_rule_is_actlocs() -> None:
         best = max(values, key=lambda key: values[key])
         assert ids[waypoint] == best
         row, column = divmod(best, 18)
-    assert best_sequence(scores, limit).scores.sum() > sequence.total
+    assert best_sequence(scores, limit).scores.sum() > sequence.scores.sum()
 
 
 def test_waypoints_every_20_cm() -> None:

@@ -38,7 +38,7 @@ SPARE = 3
 """Views of a waypoint, beyond those asked for, whose scores are computed again: where many landmarks are in view, the
 scores of all directions are computed from other samples of them."""
 
-OCCLUSION_CACHE_BYTES = 1 << 30
+CONFIG = EnvironmentConfig(occlusion_cache_bytes=1 << 30)
 
 SIGHT_LINES = 1 << 24  # lines of sight tested at once
 
@@ -91,8 +91,7 @@ class WhereToLook:
                 camera_id of one of the model. None for the model's own.
             fov_deg: instead, a pinhole of that horizontal field of view in degrees, of 640 x 480 px.
             mesh: mesh of the scene, for true occlusion.
-            depth: folder of depth images of the model's images, for occlusion by the surface they fuse to; see
-                `wheretolook.scans.depth_images.read_depth_images`.
+            depth: folder of depth images of the model's images, for occlusion by the surface they fuse to.
             depth_scale: units of integer depth images in a metre.
             occlusion: "mesh", "tsdf" (depth images), "hidden-points" (from the landmarks alone) or "none" (landmarks
                 are visible through walls); None for the first of these that there is data for.
@@ -104,8 +103,7 @@ class WhereToLook:
             anywhere: whether weights that are adapted to another scene may score in this one.
 
         Raises:
-            MapError: no usable model in the folder, or database.
-            SceneError: the mesh or the depth images cannot be used.
+            MapError, SceneError: the model or database, the mesh or depth images cannot be used.
             WeightsError: the weights cannot be used, or there are none.
             ConfigError: no such method, camera, occlusion, lattice or device.
         """
@@ -113,25 +111,17 @@ class WhereToLook:
         from wheretolook.weights.resolve import load_scorer, resolve_weights
 
         device = usable_device(device)
-        if camera is not None and fov_deg is not None:
-            raise ConfigError("a camera is described in two ways", value=fov_deg, fix="Give camera or fov_deg.")
+        camera = _described_camera(camera, fov_deg)
         axes = direction_lattice(directions, lattice)
-        if isinstance(camera, str):
-            camera = parse_camera(camera)
-        elif fov_deg is not None:
-            camera = PinholeCamera.of_field_of_view(fov_deg, 640, 480)
         resolve_weights(method, weights)  # so that missing ones are reported before anything is read
         mesh, depth, database = (None if file is None else Path(file) for file in (mesh, depth, database))
         files = ColmapFiles(Path(path), mesh, depth, depth_scale, database, max_reprojection_error_px)
-        config = EnvironmentConfig(occlusion_cache_bytes=OCCLUSION_CACHE_BYTES)
-        environment = ColmapEnvironment(files, camera, occlusion or "", config, device)
-        localization_map = environment.localization_map
-        weights = resolve_weights(method, weights, localization_map.landmarks.features)
-        if method:
-            scorer = make_scorer(method, localization_map, weights=weights, anywhere=anywhere)
-        else:
-            scorer = load_scorer(weights, localization_map, anywhere)
-        return cls(scorer, axes, environment.space)
+        environment = ColmapEnvironment(files, camera, occlusion or "", CONFIG, device)
+        here = environment.localization_map
+        weights = resolve_weights(method, weights, here.landmarks.features)
+        if not method:
+            return cls(load_scorer(weights, here, anywhere), axes, environment.space)
+        return cls(make_scorer(method, here, weights=weights, anywhere=anywhere), axes, environment.space)
 
     @property
     def localization_map(self) -> LocalizationMap:
@@ -283,3 +273,12 @@ class WhereToLook:
             fix = "Ask for fewer views, score more directions, or widen the limit on pitch."
             raise ConfigError(f"there are only {len(axes)} directions to choose from", value=needed, fix=fix)
         return axes
+
+
+def _described_camera(camera: Camera | str | int | None, fov_deg: float | None) -> Camera | int | None:
+    """Return the camera of a text or of a field of view. Raises ConfigError if both are given, or it is invalid."""
+    if fov_deg is None:
+        return parse_camera(camera) if isinstance(camera, str) else camera
+    if camera is not None:
+        raise ConfigError("a camera is described in two ways", value=fov_deg, fix="Give camera or fov_deg.")
+    return PinholeCamera.of_field_of_view(fov_deg, 640, 480)

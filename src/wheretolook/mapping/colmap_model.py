@@ -55,9 +55,6 @@ class ModelArrays:
 def model_suffix(model_dir: str | Path) -> str:
     """Suffix of the model's files in a folder: ".bin" or ".txt". Raises MapError if the model is missing or incomplete."""
     folder = Path(model_dir)
-    if not folder.is_dir():
-        fix = "Give the folder that holds cameras.bin, images.bin and points3D.bin."
-        raise MapError("there is no such folder", path=folder, fix=fix)
     suffix = next((s for s in _SUFFIXES if any((folder / (n + s)).is_file() for n in MODEL_FILES)), None)
     if suffix is None:
         inside = [str(path.parent) for path in sorted(folder.glob("**/images.*")) if holds_model(path.parent)][:5]

@@ -147,8 +147,8 @@ def fit_similarity(source: ArrayLike, target: ArrayLike) -> Similarity:
 
     a = np.asarray(source, dtype=np.float64)
     b = np.asarray(target, dtype=np.float64)
-    determined = len(a) >= 3 and not _are_on_a_line(a) and not _are_on_a_line(b)
-    sim3d = pycolmap.estimate_sim3d(a, b) if determined else None
+    ranks = [np.linalg.matrix_rank(points - points.mean(0), rtol=_FLAT) if len(points) else 0 for points in (a, b)]
+    sim3d = pycolmap.estimate_sim3d(a, b) if len(a) >= 3 and min(ranks) >= 2 else None
     if sim3d is None:
         fix = "Give the positions of three photographs or more, not on a line."
         raise MapError("these positions do not determine a frame", value=len(a), fix=fix)
@@ -170,19 +170,27 @@ def scale_from_markers(
     sizes = np.array([size_m if isinstance(size_m, float | int) else size_m[marker.marker_id] for marker in markers])
     lengths = np.stack([marker.sides for marker in markers])
     factor = float(np.median(sizes[:, None] / lengths))
-    errors = 100 * (factor * lengths / sizes[:, None] - 1)
-    names = [f"marker {marker.marker_id}" for marker in markers]
-    wrong = np.flatnonzero(np.abs(errors).max(1) > SCALE_TOLERANCE_PERCENT)
-    if len(wrong):
-        values = [f"{names[row]}: {' '.join(f'{value:+.1f}' for value in errors[row])} %" for row in wrong]
+    errors = dict(zip(markers, 100 * (factor * lengths / sizes[:, None] - 1), strict=True))
+    wrong = [
+        f"{marker.name}: {sides.round(1)} %"
+        for marker, sides in errors.items()
+        if np.abs(sides).max() > SCALE_TOLERANCE_PERCENT
+    ]
+    if wrong:
         problem = f"the markers do not agree on a scale: sides are wrong by more than {SCALE_TOLERANCE_PERCENT:g} %"
         fix = "Measure the black squares; give markers of different sizes in a marker_table."
-        raise MapError(problem, value=", ".join(values), fix=fix)
-    sides = [f"{name} side {side}" for name in names for side in range(4)]
-    residuals = dict(zip(sides, errors.ravel().tolist(), strict=True))
-    errors_px = dict(zip(names, (marker.error_px for marker in markers), strict=True))
-    n_views = dict(zip(names, (len(set(marker.images)) for marker in markers), strict=True))
-    return MapScale("markers", factor, residuals, "percent", dict(unused or {}), errors_px, n_views)
+        raise MapError(problem, value=wrong, fix=fix)
+    return MapScale(
+        source="markers",
+        factor=factor,
+        residuals={
+            f"{marker.name} side {i}": float(side) for marker in markers for i, side in enumerate(errors[marker])
+        },
+        unit="percent",
+        unused=dict(unused or {}),
+        marker_error_px={marker.name: marker.error_px for marker in markers},
+        marker_views={marker.name: len(set(marker.images)) for marker in markers},
+    )
 
 
 def scale_from_distance(first: ArrayLike, second: ArrayLike, distance_m: float) -> MapScale:
@@ -268,11 +276,6 @@ def read_scale(map_dir: Path) -> MapScale | None:
         return None
     except (OSError, ValueError, TypeError) as error:
         raise MapError(f"the map's report is damaged: {error}", path=path, fix="Run the map stage again.") from error
-
-
-def _are_on_a_line(points: Float) -> bool:
-    spread = np.linalg.svd(points - points.mean(0), compute_uv=False)
-    return bool(spread[1] <= _FLAT * max(spread[0], 1e-12))
 
 
 def _marker_views(image: Any, path: Path, dictionary: str, turned: bool) -> dict[int, MarkerView]:

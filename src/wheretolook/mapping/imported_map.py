@@ -51,7 +51,7 @@ class ExistingMapReport(MapReport):
 def map_existing(
     config: MapConfig,
     out_dir: str | Path = "map",
-    work: str | Path = "photographs",
+    work: Path = Path("photographs"),
     seed: int = 0,
     workers: int = 1,
     device: str = "cpu",
@@ -83,7 +83,7 @@ def map_existing(
         if photographs.images is not None:
             turned = _are_turned(model, photographs.images)
             database = folder / DATABASE_FILE
-            model = _triangulate(model, photographs.images, turned, Path(work), database, run)
+            model = _triangulate(model, photographs.images, turned, work, database, run)
             limit_px = limit_px or photographs.max_reprojection_error_px
         with run.clock("frame"):
             rotation = estimate_gravity(colmap_poses("", model)).rotation if settings.level else np.eye(3)

@@ -51,6 +51,11 @@ class Marker:
     error_px: float  # root mean square reprojection error of its corners
 
     @property
+    def name(self) -> str:
+        """Name in reports."""
+        return f"marker {self.marker_id}"
+
+    @property
     def sides(self) -> Float:
         """Lengths (4,) of the sides, in the map's units."""
         return np.asarray(np.linalg.norm(np.roll(self.corners, -1, axis=0) - self.corners, axis=1))

@@ -38,7 +38,7 @@ class PhotographMapReport(MapReport):
 def map_photographs(
     config: MapConfig,
     out_dir: str | Path = "map",
-    work: str | Path = "photographs",
+    work: Path = Path("photographs"),
     seed: int = 0,
     workers: int = 1,
     device: str = "cpu",
@@ -53,7 +53,6 @@ def map_photographs(
     MapError if photographs are unreadable, do not overlap or do not give the scale; ConfigError for invalid settings.
     """
     settings = config.photographs
-    work = Path(work)
     if settings.images is None:
         raise ConfigError("no folder of photographs was named", fix="Set map.photographs.images.")
     known = KnownScale.read(settings.scale)  # a damaged table is reported before the work

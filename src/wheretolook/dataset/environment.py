@@ -27,8 +27,7 @@ if TYPE_CHECKING:  # pandas and Warp are imported when first needed
     from wheretolook.geometry.mesh import TexturedMesh
     from wheretolook.geometry.tsdf import DepthImage, DepthImages, TsdfVolume
     from wheretolook.inputs.localization_map import LocalizationMap
-    from wheretolook.mapping.colmap_source import ColmapSource
-    from wheretolook.mapping.landmarks import Landmarks
+    from wheretolook.mapping.landmarks import ColmapSource, Landmarks
     from wheretolook.rendering.raycasting import MeshRaycaster
     from wheretolook.rendering.types import Renderer
     from wheretolook.space.free_space import FreeSpace
@@ -365,7 +364,7 @@ class ColmapEnvironment(Environment):
 
     @cached_property
     def _map(self) -> ColmapSource:
-        from wheretolook.mapping.colmap_source import open_colmap
+        from wheretolook.mapping.landmarks import open_colmap
 
         files = self.files
         limit_px = files.max_reprojection_error_px

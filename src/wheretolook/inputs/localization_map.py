@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from wheretolook.geometry.camera import Camera, ColmapCamera
 from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
-from wheretolook.mapping.colmap_source import open_colmap
-from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.landmarks import Landmarks, open_colmap
 from wheretolook.mapping.sanity import warn_of_mesh
 from wheretolook.utils.validation import check_positive
 from wheretolook.visibility import frustum

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -14,11 +14,20 @@ from tqdm.auto import tqdm
 from wheretolook.features.descriptors import DescriptorKind, unit_descriptors
 from wheretolook.features.registry import all_kinds
 from wheretolook.features.sift import SIFT
+from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.local_origin import local_origin
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
-from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, read_model
+from wheretolook.mapping.colmap_model import (
+    ModelArrays,
+    camera_of_model,
+    colmap_poses,
+    compact_poses,
+    model_arrays,
+    read_model,
+)
 from wheretolook.mapping.feature_files import read_descriptors
+from wheretolook.mapping.sanity import warn_of_frame
 from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.npz_files import load_npz, save_npz
 
@@ -142,6 +151,34 @@ def _cast_floats(values: dict[str, NDArray[Any]], points: DTypeLike, others: DTy
     """Cast the points and all other arrays of floats to the given types; arrays of integers stay as they are."""
     types = {name: points if name == "points" else others for name, value in values.items() if value.dtype.kind == "f"}
     return {name: value.astype(types.get(name, value.dtype), copy=False) for name, value in values.items()}
+
+
+class ColmapSource(NamedTuple):
+    """Parts of a COLMAP model in metres with z up."""
+
+    landmarks: Landmarks
+    camera: Camera  # the query camera
+    mapping_poses: Float  # cam_from_world (M, 3, 4) of its images
+
+
+def open_colmap(
+    model: str | Path,
+    camera: Camera | int | None = None,
+    database: str | Path | None = None,
+    max_reprojection_error_px: float | None = None,
+    device: str = "cpu",
+) -> ColmapSource:
+    """Read a COLMAP model; arguments, errors and warnings are those of `LocalizationMap.from_colmap`.
+
+    Without a database torch and Warp are not imported: importing them takes longer than reading 200,000 landmarks.
+    """
+    reconstruction = read_model(model)
+    landmarks = load_colmap_landmarks(Path(model), database, max_reprojection_error_px, device, reconstruction)
+    poses = colmap_poses(model, reconstruction)
+    warn_of_frame(model, landmarks.mapping_distance_m, poses)
+    if camera is None or isinstance(camera, int):
+        camera = camera_of_model(reconstruction, Path(model), camera)
+    return ColmapSource(landmarks, camera, compact_poses(poses))
 
 
 def load_colmap_landmarks(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -78,13 +77,11 @@ def detect_markers(rgb: NDArray[np.uint8], dictionary: str, path: Path | None = 
     corners, ids, _ = marker_detector(dictionary).detectMarkers(grey)
     numbers = [] if ids is None else np.asarray(ids).reshape(-1).tolist()
     if len(set(numbers)) < len(numbers):
-        twice = next(number for number in numbers if numbers.count(number) > 1)
         fix = "Print every marker once, or choose the markers' dictionary."
-        raise MapError(f"marker {twice} appears twice in this photograph", path=path, value=numbers, fix=fix)
-    refined = [refine_corners(grey, np.asarray(at, np.float64).reshape(4, 2)) for at in corners]
-    return {
-        number: at + 0.5 for number, at in zip(numbers, refined, strict=True)
-    }  # OpenCV's pixel centres are integers
+        raise MapError("a marker appears twice in this photograph", path=path, value=sorted(numbers), fix=fix)
+    refined = (refine_corners(grey, np.asarray(at, np.float64).reshape(4, 2)) for at in corners)
+    # OpenCV counts pixels from the centre of the top-left one.
+    return {number: at + 0.5 for number, at in zip(numbers, refined, strict=True)}
 
 
 def place_marker(marker_id: int, views: Sequence[MarkerView]) -> Marker:
@@ -96,18 +93,14 @@ def place_marker(marker_id: int, views: Sequence[MarkerView]) -> Marker:
     from scipy.optimize import least_squares
 
     images = tuple(view.image for view in views)
-    again = "Take another photograph of it from another place."
-    if len(views) < 2:
-        problem = f"marker {marker_id} is seen in one photograph only, which does not determine its distance"
-        raise MapError(problem, value=" ".join(images), fix=again)
     start = np.stack([_meeting_point(views, corner) for corner in range(4)])
     centers = camera_centers(np.stack([view.cam_from_world for view in views]))
     rays = start.mean(0) - centers
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    angle_deg = max(np.degrees(np.arccos(np.clip(a @ b, -1, 1))) for a, b in itertools.combinations(rays, 2))
+    angle_deg = np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1)))
     if not angle_deg >= _MIN_ANGLE_DEG:
-        problem = f"the photographs see marker {marker_id} from one direction, {angle_deg:.1f} degrees apart at most"
-        raise MapError(problem, value=" ".join(images), fix=again)
+        problem = f"marker {marker_id} is in photographs from one direction only, {angle_deg:.1f} degrees apart at most"
+        raise MapError(problem, value=" ".join(images), fix="Take another photograph of it from another place.")
 
     def residuals(values: Float) -> Float:
         return np.concatenate([_reprojection(view, values.reshape(4, 3)).ravel() for view in views])
@@ -116,8 +109,9 @@ def place_marker(marker_id: int, views: Sequence[MarkerView]) -> Marker:
     error_px = float(np.sqrt(2 * np.mean(residuals(found.x) ** 2)))
     limit_px = max(MAX_ERROR_PX, MAX_ERROR_SHARE * max(max(view.camera.width, view.camera.height) for view in views))
     if not error_px <= limit_px:
-        misses = f"its corners miss by {error_px:.1f} px, more than {limit_px:.1f}"
-        problem = f"no single place fits the photographs of marker {marker_id}, {misses}"
+        problem = (
+            f"no position of marker {marker_id} fits: its corners are off by {error_px:.1f} px, over {limit_px:.1f}"
+        )
         fix = "Print every marker once, and leave out photographs from before it was moved."
         raise MapError(problem, value=" ".join(images), fix=fix)
     return Marker(marker_id, found.x.reshape(4, 3), images, error_px)

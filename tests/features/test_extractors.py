@@ -136,16 +136,16 @@ def test_aliked_finds_in_a_batch_what_kornia_finds_image_by_image(least, tmp_pat
 
 
 @pytest.mark.parametrize("method", LEARNED)
-def test_weights_that_are_not_the_networks(method, tmp_path):
+def test_invalid_weights(method, tmp_path):
     weights = untrained(method, tmp_path)
     other = untrained("xfeat" if method != "xfeat" else "disk", tmp_path)
-    (tmp_path / "half.pth").write_bytes(weights.read_bytes()[:999])
+    (tmp_path / "truncated.pth").write_bytes(weights.read_bytes()[:999])
     torch = pytest.importorskip("torch")
     torch.save({"a": Path()}, tmp_path / "object.pth")
     state = torch.load(weights, weights_only=True)
     tensors = state["extractor"] if method == "disk" else state
     next(value for value in tensors.values() if value.is_floating_point()).view(-1)[0] = torch.nan
     torch.save(state, tmp_path / "nan.pth")
-    for name in (other.name, "half.pth", "missing.pth", "object.pth", "nan.pth"):
+    for name in (other.name, "truncated.pth", "missing.pth", "object.pth", "nan.pth"):
         with pytest.raises(WeightsError):
             KeypointExtractor(ExtractorConfig(method, weights=str(tmp_path / name)))

@@ -16,7 +16,6 @@ from wheretolook.features.keypoints import Keypoints
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import pose_error, transform
 from wheretolook.localization.config import LabelConfig
-from wheretolook.localization.labeller import LabelTask, _SceneInProgress
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.shard import label_rows
 from wheretolook.mapping.landmarks import Landmarks
@@ -106,15 +105,3 @@ def test_views_of_several_cameras_are_labelled_as_each_alone(room: MappedRoom) -
         rows = table["camera_id"] == number
         alone = label_rows(table[rows], renderer, Localizer(localizer.landmarks, camera), camera)
         pd.testing.assert_frame_equal(labelled[rows], alone)
-
-
-@pytest.mark.parametrize(("where", "cameras", "expected"), [("cpu", 5, 30), ("cuda", 5, 80), ("cuda", 0, 30)])
-def test_a_gpu_gets_many_views_of_each_camera_at_once(
-    room: MappedRoom, tmp_path: Path, where: str, cameras: int, expected: int
-) -> None:
-    """Only views of one camera go together: of forty, shards of 64 views made batches of one or two."""
-    numbered = tuple((number, CAMERA) for number in range(cameras))
-    task = LabelTask("room", replace(room.job, device=where, cameras=numbered), facing(POSTER, 200, 1.5), tmp_path)
-    shards = _SceneInProgress.of(task, 30).shards
-    assert [len(shard.rows) for shard in shards[:-1]] == [expected] * (len(shards) - 1)
-    assert sum(len(shard.rows) for shard in shards) == 200

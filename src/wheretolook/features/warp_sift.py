@@ -23,9 +23,10 @@ _ASSUMED_SIGMA = 0.5  # blur of an input image, in its pixels
 class WarpSift:
     """Extracts SIFT keypoints of many images at once (Lowe, IJCV 2004).
 
-    The plain twin is `cv2.SIFT` with the same constants and conventions, but another order of summation. The keypoints of an image do not depend on the others in its batch. An extractor must be used by
-    one thread only, since it keeps its memory on the device from call to call. It ignores the method of its config, and
-    fills `block_bytes` of scale spaces at a time (40 MB for an image of 640 x 480). The device is a CUDA device, or
+    The plain twin is `cv2.SIFT` with the same constants and conventions, but another order of summation. The keypoints
+    of an image do not depend on the others in its batch. An extractor must be used by one thread only, since it keeps
+    its memory on the device from call to call. It ignores the method of its config, and fills `block_bytes` of scale
+    spaces at a time (40 MB for an image of 640 x 480). The device is a CUDA device, or
     "cpu" (one core and slow: for tests). Raises ConfigError if it is missing.
     """
 
@@ -42,13 +43,11 @@ class WarpSift:
         self._space: ScaleSpace | None = None
         self._buffers: dict[str, Any] = {}
 
-    def extract_many(self, grey: NDArray[np.uint8] | Any) -> list[Keypoints]:
+    def extract_many(self, grey: NDArray[np.uint8]) -> list[Keypoints]:
         """At most `max_keypoints` keypoints of each grey image (B, H, W) uint8, those of most contrast first.
 
-        The images are a NumPy or Warp array. Raises ValueError if they have another shape or type, or are too large.
+        Raises ValueError if the images are too large.
         """
-        if grey.dtype not in (np.uint8, wp.uint8) or grey.ndim != 3:
-            raise ValueError(f"expected (B, H, W) uint8 images, got {grey.shape} {grey.dtype}")
         n_images, rows, columns = grey.shape
         size = values_of_image(rows, columns)
         if 2 * max(rows, columns) > MAX_SIDE or size >= 1 << 31:
@@ -63,11 +62,10 @@ class WarpSift:
             self._space = space = ScaleSpace(rows, columns, block, self.config.first_octave, self._limits, self.device)
         keypoints: list[Keypoints] = []
         for start in range(0, n_images, space.n_images):
-            stop = min(start + space.n_images, n_images)  # a Warp slice may not exceed the array
-            keypoints += self._extract_block(space, grey[start:stop])
+            keypoints += self._extract_block(space, grey[start : start + space.n_images])
         return keypoints
 
-    def _extract_block(self, space: ScaleSpace, grey: Any) -> list[Keypoints]:
+    def _extract_block(self, space: ScaleSpace, grey: NDArray[np.uint8]) -> list[Keypoints]:
         n_images = grey.shape[0]
         space.fill(grey)
         keys = np.unique(space.find())
@@ -171,10 +169,8 @@ class ScaleSpace:
         self.first_octave = first_octave
         self.limits = limits
         self.sizes = octave_sizes(rows, columns)
-        starts = np.cumsum([0, *(LEVELS * r * c for r, c in self.sizes)])
-        self.image_size = int(starts[-1])
-        self.starts = [int(start) for start in starts[:-1]]
-        rows_of, columns_of = ([size[side] for size in self.sizes] for side in (0, 1))
+        rows_of, columns_of = zip(*self.sizes, strict=True)
+        *self.starts, self.image_size = np.cumsum([0, *(LEVELS * r * c for r, c in self.sizes)]).tolist()
         pyramid: Any = scale_kernels.Pyramid()
         pyramid.values = wp.empty(n_images * self.image_size, dtype=wp.float32, device=device)
         pyramid.image_size = self.image_size
@@ -192,11 +188,10 @@ class ScaleSpace:
         self.weights: Any = wp.array(np.concatenate(filters).astype(np.float32), dtype=wp.float32, device=device)
         self._commands = self._record()
 
-    def fill(self, grey: Any) -> None:
-        """Compute the scale spaces of images (B, H, W) uint8, in NumPy or Warp, B at most `n_images`."""
-        if isinstance(grey, np.ndarray):
-            grey = wp.array(np.ascontiguousarray(grey), dtype=wp.uint8, device="cpu", copy=False)
-        wp.copy(self.grey, grey.contiguous(), count=grey.size)
+    def fill(self, grey: NDArray[np.uint8]) -> None:
+        """Compute the scale spaces of images (B, H, W) uint8, B at most `n_images`."""
+        host = wp.array(np.ascontiguousarray(grey), dtype=wp.uint8, device="cpu", copy=False)
+        wp.copy(self.grey, host, count=grey.size)
         if grey.shape[0] != self.filled:
             self.filled = grey.shape[0]
             for command, size in self._commands:
@@ -232,14 +227,9 @@ class ScaleSpace:
             """A level of the pyramid, or the memory for one smoothed along its rows only."""
             result: Any = scale_kernels.Level()
             result.rows, result.columns = self.sizes[octave]
-            if half_smooth:
-                result.values = self.half_smooth
-                result.image_size = 4 * self.rows * self.columns
-                result.start = 0
-            else:
-                result.values = self.pyramid.values
-                result.image_size = self.image_size
-                result.start = self.starts[octave] + level * result.rows * result.columns
+            result.values = self.half_smooth if half_smooth else self.pyramid.values
+            result.image_size = 4 * self.rows * self.columns if half_smooth else self.image_size
+            result.start = 0 if half_smooth else self.starts[octave] + level * result.rows * result.columns
             return result
 
         def smooth(octave: int, source: int, target: int) -> None:

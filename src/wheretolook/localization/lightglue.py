@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.learned import kornia_feature, load_state, one_thread
 from wheretolook.features.matching import Matches
-from wheretolook.features.registry import all_extractors
+from wheretolook.features.registry import all_extractors, all_kinds
 from wheretolook.mapping.colmap_model import model_arrays, read_model
 from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import Landmarks
@@ -32,8 +32,8 @@ class _MappingImages:
     stored: list[tuple[NDArray[np.float32], NDArray[Any]]]
     sizes: NDArray[np.int64]  # (I, 2) width and height
     rows: list[NDArray[np.int64]]  # landmark row of each keypoint, -1 for none
-    start: NDArray[np.int64]  # (N + 1,); observers[start[i] : start[i + 1]] are the images that observe landmark i
-    observers: NDArray[np.int64]
+    observer: NDArray[np.int64]  # (O,) image of each observation
+    landmark: NDArray[np.int64]  # (O,) and its landmark
 
 
 class LightGlueMatcher:
@@ -44,21 +44,20 @@ class LightGlueMatcher:
     """
 
     def __init__(self, landmarks: Landmarks, map_dir: Path | None, weights: str, device: str = "cpu") -> None:
-        self.landmarks = landmarks
-        self.map_dir = map_dir
-        self.device = torch.device(device)
-        records = all_extractors().values()
-        self.kind = next(record.descriptors for record in records if record.descriptors.name == landmarks.features)
-        named = {record.descriptors.name: record.lightglue for record in records if record.lightglue}
-        if landmarks.features not in named:
-            fix = f"Leave label.localizer.lightglue out, or map with one of {', '.join(named)}."
+        supported = {
+            record.descriptors.name: record.lightglue for record in all_extractors().values() if record.lightglue
+        }
+        if landmarks.features not in supported:
+            fix = f"Leave label.localizer.lightglue out, or map with one of {', '.join(supported)}."
             raise ConfigError("LightGlue does not support these features", value=landmarks.features, fix=fix)
-        self._network = _network(named[landmarks.features], "" if weights == KORNIA_WEIGHTS else weights).to(
-            self.device
-        )
         if map_dir is None or not (map_dir / _DATABASE).is_file():
             fix = "Map again with --map.keep_database true."
             raise MapError("LightGlue needs the database of the mapping images", path=map_dir, fix=fix)
+        self.landmarks = landmarks
+        self.map_dir = map_dir
+        self.device = torch.device(device)
+        self.kind = all_kinds()[landmarks.features]
+        self._network = _network(supported[landmarks.features], weights).to(self.device)
 
     def match(
         self, query: Keypoints, size: tuple[int, int], landmark_rows: NDArray[np.int64], n_images: int
@@ -68,8 +67,8 @@ class LightGlueMatcher:
         If several images lead to different landmarks for a keypoint, or keypoints for a landmark, the best score wins.
         """
         images = self._images
-        observers = [images.observers[images.start[row] : images.start[row + 1]] for row in landmark_rows]
-        votes = np.bincount(np.concatenate([*observers, np.zeros(0, np.int64)]), minlength=len(images.stored))
+        voted = np.isin(np.arange(len(self.landmarks)), landmark_rows)[images.landmark]
+        votes = np.bincount(images.observer[voted], minlength=len(images.stored))
         best = np.argsort(-votes, kind="stable")[:n_images]
         matches = [self._match_image(query, size, int(image)) for image in best[votes[best] > 0]]
         if not matches:
@@ -104,7 +103,6 @@ class LightGlueMatcher:
 
     @cached_property
     def _images(self) -> _MappingImages:
-        assert self.map_dir is not None
         model = read_model(self.map_dir)
         arrays = model_arrays(model)
         kind, stored = read_features(self.map_dir / _DATABASE, arrays.image_names)
@@ -120,15 +118,13 @@ class LightGlueMatcher:
         rows = [np.full(len(pixels), -1, dtype=np.int64) for pixels, _ in stored]
         for number, of_image in enumerate(rows):
             of_image[keypoint[image == number]] = row[image == number]
-        order = np.argsort(row, kind="stable")
-        start = np.searchsorted(row[order], np.arange(len(self.landmarks) + 1))
         cameras = [model.cameras[model.images[int(number)].camera_id] for number in arrays.image_ids]
         sizes = np.array([(camera.width, camera.height) for camera in cameras], dtype=np.int64)
-        return _MappingImages(stored, sizes, rows, start, image[order])
+        return _MappingImages(stored, sizes, rows, image, row)
 
 
 def _network(features: str, weights: str) -> Any:
-    """LightGlue for some features, with weights from a file or, without one, kornia's."""
+    """LightGlue for some features, with weights from a file or `KORNIA_WEIGHTS`."""
     light_glue = kornia_feature().LightGlue
     settings = {name: value for name, value in light_glue.features[features].items() if name != "weights"}
     network = light_glue(features=None, **settings)
@@ -143,4 +139,5 @@ def _network(features: str, weights: str) -> Any:
         renamed = {names[key].removeprefix("matcher."): value for key, value in state.items()}
         return {key: value for key, value in renamed.items() if key in network.state_dict()}
 
-    return load_state(network, weights, name, [url], prepare, "--label.localizer.lightglue").eval()
+    file = "" if weights == KORNIA_WEIGHTS else weights
+    return load_state(network, file, name, [url], prepare, "--label.localizer.lightglue").eval()

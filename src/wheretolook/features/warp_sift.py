@@ -190,7 +190,7 @@ class ScaleSpace:
 
     def fill(self, grey: NDArray[np.uint8]) -> None:
         """Compute the scale spaces of images (B, H, W) uint8, B at most `n_images`."""
-        host = wp.array(np.ascontiguousarray(grey), dtype=wp.uint8, device="cpu", copy=False)
+        host: Any = wp.array(np.ascontiguousarray(grey), dtype=wp.uint8, device="cpu", copy=False)
         wp.copy(self.grey, host, count=grey.size)
         if grey.shape[0] != self.filled:
             self.filled = grey.shape[0]

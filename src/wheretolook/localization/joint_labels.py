@@ -73,6 +73,7 @@ def label_sets(
     localizer = JointLocalizer(PoseEstimator(points, config), turn_noise_deg)
     rng = np.random.default_rng(seed)
     true_poses = poses(table)
+    locations = table["location_id"].tolist()
     single_view: dict[int, SingleViewPoses] = {}
     known: dict[tuple[int, ...], tuple[object, ...]] = {}  # repeated sets, if nothing is drawn for each
     rows: list[tuple[object, ...]] = []
@@ -96,7 +97,7 @@ def label_sets(
                 error_m, error_deg = (error.max() for error in pose_error(result.cams_from_world[:n], true[:n]))
             known[key] = (
                 len(key),
-                int(table["location_id"].iat[key[0]]),
+                locations[key[0]],
                 result.status,
                 error_m,
                 error_deg,

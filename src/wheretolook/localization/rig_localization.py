@@ -232,9 +232,9 @@ class _Rig:
                 poses += [self._refine(self._rig_pose(k, pose)) for pose, _ in single]
             poses.sort(key=lambda pose: -pose.support)
         distinct: list[_Hypothesis] = []
-        for pose in poses:
-            if all(pose.differs_from(other) for other in distinct):
-                distinct.append(pose)
+        for hypothesis in poses:
+            if all(hypothesis.differs_from(other) for other in distinct):
+                distinct.append(hypothesis)
         return distinct
 
     def inlier_rows(self, pose: _Hypothesis) -> NDArray[np.int64]:

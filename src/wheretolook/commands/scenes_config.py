@@ -10,7 +10,7 @@ from wheretolook.scans.config import RgbdConfig
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.utils.confine import check_folder_name
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.validation import reject
 
 NOT_SCENES = ("weights", "results", "adapted", "all")  # other folders of a dataset, and the name of all scenes
 
@@ -72,13 +72,13 @@ class ScenesConfig:
     mapped_space: MappedSpaceConfig = field(default_factory=MappedSpaceConfig)
 
     def __post_init__(self) -> None:
-        if min(self.train, self.val, self.test) < 0 or self.train + self.val + self.test + len(self.meshes) == 0:
-            fix = "Set scenes.train and scenes.test, or name meshes in scenes.meshes."
-            value = (self.train, self.val, self.test, self.meshes)
-            raise ConfigError("an experiment needs scenes", value=value, fix=fix)
-        if not self.kinds or not set(self.kinds) <= set(get_args(SceneKind)):
-            fix = f"Name some of {', '.join(get_args(SceneKind))}."
-            raise ConfigError("scenes.kinds are kinds of generated scenes", value=self.kinds, fix=fix)
+        counts = (self.train, self.val, self.test)
+        unknown = {*self.kinds} - {*get_args(SceneKind)}
+        reject(
+            (min(counts) < 0, "numbers of scenes must be at least 0", counts),
+            (sum(counts) + len(self.meshes) == 0, "set scenes.train, scenes.test or scenes.meshes", counts),
+            (not self.kinds or bool(unknown), f"scenes.kinds are some of {get_args(SceneKind)}", self.kinds),
+        )
 
     def kind_of(self, seed: int) -> SceneKind:
         """Return the kind of the generated scene of a seed."""

@@ -32,7 +32,7 @@ from wheretolook.utils.version import VERSION
 if TYPE_CHECKING:
     import pandas as pd
     from mlflow import MlflowClient
-    from mlflow.entities import Experiment, Metric, Run
+    from mlflow.entities import Metric, Run
 
 Values = Mapping[str, Any] | None
 """Parameters or metrics by name."""
@@ -62,7 +62,7 @@ ALL_METHODS = "all methods"
 NOTES_GROUP = "wheretolook.experiment_notes"
 """Entry points of functions (stage, experiment_id) -> tags that describe a new experiment."""
 
-_LAYOUT_TAGS = {"made_by": "wheretolook"}  # of experiments of a dataset and purpose
+_MADE_BY = "made_by"  # tag of experiments of a dataset and purpose
 _KIND_TAGS = {"mlflow.experimentKind": "custom_model_development"}  # lets MLflow open the table of runs
 _METRICS_PER_BATCH = 800  # MLflow takes 1000 metrics and parameters together
 _RUNS_PER_PAGE = 50
@@ -91,21 +91,15 @@ def joined(what: str, *conditions: str) -> str:
     return ", ".join(filter(None, (what, *conditions)))
 
 
-def experiments(mlflow_client: MlflowClient, tracking: TrackingConfig) -> list[Experiment]:
-    """Return all experiments of this package in the store, also those logged before the store was moved."""
-    name = tracking.experiment
-    tag, value = next(iter(_LAYOUT_TAGS.items()))
-    return [
-        experiment
-        for experiment in mlflow_client.search_experiments()
-        if (name and (experiment.name == name or experiment.name.startswith(f"{name} at ")))
-        or (not name and experiment.tags.get(tag) == value)
-    ]
-
-
 def experiment_ids(mlflow_client: MlflowClient, tracking: TrackingConfig) -> list[str]:
-    """Return the ids of `experiments`."""
-    return [str(experiment.experiment_id) for experiment in experiments(mlflow_client, tracking)]
+    """Return the ids of this package's experiments in the store, also of those logged before the store was moved."""
+    name = tracking.experiment
+    ids = []
+    for experiment in mlflow_client.search_experiments():
+        named = experiment.name == name or experiment.name.startswith(f"{name} at ")
+        if named if name else experiment.tags.get(_MADE_BY) == "wheretolook":
+            ids.append(str(experiment.experiment_id))
+    return ids
 
 
 def experiment_id(mlflow_client: MlflowClient, tracking: TrackingConfig, stage: str, dataset: str = "") -> str:
@@ -122,7 +116,7 @@ def experiment_id(mlflow_client: MlflowClient, tracking: TrackingConfig, stage: 
             break
         if known.lifecycle_stage == "active" and known.artifact_location == tracking.artifacts:
             return str(known.experiment_id)
-    tags = _KIND_TAGS | ({} if tracking.experiment else _LAYOUT_TAGS)
+    tags = _KIND_TAGS | ({} if tracking.experiment else {_MADE_BY: "wheretolook"})
     created = str(mlflow_client.create_experiment(candidate, artifact_location=tracking.artifacts, tags=tags))
     if not tracking.experiment:
         for entry_point in entry_points(group=NOTES_GROUP):
@@ -173,27 +167,17 @@ def log(mlflow_client: MlflowClient, run_id: str, params: Values = None, metrics
 
 def log_history(mlflow_client: MlflowClient, run_id: str, history: pd.DataFrame) -> None:
     """Log a training history, one row per `epoch`, as training itself logs it."""
-    start_ms = int(mlflow_client.get_run(run_id).info.start_time)
     rows = history.drop(columns="epoch").to_dict("records")
-    steps = [(int(epoch), row) for epoch, row in zip(history["epoch"], rows, strict=True)]
-    log_metrics(mlflow_client, run_id, steps, start_ms)
+    log_metrics(mlflow_client, run_id, zip(map(int, history["epoch"]), rows, strict=True))
 
 
-def log_metrics(
-    mlflow_client: MlflowClient,
-    run_id: str,
-    steps: Iterable[tuple[int, Mapping[Any, Any]]],
-    start_ms: int | None = None,
-) -> None:
-    """Log metrics of steps in batches. Metrics that are not finite are skipped.
-
-    The time of a step is now, or `start_ms` plus the step in milliseconds.
-    """
+def log_metrics(mlflow_client: MlflowClient, run_id: str, steps: Iterable[tuple[int, Mapping[Any, Any]]]) -> None:
+    """Log metrics of steps in batches. Metrics that are not finite are skipped."""
     from mlflow.entities import Metric
 
     now = int(time.time() * 1000)
     metrics: list[Metric] = [
-        Metric(str(name), float(value), now if start_ms is None else start_ms + step, step)
+        Metric(str(name), float(value), now, step)
         for step, values in steps
         for name, value in values.items()
         if math.isfinite(value)

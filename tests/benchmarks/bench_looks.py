@@ -38,7 +38,7 @@ def main() -> None:
     scorer = load_scorer(str(shipped(WEIGHTS) / "set.safetensors"), localization_map)
     places = np.unique(np.round(camera_centers(poses(read_table(scene.table))), 9), axis=0)[: options.places]
     directions = direction_lattice(options.directions)
-    scores = scorer.score_around(places, directions)
+    scores = scorer.score_directions(places, directions)
     best_views(scorer, places[0], directions, scores[0], options.looks)  # warm-up
     seconds = []
     for place, values in zip(places, scores, strict=True):

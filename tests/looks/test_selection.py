@@ -99,7 +99,7 @@ def test_the_order_is_of_least_rotation_and_within_the_limit(
 
 def test_more_views_score_higher_and_the_first_is_the_best_single_one(scorer: Scorer) -> None:
     axes = direction_lattice(200)
-    scores = scorer.score_around(POINTS[:1], axes)[0]
+    scores = scorer.score_directions(POINTS[:1], axes)[0]
     sets = [best_views(scorer, POINTS[0], axes, scores, n) for n in (1, 2, 3)]
     assert sets[0].rows == (int(scores.argmax()),)
     assert sets[0].score < sets[1].score < sets[2].score

@@ -41,13 +41,15 @@ def test_a_smooth_maximum_is_found_within_the_last_step() -> None:
 def test_no_method_gets_worse_and_batches_change_nothing(method: str) -> None:
     scorer = make_scorer(method, room_map(room_landmarks(400)))
     locations = GRID.centers()[list(free_voxels())]
-    scores = scorer.score_around(locations, DIRECTIONS)
+    scores = scorer.score_directions(locations, DIRECTIONS)
     best = DIRECTIONS[scores.argmax(axis=1)]
     found = refine_directions(scorer, locations, best)
     np.testing.assert_allclose(found.start_scores, scores.max(axis=1), rtol=1e-12)
     assert np.all(found.scores >= found.start_scores)
     assert np.mean(found.scores > found.start_scores) > 0.3
-    again = [scorer.score_around(at[None], axis[None])[0, 0] for at, axis in zip(locations, found.axes, strict=True)]
+    again = [
+        scorer.score_directions(at[None], axis[None])[0, 0] for at, axis in zip(locations, found.axes, strict=True)
+    ]
     np.testing.assert_allclose(again, found.scores, rtol=1e-6)
     assert angle_deg(found.axes, best).max() <= 10 + 1e-6
     alone = refine_directions(scorer, locations[4], best[4])

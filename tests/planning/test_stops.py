@@ -36,7 +36,7 @@ def scorer() -> Scorer:
 def path(scorer: Scorer) -> PlannedPath:
     """Level views along a given path, the worst at its end, which looks at a corner without landmarks."""
     level = DIRECTIONS[np.abs(DIRECTIONS[:, 2]) < 0.3]
-    chosen = best_sequence(-scorer.score_around(POSITIONS, level), TurnLimit.of(level, 40.0))
+    chosen = best_sequence(-scorer.score_directions(POSITIONS, level), TurnLimit.of(level, 40.0))
     axes = level[chosen.direction_ids]
     return PlannedPath(POSITIONS, axes, scorer.score(poses_looking_along(POSITIONS, axes)), np.nan)
 

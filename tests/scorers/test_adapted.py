@@ -161,7 +161,7 @@ def test_a_file_of_adapted_weights_scores_as_it_says(place: tuple[LocalizationMa
     np.testing.assert_allclose(adapted.score(poses), expected, atol=1e-9)
     np.testing.assert_allclose(adapted.report(poses).score, expected, atol=1e-9)
     np.testing.assert_allclose(adapted.report(poses).expected_inliers, base.report(poses).expected_inliers)
-    np.testing.assert_allclose(adapted.score_around(locations, directions).ravel(), expected, atol=0.01)
+    np.testing.assert_allclose(adapted.score_directions(locations, directions).ravel(), expected, atol=0.01)
     assert adapted.name == "adapted"
 
 

@@ -123,7 +123,7 @@ def test_scorers_keep_their_contract(
         with pytest.raises(PoseError):
             method(invalid)
     with pytest.raises(PoseError):
-        scorer.score_around(np.array([[0.0, np.inf, 1]]), np.array([[1.0, 0, 0]]))
+        scorer.score_directions(np.array([[0.0, np.inf, 1]]), np.array([[1.0, 0, 0]]))
 
 
 def _binned(counts: list[list[int]]) -> BinnedViews:

@@ -58,7 +58,7 @@ def test_all_directions_at_once_score_as_one_by_one(camera: ColmapCamera | None,
     localization_map = LocalizationMap.from_colmap(folder, camera, occlusion=HiddenPointRemoval())
     scorer = load_scorer(WEIGHTS, localization_map)
     slow = all_scores(scorer, POINTS)
-    fast = scorer.score_around(POINTS, AXES)
+    fast = scorer.score_directions(POINTS, AXES)
     odds = [np.log(scores / (1 - scores)) for scores in (slow, fast)]
     assert np.ptp(slow) > 0.05
     np.testing.assert_allclose(odds[0], odds[1], atol=0.02)
@@ -71,7 +71,7 @@ def test_a_sample_of_the_landmarks_ranks_as_all(tmp_path: Path) -> None:
     starts, _ = localization_map.in_view_on_device(poses)
     assert np.diff(starts).max() > 1500
     slow = all_scores(scorer, POINTS)
-    fast = scorer.score_around(POINTS, AXES)
+    fast = scorer.score_directions(POINTS, AXES)
     assert np.corrcoef(slow.ravel(), fast.ravel())[0, 1] > 0.999
     rows = np.arange(len(POINTS))
     assert (slow.max(axis=1) - slow[rows, fast.argmax(axis=1)] < 0.01).all()
@@ -81,7 +81,7 @@ def test_the_sequence_is_the_best_of_all(sparse: Path) -> None:
     look = WhereToLook.from_colmap(sparse, weights=WEIGHTS, directions=12, device="cpu")
     axes = look.directions
     limit = 60.0
-    scores = look.scorer.score_around(POINTS, axes)
+    scores = look.scorer.score_directions(POINTS, axes)
     rotations = rotation_looking_along(axes)
     turns = rotation_angle_deg(rotations[:, None], rotations[None])
     best = max(

@@ -45,7 +45,7 @@ def test_the_best_views_of_a_location_are_those_of_select(room: ViewedMap) -> No
     location = score_location(selector, POINTS[0], 4)
     chosen = WhereToLook(selector.scorer, selector.directions).best(POINTS[:1], 4)
     np.testing.assert_array_equal(location.best.cam_from_world, chosen.cam_from_world)
-    np.testing.assert_allclose(location.scores, selector.scorer.score_around(POINTS[:1], selector.directions)[0])
+    np.testing.assert_allclose(location.scores, selector.scorer.score_directions(POINTS[:1], selector.directions)[0])
     with pytest.raises(TableError):
         score_location(selector, np.array([80.0, 0.0, 1.0]), 1)
 

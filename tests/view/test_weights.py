@@ -49,7 +49,7 @@ def test_adapted_weights_score_in_their_scene_only(dataset: Dataset) -> None:
     scene = viewed(dataset, "scene-1")
     assert "adapted" in scene.weights.describe(scene.weights.methods[0])
     scorers = [scene.selector(name, "none", 30).scorer for name in ("adapted", "set")]
-    adapted, base = (scorer.score_around(np.array([[0.0, 0.0, 1.2]]), np.eye(3)) for scorer in scorers)
+    adapted, base = (scorer.score_directions(np.array([[0.0, 0.0, 1.2]]), np.eye(3)) for scorer in scorers)
     np.testing.assert_allclose(2 * np.log(adapted / (1 - adapted)), np.log(base / (1 - base)), atol=1e-6)
     assert viewed(dataset, "scene-0").weights.methods[0] == "set"
     assert viewed(dataset, "scene-1", BASE).weights.methods[0] == "set"

@@ -1,4 +1,4 @@
-"""Names of what bins and landmarks in view tell: apart from what makes them, so that options need no PyTorch."""
+"""Names of the channels of bins and the attributes of landmarks, for options without PyTorch."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ CHANNELS = ("u", "v", "x", "y", "z")
 """Channels of every landmark: pixel (u, v) and position (x, y, z) in the camera frame in metres."""
 
 POSE_ATTRIBUTES = ("across", "down", "distance", "mapped_angle", "distance_ratio", "pixel_angle", "pixel_size_ratio")
-"""Of a landmark in a view: x/z and y/z in the camera; the distance in metres, its logarithm; the cosine between the ray
-from the camera and the mean direction it was mapped from; the logarithm of the distance over the mean mapping one; the
-logarithm of the angle that a pixel of the camera covers, one over its focal length in pixels; and the logarithm of the
-size on the landmark's surface that a pixel covers, over that when it was mapped."""
+"""Attributes of a landmark in a view: x/z and y/z in the camera; the logarithm of the distance in metres; the cosine
+between the ray from the camera and the mean direction it was mapped from; the logarithm of the distance over the mean
+mapping distance; the logarithm of the angle of a pixel of the camera, one over its focal length in pixels; and the
+logarithm of a pixel's size on the landmark's surface, over that in the mapping images."""
 
 ATTRIBUTES = POSE_ATTRIBUTES + MAP_ATTRIBUTES
-"""All that is known of a landmark in a view."""
+"""All attributes of a landmark in a view."""
 
 OF_SIZE = ("distance", "mapped_distance", "mapped_pixel_size")
-"""Attributes that tell how large a scene is, logarithms of metres: they change when it is enlarged. Matching does not
-depend on that, so models of detection probability ignore them by default."""
+"""Attributes that depend on the size of a scene, logarithms of metres. Matching does not depend on it, so models of
+detection probability ignore them by default."""
 
 LANDMARK_CHANNELS = ("mapped_angle", "distance_ratio", *MAP_ATTRIBUTES)
-"""Channels of what landmarks are like, on request only: two of `POSE_ATTRIBUTES`, and what the map knows. A bin's mean
-is NaN where one of its landmarks' values is not known."""
+"""Channels of landmarks' attributes, on request only: two of `POSE_ATTRIBUTES`, and those of the map. A bin's mean is
+NaN where one of its landmarks' values is unknown."""
 
 ALL_CHANNELS = CHANNELS + LANDMARK_CHANNELS
 

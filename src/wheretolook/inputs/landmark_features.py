@@ -113,7 +113,7 @@ class LandmarkDescriber:
         """Describe the landmarks of views (B, 3, 4) in blocks that leave a network over the landmarks memory to work.
 
         At most `limit` landmarks of each view are described, evenly spread over the visible ones in the map's order.
-        Yields which views a block holds, their landmarks, and how many each of them sees in all.
+        Yields which views a block holds, their landmarks, and how many landmarks each of them sees in all.
         """
         starts, indices = self.localization_map.in_view_on_device(cam_from_world)
         n_visible = np.diff(starts)

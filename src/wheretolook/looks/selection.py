@@ -19,7 +19,7 @@ from wheretolook.utils.errors import ConfigError, PlanningError
 if TYPE_CHECKING:
     from wheretolook.scorers.base import Scorer
 
-MAX_VIEWS = 6  # of a set: its order is found by trying all
+MAX_VIEWS = 6  # of a set: all orders are tried
 EXCHANGES = 3  # rounds in which each view may be exchanged for a better one
 CANDIDATES = 24  # directions with the best single-view scores that a set is selected from
 SEPARATION_DEG = 15.0  # angle between candidates; nearer ones see the same

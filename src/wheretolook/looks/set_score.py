@@ -16,7 +16,7 @@ MIN_PROBABILITY = 1e-3  # that some view localizes on its own, or that none does
 class SetScoreModel(LogisticRegression):
     """Logistic regression fitted to random sets of 1 to 5 views; the same for every size.
 
-    The log-odds that some view localizes on its own tell most, but treat views of the same landmarks as independent.
+    The log-odds that some view localizes on its own matter most, but treat views of the same landmarks as independent.
     The position variance left by all landmarks they detect jointly corrects for that: it falls more with new landmarks
     than with more detections of the same.
     """

@@ -145,7 +145,7 @@ def _score_and_count(
 
 
 def _score_exactly(scorer: Scorer, locations: Float, directions: Float) -> Float:
-    """Scores (L, D) of directions (D, 3) at locations (L, 3) m; `Scorer.score_around` may approximate them."""
+    """Scores (L, D) of directions (D, 3) at locations (L, 3) m; `Scorer.score_directions` may approximate them."""
     poses = poses_looking_along(np.repeat(locations, len(directions), axis=0), np.tile(directions, (len(locations), 1)))
     return scorer.score(poses).reshape(len(locations), len(directions))
 

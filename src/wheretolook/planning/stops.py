@@ -97,7 +97,7 @@ def _best_stop(scorer: Scorer, view: _View, directions: Float, config: StopConfi
     apart = directions[directions @ view.axis < math.cos(math.radians(SEPARATION_DEG))]
     if len(apart) == 0:
         return None
-    scores = scorer.score_around(view.position[None], apart)[0]
+    scores = scorer.score_directions(view.position[None], apart)[0]
     near = np.flatnonzero(apart @ view.axis > math.cos(math.radians(NEAR_DEG)))
     rows = np.union1d(candidates(apart, scores, CANDIDATES), near[candidates(apart[near], scores[near], N_NEAR)])
     axes = np.concatenate([view.axis[None], apart[rows]])

@@ -67,7 +67,7 @@ class Scorer(ABC):
         """Return which poses (B, 3, 4) have views in the range of the training views, (B,) bool; all if there is none."""
         return np.ones(len(check_poses(cam_from_world)), dtype=bool)
 
-    def score_around(self, locations: Float, directions: Float) -> Float:
+    def score_directions(self, locations: Float, directions: Float) -> Float:
         """Score cameras without roll at locations (L, 3) m along each of directions (D, 3). Returns (L, D).
 
         Methods that sample landmarks may differ slightly from `score`.

@@ -11,9 +11,6 @@ ORACLE = "oracle"  # the best views by their labels, in tables and figures
 
 _ORACLE_STYLE = MethodStyle("oracle", "#000000", "*", "-")
 
-_SPARE = (("#CC79A7", "8", (0, (1, 1))), ("#F0E442", "H", (0, (4, 2))), ("#7F3C8D", "3", (0, (2, 1))))
-"""Styles of methods that are not installed."""
-
 
 def method_style(name: str) -> MethodStyle:
     """Return the style of a method; what follows a space in its name, such as a weights file, is added to the label."""
@@ -21,7 +18,7 @@ def method_style(name: str) -> MethodStyle:
         return _ORACLE_STYLE
     method = find(name)
     if method is None:
-        return MethodStyle(name, *_SPARE[sum(name.encode()) % len(_SPARE)])
+        return MethodStyle(name)
     further = name.partition(" ")[2]
     return replace(method.style, label=f"{method.style.label}, {further}") if further else method.style
 

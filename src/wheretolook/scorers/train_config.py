@@ -40,8 +40,8 @@ def _train_config() -> type:
         if groups.setdefault(method.folder, method.config) is not method.config:
             fix = "Give all methods of a folder the same class of options."
             raise ConfigError("methods of one folder have different classes of options", value=method.folder, fix=fix)
-    if taken := {*groups} & {own.name for own in fields(_NamedMethods)}:
-        raise ConfigError("a learned method's folder has the name of an option", value=min(taken), fix="Rename it.")
+    if reserved := {*groups} & {own.name for own in fields(_NamedMethods)}:
+        raise ConfigError("a learned method's folder has the name of an option", value=min(reserved), fix="Rename it.")
     own = [(name, config, field(default_factory=config)) for name, config in groups.items()]
     made = make_dataclass("TrainConfig", own, bases=(_NamedMethods,), frozen=True)
     made.__module__ = __name__  # so that training processes can unpickle it

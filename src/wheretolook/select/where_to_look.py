@@ -259,7 +259,7 @@ class WhereToLook:
         with tqdm(total=len(locations), desc="score", unit="waypoint", disable=not progress) as bar:
             for begin in range(0, len(locations), step):
                 block = locations[begin : begin + step]
-                scores[begin : begin + step] = self.scorer.score_around(block, axes)
+                scores[begin : begin + step] = self.scorer.score_directions(block, axes)
                 bar.update(len(block))
         return scores
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from math import ceil
 from typing import Any, NamedTuple, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -25,8 +26,11 @@ class IndexBatches(ABC):
 
     Every process cuts the same batches of `batch_size` and keeps its `share` of each, (its rank, the number of
     processes). Shares differ by one example at most and may be empty, so that all processes take equally many steps.
-    With a `shuffle_seed` every pass has its own order, the same in every run; None keeps the order of `rows`.
+    With a `shuffle_seed` every pass has its own order, the same in every run; None keeps the order of `rows`. The order
+    is drawn by NumPy if `numpy_order`, else by the generator that `collate` is called with.
     """
+
+    numpy_order = False
 
     def __init__(
         self, rows: Tensor, batch_size: int, shuffle_seed: int | None = None, share: tuple[int, int] = (0, 1)
@@ -45,14 +49,14 @@ class IndexBatches(ABC):
         generator = torch.Generator(rows.device)
         if self.shuffle_seed is not None:
             generator.manual_seed(1_000_003 * self.shuffle_seed + self._passes)
-            rows = rows[self.permutation(generator).to(rows.device)]
+            if self.numpy_order:
+                rng = np.random.default_rng([self.shuffle_seed, self._passes])
+                rows = rows[torch.from_numpy(rng.permutation(len(rows))).to(rows.device)]
+            else:
+                rows = rows[torch.randperm(len(rows), generator=generator, device=rows.device)]
             self._passes += 1
         for part in rows.split(self.batch_size):
             yield self.collate(part, generator)
-
-    def permutation(self, generator: torch.Generator) -> Tensor:
-        """Return the order (n,) of the rows in this pass."""
-        return torch.randperm(len(self.rows), generator=generator, device=self.rows.device)
 
     def share_of(self, whole: Tensor) -> Tensor:
         """Return this process's part of a tensor with a row for each example of a batch."""

@@ -72,8 +72,8 @@ class ViewpointClassifier(LightningModule):
         self.class_weights = class_weights
         self.seed = seed
         # logits and labels of an epoch's batches: metrics of every step would take longer than the steps
-        self._train_seen: list[Tensor] = []
-        self._val_seen: list[Tensor] = []
+        self._train_outputs: list[Tensor] = []
+        self._val_outputs: list[Tensor] = []
         self._penalties: list[Tensor] = []
 
     def forward(self, *inputs: Tensor) -> Tensor:
@@ -92,33 +92,38 @@ class ViewpointClassifier(LightningModule):
         if isinstance(self.network, Augmented):
             inputs = self.network.augment(self.options, *inputs)
         count = total / self.trainer.world_size
-        more: Tensor | float = 0.0
         if isinstance(self.network, HasFurtherLoss):
-            logits, more = self.network.learn_more(self.options, count, *inputs)
+            logits, further_loss = self.network.learn_more(self.options, count, *inputs)
         else:
-            logits = self(*inputs)
-        penalty = self.options.l2 * weight_penalty(self.network)
-        self._train_seen.append(torch.stack([logits.detach(), labels]))
+            logits, further_loss = self(*inputs), 0.0
+        penalty = self._penalty()
+        self._train_outputs.append(torch.stack([logits.detach(), labels]))
         self._penalties.append(penalty.detach() * total)
-        return weighted_bce(logits, labels, self.class_weights, count) + more + penalty
+        return weighted_bce(logits, labels, self.class_weights, count) + further_loss + penalty
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Store the logits of one process's share of a batch."""
-        self._val_seen.append(torch.stack([self(*batch.inputs), batch.labels]))
+        self._val_outputs.append(torch.stack([self(*batch.inputs), batch.labels]))
 
     def on_validation_epoch_end(self) -> None:
         """Log the metrics of all validation views."""
-        logits, labels = self._gather(self._val_seen)
+        logits, labels = self._gather(self._val_outputs)
         bce = weighted_bce(logits, labels, self.class_weights)
-        penalty = self.options.l2 * weight_penalty(self.network)
+        penalty = self._penalty()
         views: dict[str, Any] = {"preds": logits.sigmoid(), "target": labels.long(), "validate_args": False}
-        ranking = {"val_average_precision": binary_average_precision(**views), "val_roc_auc": binary_auroc(**views)}
-        calibration = {"val_calibration_error": binary_calibration_error(**views, n_bins=CALIBRATION_BINS, norm="l1")}
-        self._log({"val_loss": bce + penalty, "val_bce": bce, "l2": penalty, **ranking, **calibration})
+        values = {
+            "val_loss": bce + penalty,
+            "val_bce": bce,
+            "l2": penalty,
+            "val_average_precision": binary_average_precision(**views),
+            "val_roc_auc": binary_auroc(**views),
+            "val_calibration_error": binary_calibration_error(**views, n_bins=CALIBRATION_BINS, norm="l1"),
+        }
+        self._log(values)
 
     def on_train_epoch_end(self) -> None:
         """Log the metrics of all training views, each at the time of its training step."""
-        logits, labels = self._gather(self._train_seen)
+        logits, labels = self._gather(self._train_outputs)
         bce = weighted_bce(logits, labels, self.class_weights)
         penalty = torch.stack(self._penalties).sum() / len(labels)
         self._penalties.clear()
@@ -132,10 +137,13 @@ class ViewpointClassifier(LightningModule):
             return optimizer
         return [optimizer], [torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, T_max=self.options.epochs)]
 
-    def _gather(self, seen: list[Tensor]) -> tuple[Tensor, Tensor]:
+    def _penalty(self) -> Tensor:
+        return self.options.l2 * weight_penalty(self.network)
+
+    def _gather(self, outputs: list[Tensor]) -> tuple[Tensor, Tensor]:
         """Return logits and labels of an epoch, (B,) each, over all processes."""
-        values = torch.cat(seen, 1)
-        seen.clear()
+        values = torch.cat(outputs, 1)
+        outputs.clear()
         if self.trainer.world_size > 1:
             values = torch.cat(gather_all_tensors(values), 1)
         logits, labels = values

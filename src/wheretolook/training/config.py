@@ -14,11 +14,11 @@ Keep = Literal["best", "last"]
 
 @dataclass(frozen=True)
 class SharedConfig:
-    """Options of training that all learners share. Each learner has its own beside them, in the group of its folder.
+    """Options of training that all learners share. Each learner's own are in the group of its folder.
 
     Args:
         methods: what to train, by name or family, such as set and mlp. See `wheretolook evaluate --list-methods`; and
-            "matchability", which tells which landmarks will be found (needs labels with `--label.store_matches true`).
+            "matchability", which predicts the detection of landmarks (needs labels with `--label.store_matches true`).
         also: further datasets in the same folder whose train scenes are trained on as well.
         max_error_m: a viewpoint is positive if its position error is strictly smaller, in metres.
         max_error_deg: and if its orientation error is strictly smaller, in degrees.
@@ -52,9 +52,9 @@ DECIDING = ("max_error_m", "max_error_deg", "val_fraction", "seed")
 
 @dataclass(frozen=True)
 class FittingConfig:
-    """Options of a network that is fitted with Adam, its rate falling to zero by a cosine, to all views as they are.
+    """Options of a network that Adam fits to all views, with a learning rate that falls to zero by a cosine.
 
-    The weights kept are those of the epoch with the best validation average precision. A network that learns in another
+    The weights of the epoch with the best validation average precision are kept. A network that is trained in another
     way declares `schedule`, `keep`, `patience` or `balance` as options of its own.
 
     Args:
@@ -76,7 +76,7 @@ class FittingConfig:
 
     @property
     def schedule(self) -> Schedule:
-        """How the learning rate goes on."""
+        """How the learning rate changes."""
         return "cosine"
 
     @property

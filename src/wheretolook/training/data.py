@@ -173,15 +173,12 @@ def balance_classes(positive: NDArray[np.bool_], seed: int) -> Ints:
 class BinnedBatches(IndexBatches):
     """Batches of binned views with some of their channels."""
 
+    numpy_order = True
+
     def __init__(self, views: LabelledViews, rows: Tensor, channels: tuple[str, ...], *options: Any) -> None:
         super().__init__(rows.to(views.device), *options)
         self.views = views
         self._channels = torch.tensor([views.channels.index(name) for name in channels], device=views.device)
-
-    def permutation(self, generator: torch.Generator) -> Tensor:
-        """Return the order (n,) of the rows in this pass."""
-        assert self.shuffle_seed is not None
-        return torch.from_numpy(np.random.default_rng([self.shuffle_seed, self._passes]).permutation(len(self.rows)))
 
     def collate(self, rows: Tensor, generator: torch.Generator) -> Batch:
         """Return this process's share of the views in `rows`."""

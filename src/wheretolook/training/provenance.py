@@ -31,7 +31,7 @@ class TrainedModel:
 
 
 def weights_path(dataset: Dataset, method: str) -> Path:
-    """Return the path of a method's weights in a dataset's folder; the record of training is `.json` beside it."""
+    """Return the path of a method's weights in a dataset's folder; the record of training is the `.json` next to it."""
     return dataset.root / "weights" / f"{method}.safetensors"
 
 
@@ -40,7 +40,9 @@ def about_training(dataset: Dataset, method: str, config: SharedConfig, options:
 
     The dataset includes the scenes of `train.also`, see `with_also`; `options` are the method's own, a dataclass.
     """
-    shared = {name: value for name, value in asdict(config).items() if name in DECIDING}
+    from wheretolook.mapping.landmarks import read_feature_name
+
+    shared = {name: getattr(config, name) for name in DECIDING}
     scenes = [scene for scene in dataset.scenes if scene.split != "test"]
     cameras = dataset.cameras
     about: dict[str, Any] = {
@@ -53,8 +55,6 @@ def about_training(dataset: Dataset, method: str, config: SharedConfig, options:
         "camera": cameras[0].record() if len(cameras) == 1 else f"{len(cameras)} cameras",
         "config": {**asdict(options), **shared},
     }
-    from wheretolook.mapping.landmarks import read_feature_name
-
     features = sorted({read_feature_name(scene.landmarks) for scene in scenes if scene.landmarks.is_file()})
     if features not in ([], [SIFT.name]):  # SIFT is the default and not recorded
         about["features"] = features

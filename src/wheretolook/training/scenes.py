@@ -24,13 +24,13 @@ def with_also(dataset: Dataset, names: Sequence[str]) -> Dataset:
         other = Dataset.load(safe_child(dataset.root.parent, name, "a dataset's name"))
         scenes += training_scenes(Dataset(other.root, other.split("train")))
     if names:
-        seen: dict[str, SceneFolder] = {}
+        scene_of: dict[str, SceneFolder] = {}
         for scene in scenes:
             landmarks = fingerprint(scene.landmarks) if scene.landmarks.is_file() else str(scene.folder)
-            if landmarks in seen:
+            if landmarks in scene_of:
                 fix = "Leave the dataset out of train.also: scenes must not cross splits."
-                raise ConfigError(f"this is the scene {seen[landmarks].folder} again", path=scene.folder, fix=fix)
-            seen[landmarks] = scene
+                raise ConfigError(f"this is the scene {scene_of[landmarks].folder} again", path=scene.folder, fix=fix)
+            scene_of[landmarks] = scene
     return Dataset(dataset.root, tuple(scenes))
 
 

@@ -59,7 +59,7 @@ class Floor:
         rows = slice(self.n_scored, min(self.n_scored + n, len(self.cells)))
         if rows.start == rows.stop:
             return False
-        scores = self.selector.scorer.score_around(self.points[rows], self.selector.directions)
+        scores = self.selector.scorer.score_directions(self.points[rows], self.selector.directions)
         self.scores[rows] = scores.max(axis=1)
         self.axes[rows] = self.selector.directions[scores.argmax(axis=1)]
         self.n_scored = rows.stop
@@ -129,7 +129,7 @@ def score_location(selector: WhereToLook, position: Float, n: int) -> ScoredLoca
     Raises TableError if the position is outside the map or inside geometry.
     """
     best = selector.best(position[None], n)
-    scores = selector.scorer.score_around(position[None], selector.directions)[0]
+    scores = selector.scorer.score_directions(position[None], selector.directions)[0]
     return ScoredLocation(position, selector.directions, scores, best)
 
 

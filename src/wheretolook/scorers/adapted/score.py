@@ -57,9 +57,9 @@ class AdaptedScorer(Scorer):
         """Return probabilities (B,) in [0, 1]."""
         return self._corrected(self.base.score(cam_from_world), cam_from_world)
 
-    def score_around(self, locations: Float, directions: Float) -> Float:
-        """Return probabilities (L, D); see `SetScorer.score_around`."""
-        probability = self.base.score_around(check_locations(locations), directions)
+    def score_directions(self, locations: Float, directions: Float) -> Float:
+        """Return probabilities (L, D); see `SetScorer.score_directions`."""
+        probability = self.base.score_directions(check_locations(locations), directions)
         return self._adapted(probability, self.correction.grid(locations, directions))
 
     def report(self, cam_from_world: Float) -> ViewReport:

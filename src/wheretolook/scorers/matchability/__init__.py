@@ -9,7 +9,7 @@ METHODS = (
     Method(
         position=70,
         name="matchability",
-        about="The chance that a landmark in view is found.",
+        about="The probability that a visible landmark is detected.",
         style=MethodStyle("matchability", "#CC79A7", "8", (0, (1, 1))),
         group="learned",
         learn=imported("wheretolook.scorers.matchability.learn:learn_matchability"),

@@ -1,4 +1,4 @@
-"""Options of the probability that a landmark in view is found."""
+"""Options of the networks over single landmarks."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class LandmarksConfig(FittingConfig):
     """Options of a network over single landmarks.
 
     Args:
-        landmarks: landmarks of a view to learn from at a time, at most, chosen at random.
-        width: units of the layers that look at single landmarks.
-        hidden: attributes (`inputs.landmarks_in_view.ATTRIBUTES`) not to look at; by default those that tell how large
-            a scene is, on which matching does not depend.
-        enlarged: greatest factor by which scenes come larger or smaller in training; 1 leaves them as they are.
+        landmarks: maximum number of landmarks of a view in a training step, chosen at random.
+        width: units of the layers for single landmarks.
+        hidden: attributes (`inputs.channels.ATTRIBUTES`) that are no inputs; by default those that depend on the size
+            of a scene, on which matching does not depend.
+        enlarged: maximum factor by which scenes are scaled up or down in training; 1 does not scale them.
     """
 
     landmarks: int = 64
@@ -39,7 +39,7 @@ class LandmarksConfig(FittingConfig):
 
 @dataclass(frozen=True)
 class MatchabilityConfig(LandmarksConfig):
-    """Options of the probability that a landmark in view is found."""
+    """Options of the probability that a visible landmark is detected."""
 
     epochs: int = 6
     batch_size: int = 256

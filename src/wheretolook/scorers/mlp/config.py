@@ -29,7 +29,7 @@ as configured."""
 
 @dataclass(frozen=True)
 class MlpConfig(FittingConfig):
-    """Options of the paper's network. The defaults are the paper's where it says something (Sec. 3.3 and 4).
+    """Options of the paper's network. The defaults are the paper's where it gives values (Sec. 3.3 and 4).
 
     Args:
         epochs: passes over the training viewpoints (paper: 300).

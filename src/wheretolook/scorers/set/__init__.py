@@ -9,7 +9,7 @@ METHODS = (
     Method(
         position=100,
         name="set",
-        about="Network over the set of landmarks in view: each by its chance of being found, all by what they tell of "
+        about="Network over the set of visible landmarks: their probabilities of detection and their information on "
         "the pose.",
         style=MethodStyle("set of landmarks", "#CC3311", "o", "-"),
         group="learned",

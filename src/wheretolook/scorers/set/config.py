@@ -1,4 +1,4 @@
-"""Options of the network over the set of landmarks in view."""
+"""Options of the network over the set of visible landmarks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from wheretolook.training.config import check_range
 
 @dataclass(frozen=True)
 class SetConfig(LandmarksConfig):
-    """Options of the network over the set of landmarks in view.
+    """Options of the network over the set of visible landmarks.
 
     With few training views, batches get smaller and epochs more (`wheretolook.scorers.set.learn.of_size`).
 

@@ -71,10 +71,10 @@ class SetScorer(LandmarkScorer):
             logits = self.network.score(described, n_visible, height).double()
             return np.asarray(self.trained.calibrated(logits).sigmoid().cpu().numpy())
 
-    def score_around(self, locations: Float, directions: Float) -> Float:
+    def score_directions(self, locations: Float, directions: Float) -> Float:
         """Return probabilities (L, D); where many landmarks are visible, from a smaller sample than `score`."""
         if not BatchedDirections.serves(self.network):
-            return super().score_around(locations, directions)
+            return super().score_directions(locations, directions)
         if self._batched is None or not np.array_equal(self._batched.directions, directions):
             self._batched = BatchedDirections(self.localization_map, self.trained, directions, MAX_LANDMARKS // 2)
         return self._batched.score(locations)

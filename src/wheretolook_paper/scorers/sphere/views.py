@@ -139,6 +139,8 @@ class LocationBatches(IndexBatches):
     A batch has `batch_size` views on average.
     """
 
+    numpy_order = True
+
     def __init__(self, views: SphereViews, chosen: NDArray[np.int64], batch_size: int, *options: Any) -> None:
         rows = views.rows.cpu().numpy()[chosen]
         self.views = views
@@ -147,11 +149,6 @@ class LocationBatches(IndexBatches):
         self._starts = np.cumsum(self._counts) - self._counts
         per_batch = max(1, round(batch_size * len(self._locations) / max(1, len(chosen))))
         super().__init__(torch.arange(len(self._locations)), per_batch, *options)
-
-    def permutation(self, generator: torch.Generator) -> Tensor:
-        """Return the order of the locations in this pass."""
-        assert self.shuffle_seed is not None
-        return torch.from_numpy(np.random.default_rng([self.shuffle_seed, self._passes]).permutation(len(self.rows)))
 
     def collate(self, rows: Tensor, generator: torch.Generator) -> Batch:
         """Return this process's share of some locations, with all of their chosen views."""

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
+from wheretolook.geometry.camera import Camera, ColmapCamera
 from wheretolook.geometry.local_origin import poses_from
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, check_poses
@@ -96,31 +96,31 @@ class WarpRenderer:
             shape = (rows.stop - start, height, width)
             images = [wp.empty(shape, dtype=dtype, device=self.device) for dtype in (wp.vec3ub, wp.float32)]
             centers, ray_from_pixel = camera_rays(camera, poses[rows])
-            draw(camera, poses[rows], centers, self._array(ray_from_pixel.astype(np.float32), wp.mat33), images)
+            rays = (vec3_array(centers, self.device), self._array(ray_from_pixel.astype(np.float32), wp.mat33))
+            draw(camera.matrix @ poses[rows], rays, images)
             rgb[rows], depth_m[rows] = (image.numpy() for image in images)
         return Rendering(rgb, depth_m)
 
-    def _trace(self, camera: PinholeCamera, poses: Float, centers: Float, ray_from_pixel: Any, images: Any) -> None:
-        inputs = [self._mesh.id, self._appearance, vec3_array(centers, self.device), ray_from_pixel]
+    # Both draw images (rgb, depth) of B poses, given (B, 3, 4) pixel_from_world and rays: centres and ray_from_pixel.
+
+    def _trace(self, _: Float, rays: tuple[Any, Any], images: list[Any]) -> None:
+        inputs = [self._mesh.id, self._appearance, *rays]
         wp.launch(trace_kernel, _tiles(images[1].shape), inputs, images, device=self.device)
 
-    def _rasterize(self, camera: PinholeCamera, poses: Float, centers: Float, ray_from_pixel: Any, images: Any) -> None:
+    def _rasterize(self, pixel_from_world: Float, rays: tuple[Any, Any], images: list[Any]) -> None:
         shape = images[1].shape
         device = self.device
-        pixel_from_world = camera.matrix @ poses  # (B, 3, 4)
-        projected: Any = wp.empty((len(poses), self._vertices.shape[0]), dtype=wp.vec3d, device=device)
+        projected: Any = wp.empty((len(pixel_from_world), self._vertices.shape[0]), dtype=wp.vec3d, device=device)
         nearness = wp.zeros(shape, dtype=wp.float32, device=device)
         triangle = wp.full(shape, -1, dtype=wp.int32, device=device)
         rotation = self._array(pixel_from_world[:, :, :3], wp.mat33d)
         offset = self._array(pixel_from_world[:, :, 3], wp.vec3d)
         wp.launch(project_kernel, projected.shape, [self._vertices, rotation, offset], [projected], device=device)
         # With a block of one, triangles are drawn one after the other.
-        n_triangles = self._appearance.corner_uvs.shape[0]
-        corners = self._appearance.indices
-        dim = (len(poses), n_triangles)
-        outputs = [nearness, triangle]
-        wp.launch(raster_kernel, dim, [projected, corners], outputs, device=device, block_dim=1)
-        inputs = [projected, self._vertices, triangle, self._appearance, ray_from_pixel]
+        dim = (len(pixel_from_world), self._appearance.corner_uvs.shape[0])
+        inputs = [projected, self._appearance.indices]
+        wp.launch(raster_kernel, dim, inputs, [nearness, triangle], device=device, block_dim=1)
+        inputs = [projected, self._vertices, triangle, self._appearance, rays[1]]
         wp.launch(shade_kernel, _tiles(shape), inputs, images, device=device)
 
 

@@ -115,10 +115,8 @@ def _unoccluded(localization_map: LocalizationMap, places: Float, progress: bool
     """Compute bits (L, ceil(N / 8)) uint8 of the landmarks that are unoccluded from places (L, 3) m."""
     points = localization_map.landmarks.points
     packed = np.empty((len(places), (len(points) + 7) // 8), dtype=np.uint8)
-    with tqdm(total=len(places), desc="occlusion", unit="place", disable=not progress or len(places) == 0) as bar:
-        for begin in range(0, len(places), BLOCK):
-            rows = slice(begin, begin + BLOCK)
-            mask = localization_map.occlusion.unoccluded(places[rows], points)
-            packed[rows] = np.packbits(mask, axis=1)
-            bar.update(len(mask))
+    hidden = not progress or len(places) == 0
+    for begin in tqdm(range(0, len(places), BLOCK), desc="occlusion", unit=f"{BLOCK} places", disable=hidden):
+        rows = slice(begin, begin + BLOCK)
+        packed[rows] = np.packbits(localization_map.occlusion.unoccluded(places[rows], points), axis=1)
     return packed

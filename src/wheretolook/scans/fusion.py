@@ -21,12 +21,13 @@ from wheretolook.scans.config import RgbdConfig
 from wheretolook.scans.depth_correction import fit_depth_correction
 from wheretolook.scans.frames import RgbdFrames
 from wheretolook.scans.textures import textured
-from wheretolook.scans.upright import find_up
 from wheretolook.utils.errors import MapWarning, SceneError
 
 TRUNCATION_VOXELS = 4.0  # behind a surface that count as inside it: 4 cm cover the noise of depth and poses
 _MIN_READINGS = 3.0  # of a voxel that is part of the surface
 _MIN_PIECE_M2 = 0.01  # smaller disconnected pieces are noise
+_ROUNDS_DEG = (45.0,) * 5 + (15.0,) * 5  # of the refinement of up: largest angle of a level or upright surface to it
+_IS_Z_DEG = 3.0  # a world this close to upright counts as upright
 _DISAGREE_DEG = 30.0  # between the given and the estimated direction up
 
 
@@ -125,6 +126,31 @@ def _up(config: RgbdConfig, frames: RgbdFrames, mesh: TexturedMesh) -> Float:
         text += f"{off_deg:.0f} degrees from it. --scenes.rgbd.up auto estimates it"
         warnings.warn(text, MapWarning, stacklevel=3)
     return up
+
+
+def find_up(cam_from_world: Float, mesh: TexturedMesh) -> Float:
+    """Estimate the unit direction up (3,) in the frame of poses (F, 3, 4) and of a mesh of the recording.
+
+    Starts from `estimate_gravity`, then refines it by the mesh: floors and walls are perpendicular or parallel to up
+    (Gupta, Arbelaez and Malik, "Perceptual Organization and Recognition of Indoor Scenes from RGB-D Images", CVPR
+    2013), weighted by area. z itself if it is that to within 3 degrees.
+    """
+    up = estimate_gravity(cam_from_world).up
+    normals = mesh.normals
+    area = np.linalg.norm(normals, axis=1)
+    units = normals / np.maximum(area, 1e-12)[:, None]
+    for limit_deg in _ROUNDS_DEG:
+        along = units @ up
+        level = np.abs(along) > np.cos(np.radians(limit_deg))
+        upright = np.abs(along) < np.sin(np.radians(limit_deg))
+        scatter = _scatter(units[upright], area[upright]) - _scatter(units[level], area[level])
+        found = np.linalg.eigh(scatter)[1][:, 0]
+        up = found if found @ up > 0 else -found
+    return np.array([0.0, 0.0, 1.0]) if up[2] > np.cos(np.radians(_IS_Z_DEG)) else np.asarray(up)
+
+
+def _scatter(units: Float, weights: Float) -> Float:
+    return np.asarray((units.T * weights) @ units)
 
 
 def _rounded(direction: Float) -> str:

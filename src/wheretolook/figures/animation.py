@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -42,12 +43,11 @@ def save_moving(frames: Iterable[Pixels], frame_ms: int, path: Path, last_ms: in
 def _save_animation(frames: Iterable[Pixels], frame_ms: int, last_ms: int, partial: Path) -> None:
     from PIL import Image
 
-    images = map(Image.fromarray, frames)
-    if partial.suffix == ".gif":
-        images = (image.quantize(GIF_COLORS) for image in images)
-    first, *rest = images
+    is_gif = partial.suffix == ".gif"
+    images = (Image.fromarray(frame) for frame in frames)
+    first, *rest = (image.quantize(GIF_COLORS) if is_gif else image for image in images)
     times = [frame_ms] * len(rest) + [last_ms]
-    options = {"quality": WEBP_QUALITY, "method": 6} if partial.suffix == ".webp" else {}
+    options: dict[str, Any] = {} if is_gif else {"quality": WEBP_QUALITY, "method": 6}
     first.save(partial, save_all=True, append_images=rest, duration=times, loop=0, **options)
 
 

@@ -18,6 +18,7 @@ from wheretolook.rendering.registry import make_renderer
 from wheretolook.scenes.cutting import cut_above
 from wheretolook.utils.errors import SceneError
 
+AZIMUTH_DEG = -110.0  # direction of the eye, counter-clockwise from +x
 EYE_DISTANCE = 25.0  # in diagonals of the scene: close to an orthographic projection
 
 
@@ -50,7 +51,6 @@ class Dollhouse:
 
 def dollhouse(
     mesh: TexturedMesh,
-    azimuth_deg: float = -110.0,
     elevation_deg: float = 55.0,
     cut_m: float | None = None,
     width_px: int = 1400,
@@ -61,7 +61,6 @@ def dollhouse(
 
     Args:
         mesh: the scene.
-        azimuth_deg: direction of the eye, counter-clockwise from +x.
         elevation_deg: of the eye, in (0, 90]; 90 gives a plan with +x to the right and +y up.
         cut_m: world height above which the mesh is cut off.
         width_px: width of the image.
@@ -73,7 +72,7 @@ def dollhouse(
     bounds = mesh.bounds
     if cut_m is not None:
         mesh = cut_above(mesh, cut_m)
-    azimuth = np.radians(azimuth_deg)
+    azimuth = np.radians(AZIMUTH_DEG)
     elevation = np.radians(elevation_deg)
     level = np.cos(elevation) if elevation_deg < 90 else 0.0
     to_eye = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])

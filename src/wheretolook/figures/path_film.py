@@ -57,8 +57,9 @@ def still_figure(views: Sequence[PathView], landmarks: Float, title: str = "") -
         _draw_map(axes, views, landmarks, None, shown)
         axes.set_title(title)
         _draw_scores(figure.add_subplot(above[1]), views, None, shown)
-        for cell, (label, number) in zip(grid[1].subgridspec(1, len(shown)), enumerate(shown, 1), strict=True):
-            _draw_view(figure.add_subplot(cell), views[number], f"{label}: ")
+        cells = grid[1].subgridspec(1, len(shown))
+        for column, number in enumerate(shown):
+            _draw_view(figure.add_subplot(cells[column]), views[number], f"{column + 1}: ")
         return figure
 
 
@@ -85,7 +86,7 @@ def _draw_view(axes: Axes, view: PathView, prefix: str = "") -> None:
     width, height = view.size_px
     if view.rgb is not None:
         axes.imshow(view.rgb, extent=(0, width, height, 0))
-    axes.scatter(*view.pixels.T, s=3, color=LANDMARKS, linewidths=0)
+    axes.scatter(view.pixels[:, 0], view.pixels[:, 1], s=3, color=LANDMARKS, linewidths=0)
     axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal", anchor="N")
     frame(axes, linewidth=0.8)
     stop = f"view {view.look} of {view.n_looks}: " if view.n_looks > 1 else ""
@@ -102,7 +103,7 @@ def _draw_map(
     low, high = np.percentile(landmarks[:, :2], (1, 99), axis=0)
     low = np.minimum(low, xy.min(0))
     high = np.maximum(high, xy.max(0))
-    axes.scatter(*landmarks[:, :2].T, s=0.5, color="#9a9a9a", linewidths=0, rasterized=True)
+    axes.scatter(landmarks[:, 0], landmarks[:, 1], s=0.5, color="#9a9a9a", linewidths=0, rasterized=True)
     axes.plot(*xy.T, color=PATH, linewidth=2.2, zorder=3)
     stops = xy[[view.look == 1 < view.n_looks for view in views]]
     axes.plot(*stops.T, markersize=7, zorder=3.5, **_STOP)

@@ -94,11 +94,9 @@ _SCENES = {"aws_house": "furnished house", "nexuiz": "game level"}
 
 def scene_label(name: str) -> str:
     """Return the display name of a scene, such as "apartment 210" for "apartment-210"."""
-    if name in _SCENES:
-        return _SCENES[name]
-    package, _, rest = name.partition("_")
-    if package in _SCENES and rest:
-        name = f"{_SCENES[package]} {rest}"
+    for known, label in _SCENES.items():
+        if name == known or name.startswith(f"{known}_"):
+            name = name.replace(known, label, 1)
     return name.replace("_", " ").replace("-", " ")
 
 

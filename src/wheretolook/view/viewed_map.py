@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -19,12 +20,13 @@ from wheretolook.dataset.environment import (
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.utils.errors import MapError, SceneError, TableError, WhereToLookError
+from wheretolook.utils.errors import MapError, TableError, WhereToLookError
+from wheretolook.utils.shipped import or_shipped
 from wheretolook.view import drawing
 from wheretolook.view.paths import Paths
 from wheretolook.view.scores import FLOOR_DIRECTIONS, Floor, floor_at
 from wheretolook.view.state import ViewState
-from wheretolook.view.weights import AvailableWeights, given_weights, map_weights, scene_weights
+from wheretolook.view.weights import AvailableWeights, map_weights, scene_weights
 
 if TYPE_CHECKING:  # torch and Warp are imported when first needed: the page opens before them
     import pandas as pd
@@ -44,20 +46,21 @@ OCCLUSION_BYTES = 1 << 26  # memory for cached lines of sight
 class ViewedMap:
     """An environment with everything else that the viewer shows, computed once for all clients.
 
-    Scorers, floors and landmarks in view are for one thread only.
+    `own_weights` are files or folders by their origin, see `AvailableWeights`. Scorers, floors and landmarks in view
+    are for one thread only.
     """
 
     def __init__(
         self,
         name: str,
         environment: Environment,
-        weights: AvailableWeights,
+        own_weights: Mapping[str, Path | None],
         labels: pd.DataFrame | None = None,
         photographs: Photographs | None = None,
     ) -> None:
         self.name = name
         self.environment = environment
-        self.weights = weights
+        self.weights = AvailableWeights(environment.landmarks.features, own_weights)
         self.labels = labels  # labelled viewpoints
         self.photographs = photographs
         self.paths: Paths = {}  # to play
@@ -210,10 +213,10 @@ def open_map(
         raise MapError("the map has no landmarks", path=path, fix="Map it again.")
     if mesh is not None:
         warn_of_mesh(mesh, landmarks.points, environment.raycaster)
-    available = given_weights(weights, landmarks.features) if weights else map_weights(path, data, landmarks)
+    own = {"given": or_shipped(weights)} if weights else map_weights(path, data, landmarks)
     model = path.resolve()
     name = model.parent.name if model.name in ("0", "sparse", "map") else model.name
-    return ViewedMap(name, environment, available, photographs=_photographs(path, images))
+    return ViewedMap(name, environment, own, photographs=_photographs(path, images))
 
 
 def open_scene(
@@ -237,10 +240,8 @@ def open_scene(
     number, own_camera = next(iter(files.cameras().items()))
     config = EnvironmentConfig(assume_metric=True, occlusion_cache_bytes=OCCLUSION_BYTES)
     environment = SceneEnvironment(files, camera or own_camera, config, device)
-    if not environment.has_mesh and environment.mapping_poses is None:
-        raise SceneError("neither a mesh nor the map's cameras are known", path=files.folder, fix="Map it again.")
     landmarks = environment.landmarks
-    available = given_weights(weights, landmarks.features) if weights else scene_weights(files, landmarks)
+    own = {"given": or_shipped(weights)} if weights else scene_weights(files, landmarks)
     labels = None
     if camera is None and files.table.is_file():
         table = files.read_table()
@@ -248,7 +249,7 @@ def open_scene(
         if CAMERA_ID in table:
             shown &= table[CAMERA_ID] == number
         labels = table[shown].reset_index(drop=True) if shown.any() else None
-    return ViewedMap(files.name, environment, available, labels, _photographs(files.map))
+    return ViewedMap(files.name, environment, own, labels, _photographs(files.map))
 
 
 def _photographs(model: Path, folder: Path | None = None) -> Photographs | None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped
+from wheretolook.utils.shipped import WEIGHTS, shipped
 
 if TYPE_CHECKING:
     from wheretolook.dataset.layout import SceneFolder
@@ -19,7 +20,7 @@ class AvailableWeights:
     WeightsError if they cannot be used.
     """
 
-    def __init__(self, features: str, own: dict[str, Path | None]) -> None:
+    def __init__(self, features: str, own: Mapping[str, Path | None]) -> None:
         from wheretolook.weights.resolve import weights_by_method
 
         self.files: dict[str, Path] = {}
@@ -51,13 +52,8 @@ class AvailableWeights:
         return tuple(sorted(usable, key=lambda name: (scorers()[name].weights != first, name != first)))
 
 
-def given_weights(path: Path, features: str) -> AvailableWeights:
-    """Collect the weights in a file or folder, and bundled ones."""
-    return AvailableWeights(features, {"given": or_shipped(path)})
-
-
-def scene_weights(files: SceneFolder, landmarks: Landmarks) -> AvailableWeights:
-    """Collect weights adapted to a scene, trained with its dataset, and bundled ones."""
+def scene_weights(files: SceneFolder, landmarks: Landmarks) -> dict[str, Path | None]:
+    """Find weights adapted to a scene and those trained with its dataset."""
     root = files.folder.parent
     trained = None
     if any((root / "weights").glob("*.safetensors")):
@@ -68,16 +64,15 @@ def scene_weights(files: SceneFolder, landmarks: Landmarks) -> AvailableWeights:
         if trained is not None and not trained.is_relative_to(root):
             trained = None
     adapted = _if_adapted_to(root / "adapted" / f"{files.name}.safetensors", landmarks)
-    own = {"adapted to this scene": adapted, "trained with this dataset": trained}
-    return AvailableWeights(landmarks.features, own)
+    return {"adapted to this scene": adapted, "trained with this dataset": trained}
 
 
-def map_weights(model: Path, data: Path, landmarks: Landmarks) -> AvailableWeights:
-    """Collect weights adapted to a COLMAP model by `wheretolook adapt --map`, and bundled ones."""
+def map_weights(model: Path, data: Path, landmarks: Landmarks) -> dict[str, Path | None]:
+    """Find weights adapted to a COLMAP model by `wheretolook adapt --map`."""
     from wheretolook.mapping.config import ExistingModelConfig
 
     path = data / "checks" / ExistingModelConfig(model=model).scene_name / "adapted.safetensors"
-    return AvailableWeights(landmarks.features, {"adapted to this scene": _if_adapted_to(path, landmarks)})
+    return {"adapted to this scene": _if_adapted_to(path, landmarks)}
 
 
 def _if_adapted_to(path: Path, landmarks: Landmarks) -> Path | None:

@@ -44,7 +44,7 @@ def rendered_views(
     """Render B labelled viewpoints (rows of the viewpoint table) with scores (B,) and outcomes described by `words`."""
     cam_from_world = poses(rows)
     images = scene.renderer.render(scene.camera, cam_from_world).rgb
-    outcomes = [words(row) for _, row in rows.iterrows()]
+    outcomes = [words(rows.iloc[row]) for row in range(len(rows))]  # iterrows would change types
     return tuple(map(View, images, cam_from_world[:, 2, :3], scores.tolist(), outcomes))
 
 

@@ -41,10 +41,6 @@ def test_invalid_files_are_rejected(scene: SceneFolder) -> None:
     path.write_bytes(path.read_bytes()[:-40])
     with pytest.raises(MapError):
         scene.localization_map(CAMERA)
-    for wrong in (np.zeros((2, 4, 4)), np.zeros((0, 3, 4)), np.full((2, 3, 4), np.nan)):
-        save_mapping_poses(wrong, path)
-        with pytest.raises(MapError):
-            load_mapping_poses(path)
     path.unlink()
     with pytest.raises(MapError):
         load_mapping_poses(path)

@@ -187,10 +187,10 @@ def registered_names(reconstruction: Any) -> dict[int, str]:
     return {number: image.name for number, image in sorted(reconstruction.images.items()) if image.has_pose}
 
 
-def describe_intrinsics(camera: Any) -> dict[str, Any]:
-    """Model, size and parameters of a pycolmap camera, as values of JSON."""
-    size = {"model": camera.model_name, "width": camera.width, "height": camera.height}
-    return {**size, "params": [float(value) for value in camera.params]}
+def describe_cameras(reconstruction: Any) -> list[dict[str, Any]]:
+    """Model, size and parameters of each camera of a `pycolmap.Reconstruction`, as values of JSON."""
+    cameras = [camera for _, camera in sorted(reconstruction.cameras.items())]
+    return [{"model": c.model_name, "width": c.width, "height": c.height, "params": c.params.tolist()} for c in cameras]
 
 
 def holds_model(folder: Path) -> bool:
@@ -212,14 +212,10 @@ def compact_poses(cam_from_world: Float) -> Float:
 def load_mapping_poses(path: str | Path) -> Float:
     """Read the poses (M, 3, 4) that `save_mapping_poses` wrote. Raises MapError if the file is missing or damaged."""
     try:
-        poses = load_npz(Path(path))["cam_from_world"]
-        has_shape = poses.ndim == 3 and poses.shape[1:] == (3, 4) and len(poses) > 0
-        if not (has_shape and poses.dtype.kind == "f" and np.isfinite(poses).all()):
-            raise ValueError(f"an array of {poses.dtype} and shape {poses.shape}")
+        return load_npz(Path(path))["cam_from_world"]
     except (ValueError, KeyError) as error:
         fix = "Run the map stage again, or remove the file to use the COLMAP model next to it."
         raise MapError(f"cannot read the mapping images' poses: {error}", path=path, fix=fix) from error
-    return poses
 
 
 def _points_and_tracks(reconstruction: Any) -> tuple[NDArray[Any], NDArray[np.uint32]]:

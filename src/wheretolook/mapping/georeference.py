@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +18,6 @@ from wheretolook.mapping.photographs import read_photograph
 from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.reading import read_json_object
 
-Source = Literal["markers", "distance", "positions", "model", "unknown"]
 REPORT_FILE = "report.json"
 _FLAT = 1e-6  # points whose second largest spread is below this share of the largest are on a line
 
@@ -46,7 +45,9 @@ class Similarity:
 class MapScale:
     """The scale of a map; `scale` in its `report.json`."""
 
-    source: Source = "unknown"  # "model": that of an existing model; "unknown": the map is not in metres
+    source: Literal["markers", "distance", "positions", "model", "unknown"] = (
+        "unknown"  # "model": that of an existing model; "unknown": the map is not in metres
+    )
     factor: float = 1.0  # metres in a unit of COLMAP's frame; 1 if unknown
     # Error of each marker's side (in percent) or photograph's position (in metres); empty for a single distance.
     residuals: dict[str, float] = field(default_factory=dict)
@@ -268,10 +269,7 @@ def read_scale(map_dir: Path) -> MapScale | None:
     path = map_dir / REPORT_FILE
     try:
         record = read_json_object(path).get("scale")
-        scale = None if record is None else MapScale(**record)
-        if scale is not None and (scale.source not in get_args(Source) or not 0 < scale.factor < np.inf):
-            raise ValueError(f"a scale of {scale.factor} from {scale.source}")
-        return scale
+        return None if record is None else MapScale(**record)
     except FileNotFoundError:
         return None
     except (OSError, ValueError, TypeError) as error:

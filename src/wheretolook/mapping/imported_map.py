@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping.colmap_model import (
     colmap_poses,
-    describe_intrinsics,
+    describe_cameras,
     model_arrays,
     observation_matrix,
     read_model,
@@ -103,7 +103,7 @@ def map_existing(
             n_points=n_points,
             triangulated_anew=photographs.images is not None,
             has_descriptors=landmarks.descriptors is not None,
-            cameras=[describe_intrinsics(camera) for _, camera in sorted(model.cameras.items())],
+            cameras=describe_cameras(model),
             scale=scale if scale.is_metric else MapScale("model"),
         )
         report.save(folder)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from wheretolook.mapping.colmap_model import colmap_poses, describe_intrinsics, registered_names
+from wheretolook.mapping.colmap_model import colmap_poses, describe_cameras, registered_names
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.georeference import KnownScale, MapScale, Similarity, find_scale
 from wheretolook.mapping.gravity import estimate_gravity
@@ -85,7 +85,7 @@ def map_photographs(
             unregistered=[name for name in features.names if name not in registered],
             model_sizes=mapped.model_sizes,
             n_keypoints=sum(len(pixels) for pixels, _ in features.stored),
-            cameras=[describe_intrinsics(camera) for _, camera in sorted(model.cameras.items())],
+            cameras=describe_cameras(model),
             n_known_focal=cameras.n_known_focal,
             gravity={
                 "method": "positions" if known.positions else gravity.method,

@@ -119,8 +119,9 @@ def _camera(path: Path, size: list[int], config: PhotographsConfig) -> pycolmap.
     import pycolmap
 
     model = config.camera_model
+    width, height = size
     if config.camera_params:
-        camera = pycolmap.Camera(**ColmapCamera(model, *size, config.camera_params).record())
+        camera = pycolmap.Camera(**ColmapCamera(model, width, height, config.camera_params).record())
         camera.has_prior_focal_length = True
         return camera
     if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
@@ -130,6 +131,6 @@ def _camera(path: Path, size: list[int], config: PhotographsConfig) -> pycolmap.
             inferred = pycolmap.infer_camera_from_image(path, pycolmap.ImageReaderOptions(camera_model=model))
     except (ValueError, RuntimeError) as error:
         raise MapError(f"cannot read this photograph: {error}", path=path, fix="Remove it.") from error
-    camera = pycolmap.Camera.create_from_model_name(0, model, inferred.mean_focal_length(), *size)
+    camera = pycolmap.Camera.create_from_model_name(0, model, inferred.mean_focal_length(), width, height)
     camera.has_prior_focal_length = inferred.has_prior_focal_length
     return camera

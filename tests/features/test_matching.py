@@ -107,7 +107,7 @@ def run_python(code: str, **environment: str) -> str:
 @pytest.mark.slow
 @pytest.mark.parametrize("instructions", ["AVX2", "AVX512_CORE"])
 def test_a_cpu_whose_byte_products_saturate_finds_the_same(instructions: str) -> None:
-    """oneDNN is told to leave out this CPU's newer instructions."""
+    """oneDNN does not use the newer instructions of this CPU."""
     code = (
         "from features import test_matching as tests\n"
         "for make in (tests.random_descriptors, tests.extreme_descriptors, tests.sift_like_descriptors):\n"

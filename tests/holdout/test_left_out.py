@@ -37,7 +37,7 @@ def run(arguments: list[str]) -> None:
 
 @pytest.fixture(scope="module")
 def checked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
-    """The corridor's model and database, and a folder of datasets in which its check lies."""
+    """The corridor's model and database, and the data folder with its check."""
     folder = tmp_path_factory.mktemp("place")
     sparse, database = write_corridor(folder / "corridor")
     where = ["--data", str(folder / "data"), "--occlusion", "none", "--workers", "1", "--device", "cpu"]
@@ -70,7 +70,7 @@ def test_underconfident_weights_are_adapted_by_photographs(
     (logged,) = finished_runs(TrackingConfig(tmp_path / "mlruns"), "adapt")
     assert logged.data.params["photographs"] == str(training["photographs"])
 
-    # a check scores with them, on maps of few of the landmarks too, and says what they have learnt from
+    # a check scores with them, on maps of few of the landmarks too, and reports what they were trained on
     where = ["--map", str(sparse), "--database", str(database), "--metres", "--occlusion", "none", "--workers", "1"]
     run([*where, "--data", str(data), "--device", "cpu", "--weights", str(adapted)])
     content = json.loads((data / "checks" / "corridor" / "check.json").read_text())

@@ -1,4 +1,4 @@
-"""Several looks localized together: known poses are found, in spite of outliers, noise, and rooms that look alike."""
+"""Joint localization recovers known poses in spite of outliers, noise, and similar rooms."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ AXES = ((1, 0, 0), (0, 1, 0.2), (-1, 0.3, -0.1))
 
 
 def a_room(n=3000, seed=0, shift=(0.0, 0.0, 0.0)):
-    """Points on the walls of a room of 8 x 6 x 3 m around the origin, (n, 3)."""
+    """Points on the walls of a room of 8 x 6 x 3 m centred at the origin, (n, 3)."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-1, 1, (n, 3))
     axis = rng.integers(0, 3, n)

@@ -51,7 +51,7 @@ def test_a_repeated_texture_localizes_at_the_wrong_copy_and_is_labelled_so(tmp_p
 
 
 def test_errors_are_measured_against_the_true_pose(room: MappedRoom) -> None:
-    """A table that lies about a pose by 10 cm and 3 degrees gets exactly these errors."""
+    """A table whose poses are wrong by 10 cm and 3 degrees gets exactly these errors."""
     table = facing(POSTER, 3, distance_m=1.5)
     localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
 

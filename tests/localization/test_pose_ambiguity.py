@@ -51,8 +51,8 @@ def test_unique_support_counts_landmarks_that_the_other_location_lacks():
 
 @pytest.mark.parametrize("n_column", [0, 12])
 def test_unique_support_outweighs_inliers_that_both_rooms_explain(n_column):
-    """Each of three looks matches 60 landmarks of the copy and 30 of the room that it sees. With none of the column
-    nobody can tell, and the copy has more inliers; a dozen of the column, in one look, decide."""
+    """Each of three looks matches 60 landmarks of the copy and 30 of the room that it sees. Without the
+    column the rooms are indistinguishable and the copy has more inliers; a dozen matches of the column decide."""
     points, (room, _, column) = two_rooms()
     axes = [(1.0, 0.4, 0.0), (0.0, 1.0, 0.2), (-1.0, 0.3, -0.1)]
     poses = poses_looking_along(np.tile((0.4, -0.7, 0.1), (3, 1)), np.array(axes))

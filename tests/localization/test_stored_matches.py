@@ -1,4 +1,4 @@
-"""Which landmarks each view matched, stored beside its label: what the rows are, and that nothing else changes."""
+"""Matched landmarks stored with the labels: their rows, and that nothing else changes."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_shards_with_and_without_matches_have_names_of_their_own(room: MappedRoo
 def test_pixels_are_kept_in_the_order_of_the_landmarks(
     room: MappedRoom, views: pd.DataFrame, matched: pd.DataFrame, tmp_path: Path
 ) -> None:
-    """Where a good view's inliers were found lies within RANSAC's limit of where the true pose puts them."""
+    """Inliers of a good view are within RANSAC's limit of their projection at the true pose."""
     landmarks = Landmarks.load(room.landmarks)
     rows = np.flatnonzero(is_good(matched))[:4]
     localizer = Localizer(landmarks, CAMERA)

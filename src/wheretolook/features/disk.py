@@ -1,4 +1,4 @@
-"""DISK (Tyszkiewicz et al., NeurIPS 2020), its network learnt with depth, by kornia."""
+"""DISK (Tyszkiewicz et al., NeurIPS 2020), trained with depth, by kornia."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ class WarpSift:
         keys = np.unique(space.find())
         if len(keys) == 0:
             return [Keypoints.none() for _ in range(n_images)]
-        table, place, angle, places = self._turn(space, keys)
+        table, place, angle, places = self._orientations(space, keys)
         if len(place) == 0:
             return [Keypoints.none() for _ in range(n_images)]
         image = (keys // KEYS_OF_IMAGE)[place]
@@ -84,7 +84,7 @@ class WarpSift:
         pixels = table[place[order], :2] + np.float32(0.5)
         return [Keypoints(pixels[a:b], descriptors[a:b]) for a, b in pairwise(ends)]
 
-    def _turn(
+    def _orientations(
         self, space: ScaleSpace, keys: NDArray[np.int64]
     ) -> tuple[NDArray[np.float32], NDArray[np.intp], NDArray[np.float32], Any]:
         """The K keypoints at sorted keys, and their orientations, N in all.
@@ -96,14 +96,18 @@ class WarpSift:
         for name, dtype in kernels.PLACE_TYPES.items():
             setattr(places, name, self._buffer(name, n, dtype))
         table = self._buffer("table", n, wp.float32, 4)
-        histograms = self._buffer("turn_histograms", n, wp.float32, kernels.TURN_LANES, kernels.TURN_BINS)
-        n_turns = self._buffer("n_turns", n, wp.int32)
-        angles = self._buffer("angles", n, wp.float32, kernels.MAX_TURNS)
+        histograms = self._buffer(
+            "orientation_histograms", n, wp.float32, kernels.HISTOGRAM_LANES, kernels.ORIENTATION_BINS
+        )
+        n_orientations = self._buffer("n_orientations", n, wp.int32)
+        angles = self._buffer("angles", n, wp.float32, kernels.MAX_ORIENTATIONS)
         on_device = self._upload("keys", keys, wp.int64)
         self._launch(kernels.place_kernel, n, [space.pyramid, on_device, self._limits], [places, table])
-        self._launch(kernels.turn_histogram_kernel, (n, kernels.TURN_LANES), [space.pyramid, places], [histograms])
-        self._launch(kernels.turn_kernel, n, [histograms], [n_turns, angles])
-        number = n_turns[:n].numpy()
+        self._launch(
+            kernels.orientation_histogram_kernel, (n, kernels.HISTOGRAM_LANES), [space.pyramid, places], [histograms]
+        )
+        self._launch(kernels.orientation_kernel, n, [histograms], [n_orientations, angles])
+        number = n_orientations[:n].numpy()
         place = np.repeat(np.arange(n), number)
         turn = np.arange(len(place)) - np.repeat(np.cumsum(number) - number, number)
         return table[:n].numpy(), place, angles[:n].numpy()[place, turn], places

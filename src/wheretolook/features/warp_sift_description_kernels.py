@@ -14,14 +14,14 @@ from wheretolook.features.warp_sift_kernels import LAYERS, SIGMA, Limits, Pyrami
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-TURN_BINS = wp.constant(36)  # of the histogram of directions around a keypoint
-MAX_TURNS = wp.constant(18)  # peaks that a histogram of 36 bins can have
-TURN_LANES = wp.constant(8)  # threads that share the rows around a keypoint
+ORIENTATION_BINS = wp.constant(36)  # of the histogram of directions near a keypoint
+MAX_ORIENTATIONS = wp.constant(18)  # peaks that a histogram of 36 bins can have
+HISTOGRAM_LANES = wp.constant(8)  # threads that share the rows near a keypoint
 CELLS = wp.constant(4)  # along each side of a descriptor
 CELL_BINS = wp.constant(8)  # directions in each
 SIDE_OF_CELL = wp.constant(3.0)  # width of a descriptor's cell in standard deviations of the keypoint's Gaussian
 
-TurnHistogram = wp.types.vector(length=36, dtype=wp.float32)
+OrientationHistogram = wp.types.vector(length=36, dtype=wp.float32)
 CellHistogram = wp.types.vector(length=8, dtype=wp.float32)
 
 
@@ -80,8 +80,8 @@ def in_turns(gradient: wp.vec2):
 
 
 @wp.kernel
-def turn_histogram_kernel(pyramid: Pyramid, places: Places, histograms: wp.array3d[wp.float32]):
-    """Histogram of the directions of the gradients around a keypoint, in every `TURN_LANES`-th row."""
+def orientation_histogram_kernel(pyramid: Pyramid, places: Places, histograms: wp.array3d[wp.float32]):
+    """Histogram of the directions of the gradients near a keypoint, in every `HISTOGRAM_LANES`-th row."""
     row, lane = wp.tid()
     octave = places.octave[row]
     rows = pyramid.rows[octave]
@@ -93,53 +93,55 @@ def turn_histogram_kernel(pyramid: Pyramid, places: Places, histograms: wp.array
     fall = -0.5 / (spread * spread)
     left = wp.max(-radius, 1 - at[0])
     right = wp.min(radius, columns - 2 - at[0])
-    histogram = TurnHistogram()
-    for down in range(lane - radius, radius + 1, TURN_LANES):
+    histogram = OrientationHistogram()
+    for down in range(lane - radius, radius + 1, HISTOGRAM_LANES):
         y = at[1] + down
         if y > 0 and y < rows - 1:
             for across in range(left, right + 1):
                 gradient = gradient_at(pyramid.values, level + y * columns + at[0] + across, columns)
                 weight = wp.exp(fall * wp.float32(across * across + down * down))
-                turn = wp.int32(wp.rint(in_turns(gradient) * wp.float32(TURN_BINS)))
-                if turn >= TURN_BINS:
-                    turn -= TURN_BINS
+                turn = wp.int32(wp.rint(in_turns(gradient) * wp.float32(ORIENTATION_BINS)))
+                if turn >= ORIENTATION_BINS:
+                    turn -= ORIENTATION_BINS
                 histogram[turn] += weight * wp.length(gradient)
-    for turn in range(TURN_BINS):
+    for turn in range(ORIENTATION_BINS):
         histograms[row, lane, turn] = histogram[turn]
 
 
 @wp.kernel
-def turn_kernel(histograms: wp.array3d[wp.float32], n_turns: wp.array[wp.int32], angles: wp.array2d[wp.float32]):
+def orientation_kernel(
+    histograms: wp.array3d[wp.float32], n_orientations: wp.array[wp.int32], angles: wp.array2d[wp.float32]
+):
     """Peaks of the smoothed histogram, in degrees clockwise from the image's x axis, as OpenCV's."""
     row = wp.tid()
-    histogram = TurnHistogram()
-    for turn in range(TURN_BINS):
+    histogram = OrientationHistogram()
+    for turn in range(ORIENTATION_BINS):
         total = wp.float32(0.0)
-        for lane in range(TURN_LANES):
+        for lane in range(HISTOGRAM_LANES):
             total += histograms[row, lane, turn]
         histogram[turn] = total
-    smooth = TurnHistogram()
+    smooth = OrientationHistogram()
     highest = wp.float32(0.0)
-    for turn in range(TURN_BINS):
-        next = histogram[(turn + 1) % TURN_BINS] + histogram[(turn + TURN_BINS - 1) % TURN_BINS]
-        second = histogram[(turn + 2) % TURN_BINS] + histogram[(turn + TURN_BINS - 2) % TURN_BINS]
+    for turn in range(ORIENTATION_BINS):
+        next = histogram[(turn + 1) % ORIENTATION_BINS] + histogram[(turn + ORIENTATION_BINS - 1) % ORIENTATION_BINS]
+        second = histogram[(turn + 2) % ORIENTATION_BINS] + histogram[(turn + ORIENTATION_BINS - 2) % ORIENTATION_BINS]
         value = (second + 4.0 * next + 6.0 * histogram[turn]) * 0.0625
         smooth[turn] = value
         highest = wp.max(highest, value)
     number = wp.int32(0)
-    for turn in range(TURN_BINS):
+    for turn in range(ORIENTATION_BINS):
         value = smooth[turn]
-        before = smooth[(turn + TURN_BINS - 1) % TURN_BINS]
-        after = smooth[(turn + 1) % TURN_BINS]
+        before = smooth[(turn + ORIENTATION_BINS - 1) % ORIENTATION_BINS]
+        after = smooth[(turn + 1) % ORIENTATION_BINS]
         if value > before and value > after and value >= 0.8 * highest:
             peak = wp.float32(turn) + 0.5 * (before - after) / (before - 2.0 * value + after)
-            peak = wp.where(peak < 0.0, peak + wp.float32(TURN_BINS), peak)
-            angle = 360.0 - peak * (360.0 / wp.float32(TURN_BINS))
+            peak = wp.where(peak < 0.0, peak + wp.float32(ORIENTATION_BINS), peak)
+            angle = 360.0 - peak * (360.0 / wp.float32(ORIENTATION_BINS))
             if angle >= 360.0 or angle <= 0.0:
                 angle = 0.0
             angles[row, number] = angle
             number += 1
-    n_turns[row] = number
+    n_orientations[row] = number
 
 
 @wp.kernel

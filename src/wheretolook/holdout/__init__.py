@@ -1,1 +1,1 @@
-"""How well views of a map can be told apart, measured with the map's own photographs: `wheretolook check`."""
+"""Measures how well scores separate good from bad views of a map, by its own photographs: `wheretolook check`."""

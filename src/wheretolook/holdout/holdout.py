@@ -17,12 +17,11 @@ from tqdm.auto import tqdm
 
 from wheretolook.dataset.viewpoint_table import LOCALIZED
 from wheretolook.features.keypoints import Keypoints
-from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.holdout.holdout_blocks import Block, choose_blocks
 from wheretolook.holdout.photo_map import MAX_ERROR_DEG, PhotographedMap
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.labeller import versions
-from wheretolook.localization.localizer import Localizer
+from wheretolook.localization.localizer import Localizer, localization_errors
 from wheretolook.mapping.colmap_model import read_model, write_model
 from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
@@ -184,9 +183,7 @@ def _localize(job: _Job, landmarks: Landmarks) -> pd.DataFrame:
     for camera, (pixels, descriptors) in zip(cameras, stored, strict=True):
         keypoints = Keypoints(pixels, kind.restore(descriptors))
         estimates.append(localizer.estimate(keypoints, *localizer.match([keypoints])[0], camera=camera))
-    no_pose: Float = np.full((3, 4), np.nan)
-    estimated = [no_pose if one.cam_from_world is None else one.cam_from_world for one in estimates]
-    error_m, error_deg = pose_error(estimated, source.poses[rows])
+    error_m, error_deg = localization_errors(estimates, source.poses[rows])
     status = np.array([one.status for one in estimates])
     limit_m = source.limit_m[rows]
     return pd.DataFrame(

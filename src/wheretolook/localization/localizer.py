@@ -19,7 +19,7 @@ from wheretolook.features.matching import DescriptorMatcher, Matches, match
 from wheretolook.features.registry import all_kinds, kind_of
 from wheretolook.features.similarity import SimilarityMatcher
 from wheretolook.geometry.camera import Camera
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator
 from wheretolook.mapping.landmarks import Landmarks
@@ -141,3 +141,9 @@ class Localizer:
         if inliers.sum() >= self.config.min_inliers:
             status = LOCALIZED
         return Localization(status, pose, landmark_rows[inliers], landmark_rows, pixels)
+
+
+def localization_errors(results: Sequence[Localization], true_poses: Float) -> tuple[Float, Float]:
+    """Position (m) and orientation errors (degrees), (B,), of localized images; NaN without a pose."""
+    no_pose: Float = np.full((3, 4), np.nan)
+    return pose_error([no_pose if one.cam_from_world is None else one.cam_from_world for one in results], true_poses)

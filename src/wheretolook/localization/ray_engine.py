@@ -27,8 +27,6 @@ MAX_RETRIES = 5
 
 WORKERS_PER_GPU = 16
 
-_RUN_AGAIN = "Fix the cause and run again; finished shards are kept."
-
 
 def run_ray(shards: Sequence[Shard], address: str = "") -> Iterator[tuple[Shard, LabelledShard]]:
     """Label shards on a Ray cluster, each on one core and, with a CUDA device, `1 / WORKERS_PER_GPU` of a GPU.
@@ -102,7 +100,7 @@ def _run(ray: Any, shards: Sequence[Shard]) -> Iterator[tuple[Shard, LabelledSha
                 if isinstance(cause, WhereToLookError):
                     raise cause from None
                 problem = f"labelling failed: {cause or error}"
-                raise WorkerError(problem, path=shard.job.mesh, fix=_RUN_AGAIN) from error
+                raise WorkerError(problem, path=shard.job.mesh, fix="Fix the cause and run again.") from error
     finally:  # otherwise a cluster that outlives this run would finish the tasks
         for unfinished in running:
             ray.cancel(unfinished)

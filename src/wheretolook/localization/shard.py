@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, MATCH_FIELDS, PIXELS, poses
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import Camera, PinholeCamera
-from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.pipeline import Step, run_pipeline
 from wheretolook.utils.errors import WhereToLookError, WorkerError
@@ -151,6 +150,8 @@ def label_rows(
     match, pose) are added to `seconds`. Returns the table with new status, error_m, error_deg and n_inliers,
     `viewpoint_table.MATCH_FIELDS` if `store_matches`, and also `PIXEL_FIELD` if `store_pixels`.
     """
+    from wheretolook.localization.localizer import localization_errors
+
     true_poses = poses(table)
     if isinstance(cameras, Mapping):
         numbers = table[CAMERA_ID].to_numpy()
@@ -173,9 +174,7 @@ def label_rows(
     localizations = [result for batch in run_pipeline(batches, steps, seconds) for result in batch]
     order = np.argsort(np.concatenate([rows for _, rows in groups]))
     results = [localizations[row] for row in order]
-    no_pose: Float = np.full((3, 4), np.nan)
-    estimates = np.stack([no_pose if result.cam_from_world is None else result.cam_from_world for result in results])
-    error_m, error_deg = pose_error(estimates, true_poses)
+    error_m, error_deg = localization_errors(results, true_poses)
     columns: dict[str, Any] = {
         "status": [result.status for result in results],
         "error_m": error_m.astype(np.float32),

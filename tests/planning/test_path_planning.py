@@ -108,20 +108,20 @@ def test_the_camera_looks_where_it_localizes() -> None:
     assert path.length_m < 1.4 * (2 * np.hypot(1.9, 2.0) + 0.2) and path.turn_deg > 0
 
 
-def looking_at_random(seed: int, pitch_deg: tuple[float, float]) -> ViewpointMap:
+def looking_at_random(pitch_deg: tuple[float, float]) -> ViewpointMap:
     """Every voxel its own: views near the limits of the pitch are best, here and there."""
     views = looking_north()
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(1)
     pitch = np.degrees(np.arcsin(views.directions[:, 2]))
     near = np.exp(-np.abs(pitch[:, None] - pitch_deg).min(1) / 3)
     scores = (near * rng.random(views.scores.shape)).astype(np.float32)
     return replace(views, scores=scores, ranked=np.argsort(-scores, axis=1, kind="stable").astype(np.uint16))
 
 
-@pytest.mark.parametrize("pitch_deg", [(-40, 40), (5, 40)])
-def test_limits_hold_where_the_best_views_are_at_them(pitch_deg: tuple[float, float]) -> None:
+def test_limits_hold_where_the_best_views_are_at_them() -> None:
+    pitch_deg = (5, 40)
     config = PathConfig(time_s=1.0, pitch_deg=pitch_deg)
-    views = looking_at_random(1, pitch_deg)
+    views = looking_at_random(pitch_deg)
     path = plan_path(START, GOAL, Room(), BOUNDS, views, config, progress=False)
     check(path, config)
     steps = np.linalg.norm(np.diff(path.positions, axis=0), axis=1)
@@ -148,7 +148,7 @@ def test_a_pan_tilt_head_turns_no_less_than_the_camera() -> None:
 
 
 class ClosedRoom(Room):
-    """A room in two halves."""
+    """A room in two parts."""
 
     def segments_are_free(self, a, b):
         return super().segments_are_free(a, b) & ((np.atleast_2d(a)[:, 0] < 3) == (np.atleast_2d(b)[:, 0] < 3))

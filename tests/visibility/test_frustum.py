@@ -8,6 +8,7 @@ import pytest
 from conftest import RandomViews
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import rotation_looking_along, transform
+from wheretolook.visibility.counting import FrustumCounter
 from wheretolook.visibility.frustum import (
     MIN_DEPTH_M,
     LandmarkSets,
@@ -16,6 +17,7 @@ from wheretolook.visibility.frustum import (
     landmarks_in_view,
     landmarks_in_view_plain,
 )
+from wheretolook.visibility.occlusion import DevicePoints
 
 IDENTITY = np.eye(3)[None]
 CAMERA = PinholeCamera(640, 480, 320.0)  # in single precision its sides pass exactly through x = -z, x = z, y = -0.75 z
@@ -42,28 +44,15 @@ CAMERA = PinholeCamera(640, 480, 320.0)  # in single precision its sides pass ex
         ((1e300, 0, 1e300), False),
     ],
 )
-def test_behind_on_the_border_at_zero_depth_not_a_number(
-    point: tuple[float, ...], seen: bool, device: str, count_everything
-) -> None:  # type: ignore[no-untyped-def]
+def test_behind_on_the_border_at_zero_depth_not_a_number(point: tuple[float, ...], seen: bool, device: str) -> None:
     points = np.array([point], dtype=np.float64)
     with np.errstate(over="ignore"):
         assert in_view(CAMERA, IDENTITY, points.astype(np.float32)).tolist() == [[seen]]
     everything = LandmarkSets.from_mask(np.ones((1, 1), bool))
     found = landmarks_in_view(PosedViews(CAMERA, np.eye(3, 4)[None], points, everything, np.zeros(1, int)), device)
     assert found.indices.tolist() == ([0] if seen else [])
-    assert count_everything(CAMERA, IDENTITY, np.zeros((1, 3)), points, device).tolist() == [[int(seen)]]
-
-
-@pytest.fixture
-def count_everything():  # type: ignore[no-untyped-def]
-    from wheretolook.visibility.counting import FrustumCounter
-    from wheretolook.visibility.occlusion import DevicePoints
-
-    def count(camera, rotations, locations, points, device):  # type: ignore[no-untyped-def]
-        on_device = DevicePoints(points, device)
-        return FrustumCounter(camera, rotations, len(points), device).count(locations, on_device.double).numpy()
-
-    return count
+    counter = FrustumCounter(CAMERA, IDENTITY, 1, device)
+    assert counter.count(np.zeros((1, 3)), DevicePoints(points, device).double).numpy().tolist() == [[int(seen)]]
 
 
 def test_the_test_is_the_projection(random_views: RandomViews) -> None:

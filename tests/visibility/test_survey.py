@@ -41,14 +41,8 @@ class Given(OcclusionModel):
 def test_a_survey_is_what_its_plain_parts_say(random_views: RandomViews, threads: int, device: str) -> None:
     v = random_views
     rotations = rotation_looking_along(v.directions)
-    seen = survey(
-        v.camera,
-        rotations,
-        v.locations,
-        v.points,
-        Given(v.locations, v.mask),
-        SurveyOptions(keep=6, device=device, threads=threads),
-    )
+    options = SurveyOptions(keep=6, device=device, threads=threads)
+    seen = survey(v.camera, rotations, v.locations, v.points, Given(v.locations, v.mask), options)
     plain = count_plain(v.camera, rotations, v.locations, v.points, v.mask)
     np.testing.assert_array_equal(seen.counts, plain)
     for row in range(len(v.locations)):

@@ -10,7 +10,7 @@ from mask_agreement import MaskAgreement
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.tsdf import DepthImage, TsdfVolume
 from wheretolook.rendering.raycasting import MeshRaycaster
-from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.errors import SceneError
 from wheretolook.visibility.occlusion import MeshOcclusion
 from wheretolook.visibility.tsdf import TsdfOcclusion
 
@@ -79,10 +79,3 @@ def test_a_location_inside_geometry_is_refused(occlusion: TsdfOcclusion) -> None
     for location in ((2.0, 1.0, 1.2), (0.5, 2.6, 0.8), (1.0, 1.0, 0.0), (9.0, 1.0, 1.0), (np.nan, 1.0, 1.0)):
         with pytest.raises(SceneError):
             occlusion.check(np.vstack([free, location]), free)
-
-
-def test_invalid_margins_and_volumes(volume: TsdfVolume) -> None:
-    with pytest.raises(ConfigError):
-        TsdfOcclusion(volume, margin_m=-0.1)
-    with pytest.raises(SceneError):
-        TsdfOcclusion(TsdfVolume())

@@ -16,10 +16,9 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.ranking import SceneViews, join_scenes
 from wheretolook.evaluation.scores import PHOTOGRAPHS
 from wheretolook.evaluation.scoring import Weights, join_scores, score_batches, scorers_of
-from wheretolook.evaluation.views import CandidateSet
+from wheretolook.evaluation.views import CandidateSet, check_labels
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.utils.errors import TableError
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,12 +51,8 @@ def photographs_set(photographs: Sequence[HeldOutPhotographs], config: EvaluateC
     same label.
     """
     views, location_id = join_scenes([_scene_views(one.views, config) for one in photographs])
-    labels = views.good[:, 0]
-    if len(np.unique(labels)) < 2:
-        problem = "all held-out photographs have the same label"
-        fix = "Evaluate without evaluate.photographs."
-        raise TableError(problem, path=photographs[0].scene.map, value=bool(labels.any()), fix=fix)
-    return CandidateSet(PHOTOGRAPHS, np.ones(len(labels), dtype=bool), views, location_id)
+    check_labels(views.good[:, 0], PHOTOGRAPHS, photographs[0].scene.map)
+    return CandidateSet(PHOTOGRAPHS, np.ones(len(views.good), dtype=bool), views, location_id)
 
 
 def _scene_views(views: pd.DataFrame, config: EvaluateConfig) -> SceneViews:

@@ -1,4 +1,23 @@
-"""Tables of localization scores: a row for each method, N and scene, and for all scenes together."""
+"""Tables of localization scores: a row for each method (and the oracle), N and scene.
+
+`scene` is "all" in rows over all scenes. Columns: method, top_n, scene, n_locations, n_views (chosen views), and for each
+threshold, such as "0.05m_0.4deg":
+
+- good_*: number of chosen views that are good.
+- raw_*: share of good views. normalized_*: divided by the oracle's share; NaN if that is 0. released_*: divided by
+  `RELEASED_DIVISOR`, which can give more than 1.
+- any_*: share of locations with at least one good view.
+- regret_*: the oracle's raw share less the method's, at least 0.
+- difference_*: the method's raw share less the reference's, and p_*, the p-value of `ClusterBootstrap.paired_p`; NaN
+  without a reference, p_* also for random choice.
+- low_* and high_* of raw_, normalized_, any_, regret_ and difference_, such as raw_low_*: bootstrap interval over blocks
+  of locations, paired where two methods are compared (`ClusterBootstrap.ratio_interval`).
+
+Then reference ("" for none); average_precision and roc_auc of the scores against the first threshold, NaN where all views
+are of one class; and for methods that give probabilities ece (expected calibration error), ece_scaled (with logits
+divided by the temperature) and temperature, NaN where unknown. A scene without candidates has rows with 0 locations and
+NaN.
+"""
 
 from __future__ import annotations
 
@@ -119,23 +138,7 @@ def score_table(
         choices: result of `choose`, if known already.
 
     Returns:
-        One row for each method (and the oracle), N and scene, `scene` being "all" in rows over all scenes. Columns:
-        method, top_n, scene, n_locations, n_views (chosen views), and for each threshold, such as "0.05m_0.4deg":
-
-        - good_*: number of chosen views that are good.
-        - raw_*: share of good views. normalized_*: divided by the oracle's share; NaN if that is 0. released_*: divided
-          by `RELEASED_DIVISOR`, which can give more than 1.
-        - any_*: share of locations with at least one good view.
-        - regret_*: the oracle's raw share less the method's, at least 0.
-        - difference_*: the method's raw share less the reference's, and p_*, the p-value of
-          `ClusterBootstrap.paired_p`; NaN without a reference, p_* also for random choice.
-        - low_* and high_* of raw_, normalized_, any_, regret_ and difference_, such as raw_low_*: bootstrap interval
-          over blocks of locations, paired where two methods are compared (`ClusterBootstrap.ratio_interval`).
-
-        Then reference ("" for none); average_precision and roc_auc of the scores against the first threshold, NaN where
-        all views are of one class; and for learned methods ece (expected calibration error), ece_scaled (with logits
-        divided by the temperature) and temperature, NaN where unknown. A scene without candidates has rows with 0
-        locations and NaN.
+        The table, with the columns that this module lists.
 
     Raises:
         ConfigError: the reference is none of the methods.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -75,11 +76,15 @@ def candidate_sets(
     sets = []
     for best in config.candidates:
         mask = rank < best if best else np.ones(len(rank), dtype=bool)
-        labels = views.good[mask, 0]
-        if len(np.unique(labels)) < 2:
-            problem = f"all {len(labels)} {candidates_label(best)} candidates have the same label"
-            fix = "Label more viewpoints, or give other evaluate.thresholds or evaluate.candidates."
-            raise TableError(problem, path=scenes[0].table, value=bool(labels.any()), fix=fix)
+        check_labels(views.good[mask, 0], candidates_label(best), scenes[0].table)
         kept = np.unique(views.location[mask])
         sets.append(CandidateSet(candidates_label(best), mask, views.only(mask), location_id[kept]))
     return sets
+
+
+def check_labels(labels: NDArray[np.bool_], name: str, path: Path) -> None:
+    """Raise a TableError, which names the file, if the labels (B,) of a candidate set are all of one class."""
+    if labels.all() or not labels.any():
+        problem = f"all {len(labels)} candidates ({name}) have the same label"
+        fix = "Label more viewpoints, or choose other thresholds or candidates."
+        raise TableError(problem, path=path, value=bool(labels.any()), fix=fix)

@@ -59,10 +59,10 @@ def tabulate(camera: ColmapCamera, size: int = TABLE_SIZE) -> FieldOfView:
     seen[cells] = camera.sees(centers[cells])
     a, b = _neighbours(cells, size)
     a, b = (cell[seen[a] != seen[b]] for cell in (a, b))
-    first_is_seen = seen[a]
-    a, b = np.where(first_is_seen, a, b), np.where(first_is_seen, b, a)
+    inside = np.where(seen[a], a, b)
+    outside = np.where(seen[a], b, a)
     rays, on_edge = _rays_of_image(camera)
-    border = np.concatenate([_border_between(camera, centers[a], centers[b]), rays[on_edge]])
+    border = np.concatenate([_border_between(camera, centers[inside], centers[outside]), rays[on_edge]])
     between_centers = rays[~seen[cells_of(rays, size)]]  # strips and lobes too narrow for the centres
     if len(border):
         chord, _ = cKDTree(border).query(between_centers)

@@ -111,13 +111,15 @@ class Viewer:
         camera.position = self.state.eye or tuple(center + size_m * np.array([-0.5, -0.72, 0.95]))
 
     def _client_joined(self, client: Any) -> None:
-        """Start a session; one that fails does not affect others."""
+        """Start a session, unless the page is of another site; one that fails does not affect others."""
         try:
             path, headers = _request(self.server, client.client_id)
             if self._is_allowed(headers):
                 self._start_session(client, path, headers.get("Host", ""))
-            else:
-                self._reject(client, headers)
+                return
+            _log.warning("rejected a page of another site: %.100r. Serve your own site by --host", headers["Origin"])
+            text = f"This address is served to pages of {', '.join(LOCAL)} only; see --host."
+            client.add_notification("Not shown", text, color="red")
         except Exception:
             _log.exception("a client could not be served")
 
@@ -152,11 +154,6 @@ class Viewer:
             return site.hostname in LOCAL or (bool(site.netloc) and site.netloc == headers.get("X-Forwarded-Host"))
         except ValueError:
             return False
-
-    def _reject(self, client: Any, headers: Mapping[str, str]) -> None:
-        _log.warning("rejected a page of another site: %.100r. Serve your own site by --host", headers["Origin"])
-        text = f"This address is served to pages of {', '.join(LOCAL)} only; see --host."
-        client.add_notification("Not shown", text, color="red")
 
     def _client_left(self, client: Any) -> None:
         with self._lock:

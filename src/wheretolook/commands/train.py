@@ -128,9 +128,9 @@ def _train(
             result = method.learn(TrainingJob(dataset, method.name, config, options, title, run_log=run_log, **shared))
             result.model.save(path, about)
             history = "" if result.history is None else result.history.to_csv(index=False)
-            kept = {NOT_LOGGED: {"params": devices | result.counts, "history": history}}
+            unlogged = {NOT_LOGGED: {"params": devices | result.counts, "history": history}}
             record = {"about": about, "weights_sha256": sha256(path), "run_id": "", "metrics": result.metrics}
-            write_json(path.with_suffix(".json"), record | kept)
+            write_json(path.with_suffix(".json"), record | unlogged)
             log_to_run(client, run_id, params=result.counts, metrics=kept_metrics(result.metrics))
             _log_artifacts(client, run_id, path, result.history)
             if run_log.failed is not None:
@@ -150,9 +150,8 @@ def _log_later(model: TrainedModel, tracking: TrackingConfig) -> TrainedModel:
     from wheretolook.training.weights import read_record
 
     record = read_record(model.path)
-    kept = record.pop(NOT_LOGGED, {})
-    params = params_of(record["about"]) | (kept.get("params", {}) if isinstance(kept, dict) else {})
-    history = history_not_logged({NOT_LOGGED: kept})
+    history = history_not_logged(record)
+    params = params_of(record["about"]) | record.pop(NOT_LOGGED, {}).get("params", {})
     with kept_if_not_logged(f"the training of {model.method}, {model.path}"):
         with start_run(tracking, model.method, "train", params) as (client, run_id):
             log_to_run(client, run_id, metrics=kept_metrics(model.metrics))

@@ -154,12 +154,11 @@ def _pairs(source: Any) -> NDArray[np.int64]:
     same way.
     """
     poses = colmap_poses("", source)
-    n = len(poses)
-    if n <= EXHAUSTIVE_UP_TO:
-        return np.column_stack(np.triu_indices(n, 1)).astype(np.int64)
+    if len(poses) <= EXHAUSTIVE_UP_TO:
+        return np.column_stack(np.triu_indices(len(poses), 1)).astype(np.int64)
     if source.num_points3D():
         observed = observation_matrix(model_arrays(source))
-        shared = np.asarray((observed @ observed.T).toarray(), dtype=np.float64)
+        shared = (observed @ observed.T).toarray().astype(np.float64)
         np.fill_diagonal(shared, 0)
         return choose_pairs(shared, PARTNERS, 1.0)
     centers = camera_centers(poses)

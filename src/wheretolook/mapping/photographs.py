@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -109,7 +108,7 @@ def photograph_pairs(n: int, exhaustive_up_to: int, overlap: int) -> NDArray[np.
     matching does. This needs no vocabulary tree, but names in the order of capture.
     """
     if n <= exhaustive_up_to:
-        return np.array(list(itertools.combinations(range(n), 2)), dtype=np.int64).reshape(-1, 2)
+        return np.column_stack(np.triu_indices(n, 1)).astype(np.int64)
     steps = sorted({*range(1, overlap + 1), *(2**power for power in range(overlap))})
     return np.array([(i, i + step) for i in range(n) for step in steps if i + step < n], dtype=np.int64)
 

@@ -13,7 +13,7 @@ from wheretolook.commands.scenes_config import ScenesConfig
 from wheretolook.dataset.layout import SceneFolder
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.space.free_space import FreeSpace
-from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.errors import ConfigError
 from wheretolook_rooms.building import MAX_DIFFERENCE, Copy, Module, draw_building
 from wheretolook_rooms.generator import generate_scene
 from wheretolook_rooms.large import Furnished
@@ -94,8 +94,5 @@ def test_mapped_floor_is_stored_with_the_mesh(tmp_path: Path) -> None:
     assert scene.mapped_floor() == ()
     scene.save_mapped_floor(floor)
     assert scene.mapped_floor() == floor
-    (scene.folder / "scene.json").write_text('{"mapped_floor": [[1, 2]]}')
-    with pytest.raises(SceneError):
-        scene.mapped_floor()
     scene.save_mapped_floor(())
     assert scene.mapped_floor() == ()

@@ -1,17 +1,14 @@
-"""Measure labelling: milliseconds per view of each step in one process, and views per second of several workers.
+"""Measure labelling: milliseconds per view of each step in one process.
 
-    python tests/benchmarks/bench_labelling.py SCENE --views 400 --batches 8 16 32
-    python tests/benchmarks/bench_labelling.py SCENE --device cuda --batches 8 --workers 1 2 4 8
+    python tests/benchmarks/bench_labelling.py SCENE --batches 8 16 32
 
 SCENE is the folder of a mapped scene with `mesh.glb` and `map/`. One process renders, extracts (for ALIKED also its
-parts), matches and estimates poses batch by batch and synchronizes the device after each step. With `--workers`, that
-many processes label the same views like the label stage; the rate is taken between the first and the last tenth.
+parts), matches and estimates poses batch by batch and synchronizes the device after each step.
 """
 
 from __future__ import annotations
 
 import argparse
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,16 +17,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import open_scene, random_viewpoints, use_one_thread
+from common import free_points, open_scene, use_one_thread
 
 from wheretolook.commands.preconditions import extractor_of
 from wheretolook.dataset.layout import SceneFolder
 from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.features import aliked_batch
-from wheretolook.localization import labeller
-from wheretolook.localization.config import LabelConfig, LocalizerConfig
+from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer
-from wheretolook.localization.shard import SceneJob
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
@@ -91,56 +87,27 @@ def time_steps(folder: SceneFolder, views: np.ndarray, batch: int, device: str) 
     print(f"batches of {batch}, ms per view: {steps}{peak}", flush=True)
 
 
-def time_workers(folder: SceneFolder, table: Any, workers: int, device: str) -> None:
-    """Label a table with worker processes like the label stage, and print views per second."""
-    ticks: list[tuple[float, int]] = []
-
-    class RecordingBar(labeller.tqdm):  # type: ignore[misc, valid-type]
-        def update(self, n: float | None = 1) -> bool | None:
-            ticks.append((time.perf_counter(), int(n or 0)))
-            return super().update(n)
-
-    cameras = tuple(folder.cameras().items()) if folder.cameras_file.is_file() else ()
-    extractor = extractor_of(folder)
-    localizer = LabelConfig().localizer
-    job = SceneJob(folder.mesh, folder.landmarks, folder.camera, localizer, extractor, device, False, cameras)
-    config = LabelConfig(workers=workers, shard_size=max(8, min(64, len(table) // (4 * workers))))
-    usual = labeller.tqdm
-    labeller.tqdm = RecordingBar  # type: ignore[misc]
-    start = time.perf_counter()
-    with tempfile.TemporaryDirectory() as shards:
-        (done,) = labeller.label_scenes([labeller.LabelTask("scene", job, table, Path(shards))], config, progress=False)
-    labeller.tqdm = usual  # type: ignore[misc]
-    n_done = np.cumsum([n for _, n in ticks])
-    first, last = np.searchsorted(n_done, (0.1 * n_done[-1], 0.9 * n_done[-1]))
-    rate = (n_done[last] - n_done[first]) / max(1e-9, ticks[last][0] - ticks[first][0])
-    steps = ", ".join(f"{step} {1000 * seconds / len(table):.1f}" for step, seconds in done.seconds.items())
-    print(f"{workers} workers: {rate:.0f} views per second; {len(table)} views with start-up in "
-          f"{time.perf_counter() - start:.1f} s; workers' ms per view, overlapping: {steps}", flush=True)  # fmt: skip
-
-
 def main() -> None:
     """Parse the options, measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("scene", type=Path, metavar="SCENE")
-    add("--views", type=int, default=400, help="number of viewpoints (default: %(default)s)")
+    add("--views", type=int, default=256, help="number of viewpoints (default: %(default)s)")
     add("--batches", nargs="*", type=int, default=[8], help="batch sizes (default: 8)")
-    add("--workers", nargs="*", type=int, default=[], help="numbers of worker processes")
     add("--device", default="cpu")
     args = parser.parse_args()
     use_one_thread()
     folder = SceneFolder(args.scene, "test")
+    rng = np.random.default_rng(0)
     if folder.table.is_file():
-        table = folder.read_table()
+        views = poses(folder.read_table())
     else:
-        table = random_viewpoints(open_scene(folder.folder, folder.folder, 0, args.device), args.views, 0)
-    table = table.iloc[np.linspace(0, len(table) - 1, min(args.views, len(table))).astype(int)].reset_index(drop=True)
-    views = poses(table)[np.random.default_rng(0).permutation(len(table))][:256]
+        scene = open_scene(folder.folder, folder.folder, 0, args.device)
+        locations = free_points(scene.free_space, scene.mesh.bounds, args.views, rng)
+        views = poses_looking_along(locations, rng.normal(size=locations.shape))
+    views = views[rng.permutation(len(views))][: args.views]
     for batch in args.batches:
         time_steps(folder, views, batch, args.device)
-    for workers in args.workers:
-        time_workers(folder, table, workers, args.device)
 
 
 if __name__ == "__main__":

@@ -8,9 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 
-from wheretolook.dataset.viewpoint_table import SCHEMA, UNLABELLED, pose_columns
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, poses_looking_along
@@ -113,17 +111,6 @@ def open_scene(source: Path | None, folder: Path, seed: int, device: str) -> Sce
         source = source / "mesh.glb"
     mesh = load_mesh(source)
     return Scene(source, mesh, FreeSpace(mesh, device=device))
-
-
-def random_viewpoints(scene: Scene, n: int, seed: int) -> pd.DataFrame:
-    """Return n unlabelled viewpoints at random free locations, with directions uniform on the sphere."""
-    rng = np.random.default_rng(seed)
-    locations = free_points(scene.free_space, scene.mesh.bounds, n, rng)
-    ids = np.arange(n)
-    unlabelled = {"status": UNLABELLED, "error_m": np.float32(np.nan), "error_deg": np.float32(np.nan)}
-    columns = {"viewpoint_id": ids, "location_id": ids, "direction_id": 0, "n_visible": 0, "visibility_rank": 0}
-    columns |= pose_columns(poses_looking_along(locations, rng.normal(size=(n, 3))))
-    return pd.DataFrame({**columns, **unlabelled, "n_inliers": 0})[SCHEMA.names]
 
 
 def write_model(folder: Path, n: int) -> None:

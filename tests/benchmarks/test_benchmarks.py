@@ -56,8 +56,7 @@ def test_features_and_labelling(tmp_path: Path) -> None:
     assert "| opencv |" in run("features", "--work", str(tmp_path), *sizes)
     scene = tmp_path / "scene-901"
     shutil.copytree(scene / "opencv" / "map", scene / "map")
-    printed = run("labelling", str(scene), "--views", "8", "--batches", "4", "--workers", "1")
-    assert "ms per view" in printed and "views per second" in printed
+    assert "ms per view" in run("labelling", str(scene), "--views", "8", "--batches", "4")
 
 
 def test_every_benchmark_is_run() -> None:

@@ -24,8 +24,6 @@ from wheretolook.view.paths import FORWARD, RecordedPath
 from wheretolook.view.state import ViewState
 from wheretolook.view.viewed_map import ViewedMap
 
-SIZE_IN = (7.6, 4.3)
-DPI = 100
 FRAME_MS = 220
 LAST_MS = 2500  # the last frame
 MAX_FRAMES = 60

@@ -90,11 +90,12 @@ def _finish(options: Release, dataset: Dataset, log: Log, progress: Progress) ->
     config = replace(options.evaluate, weights=())
     on_cpu = replace(select_options(Evaluate, options), device="cpu", evaluate=config)
     results = dataset.root / "results"
-    if releases.choose_weights_to_ship(dataset).shelved:  # all that were trained, before only the best remain
+    choice = releases.choose_weights_to_ship(dataset)
+    if choice.shelved:  # all that were trained, before only the best remain
         methods = tuple(method.name for method in releases.trained_weights(dataset).values())
         replace(on_cpu, evaluate=replace(config, methods=methods, reference="")).run(log)
         copy_file(results / SCORES_CSV, results / VARIANTS_CSV)
-    choice = releases.ship_weights(dataset)
+    releases.ship_weights(choice)
     compared = ", ".join(f"{name} {value:.4f}" for name, value in choice.precision.items())
     log(f"validation average precision: {compared}")
     log(f"the paper's network that ships, in half precision: {choice.network}; the best of all: {choice.best}")

@@ -10,7 +10,6 @@ import pandas as pd
 
 from wheretolook.dataset.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
 from wheretolook.evaluation.scores import RELEASED_DIVISOR, main_rows, methods_of
-from wheretolook.scorers.registry import find
 from wheretolook.scorers.styles import method_style
 from wheretolook.utils.files import write_text
 from wheretolook.utils.markdown import markdown_table
@@ -86,7 +85,7 @@ def paper_tables(scores: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """
     rows = main_rows(scores)
     rows = rows[(rows["scene"] == ALL) & (rows["top_n"] == 1)]
-    paper_networks = [method for method in methods_of(rows) if _is_network(method)]
+    paper_networks = [method for method in methods_of(rows) if method.startswith("mlp-")]
     ours = {row["method"]: row for row in rows.to_dict("records")}
     tables = {}
     for name, paper in PAPER.items():
@@ -105,13 +104,6 @@ def paper_tables(scores: pd.DataFrame) -> dict[str, pd.DataFrame]:
             lines.append({**line, "note": NOTE})
         tables[name] = pd.DataFrame(lines)
     return tables
-
-
-def _is_network(method: str) -> bool:
-    """Return whether a method is of the family of the paper's proposal."""
-    known = find(method)
-    proposed = find(PROPOSED)
-    return known is not None and proposed is not None and known.family == proposed.family
 
 
 def write_paper_tables(scores: pd.DataFrame, folder: Path) -> list[Path]:

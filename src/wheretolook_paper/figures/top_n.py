@@ -55,7 +55,10 @@ def top_n_figure(scores: pd.DataFrame, methods: Sequence[str] = ()) -> Figure:
                         mark: Style = {"markersize": 5, "color": GREY, "markerfacecolor": "white"}
                         axes.plot(-0.5, _PRINTED[printed_row][index], marker, **mark)
                 else:
-                    _draw_oracle(axes, pooled, top_n, f"{column}_{key}")
+                    style = method_style(ORACLE)
+                    best = 100 * pooled[pooled["method"] == ORACLE][f"{column}_{key}"]
+                    ends = np.arange(len(top_n)) - 0.42, np.arange(len(top_n)) + 0.42
+                    axes.hlines(best, *ends, color=style.color, linewidth=1, label=style.label)
             line[0].set_ylabel(name)
         for axes in panels[-1]:
             axes.set_xlabel("N")
@@ -66,19 +69,17 @@ def top_n_figure(scores: pd.DataFrame, methods: Sequence[str] = ()) -> Figure:
         return figure
 
 
-def top_n_table(scores: pd.DataFrame, methods: Sequence[str] = ()) -> pd.DataFrame:
+def top_n_table(scores: pd.DataFrame) -> pd.DataFrame:
     """Return the numbers of `top_n_figure` at the finest threshold, in %, and the oracle's: a row per method."""
     scores = main_rows(scores)
     pooled = scores[scores["scene"] == ALL]
     key = threshold_keys(scores)[0]
+    shown = [*_the_few(pooled), ORACLE]
     names = {"normalized": "good ones, % of the oracle's", "any": "locations with one, %"}
-    columns = {}
-    for column, name in names.items():
-        for n in pooled["top_n"].unique():
-            rows = pooled[pooled["top_n"] == n].set_index("method")
-            columns[name, f"N = {n}"] = 100 * rows[f"{column}_{key}"]
-    shown = [*(_present(pooled, methods) if methods else _the_few(pooled)), ORACLE]
-    table = pd.DataFrame(columns).loc[shown]
+    parts = {name: 100 * pooled.pivot(index="method", columns="top_n", values=f"{column}_{key}")
+             for column, name in names.items()}  # fmt: skip
+    table = pd.concat(parts, axis=1).loc[shown].rename(columns="N = {}".format, level=1)
+    table.columns.names = [None, None]
     table.index = pd.Index([method_style(method).label for method in shown])
     return table
 
@@ -116,10 +117,3 @@ def _draw(axes: Axes, pooled: pd.DataFrame, methods: Sequence[str], top_n: Seque
     axes.set_xticks(places, [f"{n}" for n in top_n])
     axes.set(xlim=(-0.65, len(top_n) - 0.5), ylim=(None, 101))
     axes.grid(axis="x", visible=False)
-
-
-def _draw_oracle(axes: Axes, pooled: pd.DataFrame, top_n: Sequence[int], column: str) -> None:
-    style = method_style(ORACLE)
-    best = pooled[pooled["method"] == ORACLE].set_index("top_n").reindex(list(top_n))
-    places = np.arange(len(top_n))
-    axes.hlines(100 * best[column], places - 0.42, places + 0.42, color=style.color, linewidth=1, label=style.label)

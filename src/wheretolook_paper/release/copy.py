@@ -133,24 +133,21 @@ def choose_weights_to_ship(release: Dataset) -> Choice:
     return Choice(network, best, shelved, {path.stem: value for path, value in precision.items()})
 
 
-def ship_weights(release: Dataset) -> Choice:
-    """Choose the weights that ship; convert the paper's network to half precision, move the rest to `weights/others/`.
+def ship_weights(choice: Choice) -> None:
+    """Convert the paper's network to half precision and move the weights that do not ship to `weights/others/`.
 
-    A matchability model stays, because methods that weight landmarks need it. Repeating this changes nothing. Raises as
-    `choose_weights_to_ship`.
+    A matchability model stays, because methods that weight landmarks need it. Repeating this changes nothing.
     """
     from wheretolook.training.weights import read_record
 
-    choice = choose_weights_to_ship(release)
-    folder = release.root / "weights"
     for path in choice.shelved:
-        (folder / SHELF).mkdir(exist_ok=True)
+        shelf = path.parent / SHELF
+        shelf.mkdir(exist_ok=True)
         for file in (path, path.with_suffix(".json")):
-            os.replace(file, folder / SHELF / file.name)
+            os.replace(file, shelf / file.name)
     record = read_record(choice.network)
     convert_to_float16(choice.network)
     write_json(choice.network.with_suffix(".json"), {**record, "weights_sha256": sha256(choice.network)})
-    return choice
 
 
 def convert_to_float16(path: Path) -> None:

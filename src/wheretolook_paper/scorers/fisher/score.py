@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
 
@@ -52,29 +53,27 @@ class PoseInformation:
     def numbers(self, cam_from_world: Float, approximation: Approximation) -> Float:
         """Return the information (B, 15) of poses (B, 3, 4), see `wheretolook.geometry.pose_information`."""
         self._look_at(cam_from_world)
-        if approximation not in self._known:
-            self._known[approximation] = self._numbers(approximation)
-        return np.asarray(self._known[approximation])
+        return np.asarray(self._cached(approximation, lambda: self._numbers(approximation)))
 
     def eigenvalues(self, cam_from_world: Float, approximation: Approximation, about_origin: bool) -> Float:
         """Return the eigenvalues (B, 6) of the information of poses (B, 3, 4)."""
         numbers = self.numbers(cam_from_world, approximation)
+        pivots = -split_poses(self._poses)[1] if about_origin else None
         name = f"{approximation} eigenvalues about {'the origin' if about_origin else 'the camera'}"
-        if name not in self._known:
-            pivots = -split_poses(self._poses)[1] if about_origin else None
-            self._known[name] = eigenvalues(numbers, pivots, self.device)
-        return np.asarray(self._known[name])
+        return np.asarray(self._cached(name, lambda: eigenvalues(numbers, pivots, self.device)))
 
     def field(self, cam_from_world: Float, approximation: Approximation) -> tuple[FisherField, NDArray[np.int64]]:
         """Return the field at the locations of poses (B, 3, 4), and each pose's row in it, (B,)."""
         self._look_at(cam_from_world)
-        name = f"{approximation} field"
-        if name not in self._known:
-            locations, rows, mask = self._locations()
-            built = FisherField.build(locations, self.points, self.visibilities[approximation], mask, self.device)
-            self._known[name] = built, rows
-        field, rows = self._known[name]
+        locations, rows, mask = self._locations()
+        inputs = (locations, self.points, self.visibilities[approximation], mask, self.device)
+        field: FisherField = self._cached(f"{approximation} field", lambda: FisherField.build(*inputs))
         return field, rows
+
+    def _cached(self, name: str, compute: Callable[[], Any]) -> Any:
+        if name not in self._known:
+            self._known[name] = compute()
+        return self._known[name]
 
     def _look_at(self, cam_from_world: Float) -> None:
         poses = check_poses(cam_from_world)
@@ -84,19 +83,16 @@ class PoseInformation:
 
     def _locations(self) -> tuple[Float, NDArray[np.int64], NDArray[np.bool_]]:
         """Return locations (L, 3) of the poses, each pose's row, and the mask (L, N) of unoccluded landmarks."""
-        if "locations" not in self._known:
-            locations, rows = shared_locations(self._poses)
-            self._known["locations"] = locations, rows, self.occlusion.unoccluded(locations, self.points)
-        locations, rows, mask = self._known["locations"]
-        return locations, rows, mask
+        locations, rows = self._cached("locations", lambda: shared_locations(self._poses))
+        return locations, rows, self._cached("mask", lambda: self.occlusion.unoccluded(locations, self.points))
 
     def _numbers(self, approximation: Approximation) -> Float:
+        if approximation != "exact":
+            field, rows = self.field(self._poses, approximation)
+            return field.information_of_views(rows, self._poses[:, 2, :3])
         _, rows, mask = self._locations()
-        if approximation == "exact":
-            seen = LandmarkSets.from_mask(mask)
-            return exact_information(PosedViews(self.camera, self._poses, self.points, seen, rows), self.device)
-        field, _ = self.field(self._poses, approximation)
-        return field.information_of_views(rows, self._poses[:, 2, :3])
+        seen = LandmarkSets.from_mask(mask)
+        return exact_information(PosedViews(self.camera, self._poses, self.points, seen, rows), self.device)
 
 
 class FisherScorer(Scorer):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,6 @@ from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
-from wheretolook.mapping.colmap_model import CAMERAS_FILE
 from wheretolook.training.batches import Batch, IndexBatches, TensorViews
 from wheretolook.training.config import SharedConfig
 from wheretolook.training.data import ViewsDataModule, labelled_rows, labels_of
@@ -41,15 +39,13 @@ class LocationDescriber:
     """Describes locations to a network: their landmarks with a free line of sight, and the mapping cameras.
 
     If there are more landmarks or cameras than configured, evenly spread ones are used, in the order of their ids.
-    Raises a MapError, which names the path, if the map has no mapping cameras.
+    Raises a MapError if the map has no mapping cameras.
     """
 
-    def __init__(
-        self, localization_map: LocalizationMap, config: SphereConfig, path: Path = Path("map") / CAMERAS_FILE
-    ) -> None:
+    def __init__(self, localization_map: LocalizationMap, config: SphereConfig) -> None:
         if localization_map.mapping_poses is None:
             fix = "Run the map stage again, copy the release again, or use `LocalizationMap.from_colmap`."
-            raise MapError("the poses of the map's images are unknown", path=path, fix=fix)
+            raise MapError("the poses of the map's images are unknown", fix=fix)
         self.localization_map = localization_map
         self.config = config
         rotations, self._centers = split_poses(_spread(localization_map.mapping_poses, config.cameras))
@@ -122,7 +118,7 @@ def load_sphere_views(
         rows.append(location_of + len(tokens))
         axes.append(cam_from_world[:, 2, :3])
         localization_map = scene.localization_map(dataset.camera, device)
-        describer = LocationDescriber(localization_map, options, scene.mapping_cameras)
+        describer = LocationDescriber(localization_map, options)
         bar = tqdm(describer.describe(locations), f"describe {scene.name}", len(locations), disable=not progress)
         tokens += bar
     counts = torch.tensor([len(one) for one in tokens])

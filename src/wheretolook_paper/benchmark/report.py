@@ -77,9 +77,10 @@ def summary_table(results: Sequence[Result]) -> pd.DataFrame:
         pooled = table.groupby(["method", "measure"], sort=False)[[*counted]].agg(pd.Series.sum, skipna=False)
         table = pd.concat([table, pooled.reset_index().assign(scene=ALL)], ignore_index=True)
     for version in _VERSIONS:
-        percent = (100 * table[f"{version}_hits"] / table[f"{version}_total"]).astype(float)
-        table.insert(table.columns.get_loc(f"{version}_total") + 1, f"{version}_percent", percent)
-    return table
+        percent = 100 * table[f"{version}_hits"] / table[f"{version}_total"]
+        table[f"{version}_percent"] = percent.astype(float)
+    numbers = [f"{version}_{name}" for version in _VERSIONS for name in ("hits", "total", "percent")]
+    return table[["scene", "method", "measure", *numbers]]
 
 
 def summary_text(summary: pd.DataFrame) -> str:

@@ -96,10 +96,9 @@ def keep_histories(release: Dataset, tracking: TrackingConfig) -> pd.DataFrame:
         runs = (run for _, run in train_runs(tracking, same["dataset"], method, HISTORY_CSV))
         alike = [run for run in runs if same.items() <= run.data.params.items()]
         own = [run for run in alike if run.info.run_id == record["run_id"]]
+        history = history_not_logged(record)
         if own or alike:
             history = pd.read_csv(artifact(tracking, (own or alike)[0].info.run_id, HISTORY_CSV))
-        else:
-            history = history_not_logged(record)
         rows = known[known["method"] == method] if history is None else history.assign(method=method)
         kept.append(rows[["method", *rows.columns.drop("method")]])
     table = pd.concat([rows for rows in kept if len(rows)], ignore_index=True) if any(map(len, kept)) else known

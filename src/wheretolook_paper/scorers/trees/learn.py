@@ -61,10 +61,10 @@ class BoostedTrees:
         raw = self.booster.predict(np.asarray(pooled, dtype=np.float64), raw_score=True, num_threads=1)
         return np.asarray(raw, dtype=np.float64)
 
-    def save(self, path: Path, training: dict[str, Any]) -> None:
+    def save(self, path: Path, training: dict[str, Any] | None = None) -> None:
         """Write one safetensors file atomically, with a record of the training; equal trees give equal bytes."""
         header: dict[str, Any] = {"features": list(POOLED), "scale": self.scale, "offset": self.offset}
-        header |= {"camera": None if self.camera is None else self.camera.record(), "training": training}
+        header |= {"camera": None if self.camera is None else self.camera.record(), "training": training or {}}
         if self.training_range is not None:
             header["range"] = self.training_range.record()
         text = np.frombuffer(self.model.encode(), dtype=np.uint8)

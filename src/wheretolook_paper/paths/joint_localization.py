@@ -67,8 +67,9 @@ def localize_stops(
     result = result[result["method"].map(is_probability)].copy()
     places = pd.MultiIndex.from_frame(result[[*KEY, "waypoint"]])
     further = stop_views.groupby([*KEY, "waypoint"], sort=False)
-    rows = result.index[places.get_indexer(pd.MultiIndex.from_tuples(list(further.indices)))].tolist()
-    sets = [[row, *(len(views) + more)] for row, more in zip(rows, further.indices.values(), strict=True)]
+    groups: dict[Any, Any] = further.indices
+    rows = result.index[places.get_indexer(pd.MultiIndex.from_tuples(list(groups)))].tolist()
+    sets = [[row, *(len(views) + more)] for row, more in zip(rows, groups.values(), strict=True)]
     _replace_outcome(result, rows, localize(labels, sets))
     result.loc[rows, "score"] = further["together"].first().to_numpy()
     return result.assign(method=result["method"] + f" {WITH_STOPS}")

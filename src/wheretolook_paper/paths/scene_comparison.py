@@ -121,7 +121,7 @@ class SceneComparison:
         if config.stops.looks > 1:
             of_stops = labels.get(self.folder / "stop-shards", pd.DataFrame())
             both = pd.concat([of_views, of_stops], ignore_index=True)
-            key = [used, asdict(config.stops)]
+            key: list[Any] = [used, asdict(config.stops)]
             all_views.append(self._joint("stops", key, lambda fit: localize_stops(views, self.stop_views, both, fit)))
             all_paths.append(joint_paths(paths, all_views[-1], self.stop_views))
         if config.last_views > 1:

@@ -211,7 +211,8 @@ def _log_learners(dataset: Dataset, tracking: TrackingConfig) -> str:
     table[measures] = table[measures].apply(pd.to_numeric)
     nested = []
     of_learner: dict[str, list[tuple[float, float]]] = {}
-    for (learner, source, seed), rows in table.groupby(["learner", "learnt_from", "seed"], sort=False):
+    for key, rows in table.groupby(["learner", "learnt_from", "seed"], sort=False):
+        learner, source, seed = map(str, key)
         numbers: dict[str, float] = {}
         for split, means in rows.groupby("split")[measures].mean().iterrows():
             numbers |= {f"{measure}_{split}": mean for measure, mean in means.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -65,10 +66,11 @@ def localize_stops(
     """
     result = _without_other_rules(views)
     result = result[result["method"].map(is_probability)].copy()
-    places = pd.MultiIndex.from_frame(result[[*KEY, "waypoint"]])
-    further = stop_views.groupby([*KEY, "waypoint"], sort=False)
+    names = [*KEY, "waypoint"]
+    places = pd.MultiIndex.from_frame(result[names])
+    further = stop_views.groupby(names, sort=False)
     groups: dict[Any, Any] = further.indices
-    rows = result.index[places.get_indexer(pd.MultiIndex.from_tuples(list(groups)))].tolist()
+    rows = result.index[places.get_indexer(pd.MultiIndex.from_tuples(list(groups), names=names))].tolist()
     sets = [[row, *(len(views) + more)] for row, more in zip(rows, groups.values(), strict=True)]
     _replace_outcome(result, rows, localize(labels, sets))
     result.loc[rows, "score"] = further["together"].first().to_numpy()

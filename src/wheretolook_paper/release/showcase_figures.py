@@ -139,7 +139,8 @@ def mistaken_location(showcase: Showcase, scorer: Scorer) -> int:
     """Return the location at eye height with the largest mean difference between predictions and labels."""
     rows = showcase.table[showcase.table["location_id"].isin(showcase.layer())]
     error = pd.Series(np.abs(scorer.score(poses(rows)) - is_good(rows)), rows["location_id"])
-    return int(error.groupby(level=0).mean().idxmax())
+    means = error.groupby(level=0).mean()
+    return int(means.index[means.to_numpy().argmax()])
 
 
 def peaks_of(showcase: Showcase, scorer: Scorer, location_id: int, n: int = 3) -> Peaks:

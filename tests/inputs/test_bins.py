@@ -9,7 +9,7 @@ import pytest
 
 from conftest import RandomViews
 from synthetic_dataset import make_landmarks
-from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
+from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.inputs.bins import bin_views, bin_views_plain, count_bins
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, LANDMARK_CHANNELS
 from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber
@@ -18,6 +18,7 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews, landmarks_in_view
 
 LOOKING_ALONG_Z = np.eye(3, 4)[None]
+DISTORTED = ColmapCamera("RADIAL", 320, 240, (150.0, 165.0, 118.0, -0.15, 0.02))
 
 
 def hand_counted(points: list[list[float]]) -> LandmarkSets:
@@ -49,19 +50,20 @@ def test_bins_counted_by_hand(bin_function) -> None:  # type: ignore[no-untyped-
 def test_counted_bins_are_those_that_the_plain_twin_fills(
     random_views: RandomViews, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    v = random_views
-    arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
+    arguments = posed_views(random_views)
     plain = bin_views_plain(arguments, bins=12)
     for block_bytes in (1 << 30, 3 * 12 * 12 * 4):  # all at once, and three views at a time
         monkeypatch.setattr("wheretolook.inputs.bins.BLOCK_BYTES", block_bytes)
         n_visible, n_filled = count_bins(arguments, bins=12, device=device)
         np.testing.assert_array_equal(n_visible, plain.n_visible)
         np.testing.assert_array_equal(n_filled, plain.n_filled)
-    distorted = ColmapCamera("RADIAL", 320, 240, (150.0, 165.0, 118.0, -0.15, 0.02))
-    binned = bin_views(PosedViews(distorted, *arguments[1:]), bins=6)
-    np.testing.assert_array_equal(
-        count_bins(PosedViews(distorted, *arguments[1:]), bins=6), (binned.n_visible, binned.n_filled)
-    )
+    arguments = posed_views(random_views, DISTORTED)
+    binned = bin_views(arguments, bins=6)
+    np.testing.assert_array_equal(count_bins(arguments, bins=6), (binned.n_visible, binned.n_filled))
+
+
+def posed_views(views: RandomViews, camera: Camera | None = None) -> PosedViews:
+    return PosedViews(camera or views.camera, views.cam_from_world, views.points, views.visible, views.location_rows)
 
 
 def landmarks_of(views: RandomViews) -> Landmarks:
@@ -69,9 +71,8 @@ def landmarks_of(views: RandomViews) -> Landmarks:
 
 
 def test_kernel_bins_what_landmarks_are_like_as_its_plain_twin(random_views: RandomViews, device: str) -> None:
-    v = random_views
     landmarks = landmarks_of(random_views)
-    arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
+    arguments = posed_views(random_views)
     kernel = bin_views(arguments, bins=12, device=device, landmarks=landmarks)
     plain = bin_views_plain(arguments, bins=12, landmarks=landmarks)
     assert kernel.channels == plain.channels == ALL_CHANNELS
@@ -85,26 +86,24 @@ def test_kernel_bins_what_landmarks_are_like_as_its_plain_twin(random_views: Ran
 
 @pytest.mark.parametrize("distorted", [False, True])
 def test_channels_of_landmarks_are_means_of_their_attributes(random_views: RandomViews, distorted: bool) -> None:
-    v = random_views
     landmarks = landmarks_of(random_views)
-    camera = ColmapCamera("RADIAL", 320, 240, (150.0, 165.0, 118.0, -0.15, 0.02)) if distorted else v.camera
-    arguments = v.cam_from_world, v.points, v.visible, v.location_rows
-    binned = bin_views(PosedViews(camera, *arguments), bins=1, landmarks=landmarks)
-    seen = landmarks_in_view(PosedViews(camera, *arguments))
-    described = LandmarkDescriber(LocalizationMap(landmarks, camera)).describe(v.cam_from_world, seen)
+    arguments = posed_views(random_views, DISTORTED if distorted else None)
+    binned = bin_views(arguments, bins=1, landmarks=landmarks)
+    visible = landmarks_in_view(arguments)
+    localization_map = LocalizationMap(landmarks, arguments.camera)
+    described = LandmarkDescriber(localization_map).describe(random_views.cam_from_world, visible)
     of_bins = [ATTRIBUTES.index(name) for name in LANDMARK_CHANNELS]
-    for view in range(len(v.cam_from_world)):
+    for view in range(len(random_views.cam_from_world)):
         values = described.values[described.views == view].numpy()[:, of_bins]
         expected = values.mean(0) if len(values) else np.zeros(len(LANDMARK_CHANNELS))
         np.testing.assert_allclose(binned.means[view, len(CHANNELS) :, 0, 0], expected, rtol=1e-4, atol=1e-5)
 
 
 def test_a_mean_with_an_unknown_value_is_unknown_and_nothing_else_is(random_views: RandomViews, device: str) -> None:
-    v = random_views
     landmarks = landmarks_of(random_views)
     known = np.random.default_rng(1).random(len(landmarks)) < 0.9
     landmarks = replace(landmarks, ambiguity=np.where(known, landmarks.ambiguity, np.nan).astype(np.float32))
-    arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
+    arguments = posed_views(random_views)
     kernel = bin_views(arguments, bins=12, device=device, landmarks=landmarks)
     plain = bin_views_plain(arguments, bins=12, landmarks=landmarks)
     np.testing.assert_array_equal(np.isnan(kernel.means), np.isnan(plain.means))
@@ -114,8 +113,7 @@ def test_a_mean_with_an_unknown_value_is_unknown_and_nothing_else_is(random_view
 
 
 def test_blocks_do_not_change_the_bins(random_views: RandomViews, monkeypatch: pytest.MonkeyPatch) -> None:
-    v = random_views
-    arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
+    arguments = posed_views(random_views)
     whole = bin_views(arguments, bins=6)
     monkeypatch.setattr("wheretolook.inputs.bins.BLOCK_BYTES", 7 * 36 * 24)
     blocks = bin_views(arguments, bins=6)

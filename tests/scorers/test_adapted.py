@@ -1,4 +1,4 @@
-"""Adapting log-odds to a place, against scikit-learn's Gaussian process; and weights that know their place."""
+"""Adaptation of log-odds to a scene, against scikit-learn's Gaussian process; and adapted weights."""
 
 from __future__ import annotations
 
@@ -64,11 +64,11 @@ def test_calibration_alone_is_platts() -> None:
 
 def test_adapting_corrects_the_scorer_where_it_is_wrong() -> None:
     views = random_views(60)
-    elsewhere = random_views(60, seed=1)
+    other = random_views(60, seed=1)
     fitted = adapt(views)
     assert fitted.amplitude > 0
-    before = log_losses(elsewhere.log_odds, elsewhere.good).mean()
-    after = log_losses(fitted.adaptation.log_odds(elsewhere), elsewhere.good).mean()
+    before = log_losses(other.log_odds, other.good).mean()
+    after = log_losses(fitted.adaptation.log_odds(other), other.good).mean()
     assert after < 0.7 * before
     assert abs(log_losses(fitted.held_out, views.good).mean() - after) < 0.1  # held-out loss is that of new views
 
@@ -104,11 +104,7 @@ def test_photographs_calibrate() -> None:
 
 
 def test_photographs_are_judged_by_blocks_that_share_none_with_those_trained_on() -> None:
-    """120 photographs in six blocks, each twice: with its block, and with one of two large ones."""
-    views = random_views(240, 1)
-    photograph = np.tile(np.arange(120), 2)
-    group = np.concatenate([np.repeat(np.arange(6), 20), np.repeat([6, 7], 60)])
-    views = LocalizedViews(views.log_odds, views.good, views.centers, views.axes, group, photograph, photograph // 4)
+    views = photographed(0.0)
     judged = np.zeros(len(views), dtype=int)
     for out, trained_on in splits(views):
         judged += out
@@ -165,11 +161,11 @@ def test_a_file_of_adapted_weights_scores_as_it_says(place: tuple[LocalizationMa
     assert adapted.name == "adapted"
 
 
-def test_they_are_refused_in_another_place_unless_forced(place: tuple[LocalizationMap, Path]) -> None:
+def test_they_are_refused_in_another_scene_unless_forced(place: tuple[LocalizationMap, Path]) -> None:
     localization_map, path = place
     landmarks = localization_map.landmarks
     moved = Landmarks(**{**landmarks.__dict__, "points": landmarks.points + np.array([0.5, 0, 0])})
-    elsewhere = LocalizationMap(moved, localization_map.camera)
+    other = LocalizationMap(moved, localization_map.camera)
     with pytest.raises(WeightsError):
-        load_scorer(path, elsewhere)
-    assert load_scorer(path, elsewhere, anywhere=True).name == "adapted"
+        load_scorer(path, other)
+    assert load_scorer(path, other, anywhere=True).name == "adapted"

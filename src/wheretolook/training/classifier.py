@@ -92,10 +92,11 @@ class ViewpointClassifier(LightningModule):
         if isinstance(self.network, Augmented):
             inputs = self.network.augment(self.options, *inputs)
         count = total / self.trainer.world_size
+        further_loss: Tensor | float = 0.0
         if isinstance(self.network, HasFurtherLoss):
             logits, further_loss = self.network.learn_more(self.options, count, *inputs)
         else:
-            logits, further_loss = self(*inputs), 0.0
+            logits = self(*inputs)
         penalty = self._penalty()
         self._train_outputs.append(torch.stack([logits.detach(), labels]))
         self._penalties.append(penalty.detach() * total)

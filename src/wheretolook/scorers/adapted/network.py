@@ -51,8 +51,8 @@ class AdaptedNetwork(StoredNetwork):
         """See `StoredNetwork.of_description`."""
         base = stored["base"]
         calibration = finite(base["scale"]), finite(base["offset"])
-        length_m, sharpness = kernel = [finite(stored["kernel"][name]) for name in ("length_m", "sharpness")]
+        length_m, sharpness = (finite(stored["kernel"][name]) for name in ("length_m", "sharpness"))
         sizes = int(stored["support"]), int(stored["place"])
         if length_m <= 0 or sharpness < 0 or not all(0 <= size <= MAX_SUPPORT for size in sizes):
             raise ValueError(f"invalid kernel {stored['kernel']}, or numbers of views and landmarks {sizes}")
-        return cls(SetNetwork.of_description(base["network"]), *calibration, *kernel, *sizes)
+        return cls(SetNetwork.of_description(base["network"]), *calibration, length_m, sharpness, *sizes)

@@ -50,8 +50,9 @@ class AdaptedScorer(Scorer):
         self.trained = trained
         of_base = network.network, trained.camera, network.base_scale, network.base_offset, trained.training_range
         self.base = SetScorer(localization_map, TrainedNetwork("set", *of_base))
-        support = network.support_centers, network.support_axes, network.support_weights
-        self.correction = Correction(*(part.numpy() for part in support), network.length_m, network.sharpness)
+        poses = network.support_centers.numpy(), network.support_axes.numpy()
+        kernel = network.length_m, network.sharpness
+        self.correction = Correction(*poses, network.support_weights.numpy(), *kernel)
 
     def score(self, cam_from_world: Float) -> Float:
         """Return probabilities (B,) in [0, 1]."""

@@ -107,8 +107,9 @@ def outcome_in_words(label: pd.Series, brief: bool = False) -> str:
         return ""
     if status != LOCALIZED:
         return status.replace("_", " ")
-    right = label["error_m"] < 1
-    error = f"{100 * label['error_m']:.1f} cm, " if right else f"{label['error_m']:.1f} m, "
+    error_m = float(label["error_m"])  # a row may hold it in single precision
+    right = error_m < 1
+    error = f"{100 * error_m:.1f} cm, " if right else f"{error_m:.1f} m, "
     error += f"{label['error_deg']:.2f}° off" if right else f"{label['error_deg']:.0f}° off"
     return error if brief else f"{'pose' if right else 'wrong pose'} found, {error}"
 

@@ -72,8 +72,8 @@ def copy_dataset(dataset: Dataset, root: Path, settings: Mapping[str, Any]) -> D
         copy.label_manifest.unlink(missing_ok=True)
         if scene.label_manifest.is_file():
             manifest = read_json_object(scene.label_manifest)
-            left_out = ("shards", "store_matches", "store_pixels")
-            write_json(copy.label_manifest, {k: value for k, value in manifest.items() if k not in left_out})
+            omitted = ("shards", "store_matches", "store_pixels")
+            write_json(copy.label_manifest, {k: value for k, value in manifest.items() if k not in omitted})
     source = {"source": dataset.name, "source_fingerprint": dataset.fingerprint()}
     write_json(root / RELEASE_FILE, {**source, "code_version": VERSION, "settings": dict(settings)})
     release = Dataset(root, tuple(copy for _, copy in copied))

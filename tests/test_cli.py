@@ -48,7 +48,7 @@ def test_arguments_override_the_file() -> None:
     [
         ("scenes", ["--up", "-y", "--rgbd", "a"], "scenes.rgbd.up", "-y"),
         ("scenes", ["--scenes.meshes", "[{path: a/b.glb, up: y}]"], "scenes.meshes", (MeshSource(Path("a/b.glb"), up="y"),)),
-        ("map", ["--map.camera.fov_deg", "60"], "map.camera.fov_deg", 60.0),
+        ("map", ["--mapping.camera.fov_deg", "60"], "mapping.camera.fov_deg", 60.0),
         ("plan", ["--start", "[-4, -3, 1.4]"], "plan.start", (-4.0, -3.0, 1.4)),
         ("plan", ["--stops", "3"], "plan.stops.looks", 3),
         ("evaluate", ["--evaluate.weights", "[data/release/weights/set.safetensors]"], "evaluate.weights", None),
@@ -56,7 +56,7 @@ def test_arguments_override_the_file() -> None:
         ("select", ["--map", "m", "--out", "o.csv", "--at", "a.csv", "--pitch", "-30", "30"], "pitch_deg", (-30.0, 30.0)),
         ("select", ["--map", "m", "--out", "o.csv", "--grid", "1", "--camera-id", "3", "--skip"], "skip", True),
         ("benchmark", ["a", "b", "--methods", "best", "set"], "scenes", (Path("a"), Path("b"))),
-        ("adapt", ["--map", "m", "--map.photographs.assume_metric", "true"], "adapt.map", Path("m")),
+        ("adapt", ["--map", "m", "--mapping.photographs.assume_metric", "true"], "adapt.map", Path("m")),
     ],
 )  # fmt: skip
 def test_ways_to_write_options(command: str, arguments: list[str], name: str, value: object) -> None:
@@ -67,9 +67,9 @@ def test_ways_to_write_options(command: str, arguments: list[str], name: str, va
 
 
 def test_python_and_the_command_line_mean_the_same() -> None:
-    arguments = ["--name", "a", "--map.n_images", "5", "--camera.fov_deg", "60"]
+    arguments = ["--name", "a", "--mapping.n_images", "5", "--camera.fov_deg", "60"]
     parsed = parse_command("release", arguments)
-    assert parsed.map == MapConfig(n_images=5)
+    assert parsed.mapping == MapConfig(n_images=5)
     assert parsed.root == Experiment(name="a").root
     assert parsed.sample == Experiment().sample
 
@@ -80,10 +80,10 @@ def test_python_and_the_command_line_mean_the_same() -> None:
         ["frobnicate"],
         ["map", "--config", "nowhere.yaml"],
         ["map", "--config"],
-        ["map", "--map.n_images", "many"],
-        ["map", "--map.n_images", "3", "4"],
-        ["map", "--map.n_image", "3"],  # no abbreviations
-        ["map", "--map.partners", "1"],  # a constant
+        ["map", "--mapping.n_images", "many"],
+        ["map", "--mapping.n_images", "3", "4"],
+        ["map", "--mapping.n_image", "3"],  # no abbreviations
+        ["map", "--mapping.partners", "1"],  # a constant
         ["map", "--list-methods"],
         ["scenes", "--device", "gpu"],
         ["scenes", "--camera.width", "0"],
@@ -103,7 +103,15 @@ def test_wrong_arguments_exit_with_two(arguments: list[str], capsys: pytest.Capt
 
 
 @pytest.mark.parametrize(
-    "text", ["map: 3\n", "map: {n_imagess: 3}\n", "mapp: {n_images: 3}\n", "camera: {width: -1}\n", "[1]\n", "a: [\n"]
+    "text",
+    [
+        "mapping: 3\n",
+        "mapping: {n_imagess: 3}\n",
+        "mappin: {n_images: 3}\n",
+        "camera: {width: -1}\n",
+        "[1]\n",
+        "a: [\n",
+    ],
 )
 def test_an_error_in_a_file_names_the_file(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "settings.yaml"
@@ -116,7 +124,7 @@ def test_an_error_in_a_file_names_the_file(text: str, tmp_path: Path, capsys: py
     ("arguments", "meant"),
     [
         (["mapp"], "map"),
-        (["map", "--n_images=3"], "--map.n_images"),
+        (["map", "--n_images=3"], "--mapping.n_images"),
         (["plan", "--metod", "set"], "--method"),
         (["map", "--config", str(CONFIGS / "demo.yml")], "configs/demo.yaml"),
     ],
@@ -131,7 +139,7 @@ def test_the_nearest_name_is_suggested(arguments: list[str], meant: str, capsys:
     [("max_ratio", "label.localizer.max_ratio"), ("sample.gird", "sample.grid"), ("frobnicate", None)],
 )
 def test_nearest(wrong: str, meant: str | None) -> None:
-    assert nearest(wrong, ["map.n_images", "label.localizer.max_ratio", "sample.grid"]) == meant
+    assert nearest(wrong, ["mapping.n_images", "label.localizer.max_ratio", "sample.grid"]) == meant
 
 
 @pytest.mark.parametrize(("name", "gpus"), [("cuda", 0), ("cuda:3", 1)])

@@ -150,7 +150,7 @@ def _obj(folder: Path) -> None:
 
 def _settings(folder: Path) -> None:
     shutil.copyfile(CONFIGS / "demo.yaml", folder / "demo.yaml")
-    (folder / "alias.yaml").write_text("name: &a b\nscenes: {train: 1, kinds: [hall]}\nmap: {n_images: 5}\n")
+    (folder / "alias.yaml").write_text("name: &a b\nscenes: {train: 1, kinds: [hall]}\nmapping: {n_images: 5}\n")
 
 
 def _waypoints(folder: Path) -> None:

@@ -104,7 +104,7 @@ def test_a_scene_of_photographs_alone_is_evaluated_and_adapted_to(
     sparse, database, _ = checked
     where = ["--name", "mine", "--data", str(tmp_path / "data"), "--tracking.folder", str(tmp_path / "mlruns")]
     where += ["--device", "cpu", "--label.workers", "1"]
-    model = ["--model", str(sparse), "--database", str(database), "--map.existing.camera_id", "1"]
+    model = ["--model", str(sparse), "--database", str(database), "--mapping.existing.camera_id", "1"]
     assert main(["map", *where, *model]) == 0
     methods = ["--evaluate.methods", "[visible, set]", "--evaluate.weights", f"[{SET}]"]
     assert main(["evaluate", *where, *methods, "--evaluate.photographs", "true"]) == 0

@@ -150,7 +150,7 @@ def experiment(mapped, photographs: Path, tmp_path_factory: pytest.TempPathFacto
         name="photos",
         data=tmp_path_factory.mktemp("data"),
         device="cpu",
-        map=config_of(photographs),
+        mapping=config_of(photographs),
         sample=SampleConfig(grid=(6, 4, 3), directions=60, keep=10),
         scenes=ScenesConfig(mapped_space=MappedSpaceConfig(max_camera_distance_m=0.6)),
     )
@@ -164,8 +164,8 @@ def experiment(mapped, photographs: Path, tmp_path_factory: pytest.TempPathFacto
 @pytest.mark.slow
 def test_a_scene_of_photographs_is_sampled_and_scored_but_not_labelled(experiment: AllOptions) -> None:
     scale = ScaleConfig(marker_size_m=MARKERS[0].size_m)
-    photographs = replace(experiment.map.photographs, scale=scale)
-    metric = replace(experiment, map=replace(experiment.map, photographs=photographs))
+    photographs = replace(experiment.mapping.photographs, scale=scale)
+    metric = replace(experiment, mapping=replace(experiment.mapping, photographs=photographs))
     said: list[str] = []
     run(Map, metric, said.append)
     assert any("scale from markers" in line for line in said)

@@ -122,7 +122,7 @@ scenes:
   train: 0
   test: 1
   apartment: {n_rooms: 3, area_m2: 26, texture_size: 1024, texels_per_m: 40, light_spacing_m: 0.5, light_rays: 4}
-map: {n_images: 24}
+mapping: {n_images: 24}
 sample: {grid: [6, 6, 4], directions: 100, keep: 50, max_locations: 40, max_directions: 8}
 label: {workers: 1, shard_size: 32}
 """)

@@ -86,7 +86,7 @@ def experiment_of(model: Path, data: Path, **existing: object) -> AllOptions:
         data=data,
         device="cpu",
         scenes=ScenesConfig(mapped_space=MappedSpaceConfig(max_camera_distance_m=0.6)),
-        map=MapConfig(existing=ExistingModelConfig(model, **existing)),  # type: ignore[arg-type]
+        mapping=MapConfig(existing=ExistingModelConfig(model, **existing)),  # type: ignore[arg-type]
         sample=SampleConfig(grid=(6, 5, 3), directions=40, keep=10, max_locations=6),
         viewpoint_map=ViewpointMapConfig(grid=(6, 5, 3), directions=30, method="visible"),
         tracking=TrackingConfig(str(data / "mlruns")),
@@ -145,7 +145,7 @@ def test_one_of_several_cameras_is_chosen(tmp_path):
         run(Sample, experiment_of(folder, tmp_path / "data"))
     # each model that joins the dataset keeps its own camera
     experiment = experiment_of(save(room_model(), tmp_path / "second"), tmp_path / "more")
-    run(Map, replace(experiment, map=experiment_of(folder, tmp_path / "more", camera_id=2).map))
+    run(Map, replace(experiment, mapping=experiment_of(folder, tmp_path / "more", camera_id=2).mapping))
     scenes = run(Map, experiment).scenes
     assert [(scene.name, scene.camera) for scene in scenes] == [("flat", OTHER), ("second", LOOKS)]
     run(Sample, experiment)

@@ -41,7 +41,7 @@ scenes:
   train: 1
   test: 1
   apartment: {n_rooms: 3, area_m2: 26, texture_size: 1024, texels_per_m: 40, light_spacing_m: 0.5, light_rays: 4}
-map: {n_images: 24}
+mapping: {n_images: 24}
 sample: {grid: [6, 6, 4], directions: 100, keep: 50, max_locations: 8, max_directions: 5}
 label: {workers: 1, shard_size: 20}
 train: {val_fraction: 0.3, methods: [mlp-2d, mlp-2d+3d, set], mlp: {epochs: 2}, set: {epochs: 2, batch_size: 1}}

@@ -30,7 +30,7 @@ def experiment(tmp_path_factory):
     few = SampleConfig(max_locations=4, max_directions=6, min_visible=1)
     scenes = ScenesConfig(rgbd=rgbd)
     return AllOptions(
-        name="scan", data=folder / "data", device="cpu", scenes=scenes, map=MapConfig(n_images=30), sample=few
+        name="scan", data=folder / "data", device="cpu", scenes=scenes, mapping=MapConfig(n_images=30), sample=few
     )
 
 

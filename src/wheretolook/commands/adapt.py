@@ -130,8 +130,8 @@ class Adapt(SceneOptions, LabelOptions):
         name = ExistingModelConfig(model=model).scene_name
         target = self._target(name, folder_of_check(self.data, name) / "adapted.safetensors")
         scale = read_scale(model)
-        if scale is not None and not scale.is_metric and not self.map.photographs.assume_metric:
-            fix = "Map it with a scale (map.photographs.scale), or pass --map.photographs.assume_metric true."
+        if scale is not None and not scale.is_metric and not self.mapping.photographs.assume_metric:
+            fix = "Map it with a scale (mapping.photographs.scale), or pass --mapping.photographs.assume_metric true."
             raise MapError("the map has no scale, and this needs metres", path=model, value=scale.source, fix=fix)
         points = model_arrays(read_model(model)).points
         occlusion = "none" if self.occlusion.model == "none" else "hidden-points"
@@ -252,7 +252,7 @@ class Adapt(SceneOptions, LabelOptions):
         ids, row = np.unique(table["location_id"].to_numpy(), return_inverse=True)
         order = np.random.default_rng(self.adapt.seed).permutation(len(ids))[row.reshape(-1)]
         table = table.iloc[np.argsort(order, kind="stable")].reset_index(drop=True)
-        job = scene_job(files, self.label, extractor_of(files, self.map.extractor), scene.device)
+        job = scene_job(files, self.label, extractor_of(files, self.mapping.extractor), scene.device)
         tasks = []
         for begin in range(0, len(table), _VIEWS_PER_TASK):
             part = table.iloc[begin : begin + _VIEWS_PER_TASK]

@@ -169,7 +169,7 @@ class Check(OcclusionOptions, ScorerOptions):
         ).occlusion
         if rendered and not any((self.images, self.database, find_features(model), find_photographs(model))):
             problem = "neither the features nor the photographs of this map are known"
-            fix = "Map the scene again with `wheretolook map --map.keep_database true`, which keeps the features."
+            fix = "Map the scene again with `wheretolook map --mapping.keep_database true`, which keeps the features."
             raise MapError(problem, path=model, fix=fix)
         given = (self.images, self.database)
         folder, features = features_of(model, *given, work, workers, device, self._extractor())

@@ -59,7 +59,7 @@ class Demo(Experiment):
     CONFIG: ClassVar = "demo"
     SHORT: ClassVar = {
         "engine": "label.engine",
-        "images": "map.photographs.images",
+        "images": "mapping.photographs.images",
         "rgbd": "scenes.rgbd.folder",
         "up": "scenes.rgbd.up",
     }

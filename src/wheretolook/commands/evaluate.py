@@ -96,7 +96,7 @@ def held_out_photographs(options: Evaluate, dataset: Dataset, log: Log) -> list[
     held_out = []
     for files in filter(knows_photographs, dataset.split(options.evaluate.split)):
         log(f"{files.name}: holding out blocks of photographs")
-        metric = options.map.photographs.assume_metric or not files.is_photographed or says_metric(files.map)
+        metric = options.mapping.photographs.assume_metric or not files.is_photographed or says_metric(files.map)
         how = (check_name(options, files), metric, files.mesh.is_file())
         source, views = hold_out_photographs(options, "evaluate", files.map, *how)
         occlusion = open_scene(options, files).occlusion

@@ -39,13 +39,13 @@ class Label(LabelOptions):
       wheretolook label --config configs/paper.yaml --engine ray
 
     Args:
-        map: where the weights of the map's extractor are, if they have moved.
+        mapping: where the weights of the map's extractor are, if they have moved.
         tracking: where MLflow keeps its runs.
     """
 
     SHORT: ClassVar = {"engine": "label.engine"}
 
-    map: MapUseOptions = field(default_factory=MapUseOptions)
+    mapping: MapUseOptions = field(default_factory=MapUseOptions)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 
     @changes_dataset("label")
@@ -85,7 +85,7 @@ class Label(LabelOptions):
         return dataset
 
     def _key(self, files: SceneFolder) -> str:
-        extractor = extractor_of(files, self.map.extractor)
+        extractor = extractor_of(files, self.mapping.extractor)
         settings = [self.label.localizer.record(), extractor.record(), files.camera.record()]
         made_from = [existing(files.mesh, SceneError, "scenes"), existing(files.landmarks, MapError, "map")]
         matches = [name for name in ("store_matches", "store_pixels") if getattr(self.label, name)]
@@ -102,7 +102,7 @@ class Label(LabelOptions):
         scenes = {files.name: files for files in to_label}
         tasks = []
         for files in to_label:
-            job = scene_job(files, config, extractor_of(files, self.map.extractor), self.warp_device)
+            job = scene_job(files, config, extractor_of(files, self.mapping.extractor), self.warp_device)
             job = replace(job, store_matches=config.store_matches, store_pixels=config.store_pixels)
             tasks.append(LabelTask(files.name, job, files.read_table(), _shards(files)))
         seconds = Counter[str]()

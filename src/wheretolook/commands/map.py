@@ -37,7 +37,7 @@ class Map(SceneOptions, LabelOptions):
 
     A model of your own, from COLMAP or hloc, in metres with z up, becomes a scene for sample, viewpoint-map and plan.
     Mesh and database are optional. With --images its landmarks are triangulated again. If it is not upright, or not in
-    metres: --map.existing.level true, --map.photographs.scale.positions FILE. Its own camera is the scene's, unless
+    metres: --mapping.existing.level true, --mapping.photographs.scale.positions FILE. Its own camera is the scene's, unless
     --camera names one.
 
     Examples:
@@ -45,35 +45,35 @@ class Map(SceneOptions, LabelOptions):
       wheretolook map --name mymap --model sparse/0 --mesh scan.glb --database database.db
 
     Args:
-        map: what is mapped, and how.
+        mapping: what is mapped, and how.
     """
 
     SHORT: ClassVar = {
-        "images": "map.photographs.images",
-        "model": "map.existing.model",
-        "mesh": "map.existing.mesh",
-        "database": "map.existing.database",
+        "images": "mapping.photographs.images",
+        "model": "mapping.existing.model",
+        "mesh": "mapping.existing.mesh",
+        "database": "mapping.existing.database",
         "engine": "label.engine",
     }
 
-    map: MapConfig = field(default_factory=MapConfig)  # type: ignore[assignment]
+    mapping: MapConfig = field(default_factory=MapConfig)  # type: ignore[assignment]
 
     @changes_dataset("map")
     def run(self, log: Log = print, progress: Progress = ignore_progress) -> Dataset:
         """Write a COLMAP model of every scene with attributes of its landmarks, `<scene>/map/`.
 
-        Images are rendered along a walk, or for a scan at the poses of its frames. `map.photographs.images` makes one
-        scene of photographs, without a mesh; `map.existing.model` one of that model, with or without a mesh. Raises
+        Images are rendered along a walk, or for a scan at the poses of its frames. `mapping.photographs.images` makes one
+        scene of photographs, without a mesh; `mapping.existing.model` one of that model, with or without a mesh. Raises
         SceneError or MapError if a mesh or a model cannot be read, or no landmark could be triangulated.
         """
-        if self.map.existing.model is None and self.map.photographs.images is None:
+        if self.mapping.existing.model is None and self.mapping.photographs.images is None:
             dataset = load_dataset(self, "scenes")
             for files in dataset.scenes:
                 _map_mesh(self, files, log)
                 progress(1)
             return dataset
         refuse_release(self.root)
-        scene, dataset = (_map_photographs if self.map.existing.model is None else _import_model)(self, log)
+        scene, dataset = (_map_photographs if self.mapping.existing.model is None else _import_model)(self, log)
         scale = read_scale(scene.map)
         assert scale is not None
         log(f"{scene.name}: {scale.describe()}; camera {describe_camera(scene.camera)}")
@@ -84,7 +84,7 @@ class Map(SceneOptions, LabelOptions):
 
 def _map_mesh(options: Map, files: SceneFolder, log: Log) -> None:
     """Map a scene by renders of its mesh, unless its map is current."""
-    config = options.map
+    config = options.mapping
     unused = ("photographs", "existing", "camera", "draw_camera")  # the mapping camera is a part of the key itself
     settings = {name: value for name, value in config.record().items() if name not in unused}
     scene = open_scene(options, files)
@@ -129,7 +129,7 @@ def _mapping_camera(config: MapConfig, looking: Camera, seed: int) -> PinholeCam
         return draw_camera(np.random.default_rng([seed, 1]))
     camera = looking if config.camera is None else config.camera.camera
     if not isinstance(camera, PinholeCamera):
-        fix = "Give one without distortion: --map.camera '{width: 640, height: 480, fov_deg: 90}'."
+        fix = "Give one without distortion: --mapping.camera '{width: 640, height: 480, fov_deg: 90}'."
         raise ConfigError("a mesh is mapped with a pinhole camera", value=camera.model, fix=fix)
     return camera
 
@@ -140,13 +140,13 @@ def _seed(scene: SceneFolder) -> int:
 
 
 def _map_photographs(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
-    """Map the photographs in `map.photographs.images`: `<scene>/map/`, with finished steps in `<scene>/photographs/`.
+    """Map the photographs in `mapping.photographs.images`: `<scene>/map/`, with finished steps in `<scene>/photographs/`.
 
     Returns the scene, and the dataset with it. Raises what `map_photographs` does.
     """
     from wheretolook.mapping.photographs import list_photographs
 
-    settings = options.map.photographs
+    settings = options.mapping.photographs
     folder = settings.images
     assert folder is not None
     scene = _new_scene(options, settings.name or folder.resolve().name)
@@ -154,18 +154,18 @@ def _map_photographs(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     tables = [path for path in (settings.scale.marker_table, settings.scale.positions) if path is not None]
     for path in tables:
         if not path.is_file():
-            raise ConfigError("there is no such table", path=path, fix="Check map.photographs.scale.")
+            raise ConfigError("there is no such table", path=path, fix="Check mapping.photographs.scale.")
     images = size_and_time([folder / name for name in list_photographs(folder)])
-    used = [replace(settings, assume_metric=False).record(), options.map.extractor.record()]
+    used = [replace(settings, assume_metric=False).record(), options.mapping.extractor.record()]
     made_from = [images, [fingerprint(path) for path in tables]]
-    cache = scene.stage_cache("map", cache_key("map", [*used, options.map.keep_database, _seed(scene), *made_from]))
+    cache = scene.stage_cache("map", cache_key("map", [*used, options.mapping.keep_database, _seed(scene), *made_from]))
     if cache.is_current(scene.landmarks, scene.mapping_cameras):
         log(f"{scene.name}: reusing {scene.map}")
         return scene, dataset
     from wheretolook.mapping.photograph_map import map_photographs
 
     how = (scene.folder / "photographs", _seed(scene), options.n_workers, options.warp_device)
-    report = map_photographs(options.map, scene.map, *how, before_replace=cache.clear)
+    report = map_photographs(options.mapping, scene.map, *how, before_replace=cache.clear)
     cache.store()
     used_images = f"{report.n_registered} of {report.n_images} photographs"
     log(f"{scene.name}: {report.n_landmarks:,} landmarks from {used_images} -> {scene.map}")
@@ -175,15 +175,15 @@ def _map_photographs(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
 
 
 def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
-    """Make a scene of the model in `map.existing.model`: `<scene>/map/`, and `<scene>/mesh.glb` if a mesh is given.
+    """Make a scene of the model in `mapping.existing.model`: `<scene>/map/`, and `<scene>/mesh.glb` if a mesh is given.
 
     Returns the scene, and the dataset with it. Raises what `map_existing` does, ConfigError for a mesh of a model that
     is transformed, and SceneError if the mesh cannot be used.
     """
     from wheretolook.mapping.colmap_model import read_model
 
-    settings = options.map.existing
-    photographs = options.map.photographs
+    settings = options.mapping.existing
+    photographs = options.mapping.photographs
     folder = settings.model
     assert folder is not None
     scene = _new_scene(options, settings.scene_name)
@@ -200,7 +200,7 @@ def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
         names = [image.name for _, image in sorted(model.images.items())]
         files += [path_within(photographs.images, name, "the name of a model's image") for name in names]
     mesh = [] if settings.mesh is None else [mesh_fingerprint(settings.mesh)]
-    chosen = {name: value for name, value in options.map.record().items() if name not in ("camera", "draw_camera")}
+    chosen = {name: value for name, value in options.mapping.record().items() if name not in ("camera", "draw_camera")}
     made_from = size_and_time(filter(Path.is_file, files))
     cache = scene.stage_cache("map", cache_key("map", [chosen, _seed(scene), made_from, mesh]))
     if cache.is_current(scene.landmarks, scene.mapping_cameras, *([scene.mesh] if mesh else [])):
@@ -214,7 +214,7 @@ def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     loaded = None if settings.mesh is None else load_mesh(settings.mesh, settings.mesh_up, colored=False)
     cache.clear()
     how = (scene.folder / "photographs", _seed(scene), options.n_workers, options.warp_device)
-    report = map_existing(options.map, scene.map, *how, reconstruction=model)
+    report = map_existing(options.mapping, scene.map, *how, reconstruction=model)
     scene.mesh.unlink(missing_ok=True)
     if settings.mesh is not None and loaded is not None:
         warn_of_mesh(settings.mesh, scene.read_landmarks().points, MeshRaycaster(loaded, options.warp_device))
@@ -228,7 +228,7 @@ def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
 
 def _new_scene(options: Map, name: str) -> SceneFolder:
     """Return the scene of photographs or of a model. Raises ConfigError if the name cannot be a folder's."""
-    check_folder_name("a scene's name, map.photographs.name or map.existing.name,", name, NOT_SCENES)
+    check_folder_name("a scene's name, mapping.photographs.name or mapping.existing.name,", name, NOT_SCENES)
     return SceneFolder(options.root / name, "test", options.camera.camera)
 
 
@@ -240,7 +240,9 @@ def _with_own_camera(scene: SceneFolder, model: Any, settings: ExistingModelConf
     try:
         return replace(scene, camera=camera_of_model(model, settings.model, settings.camera_id), own_camera=True)
     except MapError as error:
-        fix = "Name one of the model's, --map.existing.camera_id 1, or describe another, such as --camera.fov_deg 70."
+        fix = (
+            "Name one of the model's, --mapping.existing.camera_id 1, or describe another, such as --camera.fov_deg 70."
+        )
         raise MapError(error.problem, path=error.path, value=error.value, fix=fix) from error
 
 

@@ -56,7 +56,7 @@ class DatasetOptions(Command):
         name: name of the dataset and its folder.
         data: folder of all datasets.
         device: where to compute: auto, cpu, cuda, or cuda:<index>.
-        camera: the camera of the viewpoints; it also maps unless `map.camera` names another.
+        camera: the camera of the viewpoints; it also maps unless `mapping.camera` names another.
     """
 
     name: str = "demo"
@@ -125,12 +125,12 @@ class SceneOptions(DatasetOptions):
     Args:
         occlusion: how occluded landmarks are recognized.
         scenes: where a camera can be.
-        map: how maps are used.
+        mapping: how maps are used.
     """
 
     occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)
     scenes: SpaceOptions = field(default_factory=SpaceOptions)
-    map: MapUseOptions = field(default_factory=MapUseOptions)
+    mapping: MapUseOptions = field(default_factory=MapUseOptions)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,13 +162,13 @@ class Experiment(SceneOptions, LabelOptions):
 
     Args:
         scenes: meshes.
-        map: COLMAP maps of meshes or of photographs.
+        mapping: COLMAP maps of meshes or of photographs.
         sample: viewpoints and which landmarks they see.
         tracking: where MLflow keeps its runs.
     """
 
     scenes: ScenesConfig = field(default_factory=ScenesConfig)  # type: ignore[assignment]
-    map: MapConfig = field(default_factory=MapConfig)  # type: ignore[assignment]
+    mapping: MapConfig = field(default_factory=MapConfig)  # type: ignore[assignment]
     sample: SampleConfig = field(default_factory=SampleConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 

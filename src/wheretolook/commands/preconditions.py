@@ -53,7 +53,7 @@ def load_dataset(
 def open_scene(options: SceneOptions, files: SceneFolder) -> SceneEnvironment:
     """Return a scene of the dataset with a command's occlusion, free space and device; nothing is read yet."""
     scenes = options.scenes
-    assume_metric = options.map.photographs.assume_metric
+    assume_metric = options.mapping.photographs.assume_metric
     config = EnvironmentConfig(options.occlusion, scenes.free_space, scenes.mapped_space, assume_metric)
     return SceneEnvironment(files, config=config, device=options.device)
 
@@ -95,7 +95,7 @@ def extractor_of(scene: SceneFolder, given: ExtractorConfig | None = None) -> Ex
     if given is not None and given.weights and given.method == extractor.method:
         extractor = replace(extractor, weights=given.weights)
     if extractor.weights and not Path(extractor.weights).is_file():
-        fix = f"Give their new path: --map.extractor.method {extractor.method} --map.extractor.weights FILE."
+        fix = f"Give their new path: --mapping.extractor.method {extractor.method} --mapping.extractor.weights FILE."
         raise WeightsError("the weights that this map was made with are missing", path=extractor.weights, fix=fix)
     return extractor
 

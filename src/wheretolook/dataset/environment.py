@@ -295,8 +295,8 @@ class SceneEnvironment(Environment):
         """Raise MapError if the map is not known to be in metres, unless `assume_metric` is set."""
         scale = read_scale(self.files.map)
         if scale is not None and not scale.is_metric and not self.config.assume_metric:
-            fix = "Map it with marker sizes, a distance or positions (map.photographs.scale), or pass "
-            fix += "--map.photographs.assume_metric true to take its unit for a metre."
+            fix = "Map it with marker sizes, a distance or positions (mapping.photographs.scale), or pass "
+            fix += "--mapping.photographs.assume_metric true to take its unit for a metre."
             problem = "the map has no scale, and this needs metres"
             raise MapError(problem, path=self.files.map, value=scale.source, fix=fix)
 

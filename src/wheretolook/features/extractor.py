@@ -34,7 +34,7 @@ class Extractor:
     inside the functions given here.
     """
 
-    name: str  # in options: `map.extractor.method`
+    name: str  # in options: `mapping.extractor.method`
     descriptors: DescriptorKind
     build: Callable[[Any, str], Extraction] | None = None  # from an `ExtractorConfig` and a device, "cpu" or CUDA
     weights: str = ""  # usual name of the file of a network's weights; "" for none

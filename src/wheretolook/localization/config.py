@@ -21,7 +21,7 @@ class LocalizerConfig:
         min_similarity: minimum cosine of mutual nearest neighbours for learned features; by default the extractor's.
         lightglue: file of LightGlue weights for the map's features (aliked_lightglue.pth), or kornia for its copy. A
             query is then matched with mapping images, as in hloc, instead of with landmarks. Needs a map with its
-            database (`map.keep_database`) and the extra `learned`.
+            database (`mapping.keep_database`) and the extra `learned`.
         lightglue_images: number of these mapping images: those that observe most of the landmarks matched first.
         max_error_px: maximum reprojection error of an inlier in RANSAC.
         min_inliers: inliers that a pose needs: RANSAC finds some pose with a few for almost any image.

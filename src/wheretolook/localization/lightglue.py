@@ -51,7 +51,7 @@ class LightGlueMatcher:
             fix = f"Leave label.localizer.lightglue out, or map with one of {', '.join(supported)}."
             raise ConfigError("LightGlue does not support these features", value=landmarks.features, fix=fix)
         if map_dir is None or not (map_dir / _DATABASE).is_file():
-            fix = "Map again with --map.keep_database true."
+            fix = "Map again with --mapping.keep_database true."
             raise MapError("LightGlue needs the database of the mapping images", path=map_dir, fix=fix)
         self.landmarks = landmarks
         self.map_dir = map_dir

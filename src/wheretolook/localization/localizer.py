@@ -95,7 +95,7 @@ class Localizer:
     def _check_extractor(self) -> None:
         if kind_of(self._extractor.method) != self.kind:
             problem = f"the map has {self.kind.name} descriptors"
-            fix = "Use this extractor for queries, or map again with --map.extractor.method."
+            fix = "Use this extractor for queries, or map again with --mapping.extractor.method."
             raise MapError(problem, value=self._extractor.method, fix=fix)
 
     def localize(self, rgb: NDArray[np.uint8]) -> Localization:

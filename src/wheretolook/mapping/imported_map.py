@@ -30,7 +30,7 @@ from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.images import image_size
 
 _EITHER = "Leave --database out to triangulate again, or --images to keep the model's landmarks."
-_FIX = "Raise map.existing.max_reprojection_error_px, or check the model's poses and intrinsics."
+_FIX = "Raise mapping.existing.max_reprojection_error_px, or check the model's poses and intrinsics."
 _PROPORTION_TOLERANCE = 0.01  # between the proportions of a photograph and of its camera
 _EXIF_ORIENTATION = 274
 _SIDEWAYS = (5, 6, 7, 8)  # values of EXIF's orientation for photographs that are stored on a side
@@ -69,7 +69,7 @@ def map_existing(
     settings = config.existing
     photographs = config.photographs
     if settings.model is None:
-        raise ConfigError("no model was named", fix="Set map.existing.model.")
+        raise ConfigError("no model was named", fix="Set mapping.existing.model.")
     if photographs.images is not None and settings.database is not None:
         raise ConfigError("images give new keypoints, which a database does not describe", fix=_EITHER)
     known = KnownScale.read(photographs.scale)

@@ -18,7 +18,7 @@ from wheretolook.mapping.photographs import photograph_cameras
 from wheretolook.mapping.sfm import map_incrementally, photograph_features
 from wheretolook.utils.errors import ConfigError
 
-_FIX = "Raise map.photographs.max_reprojection_error_px, or take sharper photographs."
+_FIX = "Raise mapping.photographs.max_reprojection_error_px, or take sharper photographs."
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def map_photographs(
     """
     settings = config.photographs
     if settings.images is None:
-        raise ConfigError("no folder of photographs was named", fix="Set map.photographs.images.")
+        raise ConfigError("no folder of photographs was named", fix="Set mapping.photographs.images.")
     known = KnownScale.read(settings.scale)  # a damaged table is reported before the work
     work.mkdir(parents=True, exist_ok=True)
     with replacing_map(config, out_dir, seed, workers, device, progress, before_replace) as (folder, run):

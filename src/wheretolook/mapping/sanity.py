@@ -62,7 +62,7 @@ def mesh_warning(points: ArrayLike, raycaster: MeshRaycaster) -> str:
     return (
         f"half of the landmarks are {far} from the mesh, so it seems to be in another frame or unit than the model. "
         "Export both in the same frame, in metres; a mesh with y up (glTF's own) `wheretolook map --model` "
-        "turns with --map.existing.mesh_up y"
+        "turns with --mapping.existing.mesh_up y"
     )
 
 
@@ -79,7 +79,9 @@ def scale_warning(mapping_distance_m: ArrayLike, centers: ArrayLike) -> str:
         return ""
     lengths = f"landmarks are {distance:.3g} m from the cameras that mapped them, and these {spacing:.3g} m from the "
     lengths += f"nearest other (medians); plausible are {low:g} to {high:g} m, and at most {SPACING_M:g} m"
-    fix = "`wheretolook map --model` gives it a scale: --map.photographs.scale.positions, .distance or .marker_size_m"
+    fix = (
+        "`wheretolook map --model` gives it a scale: --mapping.photographs.scale.positions, .distance or .marker_size_m"
+    )
     return f"the model seems not to be in metres: {lengths}. {fix}. Ignore this warning if it is metric"
 
 
@@ -94,6 +96,6 @@ def up_axis_warning(cam_from_world: ArrayLike) -> str:
     up = " ".join(f"{value:.2f}" for value in np.round(gravity.up, 2) + 0.0)  # no -0.00
     return (
         f"the cameras are {how}: the up direction estimated from their orientations is ({up}), {off_deg:.0f} degrees from z, which is "
-        "up here. `wheretolook map --model` turns it upright with --map.existing.level true, or give a model with z up "
+        "up here. `wheretolook map --model` turns it upright with --mapping.existing.level true, or give a model with z up "
         "(COLMAP's model_orientation_aligner). Ignore this warning if the cameras were held so"
     )

@@ -185,7 +185,7 @@ def _reconstruct(database: Path, folder: Path, cameras: PhotographCameras, seed:
     ordered = sorted(mapped.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     if not ordered:
         fix = f"Give at least {_MIN_IMAGES} sharp photographs from different places, each of which overlaps the next;"
-        fix += " a focal length (map.photographs.camera_params) helps."
+        fix += " a focal length (mapping.photographs.camera_params) helps."
         raise MapError("the photographs do not overlap enough for a map", path=database, fix=fix)
     write_model(ordered[0], folder)
     return [model.num_reg_images() for model in ordered]

@@ -95,7 +95,7 @@ def _comparisons(options: ComparePaths, dataset: Dataset, log: Log) -> list[Scen
     comparisons = []
     for files in scenes:
         scene = open_scene(options, files)
-        extractor = extractor_of(files, options.map.extractor)
+        extractor = extractor_of(files, options.mapping.extractor)
         job = SceneJob(files.mesh, files.landmarks, scene.camera, options.label.localizer, extractor, scene.device)
         folder = dataset.root / "results" / FOLDER / scene.name
         comparisons.append(SceneComparison(scene, dataset, folder, config, weights, job, log))

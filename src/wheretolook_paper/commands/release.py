@@ -111,7 +111,13 @@ def _finish(options: Release, dataset: Dataset, log: Log, progress: Progress) ->
 def release_settings(options: Experiment) -> dict[str, Any]:
     """Return the settings that decide the contents of a dataset, as JSON values, with meshes by name instead of path."""
     meshes = [{"name": mesh.scene_name, "split": mesh.split, "up": mesh.up} for mesh in options.scenes.meshes]
-    settings = {name: _record(getattr(options, name)) for name in ("scenes", "map", "occlusion", "sample")}
+    groups = {
+        "scenes": options.scenes,
+        "map": options.mapping,
+        "occlusion": options.occlusion,
+        "sample": options.sample,
+    }
+    settings = {name: _record(group) for name, group in groups.items()}
     settings = {"camera": options.camera.camera.record(), **settings}
     settings["scenes"]["meshes"] = meshes
     settings["label"] = {"localizer": options.label.localizer.record()}

@@ -4,7 +4,7 @@
     python -m wheretolook_paper.studies.cameras --datasets '[data/test-45, data/test-60]' --split test --weights ...
 
 Datasets are labelled. The first line chooses on the val scenes of `configs/cameras.yaml`, the second tests by angle on
-datasets of the same scenes and maps made with `--camera.fov_deg 45 --map.camera '{fov_deg: 90}'` and so on. Scenes of
+datasets of the same scenes and maps made with `--camera.fov_deg 45 --mapping.camera '{fov_deg: 90}'` and so on. Scenes of
 a kind (`building-537` is a building) are averaged first, then kinds; narrow cameras (below 60 degrees) and wide ones
 (above 95) count as two more kinds where scenes have several cameras. 95 % intervals are over locations, neighbours
 resampled together; differences to the first method are paired.

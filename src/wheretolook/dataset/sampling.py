@@ -51,8 +51,8 @@ def sample_viewpoints(
 
     At every location all directions of the lattice are ranked by the number of landmarks in view (descending, then by
     direction id), and the best K are kept. Several cameras, by number, are assigned to the locations in turn.
-    `progress` is the text of a progress bar; `config.max_directions` that of the scene's split. The table is unlabelled and sorted by viewpoint id: location id times the
-    number of directions, plus direction id.
+    `progress` is the text of a progress bar; `config.max_directions` that of the scene's split. The table is unlabelled
+    and sorted by viewpoint id: location id times the number of directions, plus direction id.
 
     Raises:
         SceneError: no viewpoint sees enough landmarks, or a location is inside geometry.
@@ -63,8 +63,9 @@ def sample_viewpoints(
     ids = np.sort(_subset(np.asarray(location_ids, dtype=np.int64), config.max_locations, rng))
     locations = grid.centers()[ids]
     directions = config.axes()
-    memory_bytes = round(config.memory_gb * 1e9)
-    options = SurveyOptions(keep=config.keep, device=device, memory_bytes=memory_bytes, progress=progress)
+    options = SurveyOptions(
+        keep=config.keep, device=device, memory_bytes=round(config.memory_gb * 1e9), progress=progress
+    )
     rotations = rotation_looking_along(directions)
     several = cameras if isinstance(cameras, Mapping) else {0: cameras}
     numbers = np.array(list(several))[np.arange(len(ids)) % len(several)]

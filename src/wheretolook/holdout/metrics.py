@@ -7,6 +7,7 @@ rather too narrow than too wide.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -96,12 +97,7 @@ def measure(
     n_inliers = views["n_inliers"].to_numpy(np.float64)
     bootstrap = ClusterBootstrap(blocks, RESAMPLES, seed=0)
 
-    def record(statistics: Float) -> dict[str, float | None]:
-        """Value and 95 % interval of statistics (1 + R,) of the views and of each resample; None where unknown."""
-        low, high = bootstrap.interval(statistics)
-        named = {"value": statistics[0], "low": low, "high": high}
-        return {name: float(value) if np.isfinite(value) else None for name, value in named.items()}
-
+    record = partial(_record, bootstrap)
     place = places_of(centers, blocks, radius)
     scores = {method: views[column].to_numpy(np.float64) for method, column in columns.items()}
     areas = {method: resampled_auc(bootstrap, good, score) for method, score in scores.items()}
@@ -143,6 +139,13 @@ def measure(
         "inliers_found_over_expected": ratios,
         "share_in_range": float(views["in_range"].mean()),
     }
+
+
+def _record(bootstrap: ClusterBootstrap, statistics: Float) -> dict[str, float | None]:
+    """Return value and 95 % interval of statistics (1 + R,) of the views and of each resample; None where unknown."""
+    low, high = bootstrap.interval(statistics)
+    named = {"value": statistics[0], "low": low, "high": high}
+    return {name: float(value) if np.isfinite(value) else None for name, value in named.items()}
 
 
 def _correlation(a: Float, b: Float) -> float | None:

@@ -20,7 +20,7 @@ from wheretolook.localization.confidence import ConfidenceModel
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator
 from wheretolook.localization.rig import Look, rig_of
-from wheretolook.localization.rig_localization import JointLocalizer, SingleViewPoses
+from wheretolook.localization.rig_localization import JointLocalization, JointLocalizer, SingleViewPoses
 from wheretolook.utils.errors import TableError
 
 SET_COLUMNS = (
@@ -91,27 +91,29 @@ def label_sets(
                     single_view[row] = localizer.single_view_poses(look)
             result = localizer.localize(looks, [single_view[row] for row in key])
             seconds = time.perf_counter() - start
-            error_m = error_deg = np.nan
-            if result.cams_from_world is not None:
-                n = len(true) if rigs is None else 1
-                error_m, error_deg = (error.max() for error in pose_error(result.cams_from_world[:n], true[:n]))
-            known[key] = (
-                len(key),
-                locations[key[0]],
-                result.status,
-                error_m,
-                error_deg,
-                result.n_matches,
-                result.n_inliers,
-                result.support,
-                result.rival_support,
-                *result.unique_support,
-                *result.deviation,
-                ConfidenceModel.bundled().of(result),
-                seconds,
-            )
+            label = _label(result, true if rigs is None else true[:1])
+            known[key] = (len(key), locations[key[0]], *label, seconds)
         rows.append(known[key])
     return pd.DataFrame(rows, columns=list(SET_COLUMNS))
+
+
+def _label(result: JointLocalization, true: Float) -> tuple[object, ...]:
+    """Return the values of `SET_COLUMNS` from a joint pose and the true poses (N, 3, 4) of its first N views."""
+    error_m = error_deg = np.nan
+    if result.cams_from_world is not None:
+        error_m, error_deg = (error.max() for error in pose_error(result.cams_from_world[: len(true)], true))
+    return (
+        result.status,
+        error_m,
+        error_deg,
+        result.n_matches,
+        result.n_inliers,
+        result.support,
+        result.rival_support,
+        *result.unique_support,
+        *result.deviation,
+        ConfidenceModel.bundled().of(result),
+    )
 
 
 def _look(

@@ -46,7 +46,7 @@ def build_viewpoint_map(
         progress: text of the progress bar; None shows none.
 
     Raises:
-        SceneError: no voxel is free, or the centre of one lies inside geometry.
+        SceneError: no voxel is free, or the centre of one is inside geometry.
         MapError: the map has no landmarks.
         ConfigError: no directions or more than 65,536, or ids outside the grid.
         ValueError: directions that are not (D, 3), not finite or of length 0.
@@ -55,7 +55,7 @@ def build_viewpoint_map(
     given = np.asarray(free)
     rows = np.flatnonzero(given) if given.dtype == bool else np.unique(given.astype(np.int64))
     if len(rows) == 0:
-        raise SceneError("no voxel is free", value=len(grid), fix="Refine the grid, or check where it lies.")
+        raise SceneError("no voxel is free", value=len(grid), fix="Refine the grid, or check its position.")
     if rows[0] < 0 or rows[-1] >= len(grid):
         raise ConfigError("ids of free voxels lie outside the grid", value=(int(rows[0]), int(rows[-1])))
     landmarks = scorer.localization_map.landmarks

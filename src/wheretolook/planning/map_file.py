@@ -87,7 +87,7 @@ IN C++, the best direction at a point (for little-endian machines):
 
 TO UPDATE
   landmark_ids and landmark_digests (of each landmark's position, and of its attributes: the first 8 bytes of BLAKE2b)
-  tell `update_viewpoint_map` which landmarks were added; a planner has no use for them.
+  let `update_viewpoint_map` know which landmarks were added; a planner has no use for them.
 """
 
 

@@ -199,7 +199,7 @@ class NestedRun:
 def log_nested(tracking: TrackingConfig, parent: str, stage: str, runs: Iterable[NestedRun], tags: Tags = None) -> None:
     """Log finished runs of a stage within the run with id `parent`, all with the same tags.
 
-    MLflow needs 25 ms for a run and 0.3 ms for a metric (`tests/benchmarks/bench_tracking.py`): hundreds of runs take
+    MLflow needs 25 ms for a run and 0.3 ms for a metric (measured with SQLite): hundreds of runs take
     half a minute.
     """
     mlflow_client = client(tracking)

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from wheretolook.commands.options import CameraOptions, OcclusionOptions, ScorerOptions
+from wheretolook.commands.selector_options import SelectorOptions
 from wheretolook.select.request import SelectionRequest
 from wheretolook.utils.errors import ConfigError
 
 if TYPE_CHECKING:
-    from wheretolook.geometry.camera import Camera
     from wheretolook.select.views import SelectedViews
     from wheretolook.select.waypoints import Waypoints
     from wheretolook.select.where_to_look import WhereToLook
 
 
 @dataclass(frozen=True, kw_only=True)
-class Select(SelectionRequest, CameraOptions, OcclusionOptions, ScorerOptions):
+class Select(SelectionRequest, SelectorOptions):
     """Select the best views at waypoints of your own COLMAP model; needs no dataset.
 
     Waypoints (--at):
@@ -46,93 +44,33 @@ class Select(SelectionRequest, CameraOptions, OcclusionOptions, ScorerOptions):
       wheretolook select --map sparse/0 --grid 0.5 --mesh house.glb --fov 60 --out views.csv
 
     Args:
-        map: folder of a COLMAP model, binary or text, in metres with z up.
         at: waypoints: a file, or x,y,z in metres, any number of them.
         grid: instead, waypoints this many metres apart in all free space.
-        out: file of the views; its ending decides the format.
-        format: csv, json, tum, colmap or benchmark.
-        fov: instead of a camera, horizontal field of view of a pinhole in degrees.
-        size: image size of that pinhole in pixels, such as 640x480.
-        depth: folder of depth images, named like the map's images.
-        depth_scale: units of integer depth images in a metre.
-        database: the map's database, whose descriptors show which landmarks look alike.
         directions: number of directions scored at each waypoint.
         lattice: fibonacci (even), or yaw-pitch (ActLoc's 6 x 18).
-        max_error: leave out landmarks with a larger mean reprojection error, in pixels.
-        device: where to compute: auto, cpu, cuda, or cuda:<index>.
     """
 
     SHORT: ClassVar = {"pitch": "pitch_deg", "max-turn": "max_turn_deg", "max-total-turn": "max_total_turn_deg"}
 
-    map: Path
-    out: Path
     at: tuple[str, ...] = ()
     grid: float | None = None
-    format: str | None = None
-    fov: float | None = None
-    size: str | None = None
-    depth: Path | None = None
-    depth_scale: float = 1000.0
-    database: Path | None = None
     directions: int = 500
     lattice: Literal["fibonacci", "yaw-pitch"] = "fibonacci"
-    max_error: float | None = None
-    device: str = "auto"
 
     def __post_init__(self) -> None:
         from wheretolook.select.formats import check_format
 
-        super().__post_init__()
+        SelectionRequest.__post_init__(self)
+        SelectorOptions.__post_init__(self)
         check_format(self.out, self.format, max(self.n, self.looks or 1))
         if bool(self.at) == (self.grid is not None):
             raise ConfigError("waypoints are given by either --at or --grid")
-        self.named_camera()
-
-    def named_camera(self) -> Camera | int | None:
-        """Return the camera asked for: one, a camera_id of the map, or None for the map's own."""
-        from wheretolook.geometry.camera import PinholeCamera, parse_size
-
-        described = super().named_camera()
-        if self.fov is None:
-            if self.size is not None:
-                raise ConfigError("an image size belongs to a field of view, --fov", value=self.size)
-            return described
-        if described is not None:
-            raise ConfigError("the camera is described in several ways", value=self.fov, fix="Give one of them.")
-        return PinholeCamera.of_field_of_view(self.fov, *parse_size(self.size or "640x480"))
 
     def run(self) -> SelectedViews:
         """Select the views, write them to `out` and print a summary."""
-        from wheretolook.mapping.colmap_model import model_suffix
-        from wheretolook.utils.devices import usable_device
-        from wheretolook.utils.warp import start_warp
-        from wheretolook.visibility.listing import compile_kernels
-
         start = time.monotonic()
         waypoints = self._waypoints()
-        model_suffix(self.map)
-        device = usable_device(self.device)
-        with ThreadPoolExecutor(1) as executor:  # kernels compile, if they must, during imports and reading
-            compiled = executor.submit(compile_kernels, start_warp(device))
-            from wheretolook.select.where_to_look import WhereToLook
-
-            selector = WhereToLook.from_colmap(
-                self.map,
-                weights=self.weights,
-                method=self.method,
-                camera=self.named_camera(),
-                mesh=self.mesh,
-                depth=self.depth,
-                depth_scale=self.depth_scale,
-                occlusion=self.occlusion,
-                database=self.database,
-                directions=self.directions,
-                lattice=self.lattice,
-                max_reprojection_error_px=self.max_error,
-                device=device,
-                anywhere=self.anywhere,
-            )
-            compiled.result()
+        selector = self.open_map(directions=self.directions, lattice=self.lattice)
         if waypoints is None:
             assert self.grid is not None
             waypoints = selector.grid(self.grid)

@@ -1,0 +1,91 @@
+"""Options of the commands that score views of a COLMAP model: `select` (and `score`)."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from wheretolook.commands.options import CameraOptions, OcclusionOptions, ScorerOptions
+from wheretolook.utils.errors import ConfigError
+
+if TYPE_CHECKING:
+    from wheretolook.geometry.camera import Camera
+    from wheretolook.select.where_to_look import WhereToLook
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelectorOptions(CameraOptions, OcclusionOptions, ScorerOptions):
+    """A COLMAP model, and how its views are scored.
+
+    Args:
+        map: folder of a COLMAP model, binary or text, in metres with z up.
+        out: file of the views; its ending decides the format.
+        format: csv, json, tum, colmap or benchmark.
+        fov: instead of a camera, horizontal field of view of a pinhole in degrees.
+        size: image size of that pinhole in pixels, such as 640x480.
+        depth: folder of depth images, named like the map's images.
+        depth_scale: units of integer depth images in a metre.
+        database: the map's database, whose descriptors show which landmarks look alike.
+        max_error: leave out landmarks with a larger mean reprojection error, in pixels.
+        device: where to compute: auto, cpu, cuda, or cuda:<index>.
+    """
+
+    map: Path
+    out: Path
+    format: str | None = None
+    fov: float | None = None
+    size: str | None = None
+    depth: Path | None = None
+    depth_scale: float = 1000.0
+    database: Path | None = None
+    max_error: float | None = None
+    device: str = "auto"
+
+    def __post_init__(self) -> None:
+        self.named_camera()
+
+    def named_camera(self) -> Camera | int | None:
+        """Return the camera asked for: one, a camera_id of the map, or None for the map's own."""
+        from wheretolook.geometry.camera import PinholeCamera, parse_size
+
+        described = super().named_camera()
+        if self.fov is None:
+            if self.size is not None:
+                raise ConfigError("an image size belongs to a field of view, --fov", value=self.size)
+            return described
+        if described is not None:
+            raise ConfigError("the camera is described in several ways", value=self.fov, fix="Give one of them.")
+        return PinholeCamera.of_field_of_view(self.fov, *parse_size(self.size or "640x480"))
+
+    def open_map(self, **directions: Any) -> WhereToLook:
+        """Open the map; `directions` are options of `WhereToLook.from_colmap`."""
+        from wheretolook.mapping.colmap_model import model_suffix
+        from wheretolook.utils.devices import usable_device
+        from wheretolook.utils.warp import start_warp
+        from wheretolook.visibility.listing import compile_kernels
+
+        model_suffix(self.map)
+        device = usable_device(self.device)
+        with ThreadPoolExecutor(1) as executor:  # kernels compile, if they must, during imports and reading
+            compiled = executor.submit(compile_kernels, start_warp(device))
+            from wheretolook.select.where_to_look import WhereToLook
+
+            selector = WhereToLook.from_colmap(
+                self.map,
+                weights=self.weights,
+                method=self.method,
+                camera=self.named_camera(),
+                mesh=self.mesh,
+                depth=self.depth,
+                depth_scale=self.depth_scale,
+                occlusion=self.occlusion,
+                database=self.database,
+                max_reprojection_error_px=self.max_error,
+                device=device,
+                anywhere=self.anywhere,
+                **directions,
+            )
+            compiled.result()
+        return selector

@@ -34,6 +34,7 @@ COMMANDS = {
     "plan": "wheretolook.commands.plan:Plan",
     "demo": "wheretolook.commands.demo:Demo",
     "select": "wheretolook.commands.select:Select",
+    "score": "wheretolook.commands.score:Score",
     "check": "wheretolook.commands.check:Check",
     "view": "wheretolook.commands.view:View",
     "export": "wheretolook.commands.export:Export",

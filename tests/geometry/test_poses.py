@@ -76,6 +76,27 @@ def test_invalid_directions(invalid: tuple[float, ...]) -> None:
         geo.poses_looking_along((0, 0, 1), invalid)
 
 
+def test_rigid_transforms_of_any_shape_and_no_others() -> None:
+    poses = random_poses(2)
+    square = np.concatenate([poses, np.broadcast_to([0.0, 0, 0, 1], (2, 1, 4))], axis=1)
+    for given, expected in ((poses, poses), (square, poses), (poses[1], poses[1:]), (square[1], poses[1:])):
+        np.testing.assert_array_equal(geo.rigid_poses(given), expected)
+    mirrored = poses * np.array([-1, 1, 1])[:, None]
+    sheared = poses + np.eye(3, 4, 1) * 0.1
+    for invalid in (
+        1.01 * poses,
+        mirrored,
+        sheared,
+        square * 2,
+        square[:, [0, 1, 3, 2]],
+        poses * np.nan,
+        poses[:, :2],
+        1,
+    ):
+        with pytest.raises(PoseError):
+            geo.rigid_poses(invalid)
+
+
 def test_invalid_locations_and_poses() -> None:
     with pytest.raises(PoseError):
         geo.poses_looking_along([(0, 0, 1), (0, np.nan, 1)], (1, 0, 0))

@@ -19,8 +19,14 @@ def test_round_trips(tmp_path: Path) -> None:
     world = invert_poses(POSES)
     views = pd.DataFrame(quaternion_from_rotation(world[..., :3]), columns=["qw", "qx", "qy", "qz"])
     views.assign(**dict(zip("xyz", world[..., 3].T, strict=True))).to_csv(tmp_path / "views.csv")
-    for name in ("path.tum", "path.csv", "views.csv"):
-        np.testing.assert_allclose(read_poses(tmp_path / name), POSES, atol=1e-8)
+    (tmp_path / "poses.csv").write_text((tmp_path / "path.csv").read_text().replace(",", ";"))
+    image = "2 {} 1 a b.jpg\n10.5 20.5 -1 11.5 20.5 3\n"
+    first, second = pose_texts(POSES)
+    (tmp_path / "images.txt").write_text(f"# comment\n1 {first} 1 a.jpg\n\n" + image.format(second))
+    for name in ("path.tum", "path.csv", "views.csv", "poses.csv", "images.txt"):
+        np.testing.assert_allclose(read_poses(tmp_path / name).cam_from_world, POSES, atol=1e-8)
+    assert read_poses(tmp_path / "images.txt").names == ("a.jpg", "a b.jpg")
+    assert read_poses(tmp_path / "path.tum").names == ("0.5", "1")
 
 
 def test_texts_keep_the_centre_of_a_camera_far_away() -> None:
@@ -36,9 +42,24 @@ def test_rows(tmp_path: Path) -> None:
     assert read_rows(path) == [(3, ["a; b", "1", "2"]), (4, ["c", "3"])]
 
 
-@pytest.mark.parametrize("content", [b"", b"# x\n", b"\xff\xfe\x00", b"1 2 3\n", b"1 2 3 4 5 6 7 x\n"])
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"# x\n",
+        b"\xff\xfe\x00",
+        b"1 2 3\n",
+        b"1 2 3 4 5 6 7 x\n",
+        b"0 1 2 3 1 0 0 0\n1 2 3\n",
+        b"0 1 2 3 1 0 0 0\n1 2 3 4 0 0 0 2\n",  # no unit quaternion
+        b"0 1 2 3 1 0 0 0\n1 2 3 nan 0 0 0 1\n",
+        b"x,y,z,yaw\n1,2,3,4\n",
+        b"x,y,z,qw,qx,qy,qz\n",
+        b"1 1 0 0 0 0 0 0 1 a.jpg\n\n2 3 0 0 0 0 0 0 1 b.jpg\n\n",
+    ],
+)
 def test_invalid_files(content: bytes, tmp_path: Path) -> None:
-    for name in ("path.tum", "path.csv"):
+    for name in ("path.tum", "path.csv", "images.txt"):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(TableError):
             read_poses(tmp_path / name)

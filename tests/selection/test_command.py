@@ -31,7 +31,24 @@ def test_a_table_of_views(sparse: Path, at: Path, capsys: pytest.CaptureFixture[
     table = pd.read_csv("views.csv")
     np.testing.assert_allclose(table[["x", "y", "z"]].to_numpy()[::2], POINTS)
     assert (table["rank"] == [1, 2] * 4).all() and (table["score"] > 0).all()
-    assert "8 views" in capsys.readouterr().out
+    assert "views: 8 in" in capsys.readouterr().out
+
+
+def test_scores_of_poses(sparse: Path, at: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ["--map", str(sparse), *QUICK[:2], "--device", "cpu"]
+    assert main(["select", "--at", "at.csv", "--out", "views.csv", *given, *QUICK[2:4]]) == 0
+    assert main(["select", "--at", "at.csv", "--out", "views.tum", *given, *QUICK[2:4]]) == 0
+    expected = pd.read_csv("views.csv")
+    for name in ("views.csv", "views.tum"):
+        assert main(["score", "--poses", name, "--out", "scores.csv", *given]) == 0
+        found = pd.read_csv("scores.csv")
+        np.testing.assert_allclose(found["score"], expected["score"], atol=1e-5)
+        np.testing.assert_array_equal(found[["waypoint", "n_visible"]], expected[["waypoint", "n_visible"]])
+    Path("far.tum").write_text("7 1000 0 0 0 0 0 1\n" + Path("views.tum").read_text())
+    assert main(["score", "--poses", "far.tum", "--out", "scores.csv", *given]) == 2
+    assert "waypoint 7: (1000, 0, 0)" in capsys.readouterr().err
+    assert main(["score", "--poses", "far.tum", "--out", "scores.csv", "--skip", *given]) == 0
+    assert pd.read_csv("scores.csv")["waypoint"].tolist() == [0, 1, 2, 3]
 
 
 def test_a_sequence_and_a_grid(sparse: Path, at: Path) -> None:

@@ -7,14 +7,13 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from wheretolook.commands.selector_options import SelectorOptions
+from wheretolook.commands.selector_options import SelectorOptions, print_summary
 from wheretolook.select.request import SelectionRequest
 from wheretolook.utils.errors import ConfigError
 
 if TYPE_CHECKING:
     from wheretolook.select.views import SelectedViews
     from wheretolook.select.waypoints import Waypoints
-    from wheretolook.select.where_to_look import WhereToLook
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,8 +76,8 @@ class Select(SelectionRequest, SelectorOptions):
         request = {field.name: getattr(self, field.name) for field in fields(SelectionRequest)}
         views = selector.best(waypoints, progress=True, **request)
         views.save(self.out, self.format)
-        _print_summary(selector, views, len(waypoints))
-        print(f"{len(views)} views in {time.monotonic() - start:.1f} s: {self.out}")
+        print_summary(selector, views, len(waypoints), "waypoints")
+        print(f"views: {len(views)} in {time.monotonic() - start:.1f} s: {self.out}")
         return views
 
     def _waypoints(self) -> Waypoints | None:
@@ -88,21 +87,3 @@ class Select(SelectionRequest, SelectorOptions):
         if len(self.at) == 1 and (Path(self.at[0].strip()).exists() or self.at[0].count(",") != 2):
             return read_waypoints(self.at[0].strip())
         return parse_points(self.at) if self.at else None
-
-
-def _print_summary(selector: WhereToLook, views: SelectedViews, n_waypoints: int) -> None:
-    localization_map = selector.localization_map
-    n_used = len({*views.waypoint.tolist()})
-    skipped = f", {n_waypoints - n_used} left out" if n_used < n_waypoints else ""
-    landmarks = f"{len(localization_map.landmarks):,} landmarks"
-    print(f"{landmarks}, occlusion: {localization_map.occlusion.name}, method: {views.method}")
-    best = views.rank == 1
-    scores = views.score[best]
-    print(f"{n_used} waypoints{skipped}; best scores {scores.min():.3g} to {scores.max():.3g}")
-    counts = {
-        "best views see no landmark": views.n_visible[best] == 0,
-        "best views are outside the training distribution (column in_range)": ~views.in_range[best],
-    }
-    for what, rows in counts.items():
-        if rows.any():
-            print(f"{rows.sum()} of the {what}")

@@ -1,4 +1,4 @@
-"""Options of the commands that score views of a COLMAP model: `select` (and `score`)."""
+"""Options of the commands that score views of a COLMAP model: `select` and `score`."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from wheretolook.utils.errors import ConfigError
 
 if TYPE_CHECKING:
     from wheretolook.geometry.camera import Camera
+    from wheretolook.select.views import SelectedViews
     from wheretolook.select.where_to_look import WhereToLook
 
 
@@ -89,3 +90,22 @@ class SelectorOptions(CameraOptions, OcclusionOptions, ScorerOptions):
             )
             compiled.result()
         return selector
+
+
+def print_summary(selector: WhereToLook, views: SelectedViews, n_given: int, locations: str) -> None:
+    """Print how the best views of each location were scored; `locations` names those that were given."""
+    localization_map = selector.localization_map
+    n_used = len({*views.waypoint.tolist()})
+    skipped = f", {n_given - n_used} left out" if n_used < n_given else ""
+    landmarks = f"{len(localization_map.landmarks):,} landmarks"
+    print(f"{landmarks}, occlusion: {localization_map.occlusion.name}, method: {views.method}")
+    best = views.rank == 1
+    scores = views.score[best]
+    print(f"{locations}: {n_used}{skipped}; best scores {scores.min():.3g} to {scores.max():.3g}")
+    counts = {
+        "best views see no landmark": views.n_visible[best] == 0,
+        "best views are outside the training distribution (column in_range)": ~views.in_range[best],
+    }
+    for what, rows in counts.items():
+        if rows.any():
+            print(f"{rows.sum()} of the {what}")

@@ -15,6 +15,8 @@ from wheretolook.utils.errors import PoseError
 
 Float = NDArray[np.floating[Any]]
 
+RIGID_TOLERANCE = 1e-3  # of the entries of R R^T
+
 
 def transform(cam_from_world: ArrayLike, points: ArrayLike) -> Float:
     """Apply poses (..., 3, 4) to points (N, 3). Returns (..., N, 3) in the target frame."""
@@ -126,6 +128,27 @@ def check_poses(cam_from_world: ArrayLike) -> NDArray[np.float64]:
     if len(invalid):
         raise PoseError(f"pose {invalid[0]} has NaN or infinite entries", value=poses[invalid[0]].tolist())
     return poses
+
+
+def rigid_poses(poses: ArrayLike) -> NDArray[np.float64]:
+    """The poses (3, 4), (4, 4), (B, 3, 4) or (B, 4, 4) as float64 (B, 3, 4).
+
+    Raises PoseError, as `check_poses`, and if one is no rigid transform.
+    """
+    matrices = np.asarray(poses, dtype=np.float64)
+    if matrices.ndim == 2:
+        matrices = matrices[None]
+    homogeneous = matrices.ndim == 3 and matrices.shape[1:] == (4, 4)
+    checked = check_poses(matrices[:, :3] if homogeneous else matrices)
+    rotation = checked[:, :, :3]
+    off = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max((1, 2))
+    rigid = (off < RIGID_TOLERANCE) & (np.linalg.det(rotation) > 0)
+    if homogeneous:
+        rigid &= (matrices[:, 3] == (0, 0, 0, 1)).all(1)
+    for row in np.flatnonzero(~rigid):
+        fix = "Give a rotation without scale and a translation, world to camera, and as a fourth row 0 0 0 1."
+        raise PoseError(f"pose {row} is no rigid transform", value=matrices[row].tolist(), fix=fix)
+    return checked
 
 
 def check_locations(locations: ArrayLike) -> NDArray[np.float64]:

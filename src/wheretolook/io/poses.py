@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +20,13 @@ from wheretolook.utils.reading import read_text
 QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
 TRANSLATION_COLUMNS = ("tx", "ty", "tz")
 POSE_COLUMNS = (*QUATERNION_COLUMNS, *TRANSLATION_COLUMNS)
+NAME_COLUMNS = ("id", "waypoint", "name", "t", "timestamp")
+_TUM_COLUMNS = ("t", *"xyz", "qx", "qy", "qz", "qw")
+_IMAGE_COLUMNS = ("image_id", *POSE_COLUMNS, "camera_id", "name")
+_FIXED_COLUMNS = {len(columns): columns for columns in (_TUM_COLUMNS, _IMAGE_COLUMNS)}
 MAX_ROWS = 500_000  # of a text table
+MAX_IMAGES_BYTES = 100_000_000  # of an images.txt, which also has the keypoints
+UNIT_TOLERANCE = 0.01  # of a quaternion's length
 FAR_M = 1000.0  # of a camera from the origin, from where on its quaternion needs more decimals
 
 
@@ -55,26 +62,72 @@ def read_rows(path: Path) -> list[tuple[int, list[str]]]:
         raise TableError(f"the file cannot be read: {error}", path=path, fix="Give a text file of rows.") from error
 
 
-def read_poses(path: Path) -> Float:
-    """Read cam_from_world (N, 3, 4) from a CSV of a planned path or of selected views, or else from a TUM trajectory.
+class NamedPoses(NamedTuple):
+    """N poses and their names."""
 
-    Raises TableError if the file is missing or holds no poses.
+    names: tuple[str, ...]
+    cam_from_world: Float  # (N, 3, 4)
+
+
+def read_poses(path: Path) -> NamedPoses:
+    """Read poses and their names from a TUM trajectory, COLMAP's images.txt, or a CSV with a line of column names.
+
+    A CSV holds x, y, z, qw, qx, qy, qz (world_from_cam) or qw, qx, qy, qz, tx, ty, tz (cam_from_world). Raises
+    TableError, with the line, if the file is missing or holds no poses.
     """
-    import pandas as pd
-
+    number = 0
     try:
-        if path.suffix == ".csv":
-            table = pd.read_csv(path, comment="#")
-            if {*POSE_COLUMNS} <= {*table}:
-                return poses_of_values(table[[*POSE_COLUMNS]])
-            return _poses_in_world(table[[*"xyz"]].to_numpy(float), table[[*QUATERNION_COLUMNS]].to_numpy(float))
-        rows = np.array([cells for _, cells in read_rows(path)], dtype=np.float64)
-        if rows.shape[1:] != (8,):
-            raise ValueError("a TUM trajectory has eight columns")
-        return _poses_in_world(rows[:, 1:4], rows[:, [7, 4, 5, 6]])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        fix = "Give a TUM trajectory t x y z qx qy qz qw, or a CSV of a path or of selected views."
-        raise TableError(f"no poses can be read: {error}", path=path, fix=fix) from error
+        rows = _image_rows(path) if path.suffix == ".txt" else []
+        if not rows or len(rows[0][1]) < len(_IMAGE_COLUMNS):
+            rows = read_rows(path)
+        names = _FIXED_COLUMNS.get(len(rows[0][1]), ())
+        if is_header(rows[0][1]):
+            names = tuple(cell.strip("\"' ").lower() for cell in rows.pop(0)[1])
+        columns = {name: column for column, name in reversed([*enumerate(names)])}
+        wanted = POSE_COLUMNS if {*POSE_COLUMNS} <= {*columns} else (*"xyz", *QUATERNION_COLUMNS)
+        table = np.empty((len(rows), len(wanted)))
+        for row, (line, cells) in enumerate(rows):
+            number = line
+            table[row] = [float(cells[columns[name]]) for name in wanted]
+            length = np.linalg.norm(table[row, [wanted.index(name) for name in QUATERNION_COLUMNS]])
+            if not (np.isfinite(table[row]).all() and abs(length - 1) < UNIT_TOLERANCE):
+                raise ValueError("a pose has finite numbers and a quaternion of length 1")
+        number = 0
+        if not rows:
+            raise ValueError("there are none below the line of names")
+        poses = poses_of_values(table) if wanted == POSE_COLUMNS else _poses_in_world(table[:, :3], table[:, 3:])
+        named = next((columns[name] for name in NAME_COLUMNS if name in columns), None)
+        texts = range(len(rows)) if named is None else (cells[named] for _, cells in rows)
+        return NamedPoses(tuple(map(str, texts)), poses)
+    except (OSError, ValueError, LookupError) as error:
+        fix = "Give a TUM trajectory t x y z qx qy qz qw, COLMAP's images.txt, or a CSV of views or of a path."
+        problem = f"no column {error}" if isinstance(error, KeyError) else str(error)
+        value = f"line {number}" if number else None
+        raise TableError(f"no poses can be read: {problem}", path=path, value=value, fix=fix) from error
+
+
+def _image_rows(path: Path) -> list[tuple[int, list[str]]]:
+    """Read the first line of each image in an images.txt; a second one, which may be empty, holds its keypoints."""
+    lines = enumerate(read_text(path, MAX_IMAGES_BYTES).splitlines(), 1)
+    rows = []
+    for number, line in lines:
+        if line.strip() and not line.startswith("#"):
+            rows.append((number, line.split(maxsplit=len(_IMAGE_COLUMNS) - 1)))
+            next(lines, None)
+    return rows
+
+
+def is_header(row: list[str]) -> bool:
+    """Return whether cells of a table's first row are names: several, and none a number."""
+    return len(row) > 1 and not any(map(_is_number, row))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _poses_in_world(centers: Float, quaternions_wxyz: Float) -> Float:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.io.poses import read_rows
+from wheretolook.io.poses import NAME_COLUMNS, is_header, read_rows
 from wheretolook.utils.errors import ConfigError, SceneError, TableError
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ FORMATS = """\
 CSV with columns x, y, z (and id, if there is one; a line of names or none), the Active Localization Benchmark's text
 "id x y z", a TUM trajectory "t x y z qx qy qz qw", or "x y z"; lines that start with # are comments"""
 
-_IDS = ("id", "waypoint", "name", "t", "timestamp")  # names of the column of ids
 MAX_LOCATIONS = 1_000_000  # voxels of a grid
 REACH_SHARE = 0.95  # of the landmarks' mapping distances; farther from all of them the map is unknown
 ON_LANDMARK_M = 1e-6  # a location this close to a landmark is on a surface
@@ -85,7 +84,7 @@ def read_waypoints(path: str | Path) -> Waypoints:
     path = Path(path)
     rows = read_rows(path)
     columns, id_column = _columns(rows[0][1], path)
-    if _is_header(rows[0][1]):
+    if is_header(rows[0][1]):
         rows = rows[1:]
     points: list[list[float]] = []
     ids: list[str] = []
@@ -103,13 +102,9 @@ def read_waypoints(path: str | Path) -> Waypoints:
     return Waypoints(np.array(points), tuple(ids), tuple(number for number, _ in rows), path)._checked()
 
 
-def _is_header(row: list[str]) -> bool:
-    return len(row) > 1 and not any(map(_is_number, row))
-
-
 def _columns(row: list[str], path: Path) -> tuple[list[int], int | None]:
     """Return the columns of x, y, z and of the ids (or None) from the first row: a header, or a waypoint."""
-    if not _is_header(row):
+    if not is_header(row):
         if len(row) not in (3, 4, 8):
             problem = f"waypoints have 3, 4 or 8 columns, these have {len(row)}"
             raise TableError(problem, path=path, value=" ".join(row)[:80], fix=f"Give {FORMATS}.")
@@ -119,15 +114,7 @@ def _columns(row: list[str], path: Path) -> tuple[list[int], int | None]:
     if -1 in columns:
         fix = "Name the columns x, y and z."
         raise TableError("the columns of waypoints are missing", path=path, value=",".join(row)[:80], fix=fix)
-    return columns, next((index[name] for name in _IDS if name in index), None)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+    return columns, next((index[name] for name in NAME_COLUMNS if name in index), None)
 
 
 def parse_points(texts: Sequence[str]) -> Waypoints:

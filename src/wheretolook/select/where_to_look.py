@@ -15,7 +15,7 @@ from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, Envi
 from wheretolook.geometry.camera import Camera, PinholeCamera, parse_camera
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import Lattice, direction_lattice
-from wheretolook.geometry.poses import Float, camera_centers, check_poses, poses_looking_along
+from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along, rigid_poses
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.looks.selection import best_views
 from wheretolook.planning.config import StopConfig
@@ -142,8 +142,22 @@ class WhereToLook:
         return grid_waypoints(self.localization_map, self.space, spacing_m)
 
     def score(self, cam_from_world: ArrayLike) -> Float:
-        """Score poses (B, 3, 4), world-to-camera, (B,); higher is better, of learned methods a probability."""
-        return self.scorer.score(check_poses(cam_from_world))
+        """Score poses (B, 3, 4) or (B, 4, 4), or one of them, world-to-camera, (B,).
+
+        Higher is better, of learned methods a probability. Raises PoseError if a pose is no rigid transform.
+        """
+        return self.scorer.score(rigid_poses(cam_from_world))
+
+    def report(self, cam_from_world: ArrayLike, names: Sequence[str] = (), skip: bool = False) -> SelectedViews:
+        """Score poses, as `score` takes them, and report each as a view; names count from 0 unless given.
+
+        Raises a PoseError as `score`, and a TableError if one is outside the map or inside geometry, unless `skip`
+        leaves those out.
+        """
+        poses = rigid_poses(cam_from_world)
+        waypoints = Waypoints.of(camera_centers(poses), names)
+        rows = np.flatnonzero(usable_waypoints(self.localization_map, waypoints, skip))
+        return self._reported(waypoints, rows, poses[rows])
 
     def best(
         self,
@@ -196,7 +210,8 @@ class WhereToLook:
         k = chosen.shape[1]
         step = max(1, SIGHT_LINES // max(1, len(self.localization_map.landmarks)))
         blocks = np.split(np.arange(len(waypoints)), range(step, len(waypoints), step))
-        reported = [self._reported(waypoints, np.repeat(block, k), axes[chosen[block].ravel()]) for block in blocks]
+        poses = poses_looking_along(waypoints.points[:, None], axes[chosen])
+        reported = [self._reported(waypoints, np.repeat(block, k), poses[block].reshape(-1, 3, 4)) for block in blocks]
         views = joined(reported)
         order = np.argsort(-views.score.reshape(-1, k), axis=1, kind="stable")[:, : request.n]
         best = views[(np.arange(len(waypoints))[:, None] * k + order).ravel()]
@@ -211,7 +226,9 @@ class WhereToLook:
         chosen = axes[[row for view_set in sets for row in view_set.rows]]
         rank = np.tile(np.arange(1, n + 1), len(sets))
         set_scores = np.repeat([view_set.score for view_set in sets], n)
-        return self._reported(waypoints, np.repeat(np.arange(len(sets)), n), chosen, rank, set_scores)
+        rows = np.repeat(np.arange(len(sets)), n)
+        poses = poses_looking_along(waypoints.points[rows], chosen)
+        return self._reported(waypoints, rows, poses, rank, set_scores)
 
     def _sequence_with_stops(
         self, waypoints: Waypoints, axes: Float, scores: Float, request: SelectionRequest, progress: bool
@@ -224,18 +241,18 @@ class WhereToLook:
         stops = stops_along(self.scorer, points, chosen, axes, config, progress="stops" if progress else None)
         path = PlannedPath(points, chosen, self.scorer.score(poses_looking_along(points, chosen)), np.nan, stops=stops)
         places, rank = path.looks
-        return self._reported(waypoints, places, path.all_axes, rank, path.scores_with_stops[places])
+        poses = poses_looking_along(points[places], path.all_axes)
+        return self._reported(waypoints, places, poses, rank, path.scores_with_stops[places])
 
     def _reported(
         self,
         waypoints: Waypoints,
         rows: NDArray[np.int64],
-        axes: Float,
+        poses: Float,
         rank: NDArray[np.int64] | None = None,
         set_score: Float | None = None,
     ) -> SelectedViews:
-        """Return the views along axes (V, 3) from the waypoints of rows (V,), with their scores."""
-        poses = poses_looking_along(waypoints.points[rows], axes)
+        """Return the views with poses (V, 3, 4) at the waypoints of rows (V,), with their scores."""
         report = self.scorer.report(poses)
         return SelectedViews(
             waypoint=rows,

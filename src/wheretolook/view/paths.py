@@ -51,7 +51,7 @@ def read_paths(path: Path, pair: int = 0) -> Paths:
     if path.suffix == ".parquet":
         paths = _compared_paths(path, pair)
     else:
-        paths = {"planned" if path.name == "path.csv" else path.stem: RecordedPath(read_poses(path))}
+        paths = {"planned" if path.name == "path.csv" else path.stem: RecordedPath(read_poses(path).cam_from_world)}
     if not 1 <= len(paths) <= MAX_METHODS:
         problem = f"1 to {MAX_METHODS} methods can be played"
         raise TableError(problem, path=path, value=len(paths), fix="Correct --pair, or leave out methods.")

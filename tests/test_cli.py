@@ -85,6 +85,10 @@ def test_python_and_the_command_line_mean_the_same() -> None:
         ["map", "--mapping.n_image", "3"],  # no abbreviations
         ["map", "--mapping.partners", "1"],  # a constant
         ["map", "--list-methods"],
+        ["label", "--map", "sparse/0"],  # of other commands
+        ["plan", "--map.n_images", "3"],
+        ["plan", "--map", "nowhere", "--start", "[1, 1, 1]", "--goal", "[2, 1, 1]"],
+        ["plan", "--mesh", "scan.glb"],  # of a map
         ["scenes", "--device", "gpu"],
         ["scenes", "--camera.width", "0"],
         ["scenes", "--config", str(CONFIGS / "own-meshes.yaml")],  # no scene
@@ -100,6 +104,12 @@ def test_wrong_arguments_exit_with_two(arguments: list[str], capsys: pytest.Capt
     assert main(arguments) == 2
     errors = capsys.readouterr().err
     assert errors.startswith("wheretolook: error: ") and "Traceback" not in errors
+
+
+def test_the_configuration_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["scenes", "--name", "mine", "--print_config"])
+    assert capsys.readouterr().out.startswith("name: mine\n")
 
 
 @pytest.mark.parametrize(
@@ -126,6 +136,7 @@ def test_an_error_in_a_file_names_the_file(text: str, tmp_path: Path, capsys: py
         (["mapp"], "map"),
         (["map", "--n_images=3"], "--mapping.n_images"),
         (["plan", "--metod", "set"], "--method"),
+        (["map", "--map.n_images", "3"], "--mapping.n_images"),  # the group's former name
         (["map", "--config", str(CONFIGS / "demo.yml")], "configs/demo.yaml"),
     ],
 )

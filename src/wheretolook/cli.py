@@ -208,8 +208,8 @@ def named_values(command: Any, types: Mapping[str, Any], arguments: Sequence[str
         name = option.removeprefix("--").replace("-", "_")
         name = command.SHORT.get(name.replace("_", "-"), name)
         if not is_option(name, known):
-            if hasattr(command, "root") and is_option(name, configurable_options()):
-                continue  # of another command: the same options may be given to all
+            if hasattr(command, "root") and "." in name and is_option(name, configurable_options()):
+                continue  # of a group of another command: the same options may be given to all
             near = nearest(name, [*known, *command.SHORT])
             raise ConfigError("unknown option", value=option, fix=f"Did you mean --{near}?" if near else None)
         if is_sequence(types.get(name)) and values[:1] != ["null"] and not "".join(values[:1]).startswith("["):
@@ -219,12 +219,12 @@ def named_values(command: Any, types: Mapping[str, Any], arguments: Sequence[str
         elif not values and types.get(name) is not bool and name != "print_config":
             raise ConfigError("this option needs a value", value=option)
         else:
-            yield name, values[0] if values else "true"
+            yield name, values[0] if values else "" if name == "print_config" else "true"
 
 
 def is_option(name: str, known: Sequence[str]) -> bool:
-    """Return whether a dotted name is an option's, or that of a key within an option's value."""
-    return any(name == option or name.startswith(f"{option}.") for option in known)
+    """Return whether a dotted name is an option's, or that of a key within the value of an option of a group."""
+    return any(name == option or ("." in option and name.startswith(f"{option}.")) for option in known)
 
 
 def is_sequence(kind: Any) -> bool:
@@ -263,7 +263,7 @@ def flattened(content: Mapping[str, Any], types: Mapping[str, Any], prefix: str 
     """Yield dotted names and values of nested mappings, down to the options."""
     for key, value in content.items():
         name = f"{prefix}{key}"
-        if isinstance(value, dict) and value and name not in types:
+        if isinstance(value, dict) and value and not ("." in name and name in types):
             yield from flattened(value, types, f"{name}.")
         else:
             yield name, value

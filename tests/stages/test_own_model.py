@@ -13,6 +13,7 @@ import pytest
 from all_options import AllOptions, run
 from box_scenes import box_quads, quads_mesh, random_texture
 from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room, take_photographs
+from wheretolook.cli import main
 from wheretolook.commands.label import Label
 from wheretolook.commands.map import Map
 from wheretolook.commands.plan import Plan
@@ -130,6 +131,33 @@ def test_from_a_model_to_a_planned_path(tmp_path, with_mesh):
     run(Map, experiment, said.append)
     run(Sample, experiment, said.append)
     assert sum("reusing" in line for line in said) == 2
+
+
+def test_one_command_plans_a_path_in_the_folder_of_a_model(tmp_path, capsys):
+    folder = save(room_model(), tmp_path / "flat" / "sparse" / "0")
+    where = ["--map", str(folder), "--data", str(tmp_path / "data"), "--device", "cpu"]
+    grid = [
+        "--plan.grid",
+        "[6, 5, 3]",
+        "--plan.directions",
+        "30",
+        "--method",
+        "visible",
+        "--plan.planner.time_s",
+        "0.5",
+    ]
+    ends = ["--start", "[4.5, 2.5, 1.5]", "--goal", "[4.5, 3.5, 1.5]"]
+    tracking = ["--tracking.folder", str(tmp_path / "mlruns")]
+    assert main(["plan", *where, *ends, *grid, *tracking, "--film", "none", "--out", str(tmp_path / "way")]) == 0
+    assert (tmp_path / "way" / "path.csv").is_file()
+    assert "320 x 240" in capsys.readouterr().out  # the model's camera
+    out = ["--out", str(tmp_path / "flat.map"), "--method", "visible"]
+    views = [f"--viewpoint-map.{option}" for option in ("grid=[6, 5, 3]", "directions=30")]
+    assert main(["viewpoint-map", *where, *out, *views]) == 0
+    assert "reusing" in capsys.readouterr().out
+    assert main(["sample", *where, "--sample.grid", "[6, 5, 3]", "--sample.max_locations", "3"]) == 0
+    (scene,) = Dataset.load(tmp_path / "data" / "flat").scenes
+    assert scene.camera == LOOKS and scene.read_table()["location_id"].nunique() == 3
 
 
 def test_one_of_several_cameras_is_chosen(tmp_path):

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from wheretolook.commands.options import Log, Progress, SceneOptions, ignore_progress
+from wheretolook.commands.imported_scene import SceneOrMapOptions, imports_map
+from wheretolook.commands.options import Log, Progress, ignore_progress
 from wheretolook.commands.preconditions import load_dataset, open_scene
 from wheretolook.dataset.dataset_lock import reads_dataset
 from wheretolook.geometry.camera import Camera
@@ -29,15 +30,16 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan(SceneOptions):
+class Plan(SceneOrMapOptions):
     """Plan a path on which the camera can localize; a table, a picture and a film of it.
 
-    Reads a scene's map and its mesh, if it has one, as `scenes` and `map` leave them. To plan without the mesh, in the
+    Reads a scene's map and its mesh, if it has one, as `scenes` and `map` leave them; or a COLMAP model (--map). To plan without the mesh, in the
     space that depth images saw as free: --occlusion.model tsdf
 
     Examples:
       wheretolook plan --config configs/demo.yaml --scene apartment-000 --start '[-4, -3, 1.4]' --goal '[4, 3, 1.4]' \\
         --plan.against '[forward]' --film mp4 --out way
+      wheretolook plan --map sparse/0 --start '[1, 1, 1.4]' --goal '[5, 4, 1.4]' --out way
 
     Args:
         plan: start, goal, scores and costs, and what is written.
@@ -52,6 +54,7 @@ class Plan(SceneOptions):
     plan: PlanConfig = field(default_factory=PlanConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 
+    @imports_map
     @reads_dataset("plan")
     def run(self, log: Log = print, progress: Progress = ignore_progress) -> PlannedPath:
         """Plan a path, write it to `<scene>/path/path.{csv,png,gif}` and log it. Needs `map` only.
@@ -69,7 +72,8 @@ class Plan(SceneOptions):
 
         dataset = load_dataset(self, "map")
         config = self.plan
-        files = dataset.scenes[0] if not config.scene and len(dataset.scenes) == 1 else dataset.scene(config.scene)
+        name = config.scene or self.imported_name
+        files = dataset.scenes[0] if not name and len(dataset.scenes) == 1 else dataset.scene(name)
         if config.start is None or config.goal is None:
             fix = "Give plan.start and plan.goal, such as --plan.start '[1, 1, 1.4]'."
             raise ConfigError("a path needs a start and a goal", value=(config.start, config.goal), fix=fix)

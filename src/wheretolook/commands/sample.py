@@ -7,7 +7,8 @@ from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
-from wheretolook.commands.options import Log, Progress, SceneOptions, ignore_progress
+from wheretolook.commands.imported_scene import SceneOrMapOptions, imports_map
+from wheretolook.commands.options import Log, Progress, ignore_progress
 from wheretolook.commands.preconditions import existing, load_dataset, naming_file, open_scene
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.environment import SceneEnvironment
@@ -19,11 +20,12 @@ from wheretolook.utils.errors import MapError, SceneError
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sample(SceneOptions):
+class Sample(SceneOrMapOptions):
     """Choose viewpoints by the landmarks they see.
 
     Examples:
       wheretolook sample --config configs/demo.yaml --sample.max_locations 100
+      wheretolook sample --map sparse/0
 
     Args:
         sample: which viewpoints.
@@ -31,6 +33,7 @@ class Sample(SceneOptions):
 
     sample: SampleConfig = field(default_factory=SampleConfig)
 
+    @imports_map
     @changes_dataset("sample")
     def run(self, log: Log = print, progress: Progress = ignore_progress) -> Dataset:
         """Write viewpoints and the landmarks that their locations see, `<scene>/viewpoints.parquet`, `occlusion.npz`.

@@ -5,20 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar
 
-from wheretolook.commands.options import Log, Progress, SceneOptions, ignore_progress
+from wheretolook.commands.imported_scene import SceneOrMapOptions, imports_map
+from wheretolook.commands.options import Log, Progress, ignore_progress
 from wheretolook.commands.preconditions import load_dataset, naming_file, open_scene
 from wheretolook.dataset.dataset_lock import reads_dataset
 from wheretolook.planning.config import ViewpointMapConfig
+from wheretolook.utils.errors import ConfigError
 
 if TYPE_CHECKING:
     from wheretolook.planning.viewpoint_map import ViewpointMap
 
 
 @dataclass(frozen=True, kw_only=True)
-class BuildViewpointMap(SceneOptions):
+class BuildViewpointMap(SceneOrMapOptions):
     """Score every direction at every free voxel of a scene, for planners to query. Needs no labels.
 
-    Reads a scene's map and its mesh, as `scenes` and `map` leave them; a scene of photographs has no mesh, and is free
+    Reads a scene's map and its mesh, as `scenes` and `map` leave them, or a COLMAP model (--map); a scene of photographs has no mesh, and is free
     according to scenes.mapped_space. Without weights or a method, the best weights of the dataset, or else the bundled
     ones, score the views. The folder holds plain arrays and LAYOUT.txt, which describes them; in Python:
 
@@ -28,6 +30,7 @@ class BuildViewpointMap(SceneOptions):
 
     Examples:
       wheretolook viewpoint-map --config configs/demo.yaml --scene apartment-000 --out apartment.map
+      wheretolook viewpoint-map --map sparse/0 --mesh scan.glb --out house.map
 
     Args:
         viewpoint_map: which views, and how they are scored.
@@ -37,6 +40,7 @@ class BuildViewpointMap(SceneOptions):
 
     viewpoint_map: ViewpointMapConfig = field(default_factory=ViewpointMapConfig)
 
+    @imports_map
     @reads_dataset("viewpoint-map")
     def run(self, log: Log = print, progress: Progress = ignore_progress) -> dict[str, ViewpointMap]:
         """Write `<scene>/viewpoint-map/`, and return the viewpoint maps by the scene's name. Needs `map` only.
@@ -50,13 +54,17 @@ class BuildViewpointMap(SceneOptions):
 
         dataset = load_dataset(self, "map")
         config = self.viewpoint_map
+        name = config.scene or self.imported_name
+        scenes = (dataset.scene(name),) if name else dataset.scenes
+        if config.out is not None and len(scenes) != 1:
+            raise ConfigError("--out is the folder of one scene", value=str(config.out), fix="Give --scene.")
         if not config.method and config.weights is None:
             weights = resolve_weights(dataset=dataset, log=log)
             if weights is not None:
                 log(f"scored by {weights}")
                 config = replace(config, weights=weights)
         built: dict[str, ViewpointMap] = {}
-        for files in [dataset.scene(config.scene)] if config.scene else dataset.scenes:
+        for files in scenes:
             scene = open_scene(self, files)
             with naming_file(scene.source):
                 scorer = scene_scorer(scene, config.method, config.weights, config.anywhere)

@@ -39,7 +39,7 @@ class ViewpointMapConfig(MappedLattice):
             weights are of, or bins if there are none.
         weights: file of weights that the train stage wrote, for a learned method. Unless a method is named,
             the best of the dataset, or else of those that ship, for cameras with their field of view.
-        out: folder to write; empty for `<data>/<name>/<scene>/viewpoint-map`. Only with a scene.
+        out: folder to write; empty for `<data>/<name>/<scene>/viewpoint-map`. Of one scene only.
         anywhere: allow weights adapted to another scene.
     """
 
@@ -48,11 +48,6 @@ class ViewpointMapConfig(MappedLattice):
     weights: Path | None = None
     out: Path | None = None
     anywhere: bool = False
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.out is not None and not self.scene:
-            raise ConfigError("viewpoint_map.out is the folder of one scene", value=str(self.out), fix="Name a scene.")
 
 
 @dataclass(frozen=True)

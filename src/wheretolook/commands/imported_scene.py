@@ -1,0 +1,57 @@
+"""Commands on a scene of a dataset, or on a COLMAP model that they import as one first."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+from wheretolook.commands.map import Map
+from wheretolook.commands.options import DatasetOptions, Log, Progress, SceneOptions, ignore_progress, select_options
+from wheretolook.mapping.config import ExistingModelConfig, MapConfig
+from wheretolook.utils.validation import reject
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOrMapOptions(SceneOptions):
+    """A scene of a dataset, or a COLMAP model.
+
+    Args:
+        name: name of the dataset; by default demo, or with --map that of the map.
+        map: instead of a scene: folder of a COLMAP model, imported first as `wheretolook map --model` does.
+        mesh: a mesh of the map's scene (GLB, OBJ, PLY) in its frame.
+        database: the map's features: COLMAP's database.db, or hloc's feats-*.h5.
+    """
+
+    name: str = ""
+    map: Path | None = None
+    mesh: Path | None = None
+    database: Path | None = None
+
+    def __post_init__(self) -> None:
+        of_map = self.mesh or self.database
+        reject((self.map is None and of_map is not None, "--mesh and --database belong to --map", str(of_map)))
+        if not self.name:
+            object.__setattr__(self, "name", self.imported_name or DatasetOptions.name)
+        super().__post_init__()
+
+    @property
+    def imported_name(self) -> str:
+        """Name of the scene that `map` is imported as; empty without it."""
+        return "" if self.map is None else ExistingModelConfig(self.map).scene_name
+
+
+def imports_map(run: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorate `run` of a command to import the model in its option `map` first, unless its scene is up to date."""
+
+    @wraps(run)
+    def run_on_scene(command: Any, log: Log = print, progress: Progress = ignore_progress) -> Any:
+        if command.map is not None:
+            existing = ExistingModelConfig(command.map, database=command.database, mesh=command.mesh)
+            mapping = MapConfig(extractor=command.mapping.extractor, existing=existing)
+            replace(select_options(Map, command), mapping=mapping).run(log)
+        return run(command, log, progress)
+
+    return run_on_scene

@@ -1,5 +1,6 @@
 """Pose files hold the poses that were written, and invalid ones are rejected."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -7,8 +8,19 @@ import pandas as pd
 import pytest
 
 from wheretolook.geometry.poses import camera_centers, invert_poses, poses_looking_along, quaternion_from_rotation
-from wheretolook.io.poses import POSE_COLUMNS, pose_texts, pose_values, poses_of_values, read_poses, read_rows, tum_text
-from wheretolook.utils.errors import TableError
+from wheretolook.io.poses import (
+    MAX_ROWS,
+    POSE_COLUMNS,
+    pose_texts,
+    pose_values,
+    poses_of_values,
+    read_poses,
+    read_rows,
+    tum_text,
+)
+from wheretolook.mapping.georeference import read_positions
+from wheretolook.select.waypoints import read_waypoints
+from wheretolook.utils.errors import ConfigError, TableError
 
 POSES = poses_looking_along([(1.5, -2, 0.25), (0, 3, 1)], [(1, 0, 0), (-1, 2, 0.5)])
 
@@ -40,6 +52,17 @@ def test_rows(tmp_path: Path) -> None:
     path = tmp_path / "rows"
     path.write_text('\ufeff# comment\n\n"a; b"; 1;2\nc;3\n', encoding="utf-8")
     assert read_rows(path) == [(3, ["a; b", "1", "2"]), (4, ["c", "3"])]
+
+
+def test_large_tables_are_rejected_without_reading_them(tmp_path: Path) -> None:
+    path = tmp_path / "rows"
+    path.write_text("1\n" * (MAX_ROWS + 1))
+    with pytest.raises(TableError):
+        read_rows(path)
+    os.truncate(path, 2_000_000_000)
+    for read in (read_rows, read_poses, read_waypoints, read_positions):
+        with pytest.raises((TableError, ConfigError), match="16,000,000 bytes"):
+            read(path)
 
 
 @pytest.mark.parametrize(

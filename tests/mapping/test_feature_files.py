@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,12 @@ def link(h5py, file) -> None:
     file["0.png"] = h5py.ExternalLink("other.h5", "/0.png")
 
 
+def soft_link(h5py, file) -> None:
+    link(h5py, file)
+    file.move("0.png", "away")
+    file["0.png"] = h5py.SoftLink("/away")
+
+
 def virtual(h5py, file) -> None:
     layout = h5py.VirtualLayout(shape=(N, 2), dtype="f8")
     layout[:] = h5py.VirtualSource("other.h5", "0.png/keypoints", shape=layout.shape)
@@ -54,6 +61,7 @@ def virtual(h5py, file) -> None:
         replaced("descriptors", shape=(128, 12_000_000), dtype="f2", chunks=(128, 1024)),
         replaced(shape=(N, 2), maxshape=(None, 2), dtype="f8", chunks=(2**27, 2)),
         link,
+        soft_link,
         replaced(shape=(N, 2), dtype="f8", external=[("secret", 0, N * 16)]),
         virtual,
         replaced(data=np.full((N, 2), np.nan)),
@@ -75,6 +83,18 @@ def test_invalid_hdf5_is_rejected(edit, tmp_path: Path, monkeypatch: pytest.Monk
     with pytest.raises(MapError) as caught:
         read_descriptors(path, MODEL, ARRAYS)
     assert caught.value.path == path
+
+
+def test_time_does_not_grow_with_the_links_of_hdf5(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    path = hdf5_of(tmp_path / "feats-aliked.h5", KEYPOINTS, LEARNED)
+    with h5py.File(path, "a", libver="latest") as file:
+        empty = file.create_group("others").id
+        for number in range(20_000):
+            empty.links.create_hard(b"%d" % number, file["0.png"].id, b"keypoints")
+    start = time.process_time()
+    read_descriptors(path, MODEL, ARRAYS)
+    assert time.process_time() - start < 1
 
 
 def test_hdf5_needs_h5py(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

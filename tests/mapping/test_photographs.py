@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from wheretolook.mapping.photographs import (
     read_photograph,
     reduce_photograph,
 )
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.errors import ConfigError, MapError
 
 ORIENTATION = 0x0112
 EXIF_IFD = 0x8769
@@ -47,6 +48,15 @@ def test_photographs_are_listed_by_name(tmp_path: Path) -> None:
         save(tmp_path / name, sized(20, 30))
     (tmp_path / "notes.txt").write_text("not a photograph")
     assert list_photographs(tmp_path) == ["a.png", "b.JPG", "hall/c.jpg"]
+
+
+def test_names_that_colmap_cannot_read_are_rejected(tmp_path: Path) -> None:
+    for name in (b"a.png", b"caf\xe9.png", "ä.png".encode()):
+        (tmp_path / os.fsdecode(name)).touch()
+    with pytest.raises(MapError, match="UTF-8"):
+        list_photographs(tmp_path)
+    (tmp_path / os.fsdecode(b"caf\xe9.png")).unlink()
+    assert list_photographs(tmp_path) == ["a.png", "ä.png"]
 
 
 def test_photographs_are_turned_upright_and_reduced(tmp_path: Path) -> None:

@@ -117,8 +117,19 @@ def embedded(tree, buffer):
 
 
 def nested(tree, _):
-    nodes = [{"children": [i + 1]} for i in range(100_000)] + [{"mesh": 0}]
+    nodes = [{"children": [i + 1]} for i in range(1000)] + [{"mesh": 0}]
     return {**tree, "nodes": nodes, "scenes": [{"nodes": [0]}]}
+
+
+def with_nodes(n: int, n_primitives: int = 1):
+    """Many nodes that share a mesh."""
+
+    def change(tree, _):
+        primitives = tree["meshes"][0]["primitives"] * n_primitives
+        nodes = [{"mesh": 0} for _ in range(n)]
+        return {**tree, "meshes": [{"primitives": primitives}], "nodes": nodes, "scenes": [{"nodes": [*range(n)]}]}
+
+    return change
 
 
 def few_uvs(tree, _):
@@ -142,6 +153,7 @@ ADDRESSES += ["/etc/hostname", "missing.png", "http://127.0.0.1:9/a.png"]
 CHANGES = [with_image(address) for address in ADDRESSES]
 CHANGES += [with_accessor(count=count) for count in (0, -1, 300_000_000, None)]
 CHANGES += [with_accessor(count=300_000_000, bufferView=None), nested, few_uvs]
+CHANGES += [with_nodes(20_001), with_nodes(20_000, 20_000)]
 CHANGES += [lambda tree, _: None, lambda tree, _: {**tree, "accessors": None}, lambda tree, _: b"[" * 100_000]
 
 

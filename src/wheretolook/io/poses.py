@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -50,9 +51,11 @@ def read_rows(path: Path) -> list[tuple[int, list[str]]]:
     """
     try:
         lines = enumerate(map(str.strip, read_text(path).removeprefix("\ufeff").splitlines()), 1)
-        rows = [(number, line) for number, line in lines if line and not line.startswith("#")]
-        if not 0 < len(rows) <= MAX_ROWS:
-            raise ValueError(f"it has {len(rows):,} rows, not 1 to {MAX_ROWS:,}")
+        rows = [*islice(((number, line) for number, line in lines if line and not line.startswith("#")), MAX_ROWS + 1)]
+        if not rows:
+            raise ValueError("it has no rows")
+        if len(rows) > MAX_ROWS:
+            raise ValueError(f"it has more than {MAX_ROWS:,} rows")
         separator = next((mark for mark in ",;" if mark in rows[0][1]), None)
         if separator is None:
             return [(number, line.split()) for number, line in rows]

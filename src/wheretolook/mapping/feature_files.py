@@ -232,16 +232,15 @@ def _open_hdf5(path: Path) -> Iterator[Callable[[str], _Features]]:
     try:
         check_file(path)
         with h5py.File(path, "r") as file:
-            if file.visititems_links(lambda name, link: isinstance(link, h5py.ExternalLink) or None):
-                raise ValueError("it has a link to another file")
             named = _kind_in_name(path)
 
             def read(name: str) -> _Features:
-                if name not in file:
+                image = _member(file, name)
+                if image is None:
                     raise MapError("the features lack an image of the model", path=path, value=name, fix=_FIX)
                 # hloc counts pixels from the centre of the top-left one, COLMAP from its corner
-                keypoints = _array(file[name]["keypoints"], name).astype(np.float64)[:, :2] + 0.5
-                descriptors = _array(file[name]["descriptors"], name).T
+                keypoints = _array(_member(image, "keypoints"), name).astype(np.float64)[:, :2] + 0.5
+                descriptors = _array(_member(image, "descriptors"), name).T
                 kind: DescriptorKind | None = SIFT
                 may_be_sift = descriptors.shape[1] == SIFT.dimension and named in (None, SIFT)
                 if not may_be_sift or (len(descriptors) and descriptors.min() < 0):
@@ -254,6 +253,20 @@ def _open_hdf5(path: Path) -> Iterator[Callable[[str], _Features]]:
         raise
     except Exception as error:  # h5py raises errors of many kinds
         raise MapError(f"cannot read the features: {error}", path=path, fix="Give hloc's feats-*.h5.") from error
+
+
+def _member(group: Any, name: str) -> Any:
+    """A member of a group in HDF5, None if it has none. Raises ValueError for a link, which may be to another file."""
+    import h5py
+
+    for part in name.split("/"):
+        link = group.get(part, getlink=True) if isinstance(group, h5py.Group) else None
+        if link is None:
+            return None
+        if not isinstance(link, h5py.HardLink):
+            raise ValueError(f"{name} is a link")
+        group = group[part]
+    return group
 
 
 def _array(dataset: Any, name: str) -> NDArray[Any]:

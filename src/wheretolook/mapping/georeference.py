@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from io import StringIO
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +17,7 @@ from wheretolook.mapping.config import SCALE_TOLERANCE_PERCENT, ScaleConfig
 from wheretolook.mapping.markers import Marker, MarkerView, detect_markers, marker_detector, place_marker
 from wheretolook.mapping.photographs import read_photograph
 from wheretolook.utils.errors import ConfigError, MapError
-from wheretolook.utils.reading import read_json_object
+from wheretolook.utils.reading import read_json_object, read_text
 
 REPORT_FILE = "report.json"
 _FLAT = 1e-6  # points whose second largest spread is below this share of the largest are on a line
@@ -252,7 +253,7 @@ def _read_table(path: Path, key: str, columns: list[str]) -> dict[str, Float]:
         if path.suffix.lower() == ".json":
             table = pd.DataFrame.from_dict(read_json_object(path), orient="index", columns=columns)
         else:
-            table = pd.read_csv(path, dtype=str, skipinitialspace=True, keep_default_na=False, compression=None)
+            table = pd.read_csv(StringIO(read_text(path)), dtype=str, skipinitialspace=True, keep_default_na=False)
             table = table.set_index(key)[columns]
         table = table.astype(float).rename(index=str.strip)
         if table.empty or not np.isfinite(table.to_numpy()).all():

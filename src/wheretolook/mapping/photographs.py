@@ -22,11 +22,17 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
 
 def list_photographs(folder: Path) -> list[str]:
-    """List photographs in a folder and its subfolders by relative name. Raises MapError if there are fewer than two."""
+    """List photographs in a folder and its subfolders by relative name.
+
+    Raises MapError if there are fewer than two, or a name is not in UTF-8, which COLMAP needs.
+    """
     if not folder.is_dir():
         raise MapError("there is no such folder", path=folder, fix="Give the folder of the photographs.")
     files = (path for path in folder.rglob("*") if path.is_file() and path.suffix.lower() in SUFFIXES)
     names = sorted(path.relative_to(folder).as_posix() for path in files)
+    for name in names:
+        if name != name.encode(errors="replace").decode():
+            raise MapError("the name of a photograph is not in UTF-8", path=folder, value=name, fix="Rename it.")
     if len(names) < 2:
         fix = f"Files that end in {', '.join(SUFFIXES)} count."
         raise MapError("a map needs at least two photographs", path=folder, value=len(names), fix=fix)

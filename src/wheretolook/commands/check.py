@@ -31,7 +31,7 @@ class Check(OcclusionOptions, ScorerOptions):
     are the ground truth, so no mesh and no labels are needed.
 
     Features: photographs are localized with the keypoints that the map was made from, of SIFT, ALIKED, DISK, XFeat or
-    SuperPoint: a COLMAP database, or hloc's features in HDF5. A database.db next to the model is used by default. With
+    SuperPoint: a COLMAP database, or hloc's features in HDF5. By default those in the model's folder or above are used. With
     --images instead, keypoints are extracted again (SIFT, or by --extractor), and the landmarks triangulated again at
     the model's poses.
 

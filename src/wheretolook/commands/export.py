@@ -32,7 +32,7 @@ class Export(CameraOptions):
         map: folder of a COLMAP model, in metres with z up.
         out: folder to write.
         weights: file of weights of the method set.
-        database: the map's database, whose descriptors show which landmarks look alike.
+        database: the map's database, as of `wheretolook select`.
         mesh: a mesh of the scene, for occlusion.
         spacing: of the grid, in metres.
     """

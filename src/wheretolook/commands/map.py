@@ -181,6 +181,7 @@ def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     is transformed, and SceneError if the mesh cannot be used.
     """
     from wheretolook.mapping.colmap_model import read_model
+    from wheretolook.mapping.sources import choose_features
 
     settings = options.mapping.existing
     photographs = options.mapping.photographs
@@ -191,6 +192,9 @@ def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
         fix = "Give a model and a mesh that are both in metres with z up."
         raise ConfigError("a model that is turned or scaled leaves its mesh", value=str(settings.mesh), fix=fix)
     model = read_model(folder)
+    if photographs.images is None:
+        settings = replace(settings, database=choose_features(folder, model, settings.database))
+        options = replace(options, mapping=replace(options.mapping, existing=settings))
     if options.camera == CameraConfig():
         scene = _with_own_camera(scene, model, settings)
     dataset = _with_scene(scene, options.root)

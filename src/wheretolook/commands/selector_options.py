@@ -28,7 +28,8 @@ class SelectorOptions(CameraOptions, OcclusionOptions, ScorerOptions):
         size: image size of that pinhole in pixels, such as 640x480.
         depth: folder of depth images, named like the map's images.
         depth_scale: units of integer depth images in a metre.
-        database: the map's database, whose descriptors show which landmarks look alike.
+        database: COLMAP's database.db or hloc's feats-*.h5, whose descriptors show which landmarks look alike; by default
+            hloc's near the model, or a database near it of other features than SIFT.
         max_error: leave out landmarks with a larger mean reprojection error, in pixels.
         device: where to compute: auto, cpu, cuda, or cuda:<index>.
     """
@@ -97,7 +98,8 @@ def print_summary(selector: WhereToLook, views: SelectedViews, n_given: int, loc
     localization_map = selector.localization_map
     n_used = len({*views.waypoint.tolist()})
     skipped = f", {n_given - n_used} left out" if n_used < n_given else ""
-    landmarks = f"{len(localization_map.landmarks):,} landmarks"
+    features = localization_map.landmarks.features or "no descriptors"
+    landmarks = f"{len(localization_map.landmarks):,} landmarks ({features})"
     print(f"{landmarks}, occlusion: {localization_map.occlusion.name}, method: {views.method}")
     best = views.rank == 1
     scores = views.score[best]

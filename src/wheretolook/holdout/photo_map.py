@@ -19,16 +19,16 @@ from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.localization.labeller import versions
 from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_arrays, read_model, registered_names
 from wheretolook.mapping.config import ExistingModelConfig, MapConfig, PhotographsConfig
-from wheretolook.mapping.feature_files import read_descriptors
+from wheretolook.mapping.feature_files import DATABASE_FILE, read_descriptors
 from wheretolook.mapping.georeference import Similarity, read_scale
 from wheretolook.mapping.gravity import estimate_gravity
-from wheretolook.mapping.rendered_map import DATABASE_FILE
 from wheretolook.mapping.sanity import up_axis_warning
 from wheretolook.mapping.sources import find_features, find_photographs
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.confine import safe_child
 from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.files import fingerprint, size_and_time
+from wheretolook.utils.logs import LOG
 
 MAX_ERROR_M, MAX_ERROR_DEG = THRESHOLDS[0]  # below both, a photograph counts as localized
 MAX_ERROR_OF_DEPTH = 0.01  # instead of MAX_ERROR_M where metres are unknown: of the photograph's median depth
@@ -149,8 +149,8 @@ def open_map(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MapWarning)  # the error below replaces it
         if read_descriptors(features, model, arrays) is None:
-            fix = "Give the folder of its photographs instead, --images: then keypoints are extracted from them."
-            raise MapError("these features are of an unknown kind", path=features, fix=fix)
+            fix = "Give hloc's feats-*.h5, --database, or the folder of its photographs, --images, to extract features."
+            raise MapError("there are no descriptors of a known kind", path=features, fix=fix)
     cameras = cameras_by_id(model.cameras, model_dir)
     images = [model.images[int(number)] for number in arrays.image_ids]
     return PhotographedMap(
@@ -204,6 +204,7 @@ def features_of(
     if images is None and database is None:
         database = find_features(model_dir)
         images = find_photographs(model_dir) if database is None else None
+        LOG.info("%s: %s", "features" if database else "photographs", database or images or "not found")
     if database is not None:
         return model_dir, database
     model = read_model(model_dir)

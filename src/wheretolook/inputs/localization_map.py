@@ -66,7 +66,7 @@ class LocalizationMap:
                 own mapper kept.
             device: where kernels run.
             database: the COLMAP database the model was built from, or hloc's features in HDF5, for the landmarks'
-                ambiguity, which is unknown without.
+                ambiguity, which is unknown without; by default as `wheretolook.mapping.sources.choose_features`.
 
         Raises:
             MapError: no usable model in the folder, no such camera in it, or several and none is named; or the database

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +25,7 @@ from wheretolook.mapping.colmap_files import (
     read_points,
 )
 from wheretolook.utils.colmap import quiet_colmap
-from wheretolook.utils.errors import MapError, StorageError
+from wheretolook.utils.errors import MapError, MapWarning, StorageError
 from wheretolook.utils.files import STORAGE_FIX, storage_errors, temporary_folder
 from wheretolook.utils.npz_files import load_npz, save_npz
 
@@ -95,7 +97,21 @@ def read_model(model_dir: str | Path) -> Any:
         for name, number in zip(MODEL_FILES, numbers, strict=True):
             check_text_complete(folder / f"{name}.txt", number)
         check_coordinates(_points_and_tracks(model)[0], folder / "points3D.txt")
+    _warn_of_larger(folder, model.num_images())
     return model
+
+
+def _warn_of_larger(folder: Path, n_images: int) -> None:
+    """Warn of a model of more images among those of one reconstruction: sparse/N of COLMAP, models/N of hloc."""
+    others = [*folder.glob("models/*/images.bin")]
+    if folder.name.isdigit():
+        others += folder.parent.glob("[0-9]*/images.bin")
+    for path in others:
+        with suppress(OSError), path.open("rb") as file:
+            n_others = int.from_bytes(file.read(8), "little")  # as COLMAP begins the file
+            if n_others > n_images:
+                text = f"{folder} has {n_images} images, the model in {path.parent} has {n_others:,}: is that the map?"
+                warnings.warn(text, MapWarning, stacklevel=3)
 
 
 def write_model(reconstruction: Any, folder: Path) -> None:

@@ -20,12 +20,14 @@ from wheretolook.mapping.colmap_model import ModelArrays
 from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.reading import check_file, max_expanded_bytes
 
+DATABASE_FILE = "database.db"  # COLMAP's usual name
 HDF5_SUFFIXES = (".h5", ".hdf5")
 _KIND_TABLE = "wheretolook_features"  # of a database: the name of the kind of its descriptors
 _TABLES = ("images", "keypoints", "descriptors", _KIND_TABLE)
 _MAX_VALUE = np.float32(1e15)  # no pixel and no number of a descriptor comes near
 _TOLERANCE_PX = 0.01  # between keypoints of a file and of the model that was built from it
 _FIX = "Give the file of features that the model was built from, or none."
+_SAMPLE = 3  # images that show what a file of features is
 
 
 class _Features(NamedTuple):
@@ -44,8 +46,9 @@ def read_descriptors(
     They come from the file of features that the model was built from: a COLMAP database (`database.db` of version 3 or
     4; it is not written to), or hloc's features in HDF5 (`feats-*.h5`). Images are identified by their names. Their
     kind is stated by the database or by the file's name (`feats-disk.h5`); otherwise the number of columns decides:
-    64 for XFeat, 256 for SuperPoint, 128 without negatives for SIFT. Returns None, with a `MapWarning`, if the file
-    holds no descriptors, or none of a kind in `wheretolook.features.registry`.
+    64 for XFeat, 256 for SuperPoint, 128 without negatives for SIFT. Images without observations may be missing.
+    Returns None, with a `MapWarning`, if the file holds no descriptors, or none of a kind in
+    `wheretolook.features.registry`.
 
     Raises MapError if the file is missing, unreadable, or not the one the model was built from, its descriptors are not
     all of one kind, or h5py is missing.
@@ -57,16 +60,17 @@ def read_descriptors(
     )
     result: tuple[DescriptorKind, NDArray[Any]] | None = None
     without = None
-    for image_id, rows, image in zip(
-        model.image_ids, rows_of_image, _read_images(path, model.image_names), strict=True
-    ):
-        _check_keypoints(image, reconstruction.images[int(image_id)], path)
+    observing = np.unique(model.observation_image)  # hloc also keeps images that observe nothing, without keypoints
+    for row, image in zip(observing, _read_images(path, [model.image_names[row] for row in observing]), strict=True):
+        rows = rows_of_image[row]
+        in_model = reconstruction.images[int(model.image_ids[row])]
+        _check_keypoints(image, in_model, path)
         if image.descriptors is not None and image.kind is not None:
             if result is None:
                 result = image.kind, np.empty((len(order), image.kind.dimension), dtype=image.kind.stored_as)
             result[1][rows] = image.descriptors[model.observation_keypoint[rows]]
-        elif len(rows):
-            without = reconstruction.images[int(image_id)].name
+        else:
+            without = in_model.name
     if result is None:
         text = (
             f"{path} holds no descriptors of a known kind ({', '.join(all_kinds())}), so the ambiguity of landmarks is "
@@ -76,6 +80,19 @@ def read_descriptors(
     elif without is not None:
         raise MapError(f"an image has no {result[0].name} descriptors in this file", path=path, value=without, fix=_FIX)
     return result
+
+
+def features_kind(features: Path, reconstruction: Any) -> DescriptorKind | None:
+    """Read the kind of the descriptors of a model in a file of features, from a few images; None if it has none known.
+
+    Raises MapError if the file is missing, unreadable, or not the one the model was built from, or h5py is missing.
+    """
+    images = [image for _, image in sorted(reconstruction.images.items()) if image.num_points3D][:_SAMPLE]
+    kind = None
+    for image, found in zip(images, _read_images(features, [image.name for image in images]), strict=True):
+        _check_keypoints(found, image, features)
+        kind = kind or found.kind
+    return kind
 
 
 def read_features(features: str | Path, names: Sequence[str]) -> tuple[DescriptorKind, list[Stored]]:
@@ -136,7 +153,7 @@ def _check_keypoints(features: _Features, image: Any, path: Path) -> None:
             raise MapError("the file holds other keypoints than the model", path=path, value=image.name, fix=_FIX)
 
 
-def _kind_in_name(path: Path) -> DescriptorKind | None:
+def kind_in_name(path: Path) -> DescriptorKind | None:
     """The kind of descriptors that a file is named after, as hloc names it."""
     words = re.split(r"[^a-z0-9]+", path.stem.lower())
     kinds = (kind for name, kind in all_kinds().items() if any(word.startswith(name) for word in words))
@@ -165,7 +182,7 @@ def _open_database(path: Path) -> Iterator[Callable[[str], _Features]]:
         check_file(path)
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?{mode}", uri=True)) as database:
             database.row_factory = sqlite3.Row
-            named = _kind_in_table(database) or _kind_in_name(path)
+            named = _kind_in_table(database) or kind_in_name(path)
             ids = {row["name"]: row["image_id"] for row in database.execute("SELECT name, image_id FROM images")}
 
             def rows_of(table: str, name: str, item_bytes: int) -> tuple[NDArray[np.uint8], int]:
@@ -232,7 +249,7 @@ def _open_hdf5(path: Path) -> Iterator[Callable[[str], _Features]]:
     try:
         check_file(path)
         with h5py.File(path, "r") as file:
-            named = _kind_in_name(path)
+            named = kind_in_name(path)
 
             def read(name: str) -> _Features:
                 image = _member(file, name)

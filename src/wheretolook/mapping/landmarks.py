@@ -28,6 +28,7 @@ from wheretolook.mapping.colmap_model import (
 )
 from wheretolook.mapping.feature_files import read_descriptors
 from wheretolook.mapping.sanity import warn_of_frame
+from wheretolook.mapping.sources import choose_features
 from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.npz_files import load_npz, save_npz
 
@@ -153,6 +154,7 @@ def open_colmap(
     Without a database torch and Warp are not imported: importing them takes longer than reading 200,000 landmarks.
     """
     reconstruction = read_model(model)
+    database = choose_features(Path(model), reconstruction, None if database is None else Path(database))
     landmarks = load_colmap_landmarks(Path(model), database, max_reprojection_error_px, device, reconstruction)
     poses = colmap_poses(model, reconstruction)
     warn_of_frame(model, landmarks.mapping_distance_m, poses)

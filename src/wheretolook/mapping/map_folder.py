@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, save_mapping_poses, write_model
 from wheretolook.mapping.config import MapConfig
-from wheretolook.mapping.feature_files import HDF5_SUFFIXES
+from wheretolook.mapping.feature_files import DATABASE_FILE, HDF5_SUFFIXES
 from wheretolook.mapping.georeference import REPORT_FILE
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.utils.errors import MapError
@@ -23,7 +23,6 @@ from wheretolook.utils.files import atomic_folder, copy_file, write_text
 from wheretolook.utils.processes import WorkerPool
 
 LANDMARKS_FILE = "landmarks.npz"
-DATABASE_FILE = "database.db"
 IMAGES_FOLDER = "images"
 
 

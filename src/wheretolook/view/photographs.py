@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.utils.confine import path_within
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.images import image_size
 
@@ -30,9 +29,10 @@ class Photographs:
     def of_model(cls, model: Path, folder: Path) -> Self | None:
         """Collect the registered images of a COLMAP model that exist in a folder; None if none does."""
         from wheretolook.mapping.colmap_model import read_model
+        from wheretolook.mapping.sources import has_image
 
         images = read_model(model).images.values()
-        shown = [image for image in images if image.has_pose and _exists(folder, image.name)]
+        shown = [image for image in images if image.has_pose and has_image(folder, image.name)]
         poses = [image.cam_from_world().matrix() for image in shown]
         return cls(folder, tuple(image.name for image in shown), np.array(poses)) if shown else None
 
@@ -55,11 +55,3 @@ class Photographs:
                 return np.asarray(image.resize((width, height)).convert("RGB"))
         except (OSError, ValueError, Image.DecompressionBombError) as error:
             raise ConfigError(f"the photograph cannot be read: {error}", path=path) from error
-
-
-def _exists(folder: Path, name: str) -> bool:
-    """Test whether an image exists and its name stays in the folder."""
-    try:
-        return path_within(folder, name, "an image's name").is_file()
-    except ConfigError:
-        return False

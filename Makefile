@@ -1,7 +1,7 @@
 # make demo   sets everything up and runs the whole line on the embedded default
 # make test   sets everything up and runs linter, type checker and the tests: nine minutes on two cores
 # make test-all   the same and the slow tests too, in half an hour
-# make ui     opens MLflow on the runs, those of the release included; make lab opens Jupyter on the notebooks
+# make ui     opens MLflow at the comparison of methods; make lab opens Jupyter on the notebooks
 # make html   runs all notebooks and writes them as pages, notebooks/html; make docs builds the documentation, site/
 # Options: TORCH=cuda for the CUDA build of PyTorch, PYTHON=python3.12, PORT=5001 for make ui. See environment.md.
 
@@ -36,10 +36,8 @@ test test-all: $(READY)
 
 PORT ?= 5000
 ui: $(READY)
-	@$(BIN)/python -c 'import socket; s = socket.socket(); s.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1); \
-	s.bind(("127.0.0.1", $(PORT)))' 2>/dev/null || { echo "port $(PORT) is in use: make ui PORT=$$(( $(PORT) + 1 ))" >&2; exit 1; }
 	@$(BIN)/wheretolook log-release
-	$(BIN)/mlflow ui --host 127.0.0.1 --port $(PORT) --backend-store-uri sqlite:///mlruns/mlflow.db
+	@$(BIN)/wheretolook ui --port $(PORT)
 
 lab: $(READY)
 	@test -x $(BIN)/jupyter-lab || $(PIP) -c $(CONSTRAINTS) -e '.[notebooks]'

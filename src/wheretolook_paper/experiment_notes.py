@@ -132,12 +132,21 @@ def experiment_tags(stage: str, experiment_id: str) -> dict[str, str]:
     if stage not in PURPOSES:
         return {}
     purpose = PURPOSES[stage]
-    address = f"#/experiments/{experiment_id}/runs?{_SHARED_BY}"
-    links = [f"[{view.about}]({address}={name})" for name, view in purpose.views.items()]
+    links = [f"[{view.about}]({experiment_link(experiment_id, name)})" for name, view in purpose.views.items()]
     note = "\n\n".join(filter(None, (" · ".join(links), purpose.note)))
     views = {f"{_SHARED}{name}": view.state() for name, view in purpose.views.items()}
     return {"mlflow.note.content": note, **views}
 
 
+def experiment_link(experiment_id: str, view: str) -> str:
+    """Return the link to a saved view of an experiment, relative to MLflow's address; not in its part for GenAI."""
+    return f"#/experiments/{experiment_id}/runs?workflowType=machine_learning&viewStateShareKey={view}"
+
+
+def first_view(tags: Mapping[str, str]) -> str:
+    """Return the name of the first saved view in the tags of an experiment, "" without any."""
+    names = [tag.removeprefix(_SHARED) for tag in tags if tag.startswith(_SHARED)]
+    return next((name for purpose in PURPOSES.values() for name in purpose.views if name in names), "")
+
+
 _SHARED = "mlflow.sharedViewState."  # MLflow 3
-_SHARED_BY = "viewStateShareKey"

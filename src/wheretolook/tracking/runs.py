@@ -13,7 +13,6 @@ import json
 import math
 import shlex
 import subprocess
-import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -280,7 +279,7 @@ def artifact(tracking: TrackingConfig, run_id: str, path: str) -> Path:
 
 def ui_command(tracking: TrackingConfig) -> str:
     """Return the shell command that opens MLflow's UI on the store."""
-    return f"{Path(sys.executable).with_name('mlflow')} ui --backend-store-uri {shlex.quote(tracking.uri)}"
+    return f"wheretolook ui --tracking.folder {shlex.quote(tracking.folder)}"
 
 
 @cache

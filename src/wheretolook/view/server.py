@@ -46,8 +46,9 @@ def check_port(host: str, port: int) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         socket.create_server((host, port), family=family).close()
     except (OSError, OverflowError) as error:
-        kind = InUseError if getattr(error, "errno", 0) == errno.EADDRINUSE else ConfigError
-        fix = "Use another, such as --host 0.0.0.0 --port 8081."
+        in_use = getattr(error, "errno", 0) == errno.EADDRINUSE
+        kind = InUseError if in_use else ConfigError
+        fix = f"Use another: --port {port + 1}." if in_use else "Use another, such as --host 0.0.0.0 --port 8081."
         raise kind(f"this address cannot be served: {error}", value=f"{host}:{port}", fix=fix) from error
 
 

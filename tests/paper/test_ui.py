@@ -1,0 +1,66 @@
+"""`wheretolook ui`: links to comparisons, and MLflow's server without its assistant."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+from http.client import HTTPConnection
+from pathlib import Path
+
+import pytest
+
+from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.runs import experiment_id
+from wheretolook.tracking.store import client
+from wheretolook.utils.errors import InUseError, MissingRunError
+from wheretolook_paper.commands.ui import Ui, comparisons
+
+
+@pytest.fixture
+def tracking(tmp_path: Path) -> TrackingConfig:
+    return TrackingConfig(str(tmp_path / "mlruns"))
+
+
+def test_evaluations_are_compared_first(tracking: TrackingConfig) -> None:
+    stages = ("label", "paths", "evaluate")
+    ids = {stage: experiment_id(client(tracking), tracking, stage, "house") for stage in stages}
+    links = comparisons(tracking, "http://server")
+    assert list(links) == ["house: evaluation", "house: paths"]
+    view = "workflowType=machine_learning&viewStateShareKey=methods"
+    assert links["house: evaluation"] == f"http://server/#/experiments/{ids['evaluate']}/runs?{view}"
+
+
+def test_a_store_without_comparisons_is_opened(tracking: TrackingConfig) -> None:
+    experiment_id(client(tracking), tracking, "label", "house")
+    assert [*comparisons(tracking, "http://server").values()] == ["http://server/#/experiments"]
+
+
+def test_what_cannot_be_served(tracking: TrackingConfig) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(InUseError):
+        Ui(port=taken.getsockname()[1]).run()
+    with pytest.raises(MissingRunError):
+        comparisons(tracking, "")
+    assert not tracking.root.exists()
+
+
+@pytest.mark.slow
+def test_the_server_has_no_assistant_and_ends_when_interrupted(tracking: TrackingConfig) -> None:
+    experiment_id(client(tracking), tracking, "evaluate", "house")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    options = ["--tracking.folder", tracking.folder, "--port", str(port)]
+    command = [sys.executable, "-m", "wheretolook", "ui", *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        lines = iter(process.stdout.readline, "")
+        assert any(f"http://mlflow.localhost:{port}/#/experiments/1/" in line for line in lines)
+        statuses = {}
+        for path in ("/", "/ajax-api/3.0/mlflow/assistant/config"):
+            connection = HTTPConnection("127.0.0.1", port, timeout=60)
+            connection.request("GET", path)
+            statuses[path] = connection.getresponse().status
+            connection.close()
+        process.send_signal(signal.SIGINT)
+    assert [*statuses.values()] == [200, 404]

@@ -50,6 +50,8 @@ def test_arguments_override_the_file() -> None:
         ("scenes", ["--scenes.meshes", "[{path: a/b.glb, up: y}]"], "scenes.meshes", (MeshSource(Path("a/b.glb"), up="y"),)),
         ("map", ["--mapping.camera.fov_deg", "60"], "mapping.camera.fov_deg", 60.0),
         ("plan", ["--start", "[-4, -3, 1.4]"], "plan.start", (-4.0, -3.0, 1.4)),
+        ("plan", ["--start", "-4,-3,1.4"], "plan.start", (-4.0, -3.0, 1.4)),
+        ("plan", ["--goal", "0", "-3", "1.4"], "plan.goal", (0.0, -3.0, 1.4)),
         ("plan", ["--stops", "3"], "plan.stops.looks", 3),
         ("evaluate", ["--evaluate.weights", "[data/release/weights/set.safetensors]"], "evaluate.weights", None),
         ("select", ["--map", "m", "--out", "o.csv", "--at", "1,2,1.5", "-0.5,2,1.5"], "at", ("1,2,1.5", "-0.5,2,1.5")),
@@ -143,6 +145,29 @@ def test_an_error_in_a_file_names_the_file(text: str, tmp_path: Path, capsys: py
 def test_the_nearest_name_is_suggested(arguments: list[str], meant: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(arguments) == 2
     assert f"Did you mean {meant}?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "cause"),
+    [
+        ("select --map m --at 1,1,1", "--out must be given"),
+        ("select --map m --at 1,1,1 --out a.csv --n zero", "--n needs a whole number (got 'zero')"),
+        ("select --map m --at 1,1,1 --out a.csv --pitch 30", "--pitch needs 2 numbers"),
+        ("select --map m --at 1,1,1 --out a.csv --pitch 30 -30", "Give -30 30"),
+        ("select --map m --at 1,1,1 --out a.csv --pitch -0.5 0.5", "If these are radians, give -29 29"),
+        ("select --map m --at 1,1,1 --out a.csv --fov 1.2", "give 69"),
+        ("select --map m --at 1,1,1 --out a.csv --lattice x", "one of fibonacci, yaw-pitch"),
+        ("plan --start 0,0", "--start needs 3 numbers"),
+        ("map --mapping.keep_database yess", "true or false"),
+        ("map --mapping.photographs.scale.distance a,b", "{first: ..., second: ..., distance_m: ...}"),
+        ("map --model m --mapping.existing.level true --mapping.photographs.scale.positions a.csv", "no effect"),
+        ("view --scene a --film a.webp", "a film shows a path: give --path"),
+        ("view --map m --path a.csv --film a.webp", "a film of a map needs its --mesh"),
+    ],
+)
+def test_a_mistake_is_answered_with_its_cause(arguments: str, cause: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments.split()) == 2
+    assert cause in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 import time
 import traceback
@@ -13,7 +14,7 @@ from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from wheretolook.utils.errors import ConfigError, WhereToLookError
 from wheretolook.utils.images import MAX_PIXELS
@@ -162,18 +163,52 @@ def parse_command(name: str, arguments: Sequence[str]) -> Any:
         parsed.pop("config")
         return command(**parsed)
     except (ArgumentError, WhereToLookError) as error:
-        raise explained(error, name, ", ".join(files) or None) from error
+        raise explained(error, name, ", ".join(files) or None, types) from error
 
 
-def explained(error: BaseException, name: str, files: str | None) -> WhereToLookError:
-    """Return the error of this project that the parser's error hides, or a ConfigError of its text."""
+def explained(error: BaseException, name: str, files: str | None, types: Mapping[str, Any]) -> WhereToLookError:
+    """Return the error of this project that the parser's error hides, or a ConfigError on the option that it names."""
     help_text = f"`wheretolook {name} --help` explains the options."
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, WhereToLookError):
             return type(cause)(cause.problem, path=cause.path or files, value=cause.value, fix=cause.fix or help_text)
         cause = cause.__cause__ or cause.__context__
-    return ConfigError(" ".join(str(error).split()), path=files, fix=help_text)
+    text = " ".join(str(error).split())
+    short = {option: f"--{short}" for short, option in load_command(name).SHORT.items()}
+    if missing := re.search("arguments are required: (.*)", text):
+        options = " and ".join(short.get(option, f"--{option}") for option in missing[1].split(", "))
+        return ConfigError(f"{options} must be given", path=files, fix=help_text)
+    if wrong := re.search(r'Parser key "([\w.]+)".*(?:Got value|Given value): (.*)', text):
+        option = wrong[1]
+        needed = describe_type(types.get(option))
+        if needed:
+            return ConfigError(
+                f"{short.get(option, f'--{option}')} needs {needed}", path=files, value=wrong[2], fix=help_text
+            )
+    return ConfigError(text, path=files, fix=help_text)
+
+
+def describe_type(kind: Any) -> str:
+    """Describe the values that an option's type allows; empty for types that have no short description."""
+    if get_origin(kind) is Literal:
+        return f"one of {', '.join(get_args(kind))}"
+    if numbers := numbers_of(kind):
+        return "numbers" if Ellipsis in numbers else f"{len(numbers)} numbers"
+    for known, text in ((bool, "true or false"), (int, "a whole number"), (float, "a number"), (Path, "a path")):
+        if kind is known or known in get_args(kind):
+            return text
+    settings = next(filter(is_dataclass, (kind, *get_args(kind))), None)
+    return "" if settings is None else f"{{{', '.join(f'{field.name}: ...' for field in fields(settings))}}}"
+
+
+def numbers_of(kind: Any) -> tuple[Any, ...]:
+    """Return the types of the elements of a tuple of numbers, or of an optional one; empty for other types."""
+    for one in (kind, *get_args(kind)):
+        parts = get_args(one)
+        if get_origin(one) is tuple and {*parts} <= {int, float, Ellipsis}:
+            return parts
+    return ()
 
 
 def option_types(command: Any, prefix: str = "") -> dict[str, Any]:
@@ -212,7 +247,10 @@ def named_values(command: Any, types: Mapping[str, Any], arguments: Sequence[str
                 continue  # of a group of another command: the same options may be given to all
             near = nearest(name, [*known, *command.SHORT])
             raise ConfigError("unknown option", value=option, fix=f"Did you mean --{near}?" if near else None)
-        if is_sequence(types.get(name)) and values[:1] != ["null"] and not "".join(values[:1]).startswith("["):
+        if numbers_of(types.get(name)) and values[:1] != ["null"]:  # 1 2 3, 1,2,3 and [1, 2, 3] are the same
+            numbers = re.split(r"[\s,]+", " ".join(values).strip("[( )]"))
+            yield name, f"[{', '.join(filter(None, numbers))}]"
+        elif is_sequence(types.get(name)) and values[:1] != ["null"] and not "".join(values[:1]).startswith("["):
             yield name, json.dumps(values)
         elif len(values) > 1:
             raise ConfigError("this option takes one value", value=" ".join([option, *values]))

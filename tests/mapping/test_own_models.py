@@ -14,6 +14,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import model_arrays, read_model
+from wheretolook.mapping.config import place_name
 from wheretolook.mapping.landmarks import load_colmap_landmarks
 from wheretolook.mapping.sanity import scale_warning, up_axis_warning
 from wheretolook.utils.errors import MapError, MapWarning
@@ -203,3 +204,17 @@ def test_scale_and_axes_are_doubted_where_they_are_implausible():
         assert up_axis_warning(np.concatenate([poses[:, :, :3] @ np.array(turn, float).T, poses[:, :, 3:]], axis=2))
     above = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0), [30.0]), -1).reshape(-1, 3)
     assert up_axis_warning(poses_looking_along(above, np.tile([1e-3, 0, -1.0], (25, 1)))) == ""  # looking down
+
+
+@pytest.mark.parametrize(
+    ("folder", "name"),
+    [
+        ("/data/fox/images", "fox"),
+        ("/data/fox/sparse/0", "fox"),
+        ("/data/demo/room-1/map", "room-1"),
+        ("/data/kitchen", "kitchen"),
+        ("/0", "model"),
+    ],
+)
+def test_places_are_named_by_the_folder_that_has_a_name(folder, name):
+    assert place_name(Path(folder)) == name

@@ -13,6 +13,7 @@ from wheretolook.geometry.camera_turns import turns_deg as turns_deg_of_cameras
 from wheretolook.geometry.lattices import VoxelGrid, axes_of_angles, fibonacci_sphere
 from wheretolook.geometry.poses import rotation_looking_along
 from wheretolook.planning.config import PathConfig
+from wheretolook.planning.connectivity import separating_cell_m
 from wheretolook.planning.routes import turned_evenly
 from wheretolook.planning.rrt import plan_path
 from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
@@ -154,6 +155,19 @@ class ClosedRoom(Room):
         return super().segments_are_free(a, b) & ((np.atleast_2d(a)[:, 0] < 3) == (np.atleast_2d(b)[:, 0] < 3))
 
 
+class TwoRooms(ClosedRoom):
+    """The wall goes all the way across."""
+
+    def is_free(self, points):
+        return super().is_free(points) & (np.abs(np.atleast_2d(points)[:, 0] - 3) > 0.1)
+
+
+def test_separate_rooms_are_named_as_the_cause() -> None:
+    assert separating_cell_m(np.array([START, GOAL]), Room(), np.array(BOUNDS)) is None
+    with pytest.raises(PlanningError, match="separate parts"):
+        plan_path(START, GOAL, TwoRooms(), BOUNDS, config=replace(QUICK, time_s=0.3), progress=False)
+
+
 @pytest.mark.parametrize(
     "change, error",
     [
@@ -171,7 +185,9 @@ def test_impossible_requests(change: dict[str, object], error: type[Exception]) 
         plan_path(**{**request, "viewpoint_map": looking_north(), **change}, progress=False)
 
 
-@pytest.mark.parametrize("options", [{"pitch_deg": (40, -40)}, {"spacing_m": np.inf}, {"score_weight": -1}])
+@pytest.mark.parametrize(
+    "options", [{"pitch_deg": (40, -40)}, {"pitch_deg": (-0.7, 0.7)}, {"spacing_m": np.inf}, {"score_weight": -1}]
+)
 def test_invalid_options(options: dict[str, object]) -> None:
     with pytest.raises(ConfigError):
         PathConfig(**options)

@@ -18,6 +18,7 @@ AT = [[1.5, -2.0, 0.25], [0.0, 3.0, 1.0]]
         ("\ufeffid,X,Y,Z,comment\na,1.5,-2,0.25,first\nb,0,3,1,\n", ("a", "b"), (2, 3)),
         ("1.5, -2, .25\n\n0, 3, 1\n", ("0", "1"), (1, 3)),
         ("z;y;x\n0.25;-2;1.5\n1;3;0\n", ("0", "1"), (2, 3)),
+        ("1,5;-2;0,25\n0;3;1\n", ("0", "1"), (1, 2)),
         ("# id x y z\n10 1.5 -2 0.25\n2 0 3 1\n", ("10", "2"), (2, 3)),
         ("1.5 -2 0.25\n0 3 1\n", ("0", "1"), (1, 2)),
         (
@@ -26,7 +27,7 @@ AT = [[1.5, -2.0, 0.25], [0.0, 3.0, 1.0]]
             (2, 3),
         ),
     ],
-    ids=["csv", "csv-with-id", "csv-without-header", "semicolons", "benchmark", "plain", "tum"],
+    ids=["csv", "csv-with-id", "csv-without-header", "semicolons", "decimal-commas", "benchmark", "plain", "tum"],
 )
 def test_formats(text: str, ids: tuple[str, ...], lines: tuple[int, ...], tmp_path: Path) -> None:
     path = tmp_path / "waypoints"

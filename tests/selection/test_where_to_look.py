@@ -178,6 +178,7 @@ def test_cameras(sparse: Path) -> None:
         ],
         ({"camera": 7}, MapError),
         ({"fov_deg": 180}, ConfigError),
+        ({"fov_deg": 1.2}, ConfigError),
         ({"fov_deg": 60, "camera": 1}, ConfigError),
         ({"method": "nothing"}, ConfigError),
         ({"weights": "nothing.safetensors"}, WeightsError),
@@ -237,6 +238,12 @@ def test_a_sequence_stops_where_one_look_will_not_do(look: WhereToLook, tmp_path
         views.save(tmp_path / "views.tum")
 
 
+def test_a_turn_in_radians_is_rejected(look: WhereToLook) -> None:
+    with pytest.raises(ConfigError):
+        look.best(POINTS, max_turn_deg=0.5)
+    assert len({*map(tuple, look.best(POINTS, max_turn_deg=0).axes.round(6).tolist())}) == 1
+
+
 @pytest.mark.parametrize(
     "options",
     [
@@ -247,6 +254,8 @@ def test_a_sequence_stops_where_one_look_will_not_do(look: WhereToLook, tmp_path
         {"looks": 2, "max_turn_deg": 30},
         {"max_total_turn_deg": 30},
         {"pitch_deg": (30, -30)},
+        {"pitch_deg": (-0.5, 0.5)},  # radians
+        {"pitch_deg": (-100, 0)},
         {"looks": 3, "least_score": 0.5},
         {"looks": 3, "max_turn_deg": 10, "least_score": 0.5, "max_total_turn_deg": 90},
     ],

@@ -20,7 +20,7 @@ from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
 from wheretolook.geometry.poses import Float
-from wheretolook.mapping.config import ExistingModelConfig
+from wheretolook.mapping.config import place_name
 from wheretolook.scorers.adapted.config import AdaptConfig
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.store import check_store, kept_if_not_logged
@@ -127,7 +127,7 @@ class Adapt(SceneOptions, LabelOptions):
         from wheretolook.mapping.colmap_model import model_arrays, read_model
         from wheretolook.mapping.georeference import read_scale
 
-        name = ExistingModelConfig(model=model).scene_name
+        name = place_name(model)
         target = self._target(name, folder_of_check(self.data, name) / "adapted.safetensors")
         scale = read_scale(model)
         if scale is not None and not scale.is_metric and not self.mapping.photographs.assume_metric:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from wheretolook.commands.options import OcclusionOptions, ScorerOptions
 from wheretolook.dataset.names import LOCK
 from wheretolook.features.config import ExtractorConfig
-from wheretolook.mapping.config import ExistingModelConfig
+from wheretolook.mapping.config import place_name
 from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.locks import hold
 from wheretolook.utils.validation import check_range, reject
@@ -106,10 +106,7 @@ class Check(OcclusionOptions, ScorerOptions):
         for method in filter(None, (self.method, *self.also)):
             check_method(method)
         scene = None if self.scene is None else find_scene(self.data, self.scene, self.name)
-        if self.scene is None:
-            name = ExistingModelConfig(model=self.map).scene_name
-        else:
-            name = "-".join(filter(None, (self.name, self.scene)))
+        name = "-".join(filter(None, (self.name, self.scene))) if self.map is None else place_name(self.map)
         if self.map is not None and self.mesh is None:  # with a mesh, missing metres are the first error
             model_suffix(self.map)
         # the imports above are light, those below take seconds
@@ -173,5 +170,5 @@ class Check(OcclusionOptions, ScorerOptions):
             raise MapError(problem, path=model, fix=fix)
         given = (self.images, self.database)
         folder, features = features_of(model, *given, work, workers, device, self._extractor())
-        name = self.scene or ExistingModelConfig(model=model).scene_name
+        name = self.scene or place_name(model)
         return open_map(folder, features, metric, name, keep_frame=mesh is not None), occlusion

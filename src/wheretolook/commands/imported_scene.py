@@ -10,7 +10,7 @@ from typing import Any
 
 from wheretolook.commands.map import Map
 from wheretolook.commands.options import DatasetOptions, Log, Progress, SceneOptions, ignore_progress, select_options
-from wheretolook.mapping.config import ExistingModelConfig, MapConfig
+from wheretolook.mapping.config import ExistingModelConfig, MapConfig, place_name
 from wheretolook.utils.validation import reject
 
 
@@ -40,7 +40,7 @@ class SceneOrMapOptions(SceneOptions):
     @property
     def imported_name(self) -> str:
         """Name of the scene that `map` is imported as; empty without it."""
-        return "" if self.map is None else ExistingModelConfig(self.map).scene_name
+        return "" if self.map is None else place_name(self.map)
 
 
 def imports_map(run: Callable[..., Any]) -> Callable[..., Any]:

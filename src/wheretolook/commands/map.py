@@ -23,7 +23,7 @@ from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, describe_camera, draw_camera
 from wheretolook.geometry.poses import Float
-from wheretolook.mapping.config import ExistingModelConfig, MapConfig, ScaleConfig
+from wheretolook.mapping.config import ExistingModelConfig, MapConfig, ScaleConfig, place_name
 from wheretolook.mapping.georeference import read_scale
 from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.confine import check_folder_name, path_within
@@ -149,7 +149,7 @@ def _map_photographs(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     settings = options.mapping.photographs
     folder = settings.images
     assert folder is not None
-    scene = _new_scene(options, settings.name or folder.resolve().name)
+    scene = _new_scene(options, settings.name or place_name(folder))
     dataset = _with_scene(scene, options.root)
     tables = [path for path in (settings.scale.marker_table, settings.scale.positions) if path is not None]
     for path in tables:
@@ -187,7 +187,7 @@ def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     photographs = options.mapping.photographs
     folder = settings.model
     assert folder is not None
-    scene = _new_scene(options, settings.scene_name)
+    scene = _new_scene(options, settings.name or place_name(folder))
     if settings.mesh is not None and (settings.level or photographs.scale != ScaleConfig()):
         fix = "Give a model and a mesh that are both in metres with z up."
         raise ConfigError("a model that is turned or scaled leaves its mesh", value=str(settings.mesh), fix=fix)

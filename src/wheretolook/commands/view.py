@@ -82,14 +82,18 @@ class View(CameraOptions):
         of_map = self.mesh is not None or self.images is not None or self.camera_id is not None
         record = self.record
         film = self.film
-        can_film = film is None or (self.path is not None and (self.map is None or self.mesh is not None))
         reject(
             ((self.map is None) == (self.scene is None), "what is viewed is given by either --scene or --map", None),
             (self.scene is not None and of_map, "--mesh, --images and --camera-id belong to --map", self.scene),
             (record is not None and film is not None, "give either --record or --film", None),
             (record is not None and record.suffix != ".rrd", "a Rerun recording is a .rrd", str(record)),
             (film is not None and film.suffix not in (".webp", ".gif"), "a film is a .webp or a .gif", str(film)),
-            (not can_film, "a film needs --path, and of a map --mesh", str(film)),
+            (film is not None and self.path is None, "a film shows a path: give --path", str(film)),
+            (
+                film is not None and self.scene is None and self.mesh is None,
+                "a film of a map needs its --mesh",
+                str(film),
+            ),
         )
         self.named_camera()
 

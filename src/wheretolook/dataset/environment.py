@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from wheretolook.geometry.camera import Camera, cameras_by_id, only_camera
 from wheretolook.geometry.lattices import ViewLattice, VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.mapping.config import place_name
 from wheretolook.mapping.georeference import read_scale
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.utils.devices import usable_device
@@ -352,7 +353,7 @@ class ColmapEnvironment(Environment):
     ) -> None:
         super().__init__(config, device, progress=True)
         self.files = files
-        self.name = files.model.resolve().name
+        self.name = place_name(files.model)
         self._camera = camera
         if files.mesh is not None and files.depth is not None:
             raise ConfigError("give a mesh or depth images, not both", value=str(files.depth))

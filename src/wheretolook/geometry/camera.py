@@ -73,6 +73,9 @@ class PinholeCamera(_Image):
         if not 0 < across_deg < 180:
             fix = "Give the angle between the image's left and right side; a fisheye needs a COLMAP model."
             raise ConfigError("a pinhole's field of view must be between 0 and 180 degrees", value=across_deg, fix=fix)
+        if across_deg <= np.pi:
+            fix = f"If it is in radians, give {np.degrees(across_deg):.0f}; else give the focal length in pixels."
+            raise ConfigError("a field of view is in degrees, and this is a telescope's", value=across_deg, fix=fix)
         return cls(width, height, width / 2 if across_deg == 90 else width / 2 / np.tan(np.radians(across_deg) / 2))
 
     @property

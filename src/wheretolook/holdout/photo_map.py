@@ -18,7 +18,7 @@ from wheretolook.geometry.camera import Camera, cameras_by_id
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.localization.labeller import versions
 from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_arrays, read_model, registered_names
-from wheretolook.mapping.config import ExistingModelConfig, MapConfig, PhotographsConfig
+from wheretolook.mapping.config import ExistingModelConfig, MapConfig, PhotographsConfig, place_name
 from wheretolook.mapping.feature_files import DATABASE_FILE, read_descriptors
 from wheretolook.mapping.georeference import Similarity, read_scale
 from wheretolook.mapping.gravity import estimate_gravity
@@ -154,7 +154,7 @@ def open_map(
     cameras = cameras_by_id(model.cameras, model_dir)
     images = [model.images[int(number)] for number in arrays.image_ids]
     return PhotographedMap(
-        name=name or ExistingModelConfig(model=model_dir).scene_name,
+        name=name or place_name(model_dir),
         path=model_dir,
         model=model,
         arrays=arrays,

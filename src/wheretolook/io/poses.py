@@ -46,8 +46,8 @@ def poses_of_values(values: ArrayLike) -> Float:
 def read_rows(path: Path) -> list[tuple[int, list[str]]]:
     """Read the rows of a text table as pairs of line number, from 1, and cells; lines starting with # are comments.
 
-    If the first row has a comma or semicolon, cells are separated by it and may be quoted; else by blanks. Raises
-    TableError if the file is missing, no UTF-8 text, too large, or has no rows.
+    If the first row has a semicolon or comma, cells are separated by it and may be quoted; else by blanks. Commas between
+    semicolons are decimal points. Raises TableError if the file is missing, no UTF-8 text, too large, or has no rows.
     """
     try:
         lines = enumerate(map(str.strip, read_text(path).removeprefix("\ufeff").splitlines()), 1)
@@ -56,9 +56,11 @@ def read_rows(path: Path) -> list[tuple[int, list[str]]]:
             raise ValueError("it has no rows")
         if len(rows) > MAX_ROWS:
             raise ValueError(f"it has more than {MAX_ROWS:,} rows")
-        separator = next((mark for mark in ",;" if mark in rows[0][1]), None)
+        separator = next((mark for mark in ";," if mark in rows[0][1]), None)
         if separator is None:
             return [(number, line.split()) for number, line in rows]
+        if separator == ";":  # of spreadsheets where a comma is the decimal point
+            rows = [(number, line.replace(",", ".")) for number, line in rows]
         cells = csv.reader((line for _, line in rows), delimiter=separator, skipinitialspace=True)
         return [(number, [*map(str.strip, row)]) for (number, _), row in zip(rows, cells, strict=True)]
     except (OSError, ValueError, csv.Error) as error:

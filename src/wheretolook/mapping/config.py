@@ -118,7 +118,8 @@ class PhotographsConfig:
 
     Args:
         images: folder of the photographs, with any subfolders.
-        name: name of the scene; by default that of the folder.
+        name: name of the scene; by default that of the folder, and for images, rgb and the like that of the parent
+            folder.
         max_side_px: photographs are reduced to this many pixels along their longer side; 0 keeps their size. The map's
             cameras and keypoints are those of the reduced photographs.
         camera_model: COLMAP's name of the camera model.
@@ -192,15 +193,27 @@ class ExistingModelConfig:
     def __post_init__(self) -> None:
         check_range("max_reprojection_error_px", self.max_reprojection_error_px, 0)
 
-    @property
-    def scene_name(self) -> str:
-        """Name of the scene's folder."""
-        assert self.model is not None
-        parts = [part for part in self.model.resolve().parts[1:] if part not in _GENERIC_NAMES and not part.isdigit()]
-        return self.name or (parts[-1] if parts else "model")
+
+def place_name(folder: Path) -> str:
+    """Return the name of a place from the folder of its model or images: the last folder that has a name of its own."""
+    parts = [part for part in folder.resolve().parts[1:] if part not in _GENERIC_NAMES and not part.isdigit()]
+    return parts[-1] if parts else "model"
 
 
-_GENERIC_NAMES = ("sparse", "model", "models", "sfm", "colmap", "map")  # of folders that hold models
+_GENERIC_NAMES = (
+    "sparse",
+    "model",
+    "models",
+    "sfm",
+    "colmap",
+    "map",
+    "images",
+    "image",
+    "imgs",
+    "rgb",
+    "color",
+    "input",
+)
 
 
 @dataclass(frozen=True)
@@ -240,6 +253,9 @@ class MapConfig:
         if self.camera is not None and self.draw_camera:
             raise ConfigError("give camera or draw_camera, not both", value=self.camera)
         check_positive("max_reprojection_error_px", self.max_reprojection_error_px)
+        if self.existing.level and self.photographs.scale.positions is not None:
+            problem = "known positions determine the whole frame, so mapping.existing.level would have no effect"
+            raise ConfigError(problem, fix="Leave it out, and give positions with z up.")
 
     def record(self) -> dict[str, Any]:
         """Settings and constants, from which the keys of finished maps are made."""

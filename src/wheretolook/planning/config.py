@@ -11,7 +11,7 @@ from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.looks.selection import MAX_VIEWS
 from wheretolook.scorers.forward import ForwardScorer
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.validation import check_choice, check_positive, check_range
+from wheretolook.utils.validation import check_choice, check_pitch, check_positive, check_range
 
 FORWARD = ForwardScorer.name
 """The method that needs no map: the shortest path, looking ahead. Others are compared with it."""
@@ -75,8 +75,9 @@ class PathConfig:
 
     def __post_init__(self) -> None:
         low, high = self.pitch_deg
-        if not -90 < low <= high < 90:
-            raise ConfigError("pitch_deg needs a range inside -90 to 90", value=self.pitch_deg)
+        check_pitch("pitch_deg", self.pitch_deg)
+        if low == -90 or high == 90:
+            raise ConfigError("pitch_deg must exclude straight down and straight up", value=self.pitch_deg)
         for name in ("max_turn_deg_per_m", "spacing_m", "time_s"):
             check_positive(name, getattr(self, name))
         for name in ("score_weight", "turn_weight_m"):

@@ -16,6 +16,7 @@ from wheretolook.geometry.camera_turns import check_axis
 from wheretolook.geometry.lattices import axes_of_angles
 from wheretolook.geometry.poses import Float
 from wheretolook.planning.config import PathConfig
+from wheretolook.planning.connectivity import separating_cell_m
 from wheretolook.planning.routes import IMPROVEMENT, SEARCH, SHORT_ROUTE, PlannedPath, RouteSamples, RouteViews
 from wheretolook.planning.view_sequence import between, lengths_along
 from wheretolook.planning.viewpoint_map import ViewpointMap
@@ -99,7 +100,7 @@ def plan_path(
 
     Raises:
         PlanningError: the start or the goal is not free or outside the bounds; they are the same; the axis is beyond
-            the camera's limits, or given without a viewpoint map; or no path was found in time.
+            the camera's limits, or given without a viewpoint map; the free space does not connect them, or no path was found in time.
         ValueError: a point is not finite, or the axis has no direction.
     """
     ends = np.asarray([start, goal], dtype=np.float64)
@@ -190,8 +191,9 @@ def check_ends(ends: Float, space: Space, bounds: Float) -> None:
         if not ((point >= low) & (point <= high)).all() or not space.is_free(point[None])[0]:
             there = low + (high - low) * np.random.default_rng(0).random((4096, 3))
             free = there[space.is_free(there)]
-            near = free[np.linalg.norm(free - point, axis=1).argsort()[:1]].round(2).tolist()
-            fix = f"Give a point where the camera can be, such as {near}."
+            near = free[np.linalg.norm(free - point, axis=1).argsort()[:1]]
+            such = f", such as {','.join(f'{value:.2f}' for value in near[0])}" if len(near) else ""
+            fix = f"Give a point where the camera can be{such}."
             raise PlanningError(f"the {name} is not in free space", value=tuple(point.tolist()), fix=fix)
     if np.linalg.norm(ends[1] - ends[0]) < SAME_M:
         raise PlanningError("the start is the goal", value=tuple(ends[0].tolist()))
@@ -380,10 +382,20 @@ class _Problem:
             spent += step
             bar.update(min(step, max(0.0, bar.total - bar.n)))
         if not definition.hasExactSolution():
-            fix = "Give it more time, or loosen the camera's limits."
-            raise PlanningError("no path was found in time", value=f"{spent:.2g} s", fix=fix)
+            raise self.failure(spent)
         solution = definition.getSolutionPath()
         return np.array([_numbers(solution.getState(index)) for index in range(solution.getStateCount())])
+
+    def failure(self, spent_s: float) -> PlanningError:
+        """Return the error that explains why no path was found in a time in seconds."""
+        cell_m = separating_cell_m(self.request.ends, self.request.space, self.request.bounds)
+        if cell_m is None:
+            fix = "Give it more time, such as --plan.planner.time_s 30, or loosen the camera's limits."
+            return PlanningError("no path was found in time", value=f"{spent_s:.2g} s", fix=fix)
+        problem = f"start and goal are in separate parts of the free space, as far as cells of {cell_m:.2g} m show"
+        fix = "Give two positions of one part, or allow narrower passages: --scenes.free_space.clearance_m 0.15, "
+        fix += "without a mesh --scenes.mapped_space.max_camera_distance_m 1.5."
+        return PlanningError(problem, value=self.request.ends.tolist(), fix=fix)
 
     def path(self, states: Float, views: RouteViews) -> PlannedPath:
         """Return the path through states (S, 5) with their views."""

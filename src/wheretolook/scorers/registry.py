@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from wheretolook.scorers.method import Method, ScorerOptions
 from wheretolook.utils.errors import CameraError, ConfigError, OutOfRangeWarning, WeightsError
+from wheretolook.utils.nearest import nearest
 from wheretolook.utils.shipped import WEIGHTS, or_shipped
 
 if TYPE_CHECKING:
@@ -116,7 +117,9 @@ def describe_methods() -> dict[str, str]:
 def check_method(name: str) -> Method:
     """Return the scoring method of a name; a ConfigError if there is none."""
     if name not in scorers():
-        raise ConfigError("unknown method", value=name, fix=f"There are {', '.join(scorers())}.")
+        near = nearest(name, scorers())
+        fix = f"Did you mean {near}?" if near else f"There are {', '.join(scorers())}."
+        raise ConfigError("unknown method", value=name, fix=fix)
     return scorers()[name]
 
 

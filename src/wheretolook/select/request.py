@@ -7,7 +7,7 @@ from numbers import Integral
 
 from wheretolook.looks.selection import MAX_VIEWS
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.validation import check_range, reject
+from wheretolook.utils.validation import check_pitch, check_range, reject
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class SelectionRequest:
     skip: bool = False
 
     def __post_init__(self) -> None:
-        low, high = self.pitch_deg or (-90.0, 90.0)
+        check_pitch("pitch_deg", self.pitch_deg or (-90.0, 90.0))
         joint = self.looks is not None
         in_order = self.max_turn_deg is not None
         stopping = self.least_score is not None
@@ -44,11 +44,6 @@ class SelectionRequest:
         reject(
             (not isinstance(self.n, Integral) or self.n < 1, "n must be a whole number of at least 1", self.n),
             (joint and self.looks not in range(1, MAX_VIEWS + 1), f"looks must be 1 to {MAX_VIEWS}", self.looks),
-            (
-                not -90 <= low <= high <= 90,
-                "pitch_deg must be a lowest and a highest pitch, such as -30 30",
-                (low, high),
-            ),
             (stopping and not (joint and in_order), "least_score needs looks and max_turn_deg", self.least_score),
             (stopping and not 0 < (self.least_score or 0) <= 1, "least_score must be above 0, to 1", self.least_score),
             (joint and self.n > 1, "n and looks exclude each other", (self.n, self.looks)),

@@ -206,7 +206,7 @@ class WhereToLook:
         if request.max_turn_deg is None:
             chosen = np.argsort(-scores, axis=1, kind="stable")[:, : request.n + SPARE]
         else:
-            chosen = best_sequence(scores, TurnLimit.of(axes, request.max_turn_deg)).direction_ids[:, None]
+            chosen = best_sequence(scores, _turn_limit(axes, request.max_turn_deg)).direction_ids[:, None]
         k = chosen.shape[1]
         step = max(1, SIGHT_LINES // max(1, len(self.localization_map.landmarks)))
         blocks = np.split(np.arange(len(waypoints)), range(step, len(waypoints), step))
@@ -236,7 +236,7 @@ class WhereToLook:
         """Select the best sequence by scores (W, D) of axes (D, 3), with further looks where it scores too little."""
         assert request.looks is not None and request.max_turn_deg is not None and request.least_score is not None
         points = waypoints.points
-        chosen = axes[best_sequence(scores, TurnLimit.of(axes, request.max_turn_deg)).direction_ids]
+        chosen = axes[best_sequence(scores, _turn_limit(axes, request.max_turn_deg)).direction_ids]
         config = StopConfig(request.looks, request.least_score)
         stops = stops_along(self.scorer, points, chosen, axes, config, progress="stops" if progress else None)
         path = PlannedPath(points, chosen, self.scorer.score(poses_looking_along(points, chosen)), np.nan, stops=stops)
@@ -290,6 +290,16 @@ class WhereToLook:
             fix = "Ask for fewer views, score more directions, or widen the limit on pitch."
             raise ConfigError(f"there are only {len(axes)} directions to choose from", value=needed, fix=fix)
         return axes
+
+
+def _turn_limit(axes: Float, max_turn_deg: float) -> TurnLimit:
+    """Return the limit for directions (D, 3). Raises ConfigError if it allows no turn and seems to be in radians."""
+    limit = TurnLimit.of(axes, max_turn_deg)
+    if 0 < max_turn_deg <= np.pi and limit.neighbours.shape[1] == 1 < len(axes):
+        problem = "max_turn_deg is in degrees, and less than the angle between any two directions"
+        fix = f"If these are radians, give {np.degrees(max_turn_deg):.0f}; else score more directions, or give 0."
+        raise ConfigError(problem, value=max_turn_deg, fix=fix)
+    return limit
 
 
 def _described_camera(camera: Camera | str | int | None, fov_deg: float | None) -> Camera | int | None:

@@ -214,9 +214,7 @@ def open_map(
     if mesh is not None:
         warn_of_mesh(mesh, landmarks.points, environment.raycaster)
     own = {"given": or_shipped(weights)} if weights else map_weights(path, data, landmarks)
-    model = path.resolve()
-    name = model.parent.name if model.name in ("0", "sparse", "map") else model.name
-    return ViewedMap(name, environment, own, photographs=_photographs(path, images))
+    return ViewedMap(environment.name, environment, own, photographs=_photographs(path, images))
 
 
 def open_scene(

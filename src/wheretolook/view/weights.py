@@ -69,9 +69,9 @@ def scene_weights(files: SceneFolder, landmarks: Landmarks) -> dict[str, Path | 
 
 def map_weights(model: Path, data: Path, landmarks: Landmarks) -> dict[str, Path | None]:
     """Find weights adapted to a COLMAP model by `wheretolook adapt --map`."""
-    from wheretolook.mapping.config import ExistingModelConfig
+    from wheretolook.mapping.config import place_name
 
-    path = data / "checks" / ExistingModelConfig(model=model).scene_name / "adapted.safetensors"
+    path = data / "checks" / place_name(model) / "adapted.safetensors"
     return {"adapted to this scene": _if_adapted_to(path, landmarks)}
 
 

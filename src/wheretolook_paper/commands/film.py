@@ -49,9 +49,11 @@ def film(viewed: ViewedMap, path: Path, state: ViewState = ViewState()) -> int:
     A view is good if it localized, or, for paths that were not localized, if its score reaches the threshold. Raises
     ConfigError without a mesh or with fewer than two paths.
     """
-    if viewed.mesh is None or len(viewed.paths) < 2:
-        fix = "Give --path of a scene with a mesh."
-        raise ConfigError("a film needs a mesh, and two paths to compare", path=path, fix=fix)
+    if viewed.mesh is None:
+        fix = "Leave --film out for the page in the browser, or give --record FILE.rrd for a recording."
+        raise ConfigError("a film shows a mesh, and there is none here", path=path, value=viewed.name, fix=fix)
+    if len(viewed.paths) < 2:
+        raise ConfigError("a film compares two paths", path=path, value=[*viewed.paths], fix="Give --path.")
     frames = list(_frames(viewed, viewed.complete(state)))
     save_moving(frames, FRAME_MS, path, LAST_MS)
     return len(frames)

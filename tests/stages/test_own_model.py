@@ -194,7 +194,8 @@ def test_a_turned_and_scaled_model_warns_and_is_aligned(tmp_path):
     table = tmp_path / "positions.csv"
     table.write_text("image,x,y,z\n" + "".join(f"{i:03d}.jpg,{x},{y},{z}\n" for i, (x, y, z) in enumerate(centers)))
     for scale in (ScaleConfig(distance=distance), ScaleConfig(positions=table), ScaleConfig(marker_size_m=0.4)):
-        config = MapConfig(existing=existing, photographs=PhotographsConfig(scale=scale))
+        level = scale.positions is None
+        config = MapConfig(existing=replace(existing, level=level), photographs=PhotographsConfig(scale=scale))
         if scale.marker_size_m:  # no photographs to detect markers in
             with pytest.raises(ConfigError):
                 map_existing(config, tmp_path / "map", tmp_path / "work")

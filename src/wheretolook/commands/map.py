@@ -36,9 +36,9 @@ class Map(SceneOptions, LabelOptions):
     """Build a COLMAP map of every scene from renders, or of photographs: --images. Or import one: --model.
 
     A model of your own, from COLMAP or hloc, in metres with z up, becomes a scene for sample, viewpoint-map and plan.
-    Mesh and database are optional. With --images its landmarks are triangulated again. If it is not upright, or not in
-    metres: --mapping.existing.level true, --mapping.photographs.scale.positions FILE. Its own camera is the scene's, unless
-    --camera names one.
+    Mesh and database are optional. With --images its landmarks are triangulated again. --mapping.existing.level true
+    turns it upright by its cameras; --mapping.photographs.scale.positions FILE determines unit, axes and origin instead. Its
+    own camera is the scene's, unless --camera names one.
 
     Examples:
       wheretolook map --name photos --images FOLDER

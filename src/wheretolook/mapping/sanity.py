@@ -96,6 +96,6 @@ def up_axis_warning(cam_from_world: ArrayLike) -> str:
     up = " ".join(f"{value:.2f}" for value in np.round(gravity.up, 2) + 0.0)  # no -0.00
     return (
         f"the cameras are {how}: the up direction estimated from their orientations is ({up}), {off_deg:.0f} degrees from z, which is "
-        "up here. `wheretolook map --model` turns it upright with --mapping.existing.level true, or give a model with z up "
+        "up here. `wheretolook map --model` turns it upright with --mapping.existing.level true; or give a model, or known positions, with z up "
         "(COLMAP's model_orientation_aligner). Ignore this warning if the cameras were held so"
     )

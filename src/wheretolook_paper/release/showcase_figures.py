@@ -140,7 +140,7 @@ def mistaken_location(showcase: Showcase, scorer: Scorer) -> int:
     rows = showcase.table[showcase.table["location_id"].isin(showcase.layer())]
     error = pd.Series(np.abs(scorer.score(poses(rows)) - is_good(rows)), rows["location_id"])
     means = error.groupby(level=0).mean()
-    return int(means.index[means.to_numpy().argmax()])
+    return int(means.index[int(means.to_numpy().argmax())])
 
 
 def peaks_of(showcase: Showcase, scorer: Scorer, location_id: int, n: int = 3) -> Peaks:

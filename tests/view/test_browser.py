@@ -99,3 +99,17 @@ def test_views_and_an_image_are_saved_and_rings_turn_the_view(viewer: Viewer, br
     tab.drag(start, end)
     tab.wait(lambda _: 10 < np.degrees(np.arccos(session.place.axis @ before)) < 80)
     assert tab.errors == []
+
+
+def test_a_button_leaves_first_person(viewer: Viewer, browser: Browser) -> None:
+    tab = browser.open(ViewState(occlusion="none", place=(1.6, 2.1, 1.5)).link(f"localhost:{viewer.port}"))
+    tab.wait(lambda tab: "landmarks in view" in tab.text)
+    assert "camera height" in tab.text and "Leave first person" not in tab.text
+    session = viewer.sessions[max(viewer.sessions)]
+    before = session.client.camera.position.copy()
+    session.controls.inside.value = True
+    tab.wait(lambda _: np.linalg.norm(session.client.camera.position - (1.6, 2.1, 1.5)) < 0.2)
+    tab.press("Leave first person")
+    tab.wait(lambda tab: "Leave first person" not in tab.text and not session.controls.inside.value)
+    tab.wait(lambda _: np.linalg.norm(session.client.camera.position - before) < 0.2)
+    assert tab.errors == []

@@ -31,6 +31,7 @@ class Controls:
     """Handles of all elements of the panel, which is made by a `viser.GuiApi`."""
 
     def __init__(self, gui: Any, viewed: ViewedMap, state: ViewState) -> None:
+        self.leave = gui.add_button("Leave first person", visible=False, color="orange")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Scene"):
             self._add_map(gui, viewed, state)
@@ -54,7 +55,8 @@ class Controls:
         self.method = gui.add_dropdown("method", viewed.weights.methods, initial_value=state.method)
         self.weights = gui.add_markdown("")
         self.occlusion = gui.add_dropdown("occlusion model", viewed.occlusions, initial_value=state.occlusion)
-        self.height = _height_slider(gui, "height, m", viewed.bounds[:, 2], state.height)
+        self.height = _height_slider(gui, "camera height", viewed.bounds[:, 2], state.height)
+        self.height.hint = "Height z in metres at which locations are scored and selected."
         threshold = min(max(state.threshold, 0.0), 1.0)
         hint = "Locations with lower scores are paler."
         self.threshold = gui.add_slider("threshold", 0.0, 1.0, 0.01, threshold, hint=hint)

@@ -36,6 +36,7 @@ class LocationView:
         for slider in (c.yaw, c.pitch):
             session.on(slider, self._sliders_moved, by_hand=True)
         session.on(c.inside, self._move_inside)
+        session.on(c.leave, lambda: setattr(c.inside, "value", False))
 
     def select(self, position: Float, angles: tuple[float, float] | None = None) -> None:
         """Score a location (3,) m, and show its best view or the one with angles (yaw, pitch) in degrees."""
@@ -148,6 +149,7 @@ class LocationView:
         if session.location is None or self.axis is None:
             session.controls.inside.value = False
             return
+        session.controls.leave.visible = inside
         self._camera_set = time.monotonic()
         with session.client.atomic():
             if inside:

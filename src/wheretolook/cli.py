@@ -14,7 +14,7 @@ from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
 from wheretolook.utils.errors import ConfigError, WhereToLookError
 from wheretolook.utils.images import MAX_PIXELS
@@ -43,6 +43,12 @@ COMMANDS = {
 """Dataclass of each command's options, whose `run()` does the work. Packages add theirs as entry points of this group."""
 
 GROUP = "wheretolook.commands"
+
+NUMBERS = re.compile(r"tuple\[(int|float),")
+"""Types of several numbers, which are written 1 2 3, 1,2,3 or [1, 2, 3]."""
+
+NEEDED = {"bool": "true or false", "int": "a whole number", "float": "a number"}
+"""Descriptions of types by their names."""
 
 ENVIRONMENT = {
     "OMP_WAIT_POLICY": "PASSIVE",  # idle threads leave the core to other processes
@@ -175,40 +181,23 @@ def explained(error: BaseException, name: str, files: str | None, types: Mapping
             return type(cause)(cause.problem, path=cause.path or files, value=cause.value, fix=cause.fix or help_text)
         cause = cause.__cause__ or cause.__context__
     text = " ".join(str(error).split())
-    short = {option: f"--{short}" for short, option in load_command(name).SHORT.items()}
     if missing := re.search("arguments are required: (.*)", text):
-        options = " and ".join(short.get(option, f"--{option}") for option in missing[1].split(", "))
-        return ConfigError(f"{options} must be given", path=files, fix=help_text)
+        return ConfigError(f"--{missing[1].replace(', ', ' and --')} must be given", path=files, fix=help_text)
     if wrong := re.search(r'Parser key "([\w.]+)".*(?:Got value|Given value): (.*)', text):
-        option = wrong[1]
-        needed = describe_type(types.get(option))
-        if needed:
-            return ConfigError(
-                f"{short.get(option, f'--{option}')} needs {needed}", path=files, value=wrong[2], fix=help_text
-            )
+        option, value = wrong.groups()
+        short = next((short for short, known in load_command(name).SHORT.items() if known == option), option)
+        if needed := describe_type(str(types.get(option))):
+            return ConfigError(f"--{short} needs {needed}", path=files, value=value, fix=help_text)
     return ConfigError(text, path=files, fix=help_text)
 
 
-def describe_type(kind: Any) -> str:
-    """Describe the values that an option's type allows; empty for types that have no short description."""
-    if get_origin(kind) is Literal:
-        return f"one of {', '.join(get_args(kind))}"
-    if numbers := numbers_of(kind):
-        return "numbers" if Ellipsis in numbers else f"{len(numbers)} numbers"
-    for known, text in ((bool, "true or false"), (int, "a whole number"), (float, "a number"), (Path, "a path")):
-        if kind is known or known in get_args(kind):
-            return text
-    settings = next(filter(is_dataclass, (kind, *get_args(kind))), None)
-    return "" if settings is None else f"{{{', '.join(f'{field.name}: ...' for field in fields(settings))}}}"
-
-
-def numbers_of(kind: Any) -> tuple[Any, ...]:
-    """Return the types of the elements of a tuple of numbers, or of an optional one; empty for other types."""
-    for one in (kind, *get_args(kind)):
-        parts = get_args(one)
-        if get_origin(one) is tuple and {*parts} <= {int, float, Ellipsis}:
-            return parts
-    return ()
+def describe_type(kind: str) -> str:
+    """Describe the values that an option's type, as text, allows; empty for types without a short description."""
+    if kind.startswith("typing.Literal"):
+        return "one of " + ", ".join(re.findall("'(.*?)'", kind))
+    if NUMBERS.match(kind):
+        return "numbers" if "..." in kind else f"{kind.count(',') + 1} numbers"
+    return next((text for name, text in NEEDED.items() if name in kind), "")
 
 
 def option_types(command: Any, prefix: str = "") -> dict[str, Any]:
@@ -247,7 +236,7 @@ def named_values(command: Any, types: Mapping[str, Any], arguments: Sequence[str
                 continue  # of a group of another command: the same options may be given to all
             near = nearest(name, [*known, *command.SHORT])
             raise ConfigError("unknown option", value=option, fix=f"Did you mean --{near}?" if near else None)
-        if numbers_of(types.get(name)) and values[:1] != ["null"]:  # 1 2 3, 1,2,3 and [1, 2, 3] are the same
+        if NUMBERS.match(str(types.get(name))) and values[:1] != ["null"]:
             numbers = re.split(r"[\s,]+", " ".join(values).strip("[( )]"))
             yield name, f"[{', '.join(filter(None, numbers))}]"
         elif is_sequence(types.get(name)) and values[:1] != ["null"] and not "".join(values[:1]).startswith("["):

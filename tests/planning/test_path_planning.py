@@ -13,9 +13,8 @@ from wheretolook.geometry.camera_turns import turns_deg as turns_deg_of_cameras
 from wheretolook.geometry.lattices import VoxelGrid, axes_of_angles, fibonacci_sphere
 from wheretolook.geometry.poses import rotation_looking_along
 from wheretolook.planning.config import PathConfig
-from wheretolook.planning.connectivity import separating_cell_m
 from wheretolook.planning.routes import turned_evenly
-from wheretolook.planning.rrt import plan_path
+from wheretolook.planning.rrt import PathRequest, are_separate, plan_path
 from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
 from wheretolook.utils.errors import ConfigError, PlanningError
 
@@ -163,7 +162,7 @@ class TwoRooms(ClosedRoom):
 
 
 def test_separate_rooms_are_named_as_the_cause() -> None:
-    assert separating_cell_m(np.array([START, GOAL]), Room(), np.array(BOUNDS)) is None
+    assert not are_separate(PathRequest(np.array([START, GOAL]), np.array(BOUNDS), Room(), QUICK))
     with pytest.raises(PlanningError, match="separate parts"):
         plan_path(START, GOAL, TwoRooms(), BOUNDS, config=replace(QUICK, time_s=0.3), progress=False)
 

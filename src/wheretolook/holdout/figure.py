@@ -21,7 +21,6 @@ _GOOD = BLUE
 _BAD = VERMILION
 _UNTESTED = "#999999"
 _MAX_LANDMARKS = 20_000  # drawn
-_MIN_SEEN = 0.3  # length from above of a unit axis that is drawn
 _CURVE_BINS = 10  # fewer than of the calibration error, as photographs are few
 
 
@@ -77,26 +76,19 @@ def _draw_map(axes: Axes, report: CheckReport) -> None:
         )  # fmt: skip
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), aspect="equal")
     if source.is_turned:
-        _draw_own_axes(axes, source.from_model.rotation, low, (high - low).max() / 3, source.unit)
+        _draw_own_axes(axes, source.from_model.rotation, low, float(f"{(high - low).max() / 4:.0e}"), source.unit)
     else:
         axes.set(xlabel=f"x ({source.unit})", ylabel=f"y ({source.unit})")
     axes.set_title("from above; photographs held out with their neighbours", pad=24)
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, handletextpad=0.1, borderaxespad=0.2)
 
 
-def _draw_own_axes(axes: Axes, rotation: Float, corner: Float, longest: float, unit: str) -> None:
-    """Draw the axes of a map's own frame in a drawing that a rotation (3, 3) turned upright, instead of coordinates.
-
-    They start at a corner (2,), and have the greatest length of 1, 2 or 5 times a power of ten up to `longest`.
-    """
-    power = 10 ** np.floor(np.log10(longest))
-    length = max(step * power for step in (1, 2, 5) if step * power <= longest)
+def _draw_own_axes(axes: Axes, rotation: Float, corner: Float, length: float, unit: str) -> None:
+    """Draw the axes of a map's own frame, which a rotation (3, 3) turned upright, from a corner (2,) of the drawing."""
     directions = length * rotation[:2].T
-    start = corner - directions.min(axis=0, initial=0)
-    style: dict[str, Any] = {"arrowstyle": "<-", "color": INK, "shrinkA": 0, "shrinkB": 0}
+    start = corner - directions.min(axis=0)
     for name, direction in zip("xyz", directions, strict=True):
-        if np.linalg.norm(direction) > _MIN_SEEN * length:
-            axes.annotate(name, tuple(start), tuple(start + direction), arrowprops=style, zorder=6)
+        axes.annotate(name, tuple(start), tuple(start + direction), arrowprops={"arrowstyle": "<-", "color": INK})
     text = f"the map's own axes, {length:g} {unit} long; it is turned upright here only"
     axes.set(xticks=[], yticks=[], xlabel=text)
 

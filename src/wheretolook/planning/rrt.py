@@ -10,13 +10,13 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import label
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera_turns import check_axis
-from wheretolook.geometry.lattices import axes_of_angles
+from wheretolook.geometry.lattices import VoxelGrid, axes_of_angles
 from wheretolook.geometry.poses import Float
 from wheretolook.planning.config import PathConfig
-from wheretolook.planning.connectivity import separating_cell_m
 from wheretolook.planning.routes import IMPROVEMENT, SEARCH, SHORT_ROUTE, PlannedPath, RouteSamples, RouteViews
 from wheretolook.planning.view_sequence import between, lengths_along
 from wheretolook.planning.viewpoint_map import ViewpointMap
@@ -35,6 +35,11 @@ SAME_M = 1e-6  # points closer than this count as equal
 STEP_M = 1.0  # longest straight piece that the search adds at once; longer ones seldom stay free indoors
 STARTS = 12  # number of start orientations to choose from if none is given
 STEPS_M = (0.05, 1.0)  # range of the standard deviation by which a corner of a route is moved
+CELL_M = 0.1  # of the grid on which parts of the free space are found
+MAX_CELLS = 100_000  # of that grid, whose cells grow in large scenes
+_SEPARATE = """\
+Give two positions of one part, or allow narrower passages: --scenes.free_space.clearance_m 0.15, without a mesh \
+--scenes.mapped_space.max_camera_distance_m 1.5."""
 
 
 class Space(Protocol):
@@ -197,6 +202,17 @@ def check_ends(ends: Float, space: Space, bounds: Float) -> None:
             raise PlanningError(f"the {name} is not in free space", value=tuple(point.tolist()), fix=fix)
     if np.linalg.norm(ends[1] - ends[0]) < SAME_M:
         raise PlanningError("the start is the goal", value=tuple(ends[0].tolist()))
+
+
+def are_separate(request: PathRequest) -> bool:
+    """Whether start and goal are in different parts of the free space, as far as a grid shows."""
+    size = np.diff(request.bounds, axis=0)[0]
+    nx, ny, nz = (size / max(CELL_M, np.cbrt(size.prod() / MAX_CELLS))).astype(int) + 1
+    grid = VoxelGrid.over(request.bounds, (nx, ny, nz))
+    free = request.space.is_free(grid.centers()).reshape(grid.shape)
+    parts, _ = label(free, np.ones((3, 3, 3)))
+    start, goal = parts.ravel()[grid.location_ids(request.ends)]
+    return bool(start and goal and start != goal)  # 0 is not free
 
 
 def _shorten(route: Float, request: PathRequest, seconds: float, rng: np.random.Generator) -> Float:
@@ -382,20 +398,13 @@ class _Problem:
             spent += step
             bar.update(min(step, max(0.0, bar.total - bar.n)))
         if not definition.hasExactSolution():
-            raise self.failure(spent)
+            if are_separate(self.request):
+                problem = "start and goal seem to be in separate parts of the free space"
+                raise PlanningError(problem, value=self.request.ends.tolist(), fix=_SEPARATE)
+            fix = "Give it more time, such as --plan.planner.time_s 30, or loosen the camera's limits."
+            raise PlanningError("no path was found in time", value=f"{spent:.2g} s", fix=fix)
         solution = definition.getSolutionPath()
         return np.array([_numbers(solution.getState(index)) for index in range(solution.getStateCount())])
-
-    def failure(self, spent_s: float) -> PlanningError:
-        """Return the error that explains why no path was found in a time in seconds."""
-        cell_m = separating_cell_m(self.request.ends, self.request.space, self.request.bounds)
-        if cell_m is None:
-            fix = "Give it more time, such as --plan.planner.time_s 30, or loosen the camera's limits."
-            return PlanningError("no path was found in time", value=f"{spent_s:.2g} s", fix=fix)
-        problem = f"start and goal are in separate parts of the free space, as far as cells of {cell_m:.2g} m show"
-        fix = "Give two positions of one part, or allow narrower passages: --scenes.free_space.clearance_m 0.15, "
-        fix += "without a mesh --scenes.mapped_space.max_camera_distance_m 1.5."
-        return PlanningError(problem, value=self.request.ends.tolist(), fix=fix)
 
     def path(self, states: Float, views: RouteViews) -> PlannedPath:
         """Return the path through states (S, 5) with their views."""

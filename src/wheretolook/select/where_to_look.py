@@ -297,8 +297,7 @@ def _turn_limit(axes: Float, max_turn_deg: float) -> TurnLimit:
     limit = TurnLimit.of(axes, max_turn_deg)
     if 0 < max_turn_deg <= np.pi and limit.neighbours.shape[1] == 1 < len(axes):
         problem = "max_turn_deg is in degrees, and less than the angle between any two directions"
-        fix = f"If these are radians, give {np.degrees(max_turn_deg):.0f}; else score more directions, or give 0."
-        raise ConfigError(problem, value=max_turn_deg, fix=fix)
+        raise ConfigError(problem, value=max_turn_deg, fix="Convert radians; else score more directions, or give 0.")
     return limit
 
 

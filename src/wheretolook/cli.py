@@ -14,12 +14,12 @@ from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
 from wheretolook.utils.errors import ConfigError, WhereToLookError
 from wheretolook.utils.images import MAX_PIXELS
 from wheretolook.utils.logs import quiet_libraries
-from wheretolook.utils.nearest import nearest
+from wheretolook.utils.nearest import did_you_mean
 from wheretolook.utils.shipped import or_shipped, shipped, shipped_configs
 from wheretolook.utils.version import VERSION
 
@@ -45,7 +45,8 @@ COMMANDS = {
 GROUP = "wheretolook.commands"
 
 NUMBERS = re.compile(r"tuple\[(int|float),")
-"""Types of several numbers, which are written 1 2 3, 1,2,3 or [1, 2, 3]."""
+NUMBER = re.compile(r"[^\s,()\[\]]+")
+"""Types of several numbers, and each of these where they are written 1 2 3, 1,2,3 or [1, 2, 3]."""
 
 NEEDED = {"bool": "true or false", "int": "a whole number", "float": "a number"}
 """Descriptions of types by their names."""
@@ -106,8 +107,7 @@ def load_command(name: str) -> Any:
     """Return the dataclass of a command. Raises ConfigError if there is none of this name."""
     targets = command_targets()
     if name not in targets:
-        near = nearest(name, targets)
-        fix = f"Did you mean {near}?" if near else f"Use one of {', '.join(targets)}."
+        fix = did_you_mean(name, targets) or f"Use one of {', '.join(targets)}."
         raise ConfigError("unknown command", value=name, fix=fix)
     return resolve_name(targets[name])
 
@@ -234,16 +234,17 @@ def named_values(command: Any, types: Mapping[str, Any], arguments: Sequence[str
         if not is_option(name, known):
             if hasattr(command, "root") and "." in name and is_option(name, configurable_options()):
                 continue  # of a group of another command: the same options may be given to all
-            near = nearest(name, [*known, *command.SHORT])
-            raise ConfigError("unknown option", value=option, fix=f"Did you mean --{near}?" if near else None)
-        if NUMBERS.match(str(types.get(name))) and values[:1] != ["null"]:
-            numbers = re.split(r"[\s,]+", " ".join(values).strip("[( )]"))
-            yield name, f"[{', '.join(filter(None, numbers))}]"
-        elif is_sequence(types.get(name)) and values[:1] != ["null"] and not "".join(values[:1]).startswith("["):
-            yield name, json.dumps(values)
-        elif len(values) > 1:
-            raise ConfigError("this option takes one value", value=" ".join([option, *values]))
-        elif not values and types.get(name) is not bool and name != "print_config":
+            fix = did_you_mean(name, [*known, *command.SHORT], "--")
+            raise ConfigError("unknown option", value=option, fix=fix)
+        kind = str(types.get(name))
+        text = " ".join(values)
+        if NUMBERS.match(kind) and text != "null":
+            values = [f"[{', '.join(NUMBER.findall(text))}]"]
+        elif kind.startswith("tuple[") and not text.startswith(("[", "null")):
+            values = [json.dumps(values)]
+        if len(values) > 1:
+            raise ConfigError("this option takes one value", value=f"{option} {text}")
+        elif not values and kind != str(bool) and name != "print_config":
             raise ConfigError("this option needs a value", value=option)
         else:
             yield name, values[0] if values else "" if name == "print_config" else "true"
@@ -252,11 +253,6 @@ def named_values(command: Any, types: Mapping[str, Any], arguments: Sequence[str
 def is_option(name: str, known: Sequence[str]) -> bool:
     """Return whether a dotted name is an option's, or that of a key within the value of an option of a group."""
     return any(name == option or ("." in option and name.startswith(f"{option}.")) for option in known)
-
-
-def is_sequence(kind: Any) -> bool:
-    """Return whether a type is a tuple, or an optional one."""
-    return tuple in (get_origin(kind), *map(get_origin, get_args(kind)))
 
 
 def read_settings(path: Path, types: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -269,8 +265,8 @@ def read_settings(path: Path, types: Mapping[str, Any]) -> list[tuple[str, str]]
     try:
         content = read_yaml(path) or {}
     except FileNotFoundError as error:
-        near = nearest(str(path), shipped_configs())
-        fix = f"Did you mean {near}?" if near else f"Bundled configurations: {', '.join(shipped_configs())}."
+        known = shipped_configs()
+        fix = did_you_mean(str(path), known) or f"Bundled configurations: {', '.join(known)}."
         raise ConfigError("there is no such file", path=path, fix=fix) from error
     except (OSError, ValueError) as error:
         raise ConfigError(f"not a YAML file: {error}", path=path) from error
@@ -281,8 +277,7 @@ def read_settings(path: Path, types: Mapping[str, Any]) -> list[tuple[str, str]]
         if is_option(name, list(types)):
             settings.append((name, value if isinstance(value, str) else json.dumps(value, default=str)))
         elif not is_option(name, known := configurable_options()):
-            near = nearest(name, known)
-            raise ConfigError("unknown option", path=path, value=name, fix=f"Did you mean {near}?" if near else None)
+            raise ConfigError("unknown option", path=path, value=name, fix=did_you_mean(name, known))
     return settings
 
 

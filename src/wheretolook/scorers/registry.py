@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from wheretolook.scorers.method import Method, ScorerOptions
 from wheretolook.utils.errors import CameraError, ConfigError, OutOfRangeWarning, WeightsError
-from wheretolook.utils.nearest import nearest
+from wheretolook.utils.nearest import did_you_mean
 from wheretolook.utils.shipped import WEIGHTS, or_shipped
 
 if TYPE_CHECKING:
@@ -117,8 +117,7 @@ def describe_methods() -> dict[str, str]:
 def check_method(name: str) -> Method:
     """Return the scoring method of a name; a ConfigError if there is none."""
     if name not in scorers():
-        near = nearest(name, scorers())
-        fix = f"Did you mean {near}?" if near else f"There are {', '.join(scorers())}."
+        fix = did_you_mean(name, scorers()) or f"There are {', '.join(scorers())}."
         raise ConfigError("unknown method", value=name, fix=fix)
     return scorers()[name]
 

@@ -6,6 +6,12 @@ import difflib
 from collections.abc import Iterable
 
 
+def did_you_mean(name: str, names: Iterable[str], prefix: str = "") -> str | None:
+    """Return a question that suggests the known name nearest to a wrong one, after a prefix; None if none is near."""
+    near = nearest(name, names)
+    return near and f"Did you mean {prefix}{near}?"
+
+
 def nearest(name: str, names: Iterable[str]) -> str | None:
     """Return the known name that a wrong one resembles, or that ends alike in another group; None if none does."""
     known = [*names]

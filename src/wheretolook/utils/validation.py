@@ -24,13 +24,13 @@ def check_range(name: str, value: float, low: float, high: float = inf) -> None:
 def check_pitch(name: str, limits: tuple[float, float]) -> None:
     """Raise ConfigError unless limits are a lowest and a highest pitch in degrees, or if they seem to be radians."""
     low, high = limits
-    if not (abs(low) <= 90 and abs(high) <= 90):
-        raise ConfigError(f"{name} must be within -90 and 90 degrees", value=limits)
-    if low > high:
-        raise ConfigError(f"the lowest {name} comes before the highest", value=limits, fix=f"Give {high:g} {low:g}.")
-    if 0 < max(abs(low), abs(high)) <= pi / 2:
-        fix = f"If these are radians, give {degrees(low):.0f} {degrees(high):.0f}; for level views, -10 10."
-        raise ConfigError(f"{name} is in degrees, and this leaves hardly a direction", value=limits, fix=fix)
+    largest = max(abs(low), abs(high))
+    radians = f"{name} is in degrees: for radians give {degrees(low):.0f} {degrees(high):.0f}, for level views -10 10"
+    reject(
+        (not largest <= 90, f"{name} must be within -90 and 90 degrees", limits),
+        (low > high, f"the lowest {name} comes before the highest: give {high:g} {low:g}", limits),
+        (0 < largest <= pi / 2, radians, limits),
+    )
 
 
 def check_choice(name: str, value: object, choices: Iterable[object]) -> None:

@@ -169,11 +169,16 @@ def parse_command(name: str, arguments: Sequence[str]) -> Any:
         parsed.pop("config")
         return command(**parsed)
     except (ArgumentError, WhereToLookError) as error:
-        raise explained(error, name, ", ".join(files) or None, types) from error
+        raise explained(error, name, ", ".join(files) or None, types, {option for option, _ in given}) from error
 
 
-def explained(error: BaseException, name: str, files: str | None, types: Mapping[str, Any]) -> WhereToLookError:
-    """Return the error of this project that the parser's error hides, or a ConfigError on the option that it names."""
+def explained(
+    error: BaseException, name: str, files: str | None, types: Mapping[str, Any], given: set[str]
+) -> WhereToLookError:
+    """Return the error of this project that the parser's error hides, or a ConfigError on the option that it names.
+
+    It names the files, unless the option is among those given as arguments.
+    """
     help_text = f"`wheretolook {name} --help` explains the options."
     cause: BaseException | None = error
     while cause is not None:
@@ -187,7 +192,9 @@ def explained(error: BaseException, name: str, files: str | None, types: Mapping
         option, value = wrong.groups()
         short = next((short for short, known in load_command(name).SHORT.items() if known == option), option)
         if needed := describe_type(str(types.get(option))):
-            return ConfigError(f"--{short} needs {needed}", path=files, value=value, fix=help_text)
+            return ConfigError(
+                f"--{short} needs {needed}", path=None if option in given else files, value=value, fix=help_text
+            )
     return ConfigError(text, path=files, fix=help_text)
 
 

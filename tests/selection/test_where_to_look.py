@@ -256,6 +256,7 @@ def test_a_turn_in_radians_is_rejected(look: WhereToLook) -> None:
         {"pitch_deg": (30, -30)},
         {"pitch_deg": (-0.5, 0.5)},  # radians
         {"pitch_deg": (-100, 0)},
+        {"pitch_deg": (30, np.nan)},
         {"looks": 3, "least_score": 0.5},
         {"looks": 3, "max_turn_deg": 10, "least_score": 0.5, "max_total_turn_deg": 90},
     ],

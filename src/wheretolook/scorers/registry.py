@@ -104,8 +104,9 @@ def methods_named(names: Iterable[str], among: Mapping[str, Method]) -> list[Met
     parts = {name: members(name, among) for name in names}
     if not names or not all(parts.values()) or len(parts) < len(names):
         families = dict.fromkeys(method.family for method in among.values() if method.family)
+        near = next((did_you_mean(name, among) for name, part in parts.items() if not part), None)
         known = f"There are {', '.join(among)}; families {', '.join(families)}."
-        raise ConfigError("methods must be known and named once", value=names, fix=known)
+        raise ConfigError("methods must be known and named once", value=names, fix=near or known)
     return list({method.name: method for part in parts.values() for method in part}.values())
 
 

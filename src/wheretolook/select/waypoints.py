@@ -64,7 +64,7 @@ class Waypoints:
         except (TypeError, ValueError) as error:
             raise TableError(f"waypoints are numbers: {error}", fix="Give x, y, z in metres.") from error
         if at.ndim != 2 or at.shape[1] != 3 or len(at) == 0:
-            fix = "Give an array (W, 3) of x, y, z in metres."
+            fix = "Give x,y,z of each, as 1,2,1.5 or a row of an array (W, 3), in metres."
             raise TableError("waypoints have three coordinates each", value=at.shape, fix=fix)
         if ids and len(ids) != len(at):
             raise TableError("as many names as waypoints are needed", value=(len(ids), len(at)))

@@ -27,7 +27,7 @@ def check_pitch(name: str, limits: tuple[float, float]) -> None:
     largest = max(abs(low), abs(high))
     radians = f"{name} is in degrees: for radians give {degrees(low):.0f} {degrees(high):.0f}, for level views -10 10"
     reject(
-        (not largest <= 90, f"{name} must be within -90 and 90 degrees", limits),
+        (not (abs(low) <= 90 and abs(high) <= 90), f"{name} must be within -90 and 90 degrees", limits),
         (low > high, f"the lowest {name} comes before the highest: give {high:g} {low:g}", limits),
         (0 < largest <= pi / 2, radians, limits),
     )

@@ -20,7 +20,10 @@ from typing import Any
 from PIL import Image
 
 _STYLE = """\
-body { max-width: 80rem; margin: 2rem auto; padding: 0 1rem; color: #333; font: 16px/1.5 system-ui, sans-serif }
+body { max-width: 80rem; margin: 0 auto; padding: 1.5rem 1rem; color: #333; font: 16px/1.5 system-ui, sans-serif }
+a { color: #1a5fb4; text-decoration: none }
+a:hover { text-decoration: underline }
+h2 { scroll-margin-top: 1rem }
 pre { padding: .5rem .8rem; overflow-x: auto; font-size: 13px; line-height: 1.4; background: #f6f8fa }
 pre.output { background: none; border-left: 3px solid #ddd }
 img { max-width: 100%; height: auto }
@@ -31,12 +34,26 @@ ol.pages h2 { font-size: 1.15rem; margin: .4rem 0 }
 ol.pages p { margin: 0 }
 ol.pages { padding: 0; list-style: none; display: grid; gap: 1.5rem; \
 grid-template-columns: repeat(auto-fill, minmax(min(20rem, 100%), 1fr)) }
-ol.pages img { max-height: 12rem; object-fit: contain; object-position: left }
+ol.pages img { width: 100%; height: 12rem; object-fit: contain; object-position: left }
 table { border-collapse: collapse; margin: .5rem 0 }
 td, th { padding: 2px 8px; border-bottom: 1px solid #ddd; text-align: left }
-nav a { margin-right: 1em; display: inline-block }
-@media (max-width: 40rem) { body { margin: 1rem auto; font-size: 15px } pre { font-size: 12px } }
+div.page { display: grid; grid-template-columns: 15rem minmax(0, 1fr); gap: 2.5rem }
+nav { font-size: 14px; line-height: 1.35 }
+nav ol { list-style: none; margin: 0; padding: 0 }
+nav li { margin: .45rem 0 }
+nav li ol { margin: .3rem 0 .3rem .1rem; padding-left: .8rem; border-left: 2px solid #ddd }
+nav [aria-current] { color: #333; font-weight: 600 }
+nav summary { font-weight: 600; margin-bottom: .6rem; cursor: pointer }
+nav.sequence { display: flex; justify-content: space-between; gap: 2rem; margin-top: 3rem; padding-top: 1rem; \
+border-top: 1px solid #ddd }
+@media (min-width: 60.01rem) { div.page > nav { position: sticky; top: 1.5rem; align-self: start; \
+max-height: calc(100vh - 3rem); overflow-y: auto } }
+@media (max-width: 60rem) { div.page { display: block } div.page > nav { border-bottom: 1px solid #ddd } }
+@media (max-width: 40rem) { body { padding-top: 1rem; font-size: 15px } pre { font-size: 12px } }
 """
+
+_NARROW = """\
+<script>if (matchMedia("(max-width: 60rem)").matches) document.querySelector("nav details").open = false</script>"""
 
 LARGE = 25_000
 QUALITY = 55
@@ -63,12 +80,13 @@ def run_notebook(path: Path, timeout_s: float = 600) -> Any:
     return notebook
 
 
-def notebook_page(notebook: Any, others: dict[str, str] | None = None) -> str:
+def notebook_page(notebook: Any, name: str = "", pages: dict[str, str] | None = None) -> str:
     """A notebook with outputs as an HTML page; the text of a picture is the first sentence of the cell before it.
 
     Args:
         notebook: as nbformat holds it.
-        others: titles of pages beside this one to link to, by their names.
+        name: of the page, without `.html`.
+        pages: titles of all pages of the folder, by their names, in their order.
     """
     from markdown_it import MarkdownIt
     from pygments import highlight
@@ -86,9 +104,46 @@ def notebook_page(notebook: Any, others: dict[str, str] | None = None) -> str:
         elif cell.cell_type == "code":
             body.append(highlight(cell.source, PythonLexer(), formatter))
             body += [_output(output, markdown, about) for output in cell.outputs]
-    pages = {"index": "All notebooks", **(others or {})}
-    links = "".join(f'<a href="{name}.html">{html.escape(text)}</a>' for name, text in pages.items())
-    return _page(title_of(notebook), formatter.get_style_defs(".highlight"), [f"<nav>{links}</nav>", *body])
+    text, sections = _with_anchors("\n".join(body))
+    titles = {name: title_of(notebook), **(pages or {})}
+    main = ["<main>", text, _sequence(name, titles), "</main>"]
+    body = ['<div class="page">', _contents(name, titles, sections), *main, "</div>"]
+    return _page(title_of(notebook), formatter.get_style_defs(".highlight"), body)
+
+
+def _with_anchors(body: str) -> tuple[str, dict[str, str]]:
+    """Number the sections of a page; returns it and their headings (HTML) by their ids."""
+    sections: dict[str, str] = {}
+
+    def heading(found: re.Match[str]) -> str:
+        section = f"section-{len(sections) + 1}"
+        sections[section] = re.sub(r"<[^>]+>", "", found[1])
+        return f'<h2 id="{section}">{found[1]}</h2>'
+
+    return re.sub(r"<h2>(.*?)</h2>", heading, body), sections
+
+
+def _contents(name: str, titles: dict[str, str], sections: dict[str, str]) -> str:
+    """The list of all pages, with the sections of this one."""
+    below = "".join(f'<li><a href="#{section}">{text}</a></li>' for section, text in sections.items())
+    items = []
+    for page, title in titles.items():
+        here = ' aria-current="page"' if page == name else ""
+        link = f'<a href="{page}.html"{here}>{html.escape(title)}</a>'
+        items.append(f"<li>{link}{f'<ol>{below}</ol>' if below and here else ''}</li>")
+    summary = '<summary><a href="index.html">Notebooks</a></summary>'
+    return f"<nav><details open>{summary}<ol>{''.join(items)}</ol></details>{_NARROW}</nav>"
+
+
+def _sequence(name: str, titles: dict[str, str]) -> str:
+    """Links to the pages before and after this one."""
+    names = [*titles]
+    place = names.index(name)
+    previous = names[place - 1] if place > 0 else "index"
+    links = [f'<a href="{previous}.html" rel="prev">← {html.escape(titles.get(previous, "Notebooks"))}</a>']
+    if place + 1 < len(names):
+        links.append(f'<a href="{names[place + 1]}.html" rel="next">{html.escape(titles[names[place + 1]])} →</a>')
+    return f'<nav class="sequence">{"".join(links)}</nav>'
 
 
 def index_page(pages: dict[str, tuple[str, str, str]]) -> str:
@@ -209,7 +264,7 @@ def main(arguments: list[str]) -> int:
     for path in paths:
         start = time.monotonic()
         try:
-            page = notebook_page(run_notebook(path), titles)
+            page = notebook_page(run_notebook(path), path.stem, titles)
         except (CellExecutionError, CellTimeoutError, DeadKernelError) as error:
             failed.append(path.stem)
             what = f"{error.ename}: {error.evalue}" if isinstance(error, CellExecutionError) else str(error)

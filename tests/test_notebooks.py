@@ -102,7 +102,7 @@ def test_pages_are_small_and_whole(
     folder = tmp_path / "notebooks"
     folder.mkdir()
     (folder / "01_one.py").write_text(
-        "# %% [markdown]\n# # One & all\n# - ![a_picture](images/one.webp), _[elsewhere](https://example.org)_\n\n"
+        "# %% [markdown]\n# # One & all\n# - ![a_picture](images/one.webp), _[elsewhere](https://example.org)_\n# ## Part\n\n"
         "# %%\n# %matplotlib inline\nimport sys\nfrom IPython.display import display\n"
         "from matplotlib.figure import Figure\nprint('1 < 2')\nprint('std' + 'error', file=sys.stderr)\n"
         "figure = Figure()\nfigure.subplots().plot([0, 1])\ndisplay(figure)\n"
@@ -116,7 +116,9 @@ def test_pages_are_small_and_whole(
     assert "<h1>One &amp; all</h1>" in text and "1 &lt; 2" in text and "stderror" not in text
     assert 'src="../images/one.webp"' in text and 'href="https://example.org"' in text
     assert text.count("data:image/webp;base64,") == 1 and len(text) < 40_000
-    assert 'href="02_broken.html"' in text and 'href="index.html">All notebooks' in text
+    assert '<a href="01_one.html" aria-current="page">' in text and 'href="index.html">Notebooks' in text
+    assert '<h2 id="section-1">Part</h2>' in text and '<a href="#section-1">Part</a>' in text
+    assert 'href="02_broken.html" rel="next"' in text
     assert '<meta name="viewport"' in text and 'alt="a_picture, elsewhere"' in text
     text = first.read_text()
     assert '<a href="01_one.html">One &amp; all</a>' in text and "02_broken" not in text

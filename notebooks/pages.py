@@ -105,7 +105,7 @@ def notebook_page(notebook: Any, name: str = "", pages: dict[str, str] | None = 
             body.append(highlight(cell.source, PythonLexer(), formatter))
             body += [_output(output, markdown, about) for output in cell.outputs]
     text, sections = _with_anchors("\n".join(body))
-    titles = {name: title_of(notebook), **(pages or {})}
+    titles = pages or {name: title_of(notebook)}
     main = ["<main>", text, _sequence(name, titles), "</main>"]
     body = ['<div class="page">', _contents(name, titles, sections), *main, "</div>"]
     return _page(title_of(notebook), formatter.get_style_defs(".highlight"), body)

@@ -118,7 +118,7 @@ def test_pages_are_small_and_whole(
     assert text.count("data:image/webp;base64,") == 1 and len(text) < 40_000
     assert '<a href="01_one.html" aria-current="page">' in text and 'href="index.html">Notebooks' in text
     assert '<h2 id="section-1">Part</h2>' in text and '<a href="#section-1">Part</a>' in text
-    assert 'href="02_broken.html" rel="next"' in text
+    assert 'href="index.html" rel="prev"' in text and 'href="02_broken.html" rel="next"' in text
     assert '<meta name="viewport"' in text and 'alt="a_picture, elsewhere"' in text
     text = first.read_text()
     assert '<a href="01_one.html">One &amp; all</a>' in text and "02_broken" not in text

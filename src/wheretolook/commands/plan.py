@@ -37,9 +37,9 @@ class Plan(SceneOrMapOptions):
     space that depth images saw as free: --occlusion.model tsdf
 
     Examples:
-      wheretolook plan --config configs/demo.yaml --scene apartment-000 --start '[-4, -3, 1.4]' --goal '[4, 3, 1.4]' \\
+      wheretolook plan --config configs/demo.yaml --scene apartment-000 --start -4,-3,1.4 --goal 4,3,1.4 \\
         --plan.against '[forward]' --film mp4 --out way
-      wheretolook plan --map sparse/0 --start '[1, 1, 1.4]' --goal '[5, 4, 1.4]' --out way
+      wheretolook plan --map sparse/0 --start 1,1,1.4 --goal 5,4,1.4 --out way
 
     Args:
         plan: start, goal, scores and costs, and what is written.
@@ -75,7 +75,7 @@ class Plan(SceneOrMapOptions):
         name = config.scene or self.imported_name
         files = dataset.scenes[0] if not name and len(dataset.scenes) == 1 else dataset.scene(name)
         if config.start is None or config.goal is None:
-            fix = "Give plan.start and plan.goal, such as --plan.start '[1, 1, 1.4]'."
+            fix = "Give both, such as --start 1,1,1.4 --goal 5,4,1.4."
             raise ConfigError("a path needs a start and a goal", value=(config.start, config.goal), fix=fix)
         if config.rerun:
             require("rerun")

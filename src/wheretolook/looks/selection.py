@@ -175,7 +175,7 @@ def select_views(
     # the best view may be so far off that no rotation remains for the others
     chosen = greedy(np.full(n, limit)) or greedy(limit * np.arange(1, n + 1) / n)
     if chosen is None:
-        fix = "Raise the limit on rotation, or offer more directions."
+        fix = "Raise the limit on rotation, which is in degrees, or offer more directions."
         raise PlanningError(f"no {n} looks can be reached", value=max_turn_deg, fix=fix)
     score = score_of_set(views, set_score, chosen)
     for _ in range(exchanges if n > 1 else 0):

@@ -42,12 +42,15 @@ def test_most_training_views_are_in_range() -> None:
     rng = np.random.default_rng(0)
     views = views_at([rng.uniform(1, 4, rng.integers(0, 60)).tolist() for _ in range(2000)])
     known = TrainingRange.of(views)
-    assert known.contains(views).mean() > 0.98 and known.contains(views_at([[]]))[0]
+    assert known.contains(views).mean() > 0.95 and known.contains(views_at([[]]))[0]
     assert not known.complaint(views, 0.05) and TrainingRange.of_record(known.record()) == known
     far = views_at([[12.0] * 9] * 3 + [[]])
     near = views_at([[2.0] * 9])
     assert known.contains(far).tolist() == [False] * 3 + [True] and known.contains(near).all()
-    assert not TrainingRange.of(views, max_scale=2).outside(views_at([[6.0] * 9])).any()
+    distance_m = views[np.isfinite(views[:, 0]), 0]
+    assert known.bounds["distance_m"] == pytest.approx(
+        (np.quantile(distance_m, 0.005) / 1.25, np.quantile(distance_m, 0.975)), abs=1e-4
+    )
     assert known.complaint(far)
     assert known.outside(views_at([[2.0] * 500])).sum(0)[[*QUANTITIES].index("in_view")] == 1
     assert not known.complaint(np.concatenate([near] * 99 + [far]), 0.05)  # three odd ones in a hundred

@@ -214,4 +214,4 @@ class LandmarkDataModule(ViewsDataModule):
         trained_on = ~self.split(dataset)
         entries = torch.from_numpy(trained_on).repeat_interleave(self.views.starts.diff())
         self.statistics = FeatureStatistics.of_attributes(self.views.values[entries].float())
-        self.training_range = TrainingRange.of(self.views.quantities[trained_on], self.options.enlarged)
+        self.training_range = TrainingRange.of(self.views.quantities[trained_on])

@@ -30,8 +30,12 @@ QUANTITIES = {
 
 LANDMARK_QUANTITIES = ("distance_m", "depth_m", "in_view")
 ANGLES = ("across_deg", "down_deg")
+DISTANCES = ("distance_m", "depth_m")
 
 QUANTILES = (0.005, 0.995)  # of the training views that bound the range
+MAX_DISTANCE_QUANTILE = 0.975
+"""Of the training views, bounds distances from above. Three quarters of the farther ones are of three scenes, and scenes
+that are scaled in training show the same surfaces: neither covers spaces of that size."""
 MARGIN = 1.25  # factor that widens the range beyond these quantiles; for angles, degrees
 MARGIN_DEG = 2.0
 TOLERATED = 0.05  # share of the views scored at once that may be out of range without a warning
@@ -44,18 +48,16 @@ class TrainingRange:
     bounds: Mapping[str, tuple[float, float]]
 
     @classmethod
-    def of(cls, quantities: Float, max_scale: float = 1.0) -> TrainingRange:
-        """Return the range of views with `QUANTITIES` (B, 6), without those that have no landmark.
-
-        Distances are widened by `max_scale`, the factor by which scenes are scaled in training.
-        """
+    def of(cls, quantities: Float) -> TrainingRange:
+        """Return the range of views with `QUANTITIES` (B, 6), without those that have no landmark."""
         bounds = {}
         for name, values in zip(QUANTITIES, quantities[_have_landmarks(quantities)].T, strict=True):
             known = values[np.isfinite(values)]
             if len(known):
                 low, high = np.quantile(known, QUANTILES).tolist()
-                factor = MARGIN * (max_scale if name == "distance_m" else 1.0)
-                wider = (low - MARGIN_DEG, high + MARGIN_DEG) if name in ANGLES else (low / factor, high * factor)
+                wider = (low - MARGIN_DEG, high + MARGIN_DEG) if name in ANGLES else (low / MARGIN, high * MARGIN)
+                if name in DISTANCES:
+                    wider = low / MARGIN, float(np.quantile(known, MAX_DISTANCE_QUANTILE))
                 bounds[name] = (round(wider[0], 4), round(wider[1], 4))
         return cls(bounds)
 

@@ -183,7 +183,7 @@ def test_a_colmap_model_gives_the_same_views(tmp_path: Path) -> None:
     model.write_binary(str(tmp_path / "far"))
     for hides in ("none", "hidden-points"):
         near = WhereToLook.from_colmap(folder, occlusion=hides, directions=100)
-        far = WhereToLook.from_colmap(tmp_path / "far", occlusion=hides, directions=100)
+        far = WhereToLook.from_colmap(tmp_path / "far", occlusion=hides, directions=100, scale=1)
         views = near.best(POINTS)
         there = far.best(POINTS + SHIFT)
         np.testing.assert_array_equal(there.n_visible, views.n_visible)

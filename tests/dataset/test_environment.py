@@ -67,7 +67,7 @@ def test_an_occlusion_model_needs_its_files(occlusion: str, mesh: str | None, de
 
 def test_the_most_accurate_occlusion_model_is_the_default(files: SceneFolder) -> None:
     by_mesh = ColmapEnvironment(ColmapFiles(Path("sparse"), mesh=files.mesh))
-    assert by_mesh.available_occlusion == ("mesh", "hidden-points", "none") and by_mesh.occlusion.name == "mesh"
+    assert by_mesh.available_occlusion == ("mesh", "hidden-points", "none") and by_mesh.occlusion_config.model == "mesh"
     assert isinstance(ColmapEnvironment(ColmapFiles(Path("sparse"))).occlusion, HiddenPointRemoval)
     cached = ColmapEnvironment(ColmapFiles(Path("sparse")), config=EnvironmentConfig(occlusion_cache_bytes=1 << 20))
     assert isinstance(cached.occlusion, CachedOcclusion)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ WEIGHTS = Path(__file__).parents[2] / "data" / "release" / "weights"
 POINTS = np.array([(1.5, 2.0, 1.5), (2.0, 2.2, 1.4), (2.6, 2.4, 1.5), (3.2, 2.5, 1.6)])
 
 
-def write_room(folder: Path, text: bool = False, n: int = 400) -> Path:
+def write_room(folder: Path, text: bool = False, n: int = 400, metric: bool = True) -> Path:
     rng = np.random.default_rng(0)
     points = rng.uniform((0, 0, 0.2), (6, 5, 2.8), (n, 3))
     wall = rng.integers(0, 2, n)
@@ -37,5 +38,7 @@ def write_room(folder: Path, text: bool = False, n: int = 400) -> Path:
     for point in model.points3D.values():
         point.error = 0.3
     folder.mkdir(parents=True)
+    if metric:  # as the report of a rendered map states
+        (folder / "report.json").write_text(json.dumps({"n_landmarks": n}))
     (model.write_text if text else model.write_binary)(str(folder))
     return folder

@@ -20,7 +20,7 @@ from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
 from wheretolook.geometry.poses import Float
-from wheretolook.mapping.config import place_name
+from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.scorers.adapted.config import AdaptConfig
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.store import check_store, kept_if_not_logged
@@ -135,7 +135,8 @@ class Adapt(SceneOptions, LabelOptions):
             raise MapError("the map has no scale, and this needs metres", path=model, value=scale.source, fix=fix)
         points = model_arrays(read_model(model)).points
         occlusion = "none" if self.occlusion.model == "none" else "hidden-points"
-        environment = ColmapEnvironment(ColmapFiles(model), occlusion=occlusion, device=self.warp_device)
+        files = ColmapFiles(model, frame=FrameOptions(scale=1, up="z"))
+        environment = ColmapEnvironment(files, occlusion=occlusion, device=self.warp_device)
         views = self._held_out(model, name, environment.occlusion, target.weights, log)
         _check_enough(views, model)
         with hold(target.path.with_name(f".{target.path.name}.lock"), "adapt"):

@@ -26,8 +26,12 @@ class Select(SelectionRequest, SelectorOptions):
       TUM          "t x y z qx qy qz qw"; orientations are not used, the views keep the time stamps
       numbers      --at 1,2,1.5 -0.5,2,1.5
 
-    Frames: the world is the map's, metres, z up. Camera: x right, y down, z forward; it does not roll. yaw_deg is 0
-    along the world's x and 90 along y; pitch_deg is 90 straight up. By format (--format, or the ending of --out):
+    Frames: the world of waypoints and views is the map's own frame, in its unit. Camera: x right, y down, z forward; it
+    does not roll. yaw_deg is 0 along the map's x and 90 along y, of an upright map; pitch_deg is 90 straight up.
+    Scores need metres: a map of this project states its scale, as do --scale, --distance, --positions and depth
+    images. A map of unknown scale (column scale) is scored as if the median depth of its images were 5 m. A map whose
+    cameras are clearly not level is turned upright for scoring, unless --up states what is up.
+    By format (--format, or the ending of --out):
       csv, json    x, y, z: camera centre in the world; qw, qx, qy, qz: camera-to-world (quaternion_xyzw: x first)
       tum          t x y z qx qy qz qw, camera-to-world
       colmap       images.txt, world-to-camera; if --out is a folder, cameras.txt and an empty points3D.txt too
@@ -43,7 +47,7 @@ class Select(SelectionRequest, SelectorOptions):
       wheretolook select --map sparse/0 --grid 0.5 --mesh house.glb --fov 60 --out views.csv
 
     Args:
-        at: waypoints: a file, or x,y,z in metres, any number of them.
+        at: waypoints: a file, or x,y,z, any number of them.
         grid: instead, waypoints this many metres apart in all free space.
         directions: number of directions scored at each waypoint.
         lattice: fibonacci (even), or yaw-pitch (ActLoc's 6 x 18).

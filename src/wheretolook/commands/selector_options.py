@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.commands.options import CameraOptions, OcclusionOptions, ScorerOptions
+from wheretolook.mapping.config import FrameOptions
 from wheretolook.utils.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -17,11 +18,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SelectorOptions(CameraOptions, OcclusionOptions, ScorerOptions):
+class SelectorOptions(CameraOptions, OcclusionOptions, ScorerOptions, FrameOptions):
     """A COLMAP model, and how its views are scored.
 
     Args:
-        map: folder of a COLMAP model, binary or text, in metres with z up.
+        map: folder of a COLMAP model, binary or text.
         out: file of the views; its ending decides the format.
         format: csv, json, tum, colmap or benchmark.
         fov: instead of a camera, horizontal field of view of a pinhole in degrees.
@@ -46,6 +47,7 @@ class SelectorOptions(CameraOptions, OcclusionOptions, ScorerOptions):
     device: str = "auto"
 
     def __post_init__(self) -> None:
+        self.frame_options()
         self.named_camera()
 
     def named_camera(self) -> Camera | int | None:
@@ -87,6 +89,7 @@ class SelectorOptions(CameraOptions, OcclusionOptions, ScorerOptions):
                 max_reprojection_error_px=self.max_error,
                 device=device,
                 anywhere=self.anywhere,
+                **vars(self.frame_options()),
                 **directions,
             )
             compiled.result()
@@ -95,7 +98,10 @@ class SelectorOptions(CameraOptions, OcclusionOptions, ScorerOptions):
 
 def print_summary(selector: WhereToLook, views: SelectedViews, n_given: int, locations: str) -> None:
     """Print how the best views of each location were scored; `locations` names those that were given."""
+    from wheretolook.geometry.camera import describe_camera
+
     localization_map = selector.localization_map
+    print(f"{selector.frame.describe()}; camera: {describe_camera(localization_map.camera)}")
     n_used = len({*views.waypoint.tolist()})
     skipped = f", {n_given - n_used} left out" if n_used < n_given else ""
     features = localization_map.landmarks.features or "no descriptors"

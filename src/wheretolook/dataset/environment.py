@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from wheretolook.geometry.camera import Camera, cameras_by_id, only_camera
 from wheretolook.geometry.lattices import ViewLattice, VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.mapping.config import place_name
+from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.mapping.georeference import read_scale
+from wheretolook.mapping.map_frame import IDENTITY, MapFrame
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError, MapError
@@ -86,6 +87,11 @@ class Environment(ABC):
     @abstractmethod
     def mapping_poses(self) -> Float | None:
         """Poses cam_from_world (M, 3, 4) of the mapping images; None if unknown."""
+
+    @property
+    def frame(self) -> MapFrame:
+        """The frame that users give and get coordinates in."""
+        return IDENTITY
 
     @property
     @abstractmethod
@@ -198,7 +204,8 @@ class Environment(ABC):
         """The input of scorers, with `occlusion`."""
         from wheretolook.inputs.localization_map import LocalizationMap
 
-        return LocalizationMap(self.landmarks, self.camera, self.occlusion, self.device, self.mapping_poses)
+        of_map = (self.landmarks, self.camera, self.occlusion, self.device, self.mapping_poses)
+        return LocalizationMap(*of_map, self.frame)
 
 
 class SceneEnvironment(Environment):
@@ -323,7 +330,7 @@ class SceneEnvironment(Environment):
 
 @dataclass(frozen=True)
 class ColmapFiles:
-    """A COLMAP model in metres with z up, and files in its frame."""
+    """A COLMAP model, and files in its frame."""
 
     model: Path
     mesh: Path | None = None
@@ -331,6 +338,7 @@ class ColmapFiles:
     depth_scale: float = 1000.0  # units of integer depth images in a metre
     database: Path | None = None  # COLMAP database or hloc features, for the landmarks' ambiguity
     max_reprojection_error_px: float | None = None  # landmarks with a larger mean error are dropped
+    frame: FrameOptions = FrameOptions()  # how its frame is related to the world
 
 
 class ColmapEnvironment(Environment):
@@ -368,8 +376,19 @@ class ColmapEnvironment(Environment):
         from wheretolook.mapping.landmarks import open_colmap
 
         files = self.files
+        depth_scale = None
+        if files.depth is not None:
+            from wheretolook.scans.depth_images import metres_per_unit
+
+            depth_scale = metres_per_unit(files.model, files.depth, files.depth_scale)
         limit_px = files.max_reprojection_error_px
-        return open_colmap(files.model, self._camera, files.database, limit_px, self.device)
+        opened = (files.model, self._camera, files.database, limit_px, self.device)
+        return open_colmap(*opened, files.frame, depth_scale)
+
+    @property
+    def frame(self) -> MapFrame:
+        """The model's own frame."""
+        return self._map.frame
 
     @property
     def camera(self) -> Camera:  # type: ignore[override]
@@ -402,7 +421,7 @@ class ColmapEnvironment(Environment):
         from wheretolook.scenes.loading import load_mesh
 
         assert self.files.mesh is not None
-        return load_mesh(self.files.mesh, colored=False)
+        return load_mesh(self.files.mesh, colored=False).transformed(self.frame.world_from_map)
 
     @cached_property
     def depth_images(self) -> DepthImages:  # type: ignore[override]
@@ -410,7 +429,9 @@ class ColmapEnvironment(Environment):
         from wheretolook.scans.depth_images import read_depth_images
 
         assert self.files.depth is not None
-        return read_depth_images(self.files.model, self.files.depth, self.files.depth_scale)
+        images = read_depth_images(self.files.model, self.files.depth, self.files.depth_scale)
+        place = self.frame.world_from_map.apply_to_poses
+        return [replace(image, cam_from_world=place(image.cam_from_world)) for image in images]
 
     @property
     def space(self) -> FreeSpace | MappedSpace:

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wheretolook.geometry.similarity import Similarity
+
 
 @dataclass(frozen=True, eq=False)
 class TexturedMesh:
@@ -36,6 +38,11 @@ class TexturedMesh:
         """Normals of the triangles (T, 3), towards the front, as long as twice the triangle's area."""
         a, b, c = np.moveaxis(self.vertices[self.triangles].astype(np.float64), 1, 0)
         return np.cross(b - a, c - a)
+
+    def transformed(self, similarity: Similarity) -> TexturedMesh:
+        """The mesh in another frame."""
+        vertices = (similarity.scale * self.vertices @ similarity.rotation.T).astype(np.float32)
+        return replace(self, vertices=vertices, origin=similarity.apply(self.origin))
 
     def only(self, keep: NDArray[np.bool_]) -> TexturedMesh:
         """The mesh with only some of its triangles, (T,) bool, and the vertices that they use."""

@@ -16,11 +16,12 @@ from wheretolook.dataset.thresholds import THRESHOLDS
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import Camera, cameras_by_id
 from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.geometry.similarity import Similarity
 from wheretolook.localization.labeller import versions
 from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_arrays, read_model, registered_names
 from wheretolook.mapping.config import ExistingModelConfig, MapConfig, PhotographsConfig, place_name
 from wheretolook.mapping.feature_files import DATABASE_FILE, read_descriptors
-from wheretolook.mapping.georeference import Similarity, read_scale
+from wheretolook.mapping.georeference import read_scale
 from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.mapping.sanity import up_axis_warning
 from wheretolook.mapping.sources import find_features, find_photographs

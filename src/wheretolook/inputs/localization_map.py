@@ -14,6 +14,7 @@ from wheretolook.geometry.camera import Camera, ColmapCamera
 from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
 from wheretolook.mapping.landmarks import Landmarks, open_colmap
+from wheretolook.mapping.map_frame import IDENTITY, MapFrame
 from wheretolook.mapping.sanity import warn_of_mesh
 from wheretolook.utils.validation import check_positive
 from wheretolook.visibility import frustum
@@ -38,6 +39,7 @@ class LocalizationMap:
     occlusion: OcclusionModel = NoOcclusion()  # which landmarks have a free line of sight from a location
     device: str = "cpu"  # where kernels run, "cpu" or a CUDA device
     mapping_poses: Float | None = None  # cam_from_world (M, 3, 4) of the images the map was made from, if known
+    frame: MapFrame = IDENTITY  # the map's own frame; everything here is in the world: metres, z up
 
     @classmethod
     def from_colmap(
@@ -76,7 +78,7 @@ class LocalizationMap:
         """
         if max_reprojection_error_px is not None:
             check_positive("max_reprojection_error_px", max_reprojection_error_px)
-        landmarks, camera, poses = open_colmap(model, camera, database, max_reprojection_error_px, device)
+        landmarks, camera, poses, _ = open_colmap(model, camera, database, max_reprojection_error_px, device)
         if mesh is not None:
             from wheretolook.scenes.loading import load_mesh
             from wheretolook.space.free_space import FreeSpace

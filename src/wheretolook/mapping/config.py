@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.validation import check_positive, check_range
+from wheretolook.utils.validation import check_positive, check_range, reject
 
 # The walk of a person with a camera through a scene.
 COVERAGE = 0.7  # share of the reachable floor that is visited; the walk ends there
@@ -110,6 +110,60 @@ class ScaleConfig:
     def needs_markers(self) -> bool:
         """Whether markers are to be detected, for their sizes or as ends of the distance."""
         return self.has_marker_sizes or (self.distance is not None and len(self.distance.marker_ids) > 0)
+
+
+@dataclass(frozen=True)
+class FrameOptions:
+    """How the map's own frame is related to metres with z up.
+
+    Args:
+        scale: metres in a unit of the map; 1 if it is in metres.
+        distance: instead, a measured distance: the names of two images, and the metres between their cameras.
+        positions: instead, a CSV or JSON file of camera positions (image, x, y, z) in metres, z up.
+        up: the direction up in the map: z, -y and the like, x,y,z, or level, as the cameras were held. By default z,
+            unless the cameras are clearly not level.
+    """
+
+    scale: float | None = None
+    distance: tuple[str, str, float] | None = None
+    positions: Path | None = None
+    up: str | None = None
+
+    def __post_init__(self) -> None:
+        sources = [value for value in (self.scale, self.distance, self.positions) if value is not None]
+        distance_m = self.distance[2] if self.distance else 1.0
+        reject(
+            (len(sources) > 1, "the scale is given by one of scale, distance and positions", sources),
+            (
+                not 0 < (1.0 if self.scale is None else self.scale) < inf,
+                "scale is a positive number of metres in a unit of the map",
+                self.scale,
+            ),
+            (not 0 < distance_m < inf, "a distance is a positive number of metres", self.distance),
+            (bool(self.up and self.positions), "positions give the direction up too: leave up out", self.up),
+        )
+        self.up_direction()
+
+    def frame_options(self) -> FrameOptions:
+        """Return these options alone, checked, of a command that includes them."""
+        return FrameOptions(**{field.name: getattr(self, field.name) for field in fields(FrameOptions)})
+
+    def up_direction(self) -> tuple[float, ...] | None:
+        """Return the given direction up in the map; None for "level" or none."""
+        if self.up is None or self.up == "level":
+            return None
+        sign = -1.0 if self.up.startswith("-") else 1.0
+        axis = self.up.lstrip("+-")
+        try:
+            if axis in ("x", "y", "z"):
+                return tuple(sign * (axis == name) for name in "xyz")
+            up = tuple(map(float, self.up.split(",")))
+        except ValueError:
+            up = ()
+        if len(up) != 3 or not 0 < sum(map(abs, up)) < inf:
+            fix = "Give z, -y and the like, three numbers x,y,z, or level."
+            raise ConfigError("not a direction up", value=self.up, fix=fix)
+        return up
 
 
 @dataclass(frozen=True)

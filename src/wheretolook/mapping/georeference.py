@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.poses import Float
+from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.config import SCALE_TOLERANCE_PERCENT, ScaleConfig
 from wheretolook.mapping.markers import Marker, MarkerView, detect_markers, marker_detector, place_marker
 from wheretolook.mapping.photographs import read_photograph
@@ -23,33 +24,13 @@ REPORT_FILE = "report.json"
 _FLAT = 1e-6  # points whose second largest spread is below this share of the largest are on a line
 
 
-@dataclass(frozen=True, eq=False)
-class Similarity:
-    """x -> scale * rotation x + translation."""
-
-    scale: float  # positive
-    rotation: Float  # (3, 3)
-    translation: Float  # (3,), in units of the target
-
-    def apply(self, points: ArrayLike) -> Float:
-        """Transform points (..., 3)."""
-        return np.asarray(self.scale * np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation)
-
-    def transform_model(self, model: Any) -> None:
-        """Transform a `pycolmap.Reconstruction` in place."""
-        import pycolmap
-
-        model.transform(pycolmap.Sim3d(self.scale, pycolmap.Rotation3d(self.rotation), self.translation))
-
-
 @dataclass(frozen=True)
 class MapScale:
     """The scale of a map; `scale` in its `report.json`."""
 
-    source: Literal["markers", "distance", "positions", "model", "unknown"] = (
-        "unknown"  # "model": that of an existing model; "unknown": the map is not in metres
-    )
-    factor: float = 1.0  # metres in a unit of COLMAP's frame; 1 if unknown
+    # "model": that of an existing model; "unknown": the map is not in metres
+    source: Literal["markers", "distance", "positions", "given", "depth", "rendered", "model", "unknown"] = "unknown"
+    factor: float = 1.0  # metres in a unit of COLMAP's frame
     # Error of each marker's side (in percent) or photograph's position (in metres); empty for a single distance.
     residuals: dict[str, float] = field(default_factory=dict)
     unit: Literal["percent", "m", ""] = ""  # of the residuals

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import camera_centers
+from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.colmap_model import (
     colmap_poses,
     describe_cameras,
@@ -19,10 +20,10 @@ from wheretolook.mapping.colmap_model import (
     registered_names,
 )
 from wheretolook.mapping.config import EXHAUSTIVE_UP_TO, PARTNERS, MapConfig
-from wheretolook.mapping.georeference import KnownScale, MapScale, Similarity, find_scale
+from wheretolook.mapping.georeference import KnownScale, MapScale, find_scale
 from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.mapping.map_folder import DATABASE_FILE, MapDraft, MapReport, MapRun, finish_map, replacing_map
-from wheretolook.mapping.sanity import warn_of_frame
+from wheretolook.mapping.map_frame import IDENTITY
 from wheretolook.mapping.sfm import PhotographFeatures, photograph_features
 from wheretolook.mapping.triangulation import choose_pairs, triangulate_model
 from wheretolook.utils.confine import path_within
@@ -107,7 +108,7 @@ def map_existing(
             scale=scale if scale.is_metric else MapScale("model"),
         )
         report.save(folder)
-    warn_of_frame(settings.model, landmarks.mapping_distance_m, poses)
+    IDENTITY.warn(settings.model, landmarks.mapping_distance_m, poses)
     return report
 
 

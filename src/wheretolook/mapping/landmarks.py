@@ -26,8 +26,9 @@ from wheretolook.mapping.colmap_model import (
     model_arrays,
     read_model,
 )
+from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.feature_files import read_descriptors
-from wheretolook.mapping.sanity import warn_of_frame
+from wheretolook.mapping.map_frame import MapFrame, find_frame
 from wheretolook.mapping.sources import choose_features
 from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.npz_files import load_npz, save_npz
@@ -135,11 +136,12 @@ def _cast_floats(values: dict[str, NDArray[Any]], points: DTypeLike, others: DTy
 
 
 class ColmapSource(NamedTuple):
-    """Parts of a COLMAP model in metres with z up."""
+    """Parts of a COLMAP model in the world: metres, z up."""
 
     landmarks: Landmarks
     camera: Camera  # the query camera
     mapping_poses: Float  # cam_from_world (M, 3, 4) of its images
+    frame: MapFrame  # of the model
 
 
 def open_colmap(
@@ -148,19 +150,26 @@ def open_colmap(
     database: str | Path | None = None,
     max_reprojection_error_px: float | None = None,
     device: str = "cpu",
+    frame: FrameOptions = FrameOptions(scale=1, up="z"),
+    depth_scale: float | None = None,
 ) -> ColmapSource:
     """Read a COLMAP model; arguments, errors and warnings are those of `LocalizationMap.from_colmap`.
 
-    Without a database torch and Warp are not imported: importing them takes longer than reading 200,000 landmarks.
+    `depth_scale` is that of `find_frame`. Without a database torch and Warp are not imported: importing them takes
+    longer than reading 200,000 landmarks.
     """
+    model = Path(model)
     reconstruction = read_model(model)
-    database = choose_features(Path(model), reconstruction, None if database is None else Path(database))
-    landmarks = load_colmap_landmarks(Path(model), database, max_reprojection_error_px, device, reconstruction)
-    poses = colmap_poses(model, reconstruction)
-    warn_of_frame(model, landmarks.mapping_distance_m, poses)
+    database = choose_features(model, reconstruction, None if database is None else Path(database))
+    arrays = model_arrays(reconstruction)
+    found = find_frame(model, reconstruction, frame, depth_scale, arrays)
+    arrays = found.of_arrays(arrays)
+    landmarks = load_colmap_landmarks(model, database, max_reprojection_error_px, device, reconstruction, arrays=arrays)
+    poses = found.world_from_map.apply_to_poses(colmap_poses(model, reconstruction))
+    found.warn(model, landmarks.mapping_distance_m, poses)
     if camera is None or isinstance(camera, int):
-        camera = camera_of_model(reconstruction, Path(model), camera)
-    return ColmapSource(landmarks, camera, compact_poses(poses))
+        camera = camera_of_model(reconstruction, model, camera)
+    return ColmapSource(landmarks, camera, compact_poses(poses), found)
 
 
 def load_colmap_landmarks(
@@ -170,18 +179,19 @@ def load_colmap_landmarks(
     device: str = "cpu",
     reconstruction: pycolmap.Reconstruction | None = None,
     progress: bool = True,
+    arrays: ModelArrays | None = None,
 ) -> Landmarks:
     """Compute the landmarks of a COLMAP model (binary or text) in metres, with their attributes.
 
     The features that the model was built from (`read_descriptors`) give descriptors and ambiguity, by a search of the
     nearest descriptors on a torch device. All points of the model are landmarks, unless a largest mean reprojection
     error is given; a `MapWarning` counts the points that are left out. `reconstruction` is the model, if it was read
-    before; its images may have many cameras.
+    before, and `arrays` what is taken of it, if that is transformed; its images may have many cameras.
 
     Raises MapError if the folder, a file or the database is missing, corrupt or does not match, or no landmark remains.
     """
     reconstruction = reconstruction or read_model(model_dir)
-    model = model_arrays(reconstruction)
+    model = arrays or model_arrays(reconstruction)
     observed = np.diff(model.observation_start) > 0
     worst_px = np.inf if max_reprojection_error_px is None else max_reprojection_error_px
     keep = observed & (model.errors_px <= worst_px)

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.colmap_model import colmap_poses, describe_cameras, registered_names
 from wheretolook.mapping.config import MapConfig
-from wheretolook.mapping.georeference import KnownScale, MapScale, Similarity, find_scale
+from wheretolook.mapping.georeference import KnownScale, MapScale, find_scale
 from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.mapping.map_folder import MapDraft, MapReport, finish_map, replacing_map
 from wheretolook.mapping.photographs import photograph_cameras

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.utils.errors import MapWarning
 
@@ -27,22 +26,7 @@ but may tilt all their photographs of an object the same way."""
 MESH_DISTANCE_M = (0.3, 100.0)
 """Largest plausible median distance of landmarks to a mesh, and the farthest distance that is measured."""
 _MAX_MEASURED = 10_000  # landmarks whose distance to a mesh is measured: enough for a median
-_LOOKING_DOWN = 0.7  # mean of the cameras' axes along -z above which their roll does not determine up
-
-
-def warn_of_frame(model: str | Path, mapping_distance_m: ArrayLike, cam_from_world: ArrayLike) -> None:
-    """Issue a `MapWarning` each if a map seems not to be in metres, or not to have z up.
-
-    Takes the mean distance of each landmark's mapping cameras (N,), and the poses (M, 3, 4) of all.
-    """
-    for message in frame_warnings(mapping_distance_m, cam_from_world):
-        warnings.warn(f"{model}: {message}", MapWarning, stacklevel=3)
-
-
-def frame_warnings(mapping_distance_m: ArrayLike, cam_from_world: ArrayLike) -> tuple[str, ...]:
-    """Return the non-empty messages of `scale_warning` and `up_axis_warning`; arguments of `warn_of_frame`."""
-    messages = scale_warning(mapping_distance_m, camera_centers(cam_from_world)), up_axis_warning(cam_from_world)
-    return tuple(filter(None, messages))
+LOOKING_DOWN = 0.7  # mean of the cameras' axes along -z above which their roll does not determine up
 
 
 def warn_of_mesh(mesh: str | Path, points: ArrayLike, raycaster: MeshRaycaster) -> None:
@@ -79,10 +63,8 @@ def scale_warning(mapping_distance_m: ArrayLike, centers: ArrayLike) -> str:
         return ""
     lengths = f"landmarks are {distance:.3g} m from the cameras that mapped them, and these {spacing:.3g} m from the "
     lengths += f"nearest other (medians); plausible are {low:g} to {high:g} m, and at most {SPACING_M:g} m"
-    fix = (
-        "`wheretolook map --model` gives it a scale: --mapping.photographs.scale.positions, .distance or .marker_size_m"
-    )
-    return f"the model seems not to be in metres: {lengths}. {fix}. Ignore this warning if it is metric"
+    fix = "Correct --scale, --distance or --positions. Ignore this warning if it is metric"
+    return f"the model seems not to be in metres: {lengths}. {fix}"
 
 
 def up_axis_warning(cam_from_world: ArrayLike) -> str:
@@ -90,12 +72,11 @@ def up_axis_warning(cam_from_world: ArrayLike) -> str:
     poses = np.asarray(cam_from_world, dtype=np.float64)
     gravity = estimate_gravity(poses)
     off_deg = float(np.degrees(np.arccos(np.clip(gravity.up[2], -1, 1))))
-    if off_deg <= TILT_DEG[gravity.method] or poses[:, 2, 2].mean() < -_LOOKING_DOWN:
+    if off_deg <= TILT_DEG[gravity.method] or poses[:, 2, 2].mean() < -LOOKING_DOWN:
         return ""
     how = "upside down" if off_deg > 135 else "on their side" if off_deg > 45 else "askew"
     up = " ".join(f"{value:.2f}" for value in np.round(gravity.up, 2) + 0.0)  # no -0.00
     return (
         f"the cameras are {how}: the up direction estimated from their orientations is ({up}), {off_deg:.0f} degrees from z, which is "
-        "up here. `wheretolook map --model` turns it upright with --mapping.existing.level true; or give a model, or known positions, with z up "
-        "(COLMAP's model_orientation_aligner). Ignore this warning if the cameras were held so"
+        "up here. --up level turns it upright. Ignore this warning if the cameras were held so"
     )

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import Camera, PinholeCamera, cameras_by_id
+from wheretolook.geometry.poses import transform
 from wheretolook.geometry.tsdf import DepthImage
 from wheretolook.io.depth import read_depth
 from wheretolook.mapping.colmap_model import read_model
 from wheretolook.utils.errors import SceneError
 from wheretolook.utils.validation import check_positive
+
+MAX_MEASURED = 50  # images that the scale is measured in
 
 
 def read_depth_images(model: Path, folder: Path, scale: float = 1000.0) -> list[DepthImage]:
@@ -19,12 +27,49 @@ def read_depth_images(model: Path, folder: Path, scale: float = 1000.0) -> list[
     need be. It is registered to the image and may have another size; the camera must have no distortion. Raises a
     SceneError if there are none or one cannot be read, a ConfigError if the camera has distortion.
     """
-    check_positive("the number of units of depth images in a metre", scale)
     reconstruction = read_model(model)
     cameras = cameras_by_id(reconstruction.cameras, model)
-    files = {p.relative_to(folder).with_suffix("").as_posix(): p for p in sorted(folder.rglob("*")) if p.is_file()}
     images = []
-    for _, image in sorted(reconstruction.images.items()):
+    for image, depth_m in _depth_of_images(reconstruction, folder, scale):
+        camera = _scaled(cameras[image.camera_id], depth_m.shape[1], depth_m.shape[0])
+        images.append(DepthImage(depth_m, camera, image.cam_from_world().matrix()))
+    if not images:
+        fix = "Name each as its image, with the ending of a depth image, such as .png."
+        raise SceneError("no depth image belongs to an image of the map", path=folder, fix=fix)
+    return images
+
+
+def metres_per_unit(model: Path, folder: Path, scale: float = 1000.0) -> float | None:
+    """Return the metres in a unit of a COLMAP model by its depth images; arguments are those of `read_depth_images`.
+
+    It is the median ratio of the depth at keypoints to that of their landmarks, of up to `MAX_MEASURED` images; None
+    if no keypoint of a landmark has a depth.
+    """
+    reconstruction = read_model(model)
+    step = -(-reconstruction.num_images() // MAX_MEASURED)
+    ratios = []
+    for image, depth_m in _depth_of_images(reconstruction, folder, scale, step):
+        observed = image.get_observation_points2D()
+        if not observed:
+            continue
+        points = np.array([reconstruction.points3D[point.point3D_id].xyz for point in observed])
+        depth = transform(image.cam_from_world().matrix(), points)[:, 2]
+        size = (image.camera.width, image.camera.height)
+        pixels = np.array([point.xy for point in observed]) / size * depth_m.shape[::-1]
+        column, row = np.clip(pixels.astype(np.int64), 0, np.array(depth_m.shape[::-1]) - 1).T
+        known = (depth_m[row, column] > 0) & (depth > 0)
+        ratios.append(depth_m[row, column][known] / depth[known])
+    found = np.concatenate(ratios) if ratios else np.empty(0)
+    return float(np.median(found)) if len(found) else None
+
+
+def _depth_of_images(
+    reconstruction: Any, folder: Path, scale: float, step: int = 1
+) -> Iterator[tuple[Any, NDArray[np.float32]]]:
+    """Yield every step-th image of a model that has a depth image, and its depth (H, W) in metres."""
+    check_positive("the number of units of depth images in a metre", scale)
+    files = {p.relative_to(folder).with_suffix("").as_posix(): p for p in sorted(folder.rglob("*")) if p.is_file()}
+    for _, image in sorted(reconstruction.images.items())[::step]:
         stem = Path(image.name).with_suffix("").as_posix()
         stems = [stem, *(stem.replace(word, "depth") for word in ("color", "colour", "rgb"))]
         path = next((files[name] for name in stems if name in files), None)
@@ -34,12 +79,7 @@ def read_depth_images(model: Path, folder: Path, scale: float = 1000.0) -> list[
             except (OSError, ValueError) as error:
                 problem = f"cannot read the depth image: {error}"
                 raise SceneError(problem, path=path, fix="Export it again.") from error
-            camera = _scaled(cameras[image.camera_id], depth_m.shape[1], depth_m.shape[0])
-            images.append(DepthImage(depth_m, camera, image.cam_from_world().matrix()))
-    if not images:
-        fix = "Name each as its image, with the ending of a depth image, such as .png."
-        raise SceneError("no depth image belongs to an image of the map", path=folder, fix=fix)
-    return images
+            yield image, depth_m
 
 
 def _scaled(camera: Camera, width: int, height: int) -> PinholeCamera:

@@ -12,9 +12,9 @@ from trimesh.graph import connected_component_labels
 
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float
+from wheretolook.geometry.similarity import Similarity
 from wheretolook.geometry.tsdf import TsdfConfig, TsdfVolume
 from wheretolook.mapping.colmap_model import write_model
-from wheretolook.mapping.georeference import Similarity
 from wheretolook.mapping.gravity import estimate_gravity, rotation_to_z
 from wheretolook.scans.checks import check_depth_unit, landmark_readings
 from wheretolook.scans.config import RgbdConfig

@@ -1,6 +1,6 @@
 """Write selected views to files, each of which names the frame of its poses.
 
-The world is that of the map, in metres, z up; cameras look along their z, x right, y down.
+The world is the map's own frame, in its unit; cameras look along their z, x right, y down.
 """
 
 from __future__ import annotations
@@ -101,6 +101,7 @@ def _table(views: SelectedViews) -> pd.DataFrame:
         "expected_inliers": views.expected_inliers,
         "n_visible": views.n_visible,
         "in_range": views.in_range,
+        "scale": views.frame.scale.source,
         **dict(zip(("qw", "qx", "qy", "qz"), views.quaternions_wxyz.T, strict=True)),
     }
     return pd.DataFrame(columns)
@@ -119,13 +120,15 @@ def _csv(views: SelectedViews) -> str:
 
 
 def _json(views: SelectedViews) -> dict[str, Any]:
-    frames = "x, y, z: camera centre in the world, m; qw, qx, qy, qz: camera-to-world; world z up, camera z forward"
+    frames = "x, y, z: camera centre in the map, in its unit; qw, qx, qy, qz: camera-to-world; camera z forward"
     table = _table(views).astype(object)
     table = table.where(table.notna(), None)
     table["quaternion_xyzw"] = views.quaternions_xyzw.tolist()
     table["cam_from_world"] = views.cam_from_world.tolist()
     camera = views.camera.colmap.record()
-    return {"frames": frames, "method": views.method, "camera": camera, "views": table.to_dict("records")}
+    known = {"metres_per_unit": views.frame.world_from_map.scale, "up": views.frame.world_from_map.rotation[2].tolist()}
+    about = {"frames": frames, "scale": views.frame.scale.source, **known, "gravity": views.frame.gravity}
+    return {**about, "method": views.method, "camera": camera, "views": table.to_dict("records")}
 
 
 def _tum(views: SelectedViews) -> str:
@@ -134,7 +137,7 @@ def _tum(views: SelectedViews) -> str:
         np.array(stamps, dtype=float)
     except ValueError:
         stamps = tuple(map(str, range(len(views))))
-    about = "# t x y z qx qy qz qw, camera-to-world, metres; t is the waypoint's name if that is a number, else a count"
+    about = "# t x y z qx qy qz qw, camera-to-world, in the map's unit; t is the waypoint's name if that is a number, else a count"
     return f"{about}\n{tum_text(stamps, views.cam_from_world)}"
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation
+from wheretolook.mapping.map_frame import IDENTITY, MapFrame
 from wheretolook.select.formats import save_views
 
 
@@ -20,8 +21,9 @@ from wheretolook.select.formats import save_views
 class SelectedViews:
     """V views: the best of each waypoint, in the order of waypoints, the best of a waypoint first.
 
-    World in metres, z up; camera x right, y down, z forward. `cam_from_world` takes world to camera (world-to-camera);
-    `quaternions_wxyz` and `quaternions_xyzw` are of the opposite, camera-to-world, as robots and TUM files have them.
+    The world of poses is the map's own frame, in its unit; camera x right, y down, z forward. `cam_from_world` takes
+    world to camera (world-to-camera); `quaternions_wxyz` and `quaternions_xyzw` are of the opposite, camera-to-world,
+    as robots and TUM files have them.
     """
 
     waypoint: NDArray[np.int64]  # (V,) row of the waypoint in what was asked for, from 0
@@ -35,6 +37,7 @@ class SelectedViews:
     camera: Camera  # of the views
     method: str  # name of the scorer
     set_score: Float | None = None  # (V,) probability that the waypoint's views localize jointly, if chosen so
+    frame: MapFrame = IDENTITY  # the map's own frame: its unit and direction up, and how they are known
 
     def __len__(self) -> int:
         return len(self.score)
@@ -46,23 +49,30 @@ class SelectedViews:
 
     @property
     def positions(self) -> Float:
-        """Camera centres in the world, (V, 3) metres."""
+        """Camera centres in the map, (V, 3)."""
         return camera_centers(self.cam_from_world)
 
     @property
     def axes(self) -> Float:
-        """Unit optical axes in the world, (V, 3)."""
+        """Unit optical axes in the map, (V, 3)."""
         return np.asarray(self.cam_from_world[:, 2, :3])
 
     @property
+    def _pan_tilt(self) -> tuple[Float, Float]:
+        return pan_tilt_angles(self.axes @ self.frame.world_from_map.rotation.T)
+
+    @property
     def yaw_deg(self) -> Float:
-        """(V,) angle of the optical axis in the level plane: 0 along +x, 90 along +y; 0 straight up or down."""
-        return np.degrees(pan_tilt_angles(self.axes)[0])
+        """(V,) angle of the optical axis in the level plane: 0 along +x, 90 along +y; 0 straight up or down.
+
+        In a map whose z is not up, x and y are those of the map after the smallest rotation that turns up to z.
+        """
+        return np.degrees(self._pan_tilt[0])
 
     @property
     def pitch_deg(self) -> Float:
         """(V,) angle of the optical axis above the level plane: 90 straight up."""
-        return np.degrees(pan_tilt_angles(self.axes)[1])
+        return np.degrees(self._pan_tilt[1])
 
     @property
     def quaternions_wxyz(self) -> Float:

@@ -32,7 +32,7 @@ LISTED = 5  # waypoints that an error names
 class Waypoints:
     """W locations, in the order given."""
 
-    points: Float  # (W, 3) float64, world, metres
+    points: Float  # (W, 3) float64, in the map's own frame and unit
     ids: tuple[str, ...]  # W names: those of the file, a trajectory's time stamps, or 0, 1, ...
     lines: tuple[int, ...] = ()  # line of the file that each is in, counted from 1; empty without a file
     path: Path | None = None  # the file
@@ -53,7 +53,7 @@ class Waypoints:
 
     @classmethod
     def of(cls, points: ArrayLike | Waypoints, ids: Sequence[str] = ()) -> Waypoints:
-        """Make waypoints from coordinates (W, 3) or (3,) in metres and optional names.
+        """Make waypoints from coordinates (W, 3) or (3,) and optional names.
 
         Raises a TableError if there are none, they have another shape, or one is not finite.
         """
@@ -62,9 +62,9 @@ class Waypoints:
         try:
             at = np.atleast_2d(np.asarray(points, dtype=np.float64))
         except (TypeError, ValueError) as error:
-            raise TableError(f"waypoints are numbers: {error}", fix="Give x, y, z in metres.") from error
+            raise TableError(f"waypoints are numbers: {error}", fix="Give x, y, z.") from error
         if at.ndim != 2 or at.shape[1] != 3 or len(at) == 0:
-            fix = "Give x,y,z of each, as 1,2,1.5 or a row of an array (W, 3), in metres."
+            fix = "Give x,y,z of each, as 1,2,1.5 or a row of an array (W, 3)."
             raise TableError("waypoints have three coordinates each", value=at.shape, fix=fix)
         if ids and len(ids) != len(at):
             raise TableError("as many names as waypoints are needed", value=(len(ids), len(at)))
@@ -118,12 +118,12 @@ def _columns(row: list[str], path: Path) -> tuple[list[int], int | None]:
 
 
 def parse_points(texts: Sequence[str]) -> Waypoints:
-    """Parse texts "x,y,z" in metres. Raises TableError if one is not three numbers."""
+    """Parse texts "x,y,z". Raises TableError if one is not three numbers."""
     return Waypoints.of([text.split(",") for text in texts])
 
 
 def grid_waypoints(localization_map: LocalizationMap, space: Any, spacing_m: float) -> Waypoints:
-    """Return locations `spacing_m` apart in all free space; their names are voxel ids.
+    """Return locations in the world, `spacing_m` apart in all free space; their names are voxel ids.
 
     Raises a ConfigError if the spacing is no length or makes too many, a SceneError if none is free.
     """
@@ -155,24 +155,30 @@ def usable_waypoints(localization_map: LocalizationMap, waypoints: Waypoints, sk
     from scipy.spatial import cKDTree
 
     landmarks = localization_map.landmarks
+    world_from_map = localization_map.frame.world_from_map
+    points = world_from_map.apply(waypoints.points)
     reach = float(np.quantile(landmarks.mapping_distance_m, REACH_SHARE))
-    to_landmark = cKDTree(landmarks.points).query(waypoints.points)[0]
+    to_landmark = cKDTree(landmarks.points).query(points)[0]
     nearest: Float = to_landmark
     if localization_map.mapping_poses is not None:
         centers = camera_centers(localization_map.mapping_poses.astype(np.float64))
-        nearest = np.minimum(nearest, cKDTree(centers).query(waypoints.points)[0])
+        nearest = np.minimum(nearest, cKDTree(centers).query(points)[0])
     outside = nearest > reach
     inside = ~outside & (to_landmark <= ON_LANDMARK_M)
     rest = np.flatnonzero(~outside & ~inside)
-    inside[rest] = localization_map.occlusion.inside_geometry(waypoints.points[rest])
+    inside[rest] = localization_map.occlusion.inside_geometry(points[rest])
     bad = outside | inside
     if not bad.any() or (skip and not bad.all()):
         return np.asarray(~bad)
     problems = []
     for row in np.flatnonzero(bad)[:LISTED]:
-        why = f"{nearest[row]:.3g} m from all landmarks and cameras" if outside[row] else "inside geometry"
+        why = (
+            f"{nearest[row] / world_from_map.scale:.3g} from all landmarks and cameras"
+            if outside[row]
+            else "inside geometry"
+        )
         problems.append(f"{waypoints.where(row)} {why}")
-    low, high = np.quantile(landmarks.points, (0.01, 0.99), axis=0).round(1).tolist()
+    low, high = np.quantile(world_from_map.inverse.apply(landmarks.points), (0.01, 0.99), axis=0).round(1).tolist()
     fix = f"The map's landmarks are within {low} to {high}, in its unit: check unit and axes"
     fix += "." if bad.all() else ", or leave these out: --skip, in Python skip=True."
     problem = f"{bad.sum()} of {len(waypoints)} waypoints are outside the map or inside geometry"

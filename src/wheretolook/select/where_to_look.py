@@ -18,6 +18,8 @@ from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along, rigid_poses
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.looks.selection import best_views
+from wheretolook.mapping.config import FrameOptions
+from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.planning.config import StopConfig
 from wheretolook.planning.routes import PlannedPath
 from wheretolook.planning.stops import stops_along
@@ -50,9 +52,9 @@ class WhereToLook:
         views = look.best([(1.0, 2.0, 1.5), (1.2, 2.0, 1.5)])
         views.save("views.csv")
 
-    World in metres, z up. `scorer` is any method on a localization map; `directions` (D, 3) are the optical axes that
-    are scored at each location, in the world; cameras do not roll. `space` is where a camera can be, for grids; None for
-    the space near the mapping cameras.
+    Locations, poses and views are in the map's own frame and unit, `frame`. `scorer` is any method on a localization
+    map; `directions` (D, 3) are the optical axes that are scored at each location, in the world (z up); cameras do not
+    roll. `space` is where a camera can be in the world, for grids; None for the space near the mapping cameras.
     """
 
     def __init__(self, scorer: Scorer, directions: ArrayLike | None = None, space: Any = None) -> None:
@@ -80,8 +82,11 @@ class WhereToLook:
         max_reprojection_error_px: float | None = None,
         device: str = "auto",
         anywhere: bool = False,
+        **frame: Any,
     ) -> WhereToLook:
-        """Open any COLMAP model (binary or text) in metres, z up.
+        """Open any COLMAP model (binary or text), of any unit and direction up.
+
+        A `MapWarning` states what was assumed of an unknown unit or direction up.
 
         Args:
             path: folder of the model.
@@ -90,7 +95,7 @@ class WhereToLook:
             camera: the camera of the views: a camera, a text such as "PINHOLE,640,480,320,320,320,240", or the
                 camera_id of one of the model. None for the model's own.
             fov_deg: instead, a pinhole of that horizontal field of view in degrees, of 640 x 480 px.
-            mesh: mesh of the scene, for true occlusion.
+            mesh: mesh of the scene in the map's frame, for true occlusion.
             depth: folder of depth images of the model's images, for occlusion by the surface they fuse to.
             depth_scale: units of integer depth images in a metre.
             occlusion: "mesh", "tsdf" (depth images), "hidden-points" (from the landmarks alone) or "none" (landmarks
@@ -101,6 +106,7 @@ class WhereToLook:
             max_reprojection_error_px: landmarks with a larger mean error are dropped; None for the map's own default.
             device: "auto" for a GPU if there is one, "cpu", or "cuda:0".
             anywhere: whether weights that are adapted to another scene may score in this one.
+            frame: scale, distance, positions or up, see `wheretolook.mapping.config.FrameOptions`.
 
         Raises:
             MapError, SceneError: the model or database, the mesh or depth images cannot be used.
@@ -115,7 +121,8 @@ class WhereToLook:
         axes = direction_lattice(directions, lattice)
         resolve_weights(method, weights)  # so that missing ones are reported before anything is read
         mesh, depth, database = (None if file is None else Path(file) for file in (mesh, depth, database))
-        files = ColmapFiles(Path(path), mesh, depth, depth_scale, database, max_reprojection_error_px)
+        options = FrameOptions(**frame)
+        files = ColmapFiles(Path(path), mesh, depth, depth_scale, database, max_reprojection_error_px, options)
         environment = ColmapEnvironment(files, camera, occlusion or "", CONFIG, device)
         here = environment.localization_map
         weights = resolve_weights(method, weights, here.landmarks.features)
@@ -129,8 +136,13 @@ class WhereToLook:
         return self.scorer.localization_map
 
     @property
+    def frame(self) -> MapFrame:
+        """The map's own frame: its unit and direction up, and how they are known."""
+        return self.localization_map.frame
+
+    @property
     def space(self) -> Any:
-        """Where a camera can be, by mesh, depth images, or the map only."""
+        """Where a camera can be in the world, by mesh, depth images, or the map only."""
         if self._space is None:
             poses = self.localization_map.mapping_poses
             assert poses is not None
@@ -138,15 +150,16 @@ class WhereToLook:
         return self._space
 
     def grid(self, spacing_m: float) -> Waypoints:
-        """Return waypoints so far apart in all free space, in metres. Raises ConfigError or SceneError if none."""
-        return grid_waypoints(self.localization_map, self.space, spacing_m)
+        """Return waypoints so many metres apart in all free space. Raises ConfigError or SceneError if none."""
+        grid = grid_waypoints(self.localization_map, self.space, spacing_m)
+        return replace(grid, points=self.frame.world_from_map.inverse.apply(grid.points))
 
     def score(self, cam_from_world: ArrayLike) -> Float:
         """Score poses (B, 3, 4) or (B, 4, 4), or one of them, world-to-camera, (B,).
 
         Higher is better, of learned methods a probability. Raises PoseError if a pose is no rigid transform.
         """
-        return self.scorer.score(rigid_poses(cam_from_world))
+        return self.scorer.score(self.frame.world_from_map.apply_to_poses(rigid_poses(cam_from_world)))
 
     def report(self, cam_from_world: ArrayLike, names: Sequence[str] = (), skip: bool = False) -> SelectedViews:
         """Score poses, as `score` takes them, and report each as a view; names count from 0 unless given.
@@ -157,7 +170,7 @@ class WhereToLook:
         poses = rigid_poses(cam_from_world)
         waypoints = Waypoints.of(camera_centers(poses), names)
         rows = np.flatnonzero(usable_waypoints(self.localization_map, waypoints, skip))
-        return self._reported(waypoints, rows, poses[rows])
+        return self._reported(waypoints, rows, self.frame.world_from_map.apply_to_poses(poses[rows]))
 
     def best(
         self,
@@ -168,7 +181,7 @@ class WhereToLook:
         progress: bool = False,
         **options: Any,
     ) -> SelectedViews:
-        """Select the best view, the n best, or the best set of views, at each of points (W, 3) metres in the world.
+        """Select the best view, the n best, or the best set of views, at each of points (W, 3) of the map.
 
         Args:
             points: locations of the camera.
@@ -190,6 +203,7 @@ class WhereToLook:
         waypoints = Waypoints.of(points, ids)
         rows = np.flatnonzero(usable_waypoints(self.localization_map, waypoints, request.skip))
         waypoints = waypoints[rows]
+        waypoints = replace(waypoints, points=self.frame.world_from_map.apply(waypoints.points))
         scores = self._candidate_scores(waypoints.points, axes, progress)
         if request.looks is None:
             views = self._single_views(waypoints, axes, scores, request)
@@ -258,7 +272,7 @@ class WhereToLook:
             waypoint=rows,
             waypoint_id=tuple(waypoints.ids[row] for row in rows),
             rank=np.ones_like(rows) if rank is None else rank,
-            cam_from_world=poses,
+            cam_from_world=self.frame.world_from_map.inverse.apply_to_poses(poses),
             score=report.score,
             expected_inliers=report.expected_inliers,
             n_visible=report.n_visible,
@@ -266,6 +280,7 @@ class WhereToLook:
             camera=self.localization_map.camera,
             method=self.scorer.name,
             set_score=set_score,
+            frame=self.frame,
         )
 
     def _candidate_scores(self, locations: Float, axes: Float, progress: bool) -> Float:

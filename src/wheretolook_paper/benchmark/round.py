@@ -148,6 +148,8 @@ class SceneRound:
             weights=None if baseline else config.weights,
             method="" if method == BEST else method,
             camera=CAMERA,
+            scale=1,  # the benchmark is in metres, z up
+            up="z",
             mesh=self.scene.mesh,
             directions=config.directions,
             lattice="yaw-pitch" if baseline else config.lattice,

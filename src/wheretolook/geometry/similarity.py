@@ -1,0 +1,41 @@
+"""Similarity transforms between two frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from wheretolook.geometry.poses import Float
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """x -> scale * rotation x + translation."""
+
+    scale: float  # positive
+    rotation: Float  # (3, 3)
+    translation: Float  # (3,), in units of the target
+
+    def apply(self, points: ArrayLike) -> Float:
+        """Transform points (..., 3)."""
+        return np.asarray(self.scale * np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation)
+
+    def apply_to_poses(self, poses: ArrayLike) -> Float:
+        """Transform cameras from world poses (..., 3, 4) of the source's frame to those of the target's."""
+        poses = np.asarray(poses, dtype=np.float64)
+        rotation = poses[..., :3] @ self.rotation.T
+        return np.concatenate([rotation, self.scale * poses[..., 3:] - rotation @ self.translation[:, None]], axis=-1)
+
+    @property
+    def inverse(self) -> Similarity:
+        """The similarity from target to source."""
+        return Similarity(1 / self.scale, self.rotation.T, -self.rotation.T @ self.translation / self.scale)
+
+    def transform_model(self, model: Any) -> None:
+        """Transform a `pycolmap.Reconstruction` in place."""
+        import pycolmap
+
+        model.transform(pycolmap.Sim3d(self.scale, pycolmap.Rotation3d(self.rotation), self.translation))

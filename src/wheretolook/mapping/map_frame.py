@@ -1,0 +1,203 @@
+"""The frame of a map: how its own unit and axes are related to metres with z up, and how that is known."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.geometry.similarity import Similarity
+from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_arrays
+from wheretolook.mapping.config import FrameOptions
+from wheretolook.mapping.georeference import (
+    REPORT_FILE,
+    MapScale,
+    read_positions,
+    read_scale,
+    scale_from_distance,
+    scale_from_positions,
+)
+from wheretolook.mapping.gravity import estimate_gravity, rotation_to_z
+from wheretolook.mapping.sanity import LOOKING_DOWN, scale_warning, up_axis_warning
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning
+from wheretolook.utils.reading import read_json_object
+
+DEPTH_M = 5.0
+"""Median depth of the images that a map of unknown scale is scaled to: scorers were trained in rooms."""
+MAX_RATIO = 1.05  # of two scales that agree
+MAX_DEPTH_RATIO = 1.2  # of a scale and that of depth images, whose sensors are less accurate
+MAX_TILT_DEG = 60.0  # median angle between a given up and the images' own, beyond which no camera was held like that
+
+
+@dataclass(frozen=True, eq=False)
+class MapFrame:
+    """A map's own frame, in which users give and get coordinates, and the world: metres, z up.
+
+    In the world of a map of unknown scale, the median depth of its images is `DEPTH_M`.
+    """
+
+    world_from_map: Similarity = Similarity(1.0, np.eye(3), np.zeros(3))
+    scale: MapScale = MapScale("model")  # its source; the factor is that of `world_from_map`
+    gravity: Literal["given", "levelled", "model"] = "model"
+
+    def of_arrays(self, arrays: ModelArrays) -> ModelArrays:
+        """Return arrays of the model in the world."""
+        centers = self.world_from_map.apply(arrays.image_centers)
+        return replace(arrays, points=self.world_from_map.apply(arrays.points), image_centers=centers)
+
+    def describe(self) -> str:
+        """State the scale and the direction up in one clause."""
+        up = "z" if self.gravity == "model" else f"({_rounded(self.world_from_map.rotation[2])}), {self.gravity}"
+        return f"1 unit of the map = {self.world_from_map.scale:.4g} m (scale: {self.scale.source}), up: {up}"
+
+    def warn(self, model: Path, mapping_distance_m: ArrayLike, cam_from_world: ArrayLike) -> None:
+        """Issue a `MapWarning` for each of the `messages`."""
+        for message in self.messages(mapping_distance_m, cam_from_world):
+            warnings.warn(f"{model}: {message}", MapWarning, stacklevel=3)
+
+    def messages(self, mapping_distance_m: ArrayLike, cam_from_world: ArrayLike) -> tuple[str, ...]:
+        """Return what was assumed of the map, or seems wrong of a known scale and direction up: a sentence each.
+
+        Takes the mean distance of each landmark's mapping cameras (N,) m, and the poses (M, 3, 4) of all in the world.
+        """
+        scale = scale_warning(mapping_distance_m, camera_centers(cam_from_world)) if self.scale.is_metric else ""
+        up = "" if self.gravity == "levelled" else up_axis_warning(cam_from_world)
+        return (*self.doubts, *filter(None, (scale, up)))
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What was assumed of the map, and how to state it instead: a sentence each."""
+        doubts = []
+        if not self.scale.is_metric:
+            depth = f"the median depth of the images were {DEPTH_M:g} m (1 unit = {self.world_from_map.scale:.4g} m)"
+            doubts.append(f"scale unknown: scored as if {depth}; give --scale, --distance or --positions")
+        if self.gravity == "levelled":
+            up = f"up is ({_rounded(self.world_from_map.rotation[2])}) in the map, as its cameras were held"
+            doubts.append(f"{up}; --up z keeps the map's z")
+        return tuple(doubts)
+
+
+def find_frame(
+    model_dir: Path,
+    model: Any,
+    options: FrameOptions = FrameOptions(),
+    depth_scale: float | None = None,
+    arrays: ModelArrays | None = None,
+) -> MapFrame:
+    """Find the frame of a `pycolmap.Reconstruction`, which is not changed.
+
+    Args:
+        model_dir: its folder, whose report states the scale if the map is one of this project.
+        model: the reconstruction.
+        options: what the user states.
+        depth_scale: metres in a unit of the model by depth images, if there are any.
+        arrays: the reconstruction as arrays, if they are known.
+
+    Raises:
+        MapError: the options do not fit the images, or no camera agrees with the direction up.
+        ConfigError: two sources of the scale disagree, or the file of positions is not valid.
+    """
+    poses = colmap_poses(model_dir, model)
+    centers = {image.name: image.projection_center() for image in model.images.values() if image.has_pose}
+    reported = reported_scale(model_dir)
+    scale = _given_scale(model_dir, options, centers)
+    known = None if reported is None or not reported.is_metric else replace(reported, factor=1.0)
+    by_depth = None if depth_scale is None else MapScale("depth", depth_scale)
+    if options.positions is not None:
+        scale, similarity = scale_from_positions(centers, read_positions(options.positions))
+        _check_agreement(scale, known, by_depth)
+        return MapFrame(similarity, scale, "given")
+    _check_agreement(scale or known, known, by_depth)
+    chosen = scale or known or by_depth
+    if chosen is None:
+        depth = median_depths(arrays or model_arrays(model), poses)
+        depth = depth[depth > 0]  # none where nothing is observed
+        chosen = MapScale("unknown", DEPTH_M / float(np.median(depth)) if len(depth) else 1.0)
+    gravity, rotation = _upright(
+        model_dir, poses, options, is_known=reported is not None and reported.source != "model"
+    )
+    return MapFrame(Similarity(chosen.factor, rotation, np.zeros(3)), chosen, gravity)
+
+
+def reported_scale(model_dir: Path) -> MapScale | None:
+    """Read the scale that the report in a map's folder states; None without a report of this project."""
+    scale = read_scale(model_dir)
+    if scale is not None or not (model_dir / REPORT_FILE).is_file():
+        return scale
+    return MapScale("rendered") if "n_landmarks" in read_json_object(model_dir / REPORT_FILE) else None
+
+
+def median_depths(arrays: ModelArrays, cam_from_world: Float) -> Float:
+    """Median depth (I,) of the landmarks that each image observes, from poses (I, 3, 4); NaN where it observes none."""
+    point = np.repeat(arrays.points, np.diff(arrays.observation_start), axis=0)
+    axis = cam_from_world[arrays.observation_image, 2]
+    depth = (axis[:, :3] * point).sum(1) + axis[:, 3]
+    ordered = depth[np.lexsort((depth, arrays.observation_image))]
+    counts = np.bincount(arrays.observation_image, minlength=len(cam_from_world))
+    some = counts > 0
+    first = np.cumsum(counts)[some] - counts[some]
+    result = np.full(len(counts), np.nan)
+    result[some] = (ordered[first + (counts[some] - 1) // 2] + ordered[first + counts[some] // 2]) / 2
+    return result
+
+
+def _given_scale(model_dir: Path, options: FrameOptions, centers: dict[str, Float]) -> MapScale | None:
+    """Return the scale that the options state, by camera centres; None if there is none, or positions give it."""
+    if options.scale is not None:
+        return MapScale("given", options.scale)
+    if options.distance is None:
+        return None
+    *ends, distance_m = options.distance
+    for end in ends:
+        if end not in centers:
+            fix = f"Name two of its images, such as {', '.join(sorted(centers)[:2])}."
+            raise MapError("the map has no such image", path=model_dir, value=end, fix=fix)
+    return scale_from_distance(centers[ends[0]], centers[ends[1]], distance_m)
+
+
+def _check_agreement(scale: MapScale | None, reported: MapScale | None, by_depth: MapScale | None) -> None:
+    """Raise ConfigError if a scale differs from the reported one, or from that of depth images."""
+    limits = ((reported, MAX_RATIO, "Leave it out"), (by_depth, MAX_DEPTH_RATIO, "Check --depth-scale"))
+    for other, limit, fix in limits:
+        if scale is not None and other is not None and abs(np.log(scale.factor / other.factor)) > np.log(limit):
+            value = ", ".join(f"{one.source}: 1 unit = {one.factor:.4g} m" for one in (scale, other))
+            raise ConfigError(
+                "the scale of the map has two different values", value=value, fix=f"{fix}, or correct it."
+            )
+
+
+def _upright(
+    model_dir: Path, poses: Float, options: FrameOptions, is_known: bool
+) -> tuple[Literal["given", "levelled", "model"], Float]:
+    """Return how the direction up is known, and the rotation (3, 3) that turns it to z.
+
+    Without options it is z if that is known, or unless the cameras, poses (M, 3, 4), are clearly not level. A user who
+    states that z is up keeps it, however the cameras were held.
+    """
+    up = options.up_direction()
+    if up is None:
+        levels = options.up == "level" or not (is_known or not up_axis_warning(poses))
+        return ("levelled", estimate_gravity(poses).rotation) if levels else ("model", np.eye(3))
+    rotation = rotation_to_z(up)
+    off_deg = np.degrees(np.arccos(np.clip(-poses[:, 1, :3] @ rotation[2], -1, 1)))
+    looking_down = (poses[:, 2, :3] @ rotation[2]).mean() < -LOOKING_DOWN
+    if rotation[2, 2] != 1 and np.median(off_deg) > MAX_TILT_DEG and not looking_down:
+        problem = (
+            f"no camera agrees with this direction up: half were held {np.median(off_deg):.0f} degrees off or more"
+        )
+        fix = f"The cameras were held as if up were ({_rounded(estimate_gravity(poses).up)}): give that, or --up level."
+        raise MapError(problem, path=model_dir, value=options.up, fix=fix)
+    return "given", rotation
+
+
+def _rounded(direction: Float) -> str:
+    return " ".join(f"{value:.2f}" for value in np.round(direction, 2) + 0.0)  # no -0.00
+
+
+IDENTITY = MapFrame()
+"""The frame of a map that is in metres with z up."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import warnings
 from pathlib import Path
@@ -16,6 +17,8 @@ from wheretolook.mapping.feature_files import read_descriptors
 from wheretolook.mapping.landmarks import open_colmap
 from wheretolook.mapping.sources import choose_features, find_features, find_photographs
 from wheretolook.utils.errors import MapWarning
+from wheretolook.utils.files import sha256
+from wheretolook.utils.shipped import WEIGHTS, shipped
 
 h5py = pytest.importorskip("h5py", reason="hloc's features need h5py: pip install 'wheretolook[hloc]'")
 
@@ -103,6 +106,9 @@ def test_commands_report_and_use_the_features(tmp_path: Path, capsys: pytest.Cap
     out = tmp_path / "views.csv"
     assert main(["select", "--map", str(SFM), "--at", "0,0,1", "--out", str(out), "--directions", "20"]) == 0
     assert f"{FEATURES.name} (aliked)" in capsys.readouterr().out
+    assert main(["export", "--map", str(SFM), "--out", str(tmp_path / "robot")]) == 0
+    exported = json.loads((tmp_path / "robot/robot.json").read_text())["weights_sha256"]
+    assert exported == sha256(shipped(WEIGHTS) / "aliked/set.safetensors")
     assert main(["map", "--name", "made", "--data", str(tmp_path), "--model", str(SFM)]) == 0
     assert f"{FEATURES.name} (aliked)" in capsys.readouterr().out
     from wheretolook.mapping.landmarks import Landmarks

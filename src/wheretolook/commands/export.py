@@ -7,7 +7,7 @@ from pathlib import Path
 
 from wheretolook.commands.options import CameraOptions
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.shipped import WEIGHTS, or_shipped
+from wheretolook.utils.shipped import or_shipped
 from wheretolook.utils.validation import check_positive
 
 MAX_LOCATIONS = 20_000
@@ -31,7 +31,7 @@ class Export(CameraOptions):
     Args:
         map: folder of a COLMAP model, in metres with z up.
         out: folder to write.
-        weights: file of weights of the method set.
+        weights: file of weights of the method set; by default the bundled ones for the features of the map.
         database: the map's database, as of `wheretolook select`.
         mesh: a mesh of the scene, for occlusion.
         spacing: of the grid, in metres.
@@ -39,7 +39,7 @@ class Export(CameraOptions):
 
     map: Path
     out: Path
-    weights: Path = Path(WEIGHTS) / "set.safetensors"
+    weights: Path | None = None
     database: Path | None = None
     mesh: Path | None = None
     spacing: float = 0.5
@@ -53,6 +53,7 @@ class Export(CameraOptions):
         from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
         from wheretolook.robot.export import export_robot, pinhole_of
         from wheretolook.select.waypoints import grid_waypoints
+        from wheretolook.weights.resolve import resolve_weights
 
         files = ColmapFiles(self.map, mesh=self.mesh, database=self.database)
         occlusion = "none" if self.mesh is None else "mesh"
@@ -67,7 +68,9 @@ class Export(CameraOptions):
         camera = pinhole_of(source.camera)
         if camera != source.camera:
             print("the map's camera has distortion, the robot's is the pinhole of its rectified images")
-        export_robot(source.of_camera(camera), or_shipped(self.weights), self.out, locations)
+        weights = or_shipped(self.weights) if self.weights else resolve_weights("set", None, source.landmarks.features)
+        assert weights is not None
+        export_robot(source.of_camera(camera), weights, self.out, locations)
         print(f"{len(source.landmarks):,} landmarks, a camera of {camera.width} x {camera.height} px: {self.out}")
         if locations is None:
             print("without --mesh the robot sees landmarks through walls")

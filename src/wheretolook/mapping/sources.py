@@ -53,6 +53,8 @@ def choose_features(model_dir: Path, reconstruction: Any, given: Path | None = N
     if found is not None and kind is not None and (kind is not SIFT or found.suffix.lower() in HDF5_SUFFIXES):
         LOG.info("features: %s (%s)", found, kind.name)
         return found
+    if given is None and kind is not None:
+        LOG.info("features not used: %s (%s); --database gives the ambiguity of landmarks", found, kind.name)
     if given is None and kind is None:
         named = next((name for path in (model_dir, *_above(model_dir)[:2]) if (name := kind_in_name(path))), SIFT)
         if problem or named is not SIFT:

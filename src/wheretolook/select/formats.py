@@ -100,6 +100,7 @@ def _table(views: SelectedViews) -> pd.DataFrame:
         **({} if views.set_score is None else {"set_score": views.set_score}),
         "expected_inliers": views.expected_inliers,
         "n_visible": views.n_visible,
+        **{name: getattr(views, name) for name in REASONS},
         "in_range": views.in_range,
         "scale": views.frame.scale.source,
         **dict(zip(("qw", "qx", "qy", "qz"), views.quaternions_wxyz.T, strict=True)),
@@ -107,7 +108,15 @@ def _table(views: SelectedViews) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-_DIGITS = {"yaw_deg": ".3f", "pitch_deg": ".3f", "score": ".9g", "set_score": ".9g", "expected_inliers": ".2f"}
+REASONS = ("n_occluded", "n_too_far", "n_too_oblique", "n_repeated")
+_DIGITS = {
+    "yaw_deg": ".3f",
+    "pitch_deg": ".3f",
+    "score": ".9g",
+    "set_score": ".9g",
+    "expected_inliers": ".2f",
+    "n_repeated": ".0f",
+}
 
 
 def _csv(views: SelectedViews) -> str:

@@ -38,6 +38,12 @@ class SelectedViews:
     method: str  # name of the scorer
     set_score: Float | None = None  # (V,) probability that the waypoint's views localize jointly, if chosen so
     frame: MapFrame = IDENTITY  # the map's own frame: its unit and direction up, and how they are known
+    # (V,) landmarks that are hard to match, see `wheretolook.inputs.reasons`: in the image, but occluded; and of the
+    # visible ones those that are too far, seen too obliquely, or repeated (NaN for a map without descriptors)
+    n_occluded: NDArray[np.int64] | None = None
+    n_too_far: NDArray[np.int64] | None = None
+    n_too_oblique: NDArray[np.int64] | None = None
+    n_repeated: Float | None = None
 
     def __len__(self) -> int:
         return len(self.score)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along, rigid_poses
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.inputs.reasons import ReasonCounter
 from wheretolook.looks.selection import best_views
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.map_frame import MapFrame
@@ -170,7 +172,8 @@ class WhereToLook:
         poses = rigid_poses(cam_from_world)
         waypoints = Waypoints.of(camera_centers(poses), names)
         rows = np.flatnonzero(usable_waypoints(self.localization_map, waypoints, skip))
-        return self._reported(waypoints, rows, self.frame.world_from_map.apply_to_poses(poses[rows]))
+        poses = self.frame.world_from_map.apply_to_poses(poses[rows])
+        return self._explained(self._reported(waypoints, rows, poses))
 
     def best(
         self,
@@ -211,7 +214,7 @@ class WhereToLook:
             views = self._view_sets(waypoints, axes, scores, request.looks, request.max_total_turn_deg, progress)
         else:
             views = self._sequence_with_stops(waypoints, axes, scores, request, progress)
-        return replace(views, waypoint=rows[views.waypoint])
+        return replace(self._explained(views), waypoint=rows[views.waypoint])
 
     def _single_views(
         self, waypoints: Waypoints, axes: Float, scores: Float, request: SelectionRequest
@@ -282,6 +285,18 @@ class WhereToLook:
             set_score=set_score,
             frame=self.frame,
         )
+
+    @cached_property
+    def reasons(self) -> ReasonCounter:
+        """Counts the landmarks in views that are hard to match."""
+        return ReasonCounter(self.localization_map)
+
+    def _explained(self, views: SelectedViews) -> SelectedViews:
+        """Return views with the numbers of landmarks that are hard to match."""
+        step = max(1, SIGHT_LINES // max(1, len(self.localization_map.landmarks)))
+        poses = self.frame.world_from_map.apply_to_poses(views.cam_from_world)
+        parts = [vars(self.reasons.count(poses[row : row + step])) for row in range(0, len(poses), step)]
+        return replace(views, **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
 
     def _candidate_scores(self, locations: Float, axes: Float, progress: bool) -> Float:
         """Score all directions (D, 3) at locations (L, 3), (L, D)."""

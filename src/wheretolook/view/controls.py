@@ -70,6 +70,7 @@ class Controls:
         hint = "Move to the selected view; drag to turn it."
         self.inside = gui.add_checkbox("first person", False, hint=hint)
         self.picture = gui.add_image(_BLANK, visible=False)
+        self.picture_legend = gui.add_html(legend(0, 1, "probability that a landmark is detected"), visible=False)
         self.picture_caption = gui.add_markdown("")
 
     def _add_layers(self, gui: Any, viewed: ViewedMap, state: ViewState) -> None:

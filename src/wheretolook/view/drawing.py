@@ -62,12 +62,12 @@ def line_ends(colors: Any) -> Rgb:
     return np.repeat(linear_light(colors)[:, None], 2, axis=1)
 
 
-def legend(low: float, high: float) -> str:
-    """Return the colour scale of scores as HTML."""
+def legend(low: float, high: float, quantity: str = "score") -> str:
+    """Return the colour scale of a quantity as HTML."""
     stops = ",".join("rgb({},{},{})".format(*color) for color in score_colors(np.linspace(0, 1, 18)))
     bar = f"height:10px;border-radius:3px;background:linear-gradient(to right,{stops})"
     row = "display:flex;justify-content:space-between;font-size:12px;opacity:.8"
-    ends = f"<span>{low:.3g}</span><span>score</span><span>{high:.3g}</span>"
+    ends = f"<span>{low:.3g}</span><span>{quantity}</span><span>{high:.3g}</span>"
     return f'<div style="padding:4px 12px"><div style="{bar}"></div><div style="{row}">{ends}</div></div>'
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import axes_of_angles
 from wheretolook.geometry.poses import Float, poses_looking_along, quaternion_from_rotation, rotation_from_quaternion
+from wheretolook.inputs.reasons import ReasonCounts
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.view import drawing
 from wheretolook.view.controls import value_of
@@ -136,9 +137,11 @@ class LocationView:
         landmarks = session.viewed.visible_landmarks(state.method, state.occlusion, pose)
         colors = drawing.score_colors(landmarks.probabilities)
         session.add_points("/seen", landmarks.points, colors, 0.0032 * session.viewed.size_m, outside)
+        reasons = session.selector.reasons.count(pose[None])
+        c.picture_caption.content = f"{caption}\n\n{describe_reasons(reasons)}"
         yield
         c.picture.image, c.picture.label = session.viewed.picture(pose, landmarks)
-        c.picture.visible = True
+        c.picture.visible = c.picture_legend.visible = True
         session.show_state()
 
     def _move_inside(self) -> None:
@@ -169,6 +172,13 @@ class LocationView:
         """Turn the view with the browser's camera while that is inside."""
         if self.session.controls.inside.value and time.monotonic() - self._camera_set > SETTLE_S:
             self.turn_to(rotation_from_quaternion(self.session.client.camera.wxyz)[:, 2])
+
+
+def describe_reasons(counts: ReasonCounts) -> str:
+    """State how many landmarks are hard to match in a view, by reason."""
+    names = {"too far": counts.n_too_far, "too oblique": counts.n_too_oblique, "repeated": counts.n_repeated}
+    of_visible = ", ".join(f"{n[0]:,.0f} {name}" for name, n in names.items() if np.isfinite(n[0]))
+    return f"of these {of_visible}; {counts.n_occluded[0]:,} more are occluded"
 
 
 def describe(location: ScoredLocation, threshold: float) -> str:

@@ -15,9 +15,11 @@ from wheretolook import WhereToLook as Exported
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import rotation_angle_deg, rotation_looking_along
+from wheretolook.io.poses import tum_text
 from wheretolook.scenes.loading import save_glb
 from wheretolook.scorers.base import Scorer
 from wheretolook.select.request import SelectionRequest
+from wheretolook.select.waypoints import read_waypoints
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError, WhereToLookError
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
@@ -254,6 +256,11 @@ def test_a_turn_in_radians_is_rejected(look: WhereToLook) -> None:
         {"looks": 2, "max_turn_deg": 30},
         {"max_total_turn_deg": 30},
         {"pitch_deg": (30, -30)},
+        {"pan_deg": (30, -30)},
+        {"pan_deg": (-190, 30)},
+        {"apart_deg": 20},
+        {"n": 2, "apart_deg": -1},
+        {"n": 2, "apart_deg": float("nan")},
         {"pitch_deg": (-0.5, 0.5)},  # radians
         {"pitch_deg": (-100, 0)},
         {"pitch_deg": (30, np.nan)},
@@ -264,3 +271,41 @@ def test_a_turn_in_radians_is_rejected(look: WhereToLook) -> None:
 def test_invalid_requests_are_rejected(options: dict) -> None:
     with pytest.raises(ConfigError):
         SelectionRequest(**options)
+
+
+def test_limits_on_pan_are_relative_to_the_heading(look: WhereToLook, tmp_path: Path) -> None:
+    heading = np.array([170.0, -90.0, 0.0, 45.0])
+    half = np.radians(heading) / 2
+    robot = np.column_stack([np.arange(4), POINTS, np.zeros((4, 2)), np.sin(half), np.cos(half)])  # x forward, z up
+    np.savetxt(tmp_path / "robot.tum", robot)
+    cameras = poses_looking_along(POINTS, np.column_stack([np.cos(2 * half), np.sin(2 * half), np.zeros(4)]))
+    (tmp_path / "camera.tum").write_text(tum_text("0123", cameras))
+    table = np.column_stack([POINTS, heading])
+    np.savetxt(tmp_path / "at.csv", table, delimiter=",", header="x,y,z,heading_deg", comments="")
+    views = look.best(POINTS, 3, heading_deg=heading, pan_deg=(-20, 60))
+    pan = (views.yaw_deg - np.repeat(heading, 3) + 180) % 360 - 180
+    assert (pan >= -20 - 1e-6).all() and (pan <= 60 + 1e-6).all()
+    for name in ("robot.tum", "camera.tum", "at.csv"):
+        same = look.best(read_waypoints(tmp_path / name), 3, pan_deg=(-20, 60))
+        np.testing.assert_allclose(same.cam_from_world, views.cam_from_world, atol=1e-9)
+    for options in ({"looks": 3}, {"max_turn_deg": 360.0}, {"max_turn_deg": 360.0, "looks": 3, "least_score": 0.9999}):
+        other = look.best(POINTS, heading_deg=heading, pan_deg=(-20, 60), **options)
+        pan = (other.yaw_deg - heading[other.waypoint] + 180) % 360 - 180
+        assert (pan >= -20 - 1e-6).all() and (pan <= 60 + 1e-6).all()
+    for points, options in ((POINTS, {}), (POINTS, {"heading_deg": [0, np.nan, 0, 0]}), (POINTS, {"heading_deg": [0]})):
+        with pytest.raises(TableError):
+            look.best(points, pan_deg=(-20, 60), **options)
+    with pytest.raises(ConfigError):
+        look.best(POINTS, heading_deg=heading, pan_deg=(0, 0.01))
+
+
+def test_best_views_apart(look: WhereToLook) -> None:
+    near = look.best(POINTS, 4)
+    apart = look.best(POINTS, 4, apart_deg=50)
+    np.testing.assert_allclose(apart.axes[::4], near.axes[::4], atol=1e-9)
+    for axes in apart.axes.reshape(4, 4, 3):
+        cosines = (axes @ axes.T)[np.triu_indices(4, 1)]
+        assert np.degrees(np.arccos(cosines)).min() >= 50
+    assert (np.diff(apart.score.reshape(4, 4)) <= 0).all()
+    with pytest.raises(ConfigError):
+        look.best(POINTS, 4, apart_deg=170)

@@ -23,8 +23,11 @@ class Select(SelectionRequest, SelectorOptions):
     Waypoints (--at):
       CSV          columns x, y, z, and id if there is one; with a line of names or without (then x,y,z alone)
       benchmark    "id x y z", the waypoints of the Active Localization Benchmark; or "x y z"
-      TUM          "t x y z qx qy qz qw"; orientations are not used, the views keep the time stamps
+      TUM          "t x y z qx qy qz qw"; the views keep the time stamps
       numbers      --at 1,2,1.5 -0.5,2,1.5
+
+    Headings (for --pan): the column heading_deg or yaw_deg, or the orientation, of a TUM trajectory or in columns
+    qw, qx, qy, qz: that of a camera (z forward), or of a robot (x forward, z up).
 
     Frames: the world of waypoints and views is the map's own frame, in its unit. Camera: x right, y down, z forward; it
     does not roll. yaw_deg is 0 along the map's x and 90 along y, of an upright map; pitch_deg is 90 straight up.
@@ -44,6 +47,7 @@ class Select(SelectionRequest, SelectorOptions):
       wheretolook select --map sparse/0 --at 1,2,1.5 --looks 3 --max-total-turn 180 --out looks.csv
       wheretolook select --map sparse/0 --at path.tum --max-turn 30 --pitch -30 30 --out views.tum
       wheretolook select --map sparse/0 --at path.tum --max-turn 30 --looks 3 --least-score 0.7 --out views.csv
+      wheretolook select --map sparse/0 --at path.tum --pan -60 60 --n 3 --apart 20 --out views.csv
       wheretolook select --map sparse/0 --grid 0.5 --mesh house.glb --fov 60 --out views.csv
 
     Args:
@@ -53,7 +57,13 @@ class Select(SelectionRequest, SelectorOptions):
         lattice: fibonacci (even), or yaw-pitch (ActLoc's 6 x 18).
     """
 
-    SHORT: ClassVar = {"pitch": "pitch_deg", "max-turn": "max_turn_deg", "max-total-turn": "max_total_turn_deg"}
+    SHORT: ClassVar = {
+        "pitch": "pitch_deg",
+        "pan": "pan_deg",
+        "apart": "apart_deg",
+        "max-turn": "max_turn_deg",
+        "max-total-turn": "max_total_turn_deg",
+    }
 
     at: tuple[str, ...] = ()
     grid: float | None = None

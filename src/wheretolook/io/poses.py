@@ -124,10 +124,11 @@ def _image_rows(path: Path) -> list[tuple[int, list[str]]]:
 
 def is_header(row: list[str]) -> bool:
     """Return whether cells of a table's first row are names: several, and none a number."""
-    return len(row) > 1 and not any(map(_is_number, row))
+    return len(row) > 1 and not any(map(is_number, row))
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Return whether a text is a number."""
     try:
         float(text)
     except ValueError:

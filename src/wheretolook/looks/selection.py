@@ -111,18 +111,24 @@ def candidates(
         axis = np.asarray(start, dtype=np.float64)
         # a camera that does not roll rotates at least by the angle of its axis
         order = order[directions[order] @ axis / np.linalg.norm(axis) >= _cosine(max_turn_deg)]
-    rows: list[int] = []
-    free = np.ones(len(directions), dtype=bool)
-    near = np.cos(np.radians(SEPARATION_DEG))
-    for row in order.tolist():
-        if free[row] and len(rows) < limit:
-            rows.append(row)
-            free &= directions @ directions[row] < near
+    rows = separated(directions, order, limit, SEPARATION_DEG)
     if max_turn_deg is not None and len(order):
         rows += order[directions[order] @ directions[order[0]] >= _cosine(max_turn_deg)][:limit].tolist()
     if len(rows) < limit:  # so few directions, or so close to one another
         rows += order[:limit].tolist()
     return np.array(list(dict.fromkeys(rows)), dtype=np.int64)
+
+
+def separated(directions: Float, order: NDArray[np.integer], limit: int, apart_deg: float) -> list[int]:
+    """Return the first rows, at most `limit`, of unit directions (D, 3) in an order that are so far from one another."""
+    rows: list[int] = []
+    free = np.ones(len(directions), dtype=bool)
+    near = np.cos(np.radians(apart_deg))
+    for row in order.tolist():
+        if free[row] and len(rows) < limit:
+            rows.append(row)
+            free &= directions @ directions[row] < near
+    return rows
 
 
 def _cosine(limit_deg: float) -> float:

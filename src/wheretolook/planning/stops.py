@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import expit
 from tqdm.auto import tqdm
 
@@ -41,11 +42,12 @@ def stops_along(
     config: StopConfig,
     planner: PathConfig = PathConfig(),
     progress: str | None = None,
+    allowed: NDArray[np.bool_] | None = None,
 ) -> tuple[Stop, ...]:
     """Choose the stops of a path through positions (W, 3) m with views along unit axes (W, 3).
 
     A position whose view scores below `config.least_score` becomes a stop with the fewest further looks, along some of
-    unit directions (D, 3), by which all looks jointly reach that score; of equally many those with the smallest
+    unit directions (D, 3), at each position those `allowed` (W, D), by which all looks jointly reach that score; of equally many those with the smallest
     rotation. Where `config.looks` do not suffice, the stop with the largest gain is made, if positive:
     `planner.score_weight` for every metre of the path around the position times the rise of its score, less
     `planner.turn_weight_m` for every radian there and back.
@@ -64,7 +66,8 @@ def stops_along(
     rows = np.flatnonzero(scores < config.least_score)
     for row in tqdm(rows.tolist(), desc=progress, unit="stop", disable=progress is None):
         view = _View(row, positions[row], axes[row], float(scores[row]), float(metres[row]))
-        stops.append(_best_stop(scorer, view, directions, config, planner))
+        choice = directions if allowed is None else directions[allowed[row]]
+        stops.append(_best_stop(scorer, view, choice, config, planner))
     return tuple(filter(None, stops))
 
 

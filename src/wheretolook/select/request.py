@@ -18,6 +18,8 @@ class SelectionRequest:
         n: number of best views of each waypoint.
         looks: instead of n, number of views that are chosen to be localized jointly, for a camera that turns there.
         pitch_deg: lowest and highest pitch in degrees, 90 straight up.
+        pan_deg: lowest and highest yaw in degrees relative to the robot's heading at the waypoint, positive to its left.
+        apart_deg: with n, least angle between the best views of a waypoint, in degrees.
         max_turn_deg: greatest rotation between a view and the next, in the order of the waypoints. The views are then
             the sequence with the greatest sum of scores within the limit, exactly.
         max_total_turn_deg: with looks, how far the camera turns in all from the first to the last.
@@ -29,6 +31,8 @@ class SelectionRequest:
     n: int = 1
     looks: int | None = None
     pitch_deg: tuple[float, float] | None = None
+    pan_deg: tuple[float, float] | None = None
+    apart_deg: float | None = None
     max_turn_deg: float | None = None
     max_total_turn_deg: float | None = None
     least_score: float | None = None
@@ -36,12 +40,18 @@ class SelectionRequest:
 
     def __post_init__(self) -> None:
         check_pitch("pitch_deg", self.pitch_deg or (-90.0, 90.0))
+        low, high = self.pan_deg or (-180.0, 180.0)
+        fix = "Give degrees from -180 to 180, the lowest first, such as -60 60."
+        if not -180 <= low < high <= 180:
+            raise ConfigError("pan_deg is a lowest and a highest yaw", value=(low, high), fix=fix)
         joint = self.looks is not None
         in_order = self.max_turn_deg is not None
         stopping = self.least_score is not None
         for name in ("max_turn_deg", "max_total_turn_deg"):
             check_range(name, getattr(self, name) or 0, 0)
         reject(
+            (self.apart_deg is not None and self.n == 1, "apart_deg needs an n of at least 2", self.apart_deg),
+            (not 0 <= (self.apart_deg or 0) <= 180, "apart_deg must be 0 to 180", self.apart_deg),
             (not isinstance(self.n, Integral) or self.n < 1, "n must be a whole number of at least 1", self.n),
             (joint and self.looks not in range(1, MAX_VIEWS + 1), f"looks must be 1 to {MAX_VIEWS}", self.looks),
             (stopping and not (joint and in_order), "least_score needs looks and max_turn_deg", self.least_score),

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import VoxelGrid
-from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.io.poses import NAME_COLUMNS, is_header, read_rows
+from wheretolook.geometry.poses import Float, camera_centers, rotation_from_quaternion
+from wheretolook.io.poses import NAME_COLUMNS, QUATERNION_COLUMNS, is_header, is_number, read_rows
 from wheretolook.utils.errors import ConfigError, SceneError, TableError
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ CSV with columns x, y, z (and id, if there is one; a line of names or none), the
 MAX_LOCATIONS = 1_000_000  # voxels of a grid
 REACH_SHARE = 0.95  # of the landmarks' mapping distances; farther from all of them the map is unknown
 ON_LANDMARK_M = 1e-6  # a location this close to a landmark is on a surface
+BODY_UPRIGHT = 0.7  # z of a robot's own z axis, from which on it is no camera
 LISTED = 5  # waypoints that an error names
 
 
@@ -36,6 +38,8 @@ class Waypoints:
     ids: tuple[str, ...]  # W names: those of the file, a trajectory's time stamps, or 0, 1, ...
     lines: tuple[int, ...] = ()  # line of the file that each is in, counted from 1; empty without a file
     path: Path | None = None  # the file
+    # The robot's heading: (W, 1) yaws in degrees in the upright map, or (W, 4) quaternions wxyz, map_from_robot.
+    headings: Float | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -44,7 +48,24 @@ class Waypoints:
         """Return some of them."""
         kept = np.arange(len(self))[rows]
         lines = tuple(self.lines[row] for row in kept) if self.lines else ()
-        return Waypoints(self.points[kept], tuple(self.ids[row] for row in kept), lines, self.path)
+        headings = None if self.headings is None else self.headings[kept]
+        return Waypoints(self.points[kept], tuple(self.ids[row] for row in kept), lines, self.path, headings)
+
+    def heading_deg(self, world_from_map: Float) -> Float:
+        """Return the robot's yaw in degrees at each waypoint, (W,), in the world, by the rotation (3, 3) to it.
+
+        A quaternion is that of a camera, which looks along z, or of a robot whose z is up, which heads along x. Raises
+        a TableError if a heading is unknown.
+        """
+        yaw = np.full(len(self), np.nan) if self.headings is None else self.headings[:, 0]
+        if self.headings is not None and self.headings.shape[1] == 4 and np.linalg.norm(self.headings, axis=1).all():
+            axes = world_from_map @ rotation_from_quaternion(self.headings)
+            forward = np.where(axes[:, 2, 2:] > BODY_UPRIGHT, axes[..., 0], axes[..., 2])
+            yaw = np.degrees(pan_tilt_angles(forward)[0])
+        for row in np.flatnonzero(~np.isfinite(yaw)).tolist():
+            fix = "Give a TUM trajectory or a CSV with the column heading_deg, in Python heading_deg; or leave pan out."
+            raise TableError("a limit on pan needs the heading", path=self.path, value=self.where(row), fix=fix)
+        return yaw
 
     def where(self, row: int) -> str:
         """Describe a waypoint by its line or name, and its coordinates."""
@@ -52,8 +73,10 @@ class Waypoints:
         return f"{f'line {self.lines[row]}' if self.lines else f'waypoint {self.ids[row]}'}: ({at})"
 
     @classmethod
-    def of(cls, points: ArrayLike | Waypoints, ids: Sequence[str] = ()) -> Waypoints:
-        """Make waypoints from coordinates (W, 3) or (3,) and optional names.
+    def of(
+        cls, points: ArrayLike | Waypoints, ids: Sequence[str] = (), heading_deg: ArrayLike | None = None
+    ) -> Waypoints:
+        """Make waypoints from coordinates (W, 3) or (3,), optional names and optional headings (W,) in degrees.
 
         Raises a TableError if there are none, they have another shape, or one is not finite.
         """
@@ -68,7 +91,10 @@ class Waypoints:
             raise TableError("waypoints have three coordinates each", value=at.shape, fix=fix)
         if ids and len(ids) != len(at):
             raise TableError("as many names as waypoints are needed", value=(len(ids), len(at)))
-        return cls(at, tuple(ids) or tuple(map(str, range(len(at)))))._checked()
+        headings = None if heading_deg is None else np.asarray(heading_deg, dtype=np.float64).reshape(-1, 1)
+        if headings is not None and len(headings) != len(at):
+            raise TableError("as many headings as waypoints are needed", value=(len(headings), len(at)))
+        return cls(at, tuple(ids) or tuple(map(str, range(len(at)))), headings=headings)._checked()
 
     def _checked(self) -> Waypoints:
         for row in np.flatnonzero(~np.isfinite(self.points).all(axis=1)).tolist():
@@ -83,38 +109,45 @@ def read_waypoints(path: str | Path) -> Waypoints:
     """
     path = Path(path)
     rows = read_rows(path)
-    columns, id_column = _columns(rows[0][1], path)
+    columns, id_column, heading_columns = _columns(rows[0][1], path)
     if is_header(rows[0][1]):
         rows = rows[1:]
     points: list[list[float]] = []
+    headings: list[list[float]] = []
     ids: list[str] = []
     for number, row in rows:
         try:
             if len(row) != len(rows[0][1]):
                 raise ValueError(f"{len(row)} columns, unlike the first waypoint's {len(rows[0][1])}")
             points.append([float(row[column]) for column in columns])
+            headings.append([float(row[column]) if is_number(row[column]) else np.nan for column in heading_columns])
             ids.append(str(len(ids)) if id_column is None else row[id_column])
         except (ValueError, IndexError) as error:
             value = f"line {number}: {' '.join(row)[:80]}"
             raise TableError(f"not a waypoint: {error}", path=path, value=value, fix=f"Give {FORMATS}.") from error
     if not rows:
         raise TableError("there are no waypoints below the header", path=path, fix=f"Give {FORMATS}.")
-    return Waypoints(np.array(points), tuple(ids), tuple(number for number, _ in rows), path)._checked()
+    lines = tuple(number for number, _ in rows)
+    known = np.array(headings) if heading_columns else None
+    return Waypoints(np.array(points), tuple(ids), lines, path, known)._checked()
 
 
-def _columns(row: list[str], path: Path) -> tuple[list[int], int | None]:
-    """Return the columns of x, y, z and of the ids (or None) from the first row: a header, or a waypoint."""
+def _columns(row: list[str], path: Path) -> tuple[list[int], int | None, list[int]]:
+    """Return the columns of x, y, z, of the ids (or None) and of headings from the first row: a header, or a waypoint."""
     if not is_header(row):
         if len(row) not in (3, 4, 8):
             problem = f"waypoints have 3, 4 or 8 columns, these have {len(row)}"
             raise TableError(problem, path=path, value=" ".join(row)[:80], fix=f"Give {FORMATS}.")
-        return ([0, 1, 2], None) if len(row) == 3 else ([1, 2, 3], 0)
+        return ([0, 1, 2], None, []) if len(row) == 3 else ([1, 2, 3], 0, [7, 4, 5, 6] if len(row) == 8 else [])
     index = {name.strip("\"' ").lower(): column for column, name in reversed([*enumerate(row)])}
     columns = [index.get(axis, index.get(f"t{axis}", -1)) for axis in "xyz"]
     if -1 in columns:
         fix = "Name the columns x, y and z."
         raise TableError("the columns of waypoints are missing", path=path, value=",".join(row)[:80], fix=fix)
-    return columns, next((index[name] for name in NAME_COLUMNS if name in index), None)
+    yaw = next(([index[name]] for name in ("heading_deg", "yaw_deg") if name in index), [])
+    quaternion = [index[name] for name in QUATERNION_COLUMNS if name in index]
+    headings = yaw or (quaternion if len(quaternion) == 4 else [])
+    return columns, next((index[name] for name in NAME_COLUMNS if name in index), None), headings
 
 
 def parse_points(texts: Sequence[str]) -> Waypoints:

@@ -19,7 +19,7 @@ from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along, rigid_poses
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.inputs.reasons import ReasonCounter
-from wheretolook.looks.selection import best_views
+from wheretolook.looks.selection import best_views, separated
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.planning.config import StopConfig
@@ -181,6 +181,7 @@ class WhereToLook:
         n: int = 1,
         *,
         ids: Sequence[str] = (),
+        heading_deg: ArrayLike | None = None,
         progress: bool = False,
         **options: Any,
     ) -> SelectedViews:
@@ -190,6 +191,7 @@ class WhereToLook:
             points: locations of the camera.
             n: number of views of each point.
             ids: names of the points; counts from 0 unless given.
+            heading_deg: yaws (W,) of the robot at the points, for a limit on pan.
             progress: show a progress bar.
             options: further fields of `wheretolook.select.request.SelectionRequest`. With `looks`, the rank is the
                 order to look in, and `set_score` the probability that the set localizes; with `least_score`, the view
@@ -203,11 +205,13 @@ class WhereToLook:
         """
         request = SelectionRequest(n=n, **options)
         axes = self._allowed(request)
-        waypoints = Waypoints.of(points, ids)
+        waypoints = Waypoints.of(points, ids, heading_deg)
         rows = np.flatnonzero(usable_waypoints(self.localization_map, waypoints, request.skip))
         waypoints = waypoints[rows]
+        allowed = self._within_pan(waypoints, axes, request)
         waypoints = replace(waypoints, points=self.frame.world_from_map.apply(waypoints.points))
         scores = self._candidate_scores(waypoints.points, axes, progress)
+        scores[~allowed] = -np.inf
         if request.looks is None:
             views = self._single_views(waypoints, axes, scores, request)
         elif request.least_score is None:
@@ -220,7 +224,9 @@ class WhereToLook:
         self, waypoints: Waypoints, axes: Float, scores: Float, request: SelectionRequest
     ) -> SelectedViews:
         """Select the n best views at each waypoint by scores (W, D) of axes (D, 3), or the best sequence."""
-        if request.max_turn_deg is None:
+        if request.apart_deg is not None:
+            chosen = _separate_views(axes, scores, request.n, request.apart_deg)
+        elif request.max_turn_deg is None:
             chosen = np.argsort(-scores, axis=1, kind="stable")[:, : request.n + SPARE]
         else:
             chosen = best_sequence(scores, _turn_limit(axes, request.max_turn_deg)).direction_ids[:, None]
@@ -230,7 +236,9 @@ class WhereToLook:
         poses = poses_looking_along(waypoints.points[:, None], axes[chosen])
         reported = [self._reported(waypoints, np.repeat(block, k), poses[block].reshape(-1, 3, 4)) for block in blocks]
         views = joined(reported)
-        order = np.argsort(-views.score.reshape(-1, k), axis=1, kind="stable")[:, : request.n]
+        allowed = np.isfinite(np.take_along_axis(scores, chosen, axis=1))
+        final = np.where(allowed, views.score.reshape(-1, k), -np.inf)
+        order = np.argsort(-final, axis=1, kind="stable")[:, : request.n]
         best = views[(np.arange(len(waypoints))[:, None] * k + order).ravel()]
         return replace(best, rank=np.tile(np.arange(1, order.shape[1] + 1), len(waypoints)))
 
@@ -239,12 +247,16 @@ class WhereToLook:
     ) -> SelectedViews:
         """Select the n views at each waypoint with the best joint score, by scores (W, D) of axes (D, 3)."""
         pairs = zip(waypoints.points, tqdm(scores, desc="looks", unit="waypoint", disable=not progress), strict=True)
-        sets = [best_views(self.scorer, point, axes, values, n, max_turn_deg) for point, values in pairs]
-        chosen = axes[[row for view_set in sets for row in view_set.rows]]
+        sets = []
+        chosen: list[Float] = []
+        for point, values in pairs:
+            choice = axes[np.isfinite(values)]
+            sets.append(best_views(self.scorer, point, choice, values[np.isfinite(values)], n, max_turn_deg))
+            chosen.extend(choice[[*sets[-1].rows]])
         rank = np.tile(np.arange(1, n + 1), len(sets))
         set_scores = np.repeat([view_set.score for view_set in sets], n)
         rows = np.repeat(np.arange(len(sets)), n)
-        poses = poses_looking_along(waypoints.points[rows], chosen)
+        poses = poses_looking_along(waypoints.points[rows], np.array(chosen))
         return self._reported(waypoints, rows, poses, rank, set_scores)
 
     def _sequence_with_stops(
@@ -255,7 +267,9 @@ class WhereToLook:
         points = waypoints.points
         chosen = axes[best_sequence(scores, _turn_limit(axes, request.max_turn_deg)).direction_ids]
         config = StopConfig(request.looks, request.least_score)
-        stops = stops_along(self.scorer, points, chosen, axes, config, progress="stops" if progress else None)
+        allowed = np.isfinite(scores)
+        text = "stops" if progress else None
+        stops = stops_along(self.scorer, points, chosen, axes, config, progress=text, allowed=allowed)
         path = PlannedPath(points, chosen, self.scorer.score(poses_looking_along(points, chosen)), np.nan, stops=stops)
         places, rank = path.looks
         poses = poses_looking_along(points[places], path.all_axes)
@@ -320,6 +334,33 @@ class WhereToLook:
             fix = "Ask for fewer views, score more directions, or widen the limit on pitch."
             raise ConfigError(f"there are only {len(axes)} directions to choose from", value=needed, fix=fix)
         return axes
+
+    def _within_pan(self, waypoints: Waypoints, axes: Float, request: SelectionRequest) -> NDArray[np.bool_]:
+        """Return which of axes (D, 3) are within the limit on pan, (W, D). Raises ConfigError if they are too few."""
+        if request.pan_deg is None:
+            return np.ones((len(waypoints), len(axes)), dtype=bool)
+        heading = waypoints.heading_deg(self.frame.world_from_map.rotation)
+        pan = np.degrees(pan_tilt_angles(axes)[0]) - heading[:, None]
+        pan = (pan + 180) % 360 - 180
+        allowed = (pan >= request.pan_deg[0] - 1e-9) & (pan <= request.pan_deg[1] + 1e-9)
+        least = int(allowed.sum(axis=1).min())
+        if least < (request.looks or request.n):
+            fix = "Score more directions, or widen the limits on pan and pitch."
+            raise ConfigError("a waypoint has too few directions within the limit on pan", value=least, fix=fix)
+        return allowed
+
+
+def _separate_views(axes: Float, scores: Float, n: int, apart_deg: float) -> NDArray[np.int64]:
+    """Return rows (W, n) of axes (D, 3) with the best scores (W, D) that are so far from one another.
+
+    Raises ConfigError if there are fewer.
+    """
+    best = [np.argsort(-values, kind="stable")[: np.isfinite(values).sum()] for values in scores]
+    chosen = [separated(axes, order, n, apart_deg) for order in best]
+    if (least := min(map(len, chosen))) < n:
+        fix = "Ask for fewer views, or for a smaller angle."
+        raise ConfigError(f"a waypoint has only {least} views {apart_deg:g} degrees apart", value=n, fix=fix)
+    return np.array(chosen)
 
 
 def _turn_limit(axes: Float, max_turn_deg: float) -> TurnLimit:

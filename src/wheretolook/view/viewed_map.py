@@ -81,12 +81,12 @@ class ViewedMap:
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """Signs that the map is not in metres with z up, or that the mesh is in another frame."""
-        from wheretolook.mapping.sanity import frame_warnings, mesh_warning
+        """What was assumed or seems wrong of the map's unit and direction up, and signs that the mesh is in another frame."""
+        from wheretolook.mapping.sanity import mesh_warning
 
         warnings: tuple[str, ...] = ()
         if self.mapping_poses is not None and len(self.mapping_poses):
-            warnings = frame_warnings(self.landmarks.mapping_distance_m, self.mapping_poses)
+            warnings = self.environment.frame.messages(self.landmarks.mapping_distance_m, self.mapping_poses)
         if self.mesh is not None and (doubt := mesh_warning(self.landmarks.points, self.environment.raycaster)):
             warnings = (*warnings, f"The mesh: {doubt}")
         return warnings

@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.quiver import Quiver
 
 import wheretolook
 from selection.room import POINTS, WEIGHTS
 from wheretolook.cli import main
+from wheretolook.select.where_to_look import WhereToLook
 
 SOURCE = {**os.environ, "PYTHONPATH": str(Path(wheretolook.__file__).parents[1])}  # for other processes
 QUICK = ["--weights", str(WEIGHTS), "--directions", "60", "--device", "cpu"]
@@ -49,6 +51,21 @@ def test_scores_of_poses(sparse: Path, at: Path, capsys: pytest.CaptureFixture[s
     assert "waypoint 7: (1000, 0, 0)" in capsys.readouterr().err
     assert main(["score", "--poses", "far.tum", "--out", "scores.csv", "--skip", *given]) == 0
     assert pd.read_csv("scores.csv")["waypoint"].tolist() == [0, 1, 2, 3]
+
+
+def test_a_floor_plan(sparse: Path, at: Path, look: WhereToLook) -> None:
+    given = ["--map", str(sparse), "--at", "at.csv", "--out", "views.csv", "--n", "2", *QUICK]
+    assert main(["select", "--floor-plan", "plan.png", *given]) == 0
+    assert Path("plan.png").read_bytes().startswith(b"\x89PNG")
+    views = look.best(POINTS, 2)
+    plan = look.floor_plan(views).axes[0]
+    (arrows,) = (item for item in plan.collections if isinstance(item, Quiver))
+    order = np.argsort(views.score, kind="stable")
+    np.testing.assert_allclose(arrows.XY, views.positions[order, :2])
+    np.testing.assert_allclose(np.arctan2(arrows.V, arrows.U), np.radians(views.yaw_deg[order]))
+    assert [text.get_text() for text in plan.texts] == ["0", "1", "2", "3"]
+    Path("views.csv").unlink()
+    assert main(["select", "--floor-plan", "plan.gif", *given]) == 2 and not Path("views.csv").exists()
 
 
 def test_a_sequence_and_a_grid(sparse: Path, at: Path) -> None:

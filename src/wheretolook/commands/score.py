@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from wheretolook.commands.selector_options import SelectorOptions, print_summary
+from wheretolook.commands.selector_options import SelectorOptions, finish
 
 if TYPE_CHECKING:
     from wheretolook.select.views import SelectedViews
@@ -49,7 +49,6 @@ class Score(SelectorOptions):
         names, cam_from_world = read_poses(self.poses)
         selector = self.open_map()
         views = selector.report(cam_from_world, names, self.skip)
-        views.save(self.out, self.format)
-        print_summary(selector, views, len(names), "poses")
+        finish(self, selector, views, len(names), "poses")
         print(f"scores: {self.out}")
         return views

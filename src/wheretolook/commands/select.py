@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from wheretolook.commands.selector_options import SelectorOptions, print_summary
+from wheretolook.commands.selector_options import SelectorOptions, finish
 from wheretolook.select.request import SelectionRequest
 from wheretolook.utils.errors import ConfigError
 
@@ -89,8 +89,7 @@ class Select(SelectionRequest, SelectorOptions):
             waypoints = selector.grid(self.grid)
         request = {field.name: getattr(self, field.name) for field in fields(SelectionRequest)}
         views = selector.best(waypoints, progress=True, **request)
-        views.save(self.out, self.format)
-        print_summary(selector, views, len(waypoints), "waypoints")
+        finish(self, selector, views, len(waypoints), "waypoints")
         print(f"views: {len(views)} in {time.monotonic() - start:.1f} s: {self.out}")
         return views
 

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.commands.options import CameraOptions, OcclusionOptions, ScorerOptions
+from wheretolook.figures import KINDS
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.validation import check_choice
 
 if TYPE_CHECKING:
     from wheretolook.geometry.camera import Camera
@@ -25,6 +27,7 @@ class SelectorOptions(CameraOptions, OcclusionOptions, ScorerOptions, FrameOptio
         map: folder of a COLMAP model, binary or text.
         out: file of the views; its ending decides the format.
         format: csv, json, tum, colmap or benchmark.
+        floor_plan: also draw the views on a plan of the landmarks: a file .png, .pdf or .svg.
         fov: instead of a camera, horizontal field of view of a pinhole in degrees.
         size: image size of that pinhole in pixels, such as 640x480.
         depth: folder of depth images, named like the map's images.
@@ -38,6 +41,7 @@ class SelectorOptions(CameraOptions, OcclusionOptions, ScorerOptions, FrameOptio
     map: Path
     out: Path
     format: str | None = None
+    floor_plan: Path | None = None
     fov: float | None = None
     size: str | None = None
     depth: Path | None = None
@@ -49,6 +53,8 @@ class SelectorOptions(CameraOptions, OcclusionOptions, ScorerOptions, FrameOptio
     def __post_init__(self) -> None:
         self.frame_options()
         self.named_camera()
+        if self.floor_plan is not None:
+            check_choice("format of figures", self.floor_plan.suffix[1:].lower(), KINDS)
 
     def named_camera(self) -> Camera | int | None:
         """Return the camera asked for: one, a camera_id of the map, or None for the map's own."""
@@ -94,6 +100,17 @@ class SelectorOptions(CameraOptions, OcclusionOptions, ScorerOptions, FrameOptio
             )
             compiled.result()
         return selector
+
+
+def finish(command: SelectorOptions, selector: WhereToLook, views: SelectedViews, given: int, locations: str) -> None:
+    """Write views and the floor plan, and print a summary; `locations` names the kind of what was `given`."""
+    views.save(command.out, command.format)
+    if command.floor_plan is not None:
+        from wheretolook.figures.style import save_figure
+
+        save_figure(selector.floor_plan(views), command.floor_plan)
+        print(f"floor plan: {command.floor_plan}")
+    print_summary(selector, views, given, locations)
 
 
 def print_summary(selector: WhereToLook, views: SelectedViews, n_given: int, locations: str) -> None:

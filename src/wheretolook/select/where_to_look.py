@@ -34,6 +34,8 @@ from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from wheretolook.scorers.base import Scorer
 
 VIEWS_PER_STEP = {"cpu": 1 << 13, "cuda": 1 << 17}  # of the progress bar, in whole waypoints
@@ -299,6 +301,15 @@ class WhereToLook:
             set_score=set_score,
             frame=self.frame,
         )
+
+    def floor_plan(self, views: SelectedViews) -> Figure:
+        """Draw views on a plan of the landmarks, in the map's unit, upright: a Matplotlib figure."""
+        from wheretolook.figures.floor_plan import floor_plan_figure
+
+        frame = self.frame.world_from_map
+        landmarks = frame.inverse.apply(self.localization_map.landmarks.points)
+        upright = (points @ frame.rotation.T for points in (landmarks, views.positions, views.axes))
+        return floor_plan_figure(*upright, views.score, views.waypoint_id)
 
     @cached_property
     def reasons(self) -> ReasonCounter:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 
 from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.utils.errors import MapWarning
@@ -57,6 +56,8 @@ def scale_warning(mapping_distance_m: ArrayLike, centers: ArrayLike) -> str:
     """
     distance = float(np.median(np.asarray(mapping_distance_m)))
     at = np.asarray(centers, dtype=np.float64)
+    from scipy.spatial import cKDTree  # takes longer than all of --help
+
     spacing = float(np.median(cKDTree(at).query(at, 2)[0][:, 1])) if len(at) > 1 else 0.0
     low, high = DISTANCE_M
     if low <= distance <= high and spacing <= SPACING_M:

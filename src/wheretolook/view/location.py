@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import axes_of_angles
 from wheretolook.geometry.poses import Float, poses_looking_along, quaternion_from_rotation, rotation_from_quaternion
-from wheretolook.inputs.reasons import ReasonCounts
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.view import drawing
 from wheretolook.view.controls import value_of
 from wheretolook.view.scores import ScoredLocation, score_location
 from wheretolook.view.session import Session
 from wheretolook.view.worker import NOW, SOON
+
+if TYPE_CHECKING:  # torch and Warp are imported when scores are first computed
+    from wheretolook.inputs.reasons import ReasonCounts
 
 MARKERS = ("/sphere", "/view", "/views", "/turn", "/seen")  # hidden while the browser's camera is inside
 SETTLE_S = 0.3  # camera motion this soon after the program moved the camera is not by hand

@@ -9,7 +9,8 @@ import pandas as pd
 
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.sampling_config import Split
-from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, pose_columns, write_table
+from wheretolook.dataset.viewpoint_files import write_table
+from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, pose_columns
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, poses_looking_along

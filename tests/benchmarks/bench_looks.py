@@ -17,7 +17,8 @@ import numpy as np
 import torch
 
 from wheretolook.dataset.layout import SceneFolder
-from wheretolook.dataset.viewpoint_table import poses, read_table
+from wheretolook.dataset.viewpoint_files import read_table
+from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.looks.selection import best_views

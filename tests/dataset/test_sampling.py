@@ -11,7 +11,8 @@ import pytest
 from synthetic_dataset import make_landmarks
 from wheretolook.dataset.sampling import sample_viewpoints
 from wheretolook.dataset.sampling_config import SampleConfig
-from wheretolook.dataset.viewpoint_table import SCHEMA, poses
+from wheretolook.dataset.viewpoint_files import SCHEMA
+from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.geometry.poses import camera_centers, transform

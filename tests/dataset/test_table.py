@@ -8,15 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from wheretolook.dataset.viewpoint_table import (
-    MATCH_FIELDS,
-    SCHEMA,
-    is_good,
-    pose_columns,
-    poses,
-    read_table,
-    write_table,
-)
+from wheretolook.dataset.viewpoint_files import MATCH_FIELDS, SCHEMA, read_table, write_table
+from wheretolook.dataset.viewpoint_table import is_good, pose_columns, poses
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import fingerprint

@@ -19,7 +19,7 @@ from mapping.test_own_models import rig_model, written
 from scenes.test_loading import MTL, OBJ, ply, textured
 from synthetic_dataset import make_scene
 from wheretolook.cli import parse_command
-from wheretolook.dataset.viewpoint_table import has_matches, read_table, write_table
+from wheretolook.dataset.viewpoint_files import has_matches, read_table, write_table
 from wheretolook.geometry.camera import read_cameras
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.mapping.colmap_model import colmap_poses, model_arrays, read_model

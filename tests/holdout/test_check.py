@@ -178,13 +178,13 @@ def test_a_map_of_any_scale_and_frame_gives_the_same(corridor: tuple[Path, Path]
 def test_finished_blocks_are_reused(checked: Path, corridor: tuple[Path, Path], tmp_path: Path) -> None:
     shutil.copytree(checked, tmp_path / "out")
     (work,) = (tmp_path / "out" / "work").glob("blocks-*")
-    (work / "02" / "views.parquet").unlink()
+    (work / "02" / "views.json").unlink()
     (work / "03" / "landmarks.npz").write_bytes(b"half a file")
-    cached = (work / "01" / "views.parquet").stat().st_mtime_ns
+    cached = (work / "01" / "views.json").stat().st_mtime_ns
     run(_arguments(*corridor, tmp_path / "out", "--metres", "--also", "bins"))
     for name in ("check.csv", "blocks.csv", "views.csv"):
         assert (tmp_path / "out" / name).read_bytes() == (checked / name).read_bytes(), name
-    assert (work / "01" / "views.parquet").stat().st_mtime_ns == cached
+    assert (work / "01" / "views.json").stat().st_mtime_ns == cached
 
 
 # --- invalid input

@@ -15,7 +15,8 @@ import pandas as pd
 
 from mapping.conftest import ROOM_SIZE, BoxFreeSpace, box_room
 from one_scene import label_viewpoints
-from wheretolook.dataset.viewpoint_table import SCHEMA, UNLABELLED, pose_columns, write_table
+from wheretolook.dataset.viewpoint_files import SCHEMA, write_table
+from wheretolook.dataset.viewpoint_table import UNLABELLED, pose_columns
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.localization.config import LabelConfig

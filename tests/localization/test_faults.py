@@ -16,7 +16,7 @@ import pytest
 
 from localization.rooms import Deadly, MappedRoom, is_running, label, times, workers_of
 from waiting import wait_until
-from wheretolook.dataset.viewpoint_table import read_table, write_table
+from wheretolook.dataset.viewpoint_files import read_table, write_table
 from wheretolook.localization import labeller
 from wheretolook.localization.shard import Shard, run_local
 from wheretolook.scenes.loading import load_mesh, save_glb
@@ -117,7 +117,7 @@ def test_killed_at_any_moment_it_resumes_to_the_same_table(
     script.write_text(
         "import sys\nfrom pathlib import Path\n"
         "from localization.rooms import MappedRoom, label\n"
-        "from wheretolook.dataset.viewpoint_table import read_table\n"
+        "from wheretolook.dataset.viewpoint_files import read_table\n"
         "if __name__ == '__main__':\n"
         "    folder, mesh, landmarks = map(Path, sys.argv[1:])\n"
         "    table = read_table(folder / 'table.parquet')\n"

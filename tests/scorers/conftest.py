@@ -7,7 +7,8 @@ import pytest
 
 from synthetic_dataset import CAMERA, make_dataset
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.viewpoint_table import poses, read_table, write_table
+from wheretolook.dataset.viewpoint_files import read_table, write_table
+from wheretolook.dataset.viewpoint_table import poses
 
 
 @pytest.fixture(scope="session")

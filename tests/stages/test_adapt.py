@@ -11,7 +11,8 @@ import pytest
 from synthetic_dataset import make_dataset
 from wheretolook.cli import main
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.viewpoint_table import is_good, poses, write_table
+from wheretolook.dataset.viewpoint_files import write_table
+from wheretolook.dataset.viewpoint_table import is_good, poses
 from wheretolook.evaluation.adaptation import compare_log_odds
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import finished_runs

@@ -16,7 +16,8 @@ from synthetic_dataset import make_dataset
 from wheretolook.commands.evaluate import evaluate_methods as evaluate
 from wheretolook.commands.train import train_methods as train
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses, write_table
+from wheretolook.dataset.viewpoint_files import write_table
+from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.results import latest_scores
 from wheretolook.tracking.config import TrackingConfig

@@ -10,7 +10,8 @@ import pytest
 
 from synthetic_dataset import CAMERA, make_scene
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.dataset.viewpoint_table import poses, read_table, write_table
+from wheretolook.dataset.viewpoint_files import read_table, write_table
+from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.geometry.poses import pose_error
 from wheretolook.localization.confidence import ConfidenceModel, confidence_features

@@ -16,7 +16,8 @@ from mask_agreement import MaskAgreement
 from wheretolook.cli import main, parse_command
 from wheretolook.commands.preconditions import open_scene
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.viewpoint_table import is_good, poses, read_table
+from wheretolook.dataset.viewpoint_files import read_table
+from wheretolook.dataset.viewpoint_table import is_good, poses
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers

@@ -15,7 +15,8 @@ from learning_options import changed, train_config
 from synthetic_dataset import make_dataset
 from wheretolook.commands.train import train_methods as train
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.viewpoint_table import NO_POSE, UNLABELLED, is_good, write_table
+from wheretolook.dataset.viewpoint_files import write_table
+from wheretolook.dataset.viewpoint_table import NO_POSE, UNLABELLED, is_good
 from wheretolook.scorers.mlp.network import ViewpointNetwork
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.tracking.config import TrackingConfig

@@ -13,7 +13,8 @@ from synthetic_dataset import make_dataset
 from wheretolook.commands.evaluate import evaluate_methods as evaluate
 from wheretolook.commands.train import train_methods as train
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good, read_table, write_table
+from wheretolook.dataset.viewpoint_files import read_table, write_table
+from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.scorers.matchability.config import MatchabilityConfig
 from wheretolook.scorers.set.config import SetConfig

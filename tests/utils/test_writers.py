@@ -15,7 +15,7 @@ from tests.box_scenes import furnished_room
 from tests.disks import file_limit, fill, read_only, small_disk
 from tests.synthetic_dataset import CAMERA, make_mapping_poses
 
-from wheretolook.dataset.viewpoint_table import SCHEMA, write_table
+from wheretolook.dataset.viewpoint_files import SCHEMA, write_table
 from wheretolook.figures.animation import save_moving
 from wheretolook.figures.style import save_figure
 from wheretolook.mapping.colmap_model import colmap_poses, write_model

@@ -95,7 +95,7 @@ class Label(LabelOptions):
         self, to_label: Mapping[SceneFolder, str], summary: Path, log: Log, progress: Progress
     ) -> dict[str, float]:
         """Label scenes and store their keys. Returns the seconds that each step took."""
-        from wheretolook.dataset.viewpoint_table import write_table
+        from wheretolook.dataset.viewpoint_files import write_table
         from wheretolook.localization.labeller import LabelTask, label_scenes
 
         config = self.label

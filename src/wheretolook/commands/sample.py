@@ -85,7 +85,7 @@ def _cameras(scene: SceneEnvironment, config: SampleConfig) -> Camera | dict[int
 
 def _sample(scene: SceneEnvironment, config: SampleConfig, log: Log) -> None:
     from wheretolook.dataset.sampling import sample_viewpoints
-    from wheretolook.dataset.viewpoint_table import write_table
+    from wheretolook.dataset.viewpoint_files import write_table
 
     files = scene.files
     with naming_file(scene.source):

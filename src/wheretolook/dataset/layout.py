@@ -143,8 +143,8 @@ class SceneFolder:
         return self.folder / "scene.json"
 
     def read_table(self, matches: bool = False) -> pd.DataFrame:
-        """The scene's viewpoints, on request with their matches; see `wheretolook.dataset.viewpoint_table.read_table`."""
-        from wheretolook.dataset.viewpoint_table import read_table
+        """The scene's viewpoints, on request with their matches; see `wheretolook.dataset.viewpoint_files.read_table`."""
+        from wheretolook.dataset.viewpoint_files import read_table
 
         return read_table(self.table, matches)
 

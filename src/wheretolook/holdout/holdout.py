@@ -20,8 +20,8 @@ from wheretolook.features.keypoints import Keypoints
 from wheretolook.holdout.holdout_blocks import Block, choose_blocks
 from wheretolook.holdout.photo_map import MAX_ERROR_DEG, PhotographedMap
 from wheretolook.localization.config import LocalizerConfig
-from wheretolook.localization.labeller import versions
 from wheretolook.localization.localizer import Localizer, localization_errors
+from wheretolook.localization.versions import versions
 from wheretolook.mapping.colmap_model import read_model, write_model
 from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
@@ -30,9 +30,9 @@ from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.processes import WorkerPool
 
 MIN_ANGLE_DEG = 1.5  # COLMAP's own minimum angle between the rays of a landmark
-_FORMAT = 2  # version of what is cached of a block
+_FORMAT = 3  # version of what is cached of a block
 _LANDMARKS = "landmarks.npz"
-_VIEWS = "views.parquet"
+_VIEWS = "views.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +163,7 @@ def _run(job: _Job) -> None:
     job.cache.folder.mkdir(parents=True, exist_ok=True)
     job.cache.clear()
     replace(landmarks, descriptors=None).save(job.cache.folder / _LANDMARKS)
-    job.cache.store({_VIEWS: views})
+    job.cache.store({_VIEWS: views.to_dict("list")})
 
 
 def _observed(image: Any) -> NDArray[np.int64]:
@@ -207,6 +207,6 @@ def _load(cache: ArtifactCache, block: Block) -> HoldoutResult | None:
     if results is None:
         return None
     try:
-        return HoldoutResult(block, Landmarks.load(cache.folder / _LANDMARKS), results[_VIEWS])
-    except MapError:
+        return HoldoutResult(block, Landmarks.load(cache.folder / _LANDMARKS), pd.DataFrame(results[_VIEWS]))
+    except (MapError, ValueError):
         return None

@@ -17,7 +17,7 @@ from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import Camera, cameras_by_id
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.geometry.similarity import Similarity
-from wheretolook.localization.labeller import versions
+from wheretolook.localization.versions import versions
 from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_arrays, read_model, registered_names
 from wheretolook.mapping.config import ExistingModelConfig, MapConfig, PhotographsConfig, place_name
 from wheretolook.mapping.feature_files import DATABASE_FILE, read_descriptors

@@ -13,7 +13,8 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.dataset.viewpoint_table import CAMERA_ID, MATCH_FIELDS, PIXELS, poses
+from wheretolook.dataset.viewpoint_files import MATCH_FIELDS
+from wheretolook.dataset.viewpoint_table import CAMERA_ID, PIXELS, poses
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.localization.confidence import ConfidenceModel

@@ -9,7 +9,6 @@ from collections.abc import Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +16,13 @@ import numpy as np
 import pandas as pd
 from tqdm.auto import tqdm
 
-from wheretolook.dataset.viewpoint_table import CAMERA_ID, SCHEMA, read_table, write_table
+from wheretolook.dataset.viewpoint_files import SCHEMA, read_table, write_table
+from wheretolook.dataset.viewpoint_table import CAMERA_ID
 from wheretolook.localization.config import LabelConfig
 from wheretolook.localization.shard import LabelledShard, SceneJob, Shard, run_local
+from wheretolook.localization.versions import versions
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import fingerprint, sha256, write_json
-from wheretolook.utils.version import VERSION
 
 MANIFEST = "manifest.json"
 """File in the folder of shards with the settings of the labels; later `labels.json` next to the table."""
@@ -36,7 +36,7 @@ LABELS = ("status", "error_m", "error_deg", "n_inliers")
 
 @dataclass(frozen=True, eq=False)
 class LabelTask:
-    """A scene to label: its name, the workers' input, its viewpoints (`viewpoint_table.SCHEMA`), folder of shards."""
+    """A scene to label: its name, the workers' input, its viewpoints (`viewpoint_files.SCHEMA`), folder of shards."""
 
     name: str
     job: SceneJob
@@ -50,7 +50,7 @@ class LabelledScene:
 
     Attributes:
         task: the scene.
-        table: the viewpoints with status, error_m, error_deg and n_inliers, and with `viewpoint_table.MATCH_FIELDS` and
+        table: the viewpoints with status, error_m, error_deg and n_inliers, and with `viewpoint_files.MATCH_FIELDS` and
             `PIXEL_FIELD` if the job stores them; the paper's label y is `viewpoint_table.is_good`.
         manifest: versions, settings and fingerprints of the inputs, and each shard's name and SHA-256.
         seconds: the workers' time in each step, for shards labelled in this run.
@@ -99,17 +99,6 @@ def label_scenes(
 
 
 @cache
-def versions() -> dict[str, str]:
-    """Versions of the packages that decide a label."""
-    result = {"wheretolook": VERSION}
-    for package in ("poselib", "pycolmap", "opencv-python-headless", "warp-lang", "numpy", "torch"):
-        try:
-            result[package] = version(package)
-        except PackageNotFoundError:  # installed some other way
-            result[package] = "unknown"
-    return result
-
-
 @dataclass(eq=False)
 class _SceneInProgress:
     """A scene whose shards are being labelled; `missing` are those without a file yet."""

@@ -11,7 +11,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.dataset.viewpoint_table import CAMERA_ID, MATCH_FIELDS, PIXELS, poses
+from wheretolook.dataset.viewpoint_files import MATCH_FIELDS
+from wheretolook.dataset.viewpoint_table import CAMERA_ID, PIXELS, poses
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.localization.config import LocalizerConfig
@@ -41,9 +42,9 @@ class SceneJob:
     localizer: LocalizerConfig = LocalizerConfig()
     extractor: ExtractorConfig = ExtractorConfig()  # of the map
     device: str = "cpu"  # with "cuda", workers are distributed over all GPUs
-    store_matches: bool = False  # add `viewpoint_table.MATCH_FIELDS`
+    store_matches: bool = False  # add `viewpoint_files.MATCH_FIELDS`
     cameras: tuple[tuple[int, Camera], ...] = ()  # by number, if viewpoints have a `camera_id`
-    store_pixels: bool = False  # add `viewpoint_table.PIXEL_FIELD`, too
+    store_pixels: bool = False  # add `viewpoint_files.PIXEL_FIELD`, too
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +149,7 @@ def label_rows(
 
     With several cameras, `camera_id` selects that of a viewpoint. The seconds spent in each step (render, extract,
     match, pose) are added to `seconds`. Returns the table with new status, error_m, error_deg and n_inliers,
-    `viewpoint_table.MATCH_FIELDS` if `store_matches`, and also `PIXEL_FIELD` if `store_pixels`.
+    `viewpoint_files.MATCH_FIELDS` if `store_matches`, and also `PIXEL_FIELD` if `store_pixels`.
     """
     from wheretolook.localization.localizer import localization_errors
 

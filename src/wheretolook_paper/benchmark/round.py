@@ -284,7 +284,7 @@ class SceneRound:
 
     @cached_property
     def _map_key(self) -> str:
-        from wheretolook.localization.labeller import versions
+        from wheretolook.localization.versions import versions
 
         return cache_key("map", self._model_key, fingerprint(self.scene.mesh), versions())
 

@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.dataset.viewpoint_table import has_matches, is_good, poses, read_table
+from wheretolook.dataset.viewpoint_files import has_matches, read_table
+from wheretolook.dataset.viewpoint_table import is_good, poses
 from wheretolook.tracking.store import kept_if_not_logged
 from wheretolook_paper.evaluation.looks import LOOKS_CSV, LOOKS_MD, NUMBERS, STRATEGIES, log_looks, write_looks
 

@@ -13,7 +13,8 @@ import pandas as pd
 
 from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.viewpoint_table import SCHEMA, UNLABELLED
+from wheretolook.dataset.viewpoint_files import SCHEMA
+from wheretolook.dataset.viewpoint_table import UNLABELLED
 from wheretolook.localization.joint_labels import label_sets
 from wheretolook.localization.labeller import MANIFEST, LabelTask
 from wheretolook.localization.shard import SceneJob

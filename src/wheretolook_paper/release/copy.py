@@ -15,7 +15,7 @@ from typing import Any
 
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.names import RELEASE_FILE
-from wheretolook.dataset.viewpoint_table import write_table
+from wheretolook.dataset.viewpoint_files import write_table
 from wheretolook.mapping.colmap_model import CAMERAS_FILE, save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.method import Method

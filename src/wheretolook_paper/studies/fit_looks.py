@@ -21,7 +21,8 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import log_loss, roc_auc_score
 
 from wheretolook.dataset.layout import SceneFolder
-from wheretolook.dataset.viewpoint_table import is_good, poses, read_table
+from wheretolook.dataset.viewpoint_files import read_table
+from wheretolook.dataset.viewpoint_table import is_good, poses
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.localization import confidence
 from wheretolook.localization.joint_labels import label_sets

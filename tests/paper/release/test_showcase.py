@@ -14,7 +14,8 @@ from synthetic_dataset import make_landmarks, make_mapping_poses
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.sampling import free_locations, sample_viewpoints
 from wheretolook.dataset.sampling_config import SampleConfig
-from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, outcome_in_words, poses, write_table
+from wheretolook.dataset.viewpoint_files import write_table
+from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, outcome_in_words, poses
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along

@@ -7,7 +7,7 @@ from math import ceil
 
 from torch import Tensor
 
-from wheretolook.dataset.viewpoint_table import has_matches
+from wheretolook.dataset.viewpoint_files import has_matches
 from wheretolook.scorers.matchability.network import MatchabilityNetwork
 from wheretolook.scorers.set.config import SetConfig
 from wheretolook.scorers.set.network import SetNetwork

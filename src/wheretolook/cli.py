@@ -17,6 +17,7 @@ from pkgutil import resolve_name
 from typing import Any, get_type_hints
 
 from wheretolook.utils.errors import ConfigError, WhereToLookError
+from wheretolook.utils.extras import EXTRAS, missing_package
 from wheretolook.utils.images import MAX_PIXELS
 from wheretolook.utils.logs import quiet_libraries
 from wheretolook.utils.nearest import did_you_mean
@@ -92,7 +93,12 @@ def run_command(arguments: list[str]) -> None:
     else:
         start = time.monotonic()
         command = parse_command(name, rest)
-        command.run()
+        try:
+            command.run()
+        except ModuleNotFoundError as error:
+            if error.name not in EXTRAS:
+                raise
+            raise missing_package(error.name) from error
         if hasattr(command, "root") and command.root.is_dir():
             print(f"done in {time.monotonic() - start:.0f} s: {command.root}")
 

@@ -20,7 +20,7 @@ from wheretolook.utils.errors import MapWarning
 from wheretolook.utils.files import sha256
 from wheretolook.utils.shipped import WEIGHTS, shipped
 
-h5py = pytest.importorskip("h5py", reason="hloc's features need h5py: pip install 'wheretolook[hloc]'")
+h5py = pytest.importorskip("h5py", reason="hloc's features need h5py: pip install h5py")
 
 OUTPUTS = Path(__file__).parent / "hloc/outputs"
 SFM = OUTPUTS / "sfm_aliked"

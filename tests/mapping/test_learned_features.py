@@ -40,7 +40,7 @@ def database_of(path: Path, model, keypoints, stored, kind) -> Path:
 
 
 def hdf5_of(path: Path, keypoints, stored, names=("0.png", "1.png", "2.png"), dtype=None) -> Path:
-    h5py = pytest.importorskip("h5py", reason="hloc's features need h5py: pip install 'wheretolook[hloc]'")
+    h5py = pytest.importorskip("h5py", reason="hloc's features need h5py: pip install h5py")
     with h5py.File(path, "w") as file:
         for name, found, descriptors in zip(names, keypoints, stored, strict=False):
             group = file.create_group(name)

@@ -68,7 +68,7 @@ class Plan(SceneOrMapOptions):
             TrackingError: the tracking store cannot be used.
         """
         from wheretolook.planning.method_paths import path_views, plan_by_methods
-        from wheretolook.view.server import require
+        from wheretolook.utils.extras import require
 
         dataset = load_dataset(self, "map")
         config = self.plan

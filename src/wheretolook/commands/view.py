@@ -143,14 +143,14 @@ class View(CameraOptions):
 
     def _check_environment(self) -> None:
         """Raise ConfigError for missing folders, packages and ports, before long imports."""
-        from wheretolook.view.server import check_port, require
+        from wheretolook.utils.extras import require
+        from wheretolook.view.server import check_port
 
         if self.images is not None and not self.images.is_dir():
             raise ConfigError("there is no such folder of photographs", path=self.images, fix="Correct the path.")
         if self.record is not None:
             require("rerun")
         elif self.film is None:
-            require("viser")
             check_port(self.host, self.port)
 
     def _open(self) -> ViewedMap:

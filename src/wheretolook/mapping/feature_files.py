@@ -244,7 +244,7 @@ def _open_hdf5(path: Path) -> Iterator[Callable[[str], _Features]]:
     try:
         import h5py
     except ImportError as error:
-        fix = "pip install 'wheretolook[hloc]', or omit the features."
+        fix = "pip install h5py, or omit the features."
         raise MapError("features in HDF5 are read with h5py, which is not installed", path=path, fix=fix) from error
     try:
         check_file(path)

@@ -116,7 +116,7 @@ class PlanConfig(MappedLattice):
         weights: file of weights, for a learned method; by default the best there are.
         against: further methods to plan by, drawn for comparison. Such as forward and fisher-trace-gp; in `methods.png`.
         film: kind of film to make: gif, mp4 or none.
-        rerun: write a recording for the Rerun viewer too. Needs `pip install rerun-sdk`.
+        rerun: write a recording for the Rerun viewer too. Needs `pip install 'wheretolook[view]'`.
         anywhere: allow weights adapted to another scene.
         planner: costs and limits of the path, time to plan.
         stops: where one view is not enough.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.set.score import MAX_LANDMARKS
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.training_range import TrainingRange, camera_quantities
-from wheretolook.utils.errors import CameraError, ConfigError
+from wheretolook.utils.errors import CameraError
 from wheretolook.utils.files import copy_file, sha256, write_bytes, write_json
 from wheretolook.utils.npz_files import save_npz
 from wheretolook.utils.version import VERSION
@@ -50,15 +49,12 @@ def export_robot(
 
     Raises:
         CameraError: the camera is not a pinhole.
-        ConfigError: the package onnx is not installed.
         WeightsError: the weights are not of the method `set`, or are damaged.
     """
     camera = localization_map.camera
     if not isinstance(camera, PinholeCamera):
         fix = "Give the pinhole of the robot's rectified images."
         raise CameraError("a robot's camera must be a pinhole", value=describe_camera(camera), fix=fix)
-    if find_spec("onnx") is None:
-        raise ConfigError("exporting needs the package onnx", fix="Install it: pip install 'wheretolook[robot]'.")
     from wheretolook.robot.graph import set_graph
 
     out = Path(out)

@@ -12,7 +12,6 @@ import threading
 import time
 import warnings
 from collections.abc import Mapping
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
@@ -28,16 +27,8 @@ if TYPE_CHECKING:
 
 LOCAL = ("localhost", "127.0.0.1", "::1")  # names of this machine, unreachable from others
 HEADERS = ("Host", "Origin", "X-Forwarded-Host")
-EXTRAS = {"viser": "view", "rerun": "record"}
 
 _log = logging.getLogger(__name__)
-
-
-def require(package: str) -> None:
-    """Raise ConfigError with the command that installs viser or rerun if it is missing."""
-    if find_spec(package) is None:
-        fix = f"Install it: pip install 'wheretolook[{EXTRAS[package]}]'."
-        raise ConfigError(f"this needs the package {package}", fix=fix)
 
 
 def check_port(host: str, port: int) -> None:
@@ -53,7 +44,7 @@ def check_port(host: str, port: int) -> None:
 
 
 class Viewer:
-    """Serves a map until it is stopped. Raises as `check_port`, and ConfigError if viser is not installed."""
+    """Serves a map until it is stopped. Raises as `check_port`."""
 
     def __init__(
         self,
@@ -63,7 +54,6 @@ class Viewer:
         state: ViewState = ViewState(),
         dark: bool = False,
     ) -> None:
-        require("viser")
         check_port(host, port)
         self.viewed = viewed
         self.state = state

@@ -1,0 +1,35 @@
+"""Optional packages, and the extra of this distribution that installs each."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+from wheretolook.utils.errors import ConfigError
+
+EXTRAS = {
+    "cv2": "photographs",
+    "open3d": "depth",
+    "ompl": "plan",
+    "pyarrow": "plan",
+    "mlflow": "plan",
+    "lightning": "train",
+    "torchmetrics": "train",
+    "sklearn": "train",
+    "kornia": "learned",
+    "lightgbm": "paper",
+    "jinja2": "paper",
+    "rerun": "view",
+}
+"""Extras by module; of several that install it, the smallest."""
+
+
+def missing_package(module: str) -> ConfigError:
+    """Return the error for an optional module that is not installed."""
+    fix = f"pip install 'wheretolook[{EXTRAS[module]}]'."
+    return ConfigError(f"this needs the package {module}, which is not installed", fix=fix)
+
+
+def require(module: str) -> None:
+    """Raise ConfigError, with the command that installs it, if an optional module is missing."""
+    if find_spec(module) is None:
+        raise missing_package(module)

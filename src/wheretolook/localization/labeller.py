@@ -8,7 +8,6 @@ import os
 from collections.abc import Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +97,6 @@ def label_scenes(
                 yield scene.result()
 
 
-@cache
 @dataclass(eq=False)
 class _SceneInProgress:
     """A scene whose shards are being labelled; `missing` are those without a file yet."""

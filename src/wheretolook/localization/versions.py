@@ -1,10 +1,12 @@
 """Versions of the packages that labels depend on."""
 
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 
 from wheretolook.utils.version import VERSION
 
 
+@cache
 def versions() -> dict[str, str]:
     """Versions of the packages that decide a label."""
     result = {"wheretolook": VERSION}

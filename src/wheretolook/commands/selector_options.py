@@ -110,17 +110,12 @@ def finish(command: SelectorOptions, selector: WhereToLook, views: SelectedViews
 
         save_figure(selector.floor_plan(views), command.floor_plan)
         print(f"floor plan: {command.floor_plan}")
-    print_summary(selector, views, given, locations)
-
-
-def print_summary(selector: WhereToLook, views: SelectedViews, n_given: int, locations: str) -> None:
-    """Print how the best views of each location were scored; `locations` names those that were given."""
     from wheretolook.geometry.camera import describe_camera
 
     localization_map = selector.localization_map
     print(f"{selector.frame.describe()}; camera: {describe_camera(localization_map.camera)}")
     n_used = len({*views.waypoint.tolist()})
-    skipped = f", {n_given - n_used} left out" if n_used < n_given else ""
+    skipped = f", {given - n_used} left out" if n_used < given else ""
     features = localization_map.landmarks.features or "no descriptors"
     landmarks = f"{len(localization_map.landmarks):,} landmarks ({features})"
     print(f"{landmarks}, occlusion: {localization_map.occlusion.name}, method: {views.method}")

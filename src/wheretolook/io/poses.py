@@ -6,7 +6,8 @@ World in metres. TUM trajectories and tables of selected views hold world_from_c
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -21,10 +22,13 @@ from wheretolook.utils.reading import read_text
 QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
 TRANSLATION_COLUMNS = ("tx", "ty", "tz")
 POSE_COLUMNS = (*QUATERNION_COLUMNS, *TRANSLATION_COLUMNS)
+FORMATS = """\
+CSV with columns x, y, z (and id, if there is one; a line of names or none), the Active Localization Benchmark's text
+"id x y z", a TUM trajectory "t x y z qx qy qz qw", COLMAP's images.txt, or "x y z"; lines that start with # are comments"""
 NAME_COLUMNS = ("id", "waypoint", "name", "t", "timestamp")
 _TUM_COLUMNS = ("t", *"xyz", "qx", "qy", "qz", "qw")
 _IMAGE_COLUMNS = ("image_id", *POSE_COLUMNS, "camera_id", "name")
-_FIXED_COLUMNS = {len(columns): columns for columns in (_TUM_COLUMNS, _IMAGE_COLUMNS)}
+_FIXED_COLUMNS = {len(columns): columns for columns in (tuple("xyz"), ("id", *"xyz"), _TUM_COLUMNS, _IMAGE_COLUMNS)}
 MAX_ROWS = 500_000  # of a text table
 MAX_IMAGES_BYTES = 100_000_000  # of an images.txt, which also has the keypoints
 UNIT_TOLERANCE = 0.01  # of a quaternion's length
@@ -67,6 +71,59 @@ def read_rows(path: Path) -> list[tuple[int, list[str]]]:
         raise TableError(f"the file cannot be read: {error}", path=path, fix="Give a text file of rows.") from error
 
 
+@dataclass(frozen=True, eq=False)
+class NamedRows:
+    """Rows of a text table: pairs of line number, from 1, and cells."""
+
+    path: Path
+    columns: Mapping[str, int]  # by name
+    rows: list[tuple[int, list[str]]]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name of each row: that of its column of names, or else a count from 0."""
+        column = next((self.columns[name] for name in NAME_COLUMNS if name in self.columns), None)
+        return tuple(str(row) if column is None else cells[column] for row, (_, cells) in enumerate(self.rows))
+
+    def numbers(self, names: Sequence[str]) -> Float:
+        """Return the numbers in some columns (N, len(names)). Raises TableError, with the line, if one is not finite."""
+        table = np.empty((len(self.rows), len(names)))
+        for row, (number, cells) in enumerate(self.rows):
+            try:
+                if len(cells) != len(self.rows[0][1]):
+                    raise ValueError(f"{len(cells)} columns, unlike the first row's {len(self.rows[0][1])}")
+                table[row] = [float(cells[self.columns[name]]) for name in names]
+                if not np.isfinite(table[row]).all():
+                    raise ValueError("a value is not finite")
+            except (ValueError, LookupError) as error:
+                problem = f"there is no column {error}" if isinstance(error, KeyError) else str(error)
+                value = f"line {number}: {' '.join(cells)[:80]}"
+                raise TableError(problem, path=self.path, value=value, fix=f"Give {FORMATS}.") from error
+        return table
+
+
+def read_named_rows(path: Path) -> NamedRows:
+    """Read a file in one of `FORMATS`, detected from its first row. Raises TableError if it is missing or another."""
+    rows = []
+    if path.suffix == ".txt":
+        try:
+            rows = _image_rows(path)
+        except (OSError, ValueError) as error:
+            raise TableError(f"the file cannot be read: {error}", path=path, fix="Give a text file of rows.") from error
+    if not rows or len(rows[0][1]) < len(_IMAGE_COLUMNS):
+        rows = read_rows(path)
+    first = rows[0][1]
+    names = _FIXED_COLUMNS.get(len(first), ())
+    if len(first) > 1 and not any(map(_is_number, first)):
+        names = tuple(cell.strip("\"' ").lower() for cell in first)
+        rows = rows[1:]
+    if not rows or not names:
+        raise TableError(
+            "the file has no rows of a known format", path=path, value=" ".join(first)[:80], fix=f"Give {FORMATS}."
+        )
+    return NamedRows(path, {name: column for column, name in reversed([*enumerate(names)])}, rows)
+
+
 class NamedPoses(NamedTuple):
     """N poses and their names."""
 
@@ -80,35 +137,17 @@ def read_poses(path: Path) -> NamedPoses:
     A CSV holds x, y, z, qw, qx, qy, qz (world_from_cam) or qw, qx, qy, qz, tx, ty, tz (cam_from_world). Raises
     TableError, with the line, if the file is missing or holds no poses.
     """
-    number = 0
-    try:
-        rows = _image_rows(path) if path.suffix == ".txt" else []
-        if not rows or len(rows[0][1]) < len(_IMAGE_COLUMNS):
-            rows = read_rows(path)
-        names = _FIXED_COLUMNS.get(len(rows[0][1]), ())
-        if is_header(rows[0][1]):
-            names = tuple(cell.strip("\"' ").lower() for cell in rows.pop(0)[1])
-        columns = {name: column for column, name in reversed([*enumerate(names)])}
-        wanted = POSE_COLUMNS if {*POSE_COLUMNS} <= {*columns} else (*"xyz", *QUATERNION_COLUMNS)
-        table = np.empty((len(rows), len(wanted)))
-        for row, (line, cells) in enumerate(rows):
-            number = line
-            table[row] = [float(cells[columns[name]]) for name in wanted]
-            length = np.linalg.norm(table[row, [wanted.index(name) for name in QUATERNION_COLUMNS]])
-            if not (np.isfinite(table[row]).all() and abs(length - 1) < UNIT_TOLERANCE):
-                raise ValueError("a pose has finite numbers and a quaternion of length 1")
-        number = 0
-        if not rows:
-            raise ValueError("there are none below the line of names")
-        poses = poses_of_values(table) if wanted == POSE_COLUMNS else _poses_in_world(table[:, :3], table[:, 3:])
-        named = next((columns[name] for name in NAME_COLUMNS if name in columns), None)
-        texts = range(len(rows)) if named is None else (cells[named] for _, cells in rows)
-        return NamedPoses(tuple(map(str, texts)), poses)
-    except (OSError, ValueError, LookupError) as error:
-        fix = "Give a TUM trajectory t x y z qx qy qz qw, COLMAP's images.txt, or a CSV of views or of a path."
-        problem = f"no column {error}" if isinstance(error, KeyError) else str(error)
-        value = f"line {number}" if number else None
-        raise TableError(f"no poses can be read: {problem}", path=path, value=value, fix=fix) from error
+    table = read_named_rows(path)
+    quaternions = table.numbers(QUATERNION_COLUMNS)
+    lengths = np.linalg.norm(quaternions, axis=1)
+    for row in np.flatnonzero(np.abs(lengths - 1) > UNIT_TOLERANCE).tolist():
+        value = f"line {table.rows[row][0]}: {lengths[row]:.4g}"
+        raise TableError("a quaternion is not of length 1", path=path, value=value, fix="Correct the order of columns.")
+    if {*TRANSLATION_COLUMNS} <= {*table.columns}:
+        return NamedPoses(table.names, poses_of_values(table.numbers(POSE_COLUMNS)))
+    rotations = rotation_from_quaternion(quaternions)
+    world_from_cam = np.concatenate([rotations, table.numbers("xyz")[..., None]], axis=-1)
+    return NamedPoses(table.names, invert_poses(world_from_cam))
 
 
 def _image_rows(path: Path) -> list[tuple[int, list[str]]]:
@@ -122,23 +161,12 @@ def _image_rows(path: Path) -> list[tuple[int, list[str]]]:
     return rows
 
 
-def is_header(row: list[str]) -> bool:
-    """Return whether cells of a table's first row are names: several, and none a number."""
-    return len(row) > 1 and not any(map(is_number, row))
-
-
-def is_number(text: str) -> bool:
-    """Return whether a text is a number."""
+def _is_number(text: str) -> bool:
     try:
         float(text)
     except ValueError:
         return False
     return True
-
-
-def _poses_in_world(centers: Float, quaternions_wxyz: Float) -> Float:
-    """Convert world_from_cam, centres (N, 3) m and quaternions (N, 4), to cam_from_world (N, 3, 4)."""
-    return invert_poses(np.concatenate([rotation_from_quaternion(quaternions_wxyz), centers[..., None]], axis=-1))
 
 
 def pose_texts(cam_from_world: ArrayLike, exact: bool = False) -> list[str]:

@@ -54,10 +54,10 @@ def scale_warning(mapping_distance_m: ArrayLike, centers: ArrayLike) -> str:
 
     Takes the mean distance of each landmark's mapping cameras (N,), and the cameras' centres (M, 3).
     """
-    distance = float(np.median(np.asarray(mapping_distance_m)))
-    at = np.asarray(centers, dtype=np.float64)
     from scipy.spatial import cKDTree  # takes longer than all of --help
 
+    distance = float(np.median(np.asarray(mapping_distance_m)))
+    at = np.asarray(centers, dtype=np.float64)
     spacing = float(np.median(cKDTree(at).query(at, 2)[0][:, 1])) if len(at) > 1 else 0.0
     low, high = DISTANCE_M
     if low <= distance <= high and spacing <= SPACING_M:

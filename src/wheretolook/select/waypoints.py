@@ -13,15 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers, rotation_from_quaternion
-from wheretolook.io.poses import NAME_COLUMNS, QUATERNION_COLUMNS, is_header, is_number, read_rows
+from wheretolook.io.poses import QUATERNION_COLUMNS, TRANSLATION_COLUMNS, read_named_rows
 from wheretolook.utils.errors import ConfigError, SceneError, TableError
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
-
-FORMATS = """\
-CSV with columns x, y, z (and id, if there is one; a line of names or none), the Active Localization Benchmark's text
-"id x y z", a TUM trajectory "t x y z qx qy qz qw", or "x y z"; lines that start with # are comments"""
 
 MAX_LOCATIONS = 1_000_000  # voxels of a grid
 REACH_SHARE = 0.95  # of the landmarks' mapping distances; farther from all of them the map is unknown
@@ -103,51 +99,15 @@ class Waypoints:
 
 
 def read_waypoints(path: str | Path) -> Waypoints:
-    """Read a file in one of `FORMATS`, detected from its columns.
+    """Read a file in one of `io.poses.FORMATS`, detected from its columns.
 
     Raises a TableError, with the line, if the file is missing, empty, has other columns, or a value is not a number.
     """
-    path = Path(path)
-    rows = read_rows(path)
-    columns, id_column, heading_columns = _columns(rows[0][1], path)
-    if is_header(rows[0][1]):
-        rows = rows[1:]
-    points: list[list[float]] = []
-    headings: list[list[float]] = []
-    ids: list[str] = []
-    for number, row in rows:
-        try:
-            if len(row) != len(rows[0][1]):
-                raise ValueError(f"{len(row)} columns, unlike the first waypoint's {len(rows[0][1])}")
-            points.append([float(row[column]) for column in columns])
-            headings.append([float(row[column]) if is_number(row[column]) else np.nan for column in heading_columns])
-            ids.append(str(len(ids)) if id_column is None else row[id_column])
-        except (ValueError, IndexError) as error:
-            value = f"line {number}: {' '.join(row)[:80]}"
-            raise TableError(f"not a waypoint: {error}", path=path, value=value, fix=f"Give {FORMATS}.") from error
-    if not rows:
-        raise TableError("there are no waypoints below the header", path=path, fix=f"Give {FORMATS}.")
-    lines = tuple(number for number, _ in rows)
-    known = np.array(headings) if heading_columns else None
-    return Waypoints(np.array(points), tuple(ids), lines, path, known)._checked()
-
-
-def _columns(row: list[str], path: Path) -> tuple[list[int], int | None, list[int]]:
-    """Return the columns of x, y, z, of the ids (or None) and of headings from the first row: a header, or a waypoint."""
-    if not is_header(row):
-        if len(row) not in (3, 4, 8):
-            problem = f"waypoints have 3, 4 or 8 columns, these have {len(row)}"
-            raise TableError(problem, path=path, value=" ".join(row)[:80], fix=f"Give {FORMATS}.")
-        return ([0, 1, 2], None, []) if len(row) == 3 else ([1, 2, 3], 0, [7, 4, 5, 6] if len(row) == 8 else [])
-    index = {name.strip("\"' ").lower(): column for column, name in reversed([*enumerate(row)])}
-    columns = [index.get(axis, index.get(f"t{axis}", -1)) for axis in "xyz"]
-    if -1 in columns:
-        fix = "Name the columns x, y and z."
-        raise TableError("the columns of waypoints are missing", path=path, value=",".join(row)[:80], fix=fix)
-    yaw = next(([index[name]] for name in ("heading_deg", "yaw_deg") if name in index), [])
-    quaternion = [index[name] for name in QUATERNION_COLUMNS if name in index]
-    headings = yaw or (quaternion if len(quaternion) == 4 else [])
-    return columns, next((index[name] for name in NAME_COLUMNS if name in index), None), headings
+    table = read_named_rows(Path(path))
+    points = table.numbers("xyz" if "x" in table.columns else TRANSLATION_COLUMNS)
+    kinds = (("heading_deg",), ("yaw_deg",), QUATERNION_COLUMNS)
+    known = next((table.numbers(kind) for kind in kinds if {*kind} <= {*table.columns}), None)
+    return Waypoints(points, table.names, tuple(number for number, _ in table.rows), table.path, known)
 
 
 def parse_points(texts: Sequence[str]) -> Waypoints:

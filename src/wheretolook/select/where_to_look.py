@@ -226,21 +226,19 @@ class WhereToLook:
         self, waypoints: Waypoints, axes: Float, scores: Float, request: SelectionRequest
     ) -> SelectedViews:
         """Select the n best views at each waypoint by scores (W, D) of axes (D, 3), or the best sequence."""
-        if request.apart_deg is not None:
-            chosen = _separate_views(axes, scores, request.n, request.apart_deg)
-        elif request.max_turn_deg is None:
-            chosen = np.argsort(-scores, axis=1, kind="stable")[:, : request.n + SPARE]
-        else:
+        if request.max_turn_deg is not None:
             chosen = best_sequence(scores, _turn_limit(axes, request.max_turn_deg)).direction_ids[:, None]
+        elif request.apart_deg is not None or request.pan_deg is not None:
+            chosen = _separate_views(axes, scores, request)
+        else:
+            chosen = np.argsort(-scores, axis=1, kind="stable")[:, : request.n + SPARE]
         k = chosen.shape[1]
         step = max(1, SIGHT_LINES // max(1, len(self.localization_map.landmarks)))
         blocks = np.split(np.arange(len(waypoints)), range(step, len(waypoints), step))
         poses = poses_looking_along(waypoints.points[:, None], axes[chosen])
         reported = [self._reported(waypoints, np.repeat(block, k), poses[block].reshape(-1, 3, 4)) for block in blocks]
         views = joined(reported)
-        allowed = np.isfinite(np.take_along_axis(scores, chosen, axis=1))
-        final = np.where(allowed, views.score.reshape(-1, k), -np.inf)
-        order = np.argsort(-final, axis=1, kind="stable")[:, : request.n]
+        order = np.argsort(-views.score.reshape(-1, k), axis=1, kind="stable")[:, : request.n]
         best = views[(np.arange(len(waypoints))[:, None] * k + order).ravel()]
         return replace(best, rank=np.tile(np.arange(1, order.shape[1] + 1), len(waypoints)))
 
@@ -347,30 +345,25 @@ class WhereToLook:
         return axes
 
     def _within_pan(self, waypoints: Waypoints, axes: Float, request: SelectionRequest) -> NDArray[np.bool_]:
-        """Return which of axes (D, 3) are within the limit on pan, (W, D). Raises ConfigError if they are too few."""
+        """Return which of axes (D, 3) are within the limit on pan, (W, D)."""
         if request.pan_deg is None:
             return np.ones((len(waypoints), len(axes)), dtype=bool)
         heading = waypoints.heading_deg(self.frame.world_from_map.rotation)
         pan = np.degrees(pan_tilt_angles(axes)[0]) - heading[:, None]
         pan = (pan + 180) % 360 - 180
-        allowed = (pan >= request.pan_deg[0] - 1e-9) & (pan <= request.pan_deg[1] + 1e-9)
-        least = int(allowed.sum(axis=1).min())
-        if least < (request.looks or request.n):
-            fix = "Score more directions, or widen the limits on pan and pitch."
-            raise ConfigError("a waypoint has too few directions within the limit on pan", value=least, fix=fix)
-        return allowed
+        return np.asarray((pan >= request.pan_deg[0] - 1e-9) & (pan <= request.pan_deg[1] + 1e-9))
 
 
-def _separate_views(axes: Float, scores: Float, n: int, apart_deg: float) -> NDArray[np.int64]:
-    """Return rows (W, n) of axes (D, 3) with the best scores (W, D) that are so far from one another.
+def _separate_views(axes: Float, scores: Float, request: SelectionRequest) -> NDArray[np.int64]:
+    """Return rows (W, n) of axes (D, 3) with the best scores (W, D), above -inf, that are far enough from one another.
 
     Raises ConfigError if there are fewer.
     """
     best = [np.argsort(-values, kind="stable")[: np.isfinite(values).sum()] for values in scores]
-    chosen = [separated(axes, order, n, apart_deg) for order in best]
-    if (least := min(map(len, chosen))) < n:
-        fix = "Ask for fewer views, or for a smaller angle."
-        raise ConfigError(f"a waypoint has only {least} views {apart_deg:g} degrees apart", value=n, fix=fix)
+    chosen = [separated(axes, order, request.n, request.apart_deg or 0) for order in best]
+    if (least := min(map(len, chosen))) < request.n:
+        fix = "Ask for fewer views, score more directions, or widen the limits."
+        raise ConfigError(f"a waypoint has only {least} views within the limits", value=request.n, fix=fix)
     return np.array(chosen)
 
 

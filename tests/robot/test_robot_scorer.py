@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 import sys
@@ -225,6 +226,69 @@ def test_the_folder_runs_by_itself(folder: Path, tmp_path: Path) -> None:
     other = export_robot(LocalizationMap(walls(50), CAMERA), BUNDLED, tmp_path / "other")
     shutil.copy(other / "landmarks.npz", copy)
     with pytest.raises(ValueError):  # landmarks of another export
+        RobotScorer(copy)
+
+
+def setting(*keys: str, value: object):
+    """An edit of robot.json; a value of None removes the setting."""
+
+    def edit(folder: Path) -> None:
+        about = json.loads((folder / "robot.json").read_text())
+        inner = about
+        for key in keys[:-1]:
+            inner = inner[key]
+        inner[keys[-1]] = value
+        if value is None:
+            del inner[keys[-1]]
+        (folder / "robot.json").write_text(json.dumps(about))
+
+    return edit
+
+
+def array(name: str, change):
+    """An edit of an array of landmarks.npz; None removes it."""
+
+    def edit(folder: Path) -> None:
+        with np.load(folder / "landmarks.npz") as stored:
+            arrays = dict(stored)
+        arrays[name] = change(arrays[name])
+        np.savez(folder / "landmarks.npz", **{key: value for key, value in arrays.items() if value is not None})
+
+    return edit
+
+
+def content(name: str, change):
+    return lambda folder: (folder / name).write_bytes(change((folder / name).read_bytes()))
+
+
+DAMAGES = [
+    setting("camera", name, value=value) for name, value in (("fx", 0), ("fy", np.nan), ("width", -1), ("cx", "a"))
+]
+DAMAGES += [
+    setting(key, value=None) for key in ("camera", "attributes", "most", "range", "n_landmarks", "format_version")
+]
+DAMAGES += [setting("most", value=-1), setting("most", value=1e400), setting("n_landmarks", value=7)]
+DAMAGES += [setting("attributes", value=["across"]), setting("map_attributes", value=[]), setting("range", value=[1])]
+DAMAGES += [setting("range", "distance_m", value=[3, 2]), setting("range", "in_view", value=[np.nan, 2])]
+DAMAGES += [array("points", lambda a: np.where(a == a[0, 0], np.nan, a)), array("points", lambda a: a[:, :2])]
+DAMAGES += [
+    array("points", lambda a: None),
+    array("places", lambda a: a.reshape(-1)),
+    array("unoccluded", lambda a: a[:, :-1]),
+]
+DAMAGES += [array("attributes", lambda a: a.astype(str)), array("directions", lambda a: a.astype(object))]
+DAMAGES += [
+    content(name, lambda data: data[: len(data) // 2]) for name in ("robot.json", "landmarks.npz", "scorer.onnx")
+]
+DAMAGES += [content(name, lambda data: b"") for name in ("robot.json", "landmarks.npz", "scorer.onnx")]
+DAMAGES += [content("robot.json", lambda data: b"[" * 100_000), content("robot.json", lambda data: b"\xff[]")]
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_folders_are_rejected_by_file(damage, folder: Path, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    damage(copy)
+    with pytest.raises(ValueError, match=f"^{copy}.*Export again"):
         RobotScorer(copy)
 
 

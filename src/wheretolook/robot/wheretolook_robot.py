@@ -49,6 +49,10 @@ from numpy.typing import ArrayLike, NDArray
 
 FORMAT_VERSION = 1  # of the folder
 MIN_DEPTH_M = 2.0**-10  # landmarks with a smaller depth are not visible
+CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
+COMPUTED = {"across", "down", "distance", "mapped_angle", "distance_ratio", "pixel_angle", "pixel_size_ratio"}
+INPUTS = {"values", "taken", "n_visible", "axis_height"}
+OUTPUTS = ("probability", "expected_inliers")
 BLOCK = 1 << 15  # landmarks per call of the network, which fit into the cache
 
 Array = NDArray[Any]
@@ -88,29 +92,14 @@ class RobotScorer:
 
     Raises:
         OSError: a file is missing.
-        ValueError: the folder has another format version, or its files do not match.
+        ValueError: a file is damaged, of another format version, has impossible values, or does not match the others.
     """
 
     def __init__(self, folder: str | Path, threads: int = 1) -> None:
         folder = Path(folder)
-        about = json.loads((folder / "robot.json").read_text(encoding="utf-8"))
-        if about.get("format_version") != FORMAT_VERSION:
-            raise ValueError(f"{folder / 'robot.json'}: this file reads format {FORMAT_VERSION}. Export again.")
-        self.camera: dict[str, float] = about["camera"]  # width, height, fx, fy, cx, cy in pixels
-        self._names: list[str] = about["attributes"]  # inputs of the network, in its order
-        self._map_names: list[str] = about["map_attributes"]  # columns of `attributes` in landmarks.npz
-        self._most = int(about["most"])  # landmarks per view; of more, an even sample
-        self._range: dict[str, list[float]] = about["range"]
-        self._serves_camera = bool(about["serves_camera"])
-        with np.load(folder / "landmarks.npz") as stored:
-            self.points: Array = stored["points"]
-            self._directions = stored["directions"]
-            self._attributes = stored["attributes"]
-            self.places: Array = stored["places"]
-            self._unoccluded = stored["unoccluded"]
+        n_landmarks = self._read_settings(folder / "robot.json")
+        self._read_landmarks(folder / "landmarks.npz", n_landmarks)
         self._columns = np.ascontiguousarray(self.points.T)  # (3, N): contiguous coordinates are faster
-        if len(self.points) != about["n_landmarks"]:
-            raise ValueError(f"{folder / 'landmarks.npz'}: not the landmarks of robot.json. Export again.")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
@@ -118,7 +107,67 @@ class RobotScorer:
         path = str(folder / "scorer.onnx")
         if not Path(path).is_file():
             raise FileNotFoundError(f"{path}: no such file. Export again.")
-        self._session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+        try:
+            self._session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+            shapes = {value.name: value.shape for value in self._session.get_inputs()}
+            outputs = {value.name for value in self._session.get_outputs()}
+            if {*shapes} != INPUTS or shapes["values"][-1] != len(self._names) or not {*OUTPUTS} <= outputs:
+                raise ValueError("it is of another network")
+        except Exception as error:  # onnxruntime raises errors of many kinds
+            raise ValueError(f"{path}: the network cannot be read: {error}. Export again.") from error
+
+    def _read_settings(self, path: Path) -> int:
+        """Read robot.json and return its number of landmarks. Raises ValueError for impossible settings."""
+        try:
+            about = json.loads(path.read_text(encoding="utf-8"))
+            if about["format_version"] != FORMAT_VERSION:
+                raise ValueError(f"this program reads format {FORMAT_VERSION}")
+            self.camera: dict[str, float] = {name: float(about["camera"][name]) for name in CAMERA}  # in pixels
+            positive = min(self.camera[name] for name in CAMERA[:4])
+            if not (np.isfinite([*self.camera.values()]).all() and positive > 0):
+                raise ValueError(f"the camera has an impossible size or focal length: {self.camera}")
+            self._names = [str(name) for name in about["attributes"]]  # inputs of the network, in its order
+            self._map_names = [str(name) for name in about["map_attributes"]]  # columns of `attributes`
+            if not {"across", "down", "distance"} <= {*self._names} <= {*self._map_names} | COMPUTED:
+                raise ValueError("attributes are missing or unknown")
+            if not {"mapped_distance", "mapped_pixel_size"} <= {*self._map_names}:
+                raise ValueError("attributes of the map are missing")
+            self._most = int(about["most"])  # landmarks per view; of more, an even sample
+            n_landmarks = int(about["n_landmarks"])
+            if self._most < 1 or n_landmarks < 0:
+                raise ValueError(f"impossible numbers of landmarks: most {self._most}, n_landmarks {n_landmarks}")
+            self._range = {name: (float(low), float(high)) for name, (low, high) in about["range"].items()}
+            if not all(low <= high for low, high in self._range.values()):
+                raise ValueError(f"the range of the training views is not ascending: {self._range}")
+            self._serves_camera = bool(about["serves_camera"])
+            return n_landmarks
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+            problem = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+            raise ValueError(f"{path}: the settings cannot be used: {problem}. Export again.") from error
+
+    def _read_landmarks(self, path: Path, n: int) -> None:
+        """Read landmarks.npz with n landmarks. Raises ValueError for arrays that are missing or do not match."""
+        shapes = {"points": (n, 3), "directions": (n, 3), "attributes": (n, len(self._map_names))}
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                arrays = {name: stored[name] for name in (*shapes, "places", "unoccluded")}
+            shapes |= {"places": (len(arrays["places"]), 3), "unoccluded": (len(arrays["places"]), (n + 7) // 8)}
+            for name, array in arrays.items():
+                kind = "u" if name == "unoccluded" else "f"
+                if array.shape != shapes[name] or array.dtype.kind != kind:
+                    raise ValueError(f"{name} is {array.dtype} {array.shape}, robot.json expects {shapes[name]}")
+                unusable = np.isinf if name == "attributes" else lambda values: ~np.isfinite(values)
+                if unusable(array).any():
+                    raise ValueError(f"{name} is not finite")
+        except FileNotFoundError:
+            raise
+        except Exception as error:  # a damaged archive raises errors of many kinds
+            raise ValueError(f"{path}: the landmarks cannot be used: {error}. Export again.") from error
+        self.points: Array = arrays["points"]
+        self._directions = arrays["directions"]
+        self._attributes = arrays["attributes"]
+        self.places: Array = arrays["places"]
+        self._unoccluded = arrays["unoccluded"]
 
     def score(self, cam_from_world: ArrayLike, unoccluded: ArrayLike | None = None) -> Array:
         """Return the probabilities (B,) that poses (B, 3, 4) localize; see `views`."""
@@ -209,7 +258,7 @@ class RobotScorer:
                     distance_m[view] = np.exp(own[:, distance].mean())
             inputs = {"values": padded, "taken": counts, "n_visible": n_visible[block]}
             inputs["axis_height"] = rotations[block, 2, 2].astype(np.float32)
-            score[block], inliers[block] = self._session.run(["probability", "expected_inliers"], inputs)
+            score[block], inliers[block] = self._session.run(OUTPUTS, inputs)
         in_range = self._serves_camera & self._within("distance_m", distance_m)
         in_range &= (n_visible == 0) | self._within("in_view", n_visible)
         return Views(score, n_visible, inliers, in_range, np.full(len(rotations), place_m))

@@ -159,7 +159,7 @@ def test_the_nearest_name_is_suggested(arguments: list[str], meant: str, capsys:
         ("select --map m --at 1,1,1 --out a.csv --lattice x", "one of fibonacci, yaw-pitch"),
         ("plan --start 0,0", "--start needs 3 numbers"),
         ("map --mapping.keep_database yess", "true or false"),
-        ("map --model m --mapping.existing.level true --mapping.photographs.scale.positions a.csv", "no effect"),
+        ("map --model m --up level --mapping.photographs.scale.positions a.csv", "given twice"),
         ("view --scene a --film a.webp", "a film shows a path: give --path"),
         ("view --map m --path a.csv --film a.webp", "a film of a map needs its --mesh"),
     ],

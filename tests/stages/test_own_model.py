@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pycolmap
 import pytest
 
@@ -26,8 +27,16 @@ from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig, PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.io.poses import read_poses
 from wheretolook.mapping.colmap_model import colmap_poses, read_model
-from wheretolook.mapping.config import ExistingModelConfig, KnownDistance, MapConfig, PhotographsConfig, ScaleConfig
+from wheretolook.mapping.config import (
+    ExistingModelConfig,
+    FrameOptions,
+    KnownDistance,
+    MapConfig,
+    PhotographsConfig,
+    ScaleConfig,
+)
 from wheretolook.mapping.imported_map import map_existing
 from wheretolook.planning.config import PathConfig, PlanConfig, ViewpointMapConfig
 from wheretolook.rendering.raycasting import MeshRaycaster
@@ -87,7 +96,7 @@ def experiment_of(model: Path, data: Path, **existing: object) -> AllOptions:
         data=data,
         device="cpu",
         scenes=ScenesConfig(mapped_space=MappedSpaceConfig(max_camera_distance_m=0.6)),
-        mapping=MapConfig(existing=ExistingModelConfig(model, **existing)),  # type: ignore[arg-type]
+        mapping=MapConfig(existing=ExistingModelConfig(model, frame=FrameOptions(scale=1), **existing)),  # type: ignore[arg-type]
         sample=SampleConfig(grid=(6, 5, 3), directions=40, keep=10, max_locations=6),
         viewpoint_map=ViewpointMapConfig(grid=(6, 5, 3), directions=30, method="visible"),
         tracking=TrackingConfig(str(data / "mlruns")),
@@ -133,9 +142,12 @@ def test_from_a_model_to_a_planned_path(tmp_path, with_mesh):
     assert sum("reusing" in line for line in said) == 2
 
 
-def test_one_command_plans_a_path_in_the_folder_of_a_model(tmp_path, capsys):
-    folder = save(room_model(), tmp_path / "flat" / "sparse" / "0")
-    where = ["--map", str(folder), "--data", str(tmp_path / "data"), "--device", "cpu"]
+@pytest.mark.parametrize("unit_m", [1, 0.1])
+def test_one_command_plans_a_path_in_the_folder_of_a_model(tmp_path, capsys, unit_m):
+    model = room_model()
+    model.transform(pycolmap.Sim3d(1 / unit_m, pycolmap.Rotation3d(), np.zeros(3)))
+    folder = save(model, tmp_path / "flat" / "sparse" / "0")
+    where = ["--map", str(folder), "--scale", str(unit_m), "--data", str(tmp_path / "data"), "--device", "cpu"]
     grid = [
         "--plan.grid",
         "[6, 5, 3]",
@@ -146,10 +158,15 @@ def test_one_command_plans_a_path_in_the_folder_of_a_model(tmp_path, capsys):
         "--plan.planner.time_s",
         "0.5",
     ]
-    ends = ["--start", "[4.5, 2.5, 1.5]", "--goal", "[4.5, 3.5, 1.5]"]
+    start, goal = ([value / unit_m for value in point] for point in ((4.5, 2.5, 1.5), (4.5, 3.5, 1.5)))
+    ends = ["--start", str(start), "--goal", str(goal)]
     tracking = ["--tracking.folder", str(tmp_path / "mlruns")]
     assert main(["plan", *where, *ends, *grid, *tracking, "--film", "none", "--out", str(tmp_path / "way")]) == 0
-    assert (tmp_path / "way" / "path.csv").is_file()
+    path = pd.read_csv(tmp_path / "way" / "path.csv")
+    np.testing.assert_allclose(path.iloc[[0, -1], :3], [start, goal], atol=1e-6)
+    np.testing.assert_allclose(
+        camera_centers(read_poses(tmp_path / "way" / "path.csv").cam_from_world), path.iloc[:, :3], atol=1e-5
+    )
     assert "320 x 240" in capsys.readouterr().out  # the model's camera
     out = ["--out", str(tmp_path / "flat.map"), "--method", "visible"]
     views = [f"--viewpoint-map.{option}" for option in ("grid=[6, 5, 3]", "directions=30")]
@@ -185,17 +202,18 @@ def test_a_turned_and_scaled_model_warns_and_is_aligned(tmp_path):
     centers = camera_centers(colmap_poses("", model))
     turn = pycolmap.Rotation3d(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
     model.transform(pycolmap.Sim3d(37.0, turn, np.array([5.0, 0, 0])))
-    existing = ExistingModelConfig(save(model, tmp_path / "flat"), level=True)
+    existing = ExistingModelConfig(save(model, tmp_path / "flat"), frame=FrameOptions(up="level"))
+    metric = replace(existing, frame=FrameOptions(scale=1, up="z"))
     with pytest.warns(MapWarning) as warned:
-        map_existing(MapConfig(existing=replace(existing, level=False)), tmp_path / "map", tmp_path / "work")
+        map_existing(MapConfig(existing=metric), tmp_path / "map", tmp_path / "work")
     assert len([warning for warning in warned if warning.category is MapWarning]) == 2
 
     distance = KnownDistance("000.jpg", "018.jpg", float(np.linalg.norm(centers[0] - centers[18])))
     table = tmp_path / "positions.csv"
     table.write_text("image,x,y,z\n" + "".join(f"{i:03d}.jpg,{x},{y},{z}\n" for i, (x, y, z) in enumerate(centers)))
     for scale in (ScaleConfig(distance=distance), ScaleConfig(positions=table), ScaleConfig(marker_size_m=0.4)):
-        level = scale.positions is None
-        config = MapConfig(existing=replace(existing, level=level), photographs=PhotographsConfig(scale=scale))
+        frame = FrameOptions(up="level" if scale.positions is None else None)
+        config = MapConfig(existing=replace(existing, frame=frame), photographs=PhotographsConfig(scale=scale))
         if scale.marker_size_m:  # no photographs to detect markers in
             with pytest.raises(ConfigError):
                 map_existing(config, tmp_path / "map", tmp_path / "work")
@@ -223,7 +241,7 @@ def test_landmarks_are_triangulated_again_at_known_poses(tmp_path):
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
     folder = save(model, tmp_path / "flat")
     config = MapConfig(
-        existing=ExistingModelConfig(folder),
+        existing=ExistingModelConfig(folder, frame=FrameOptions(up="z")),
         photographs=PhotographsConfig(tmp_path / "photos", scale=ScaleConfig(marker_size_m=MARKERS[0].size_m)),
     )
     report = map_existing(config, tmp_path / "map", tmp_path / "work", progress=False)

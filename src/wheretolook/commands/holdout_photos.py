@@ -59,7 +59,7 @@ def hold_out_photographs(
             folder, features = features_of(model, *given, out / WORK, workers, device)
             source = open_map(folder, features, metric, name, keep_frame=keep_frame)
             if upright and source.is_turned:
-                fix = "Make a scene of it: `wheretolook map --name NAME --model SPARSE --mapping.existing.level true`."
+                fix = "Make a scene of it: `wheretolook map --name NAME --model SPARSE --up level`."
                 raise MapError("the map is on its side, and this needs z up", path=model, fix=fix)
             return source, hold_out_blocks(source, out / WORK, workers=workers, device=device)
     finally:

@@ -10,12 +10,12 @@ from typing import Any
 
 from wheretolook.commands.map import Map
 from wheretolook.commands.options import DatasetOptions, Log, Progress, SceneOptions, ignore_progress, select_options
-from wheretolook.mapping.config import ExistingModelConfig, MapConfig, place_name
+from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, place_name
 from wheretolook.utils.validation import reject
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneOrMapOptions(SceneOptions):
+class SceneOrMapOptions(SceneOptions, FrameOptions):
     """A scene of a dataset, or a COLMAP model.
 
     Args:
@@ -31,8 +31,10 @@ class SceneOrMapOptions(SceneOptions):
     database: Path | None = None
 
     def __post_init__(self) -> None:
-        of_map = self.mesh or self.database
-        reject((self.map is None and of_map is not None, "--mesh and --database belong to --map", str(of_map)))
+        frame = self.frame_options()
+        of_map = next(filter(None, (self.mesh, self.database, *vars(frame).values())), None)
+        names = "--mesh, --database, --scale, --distance, --positions and --up"
+        reject((self.map is None and of_map is not None, f"{names} belong to --map", str(of_map)))
         if not self.name:
             object.__setattr__(self, "name", self.imported_name or DatasetOptions.name)
         super().__post_init__()
@@ -49,7 +51,8 @@ def imports_map(run: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(run)
     def run_on_scene(command: Any, log: Log = print, progress: Progress = ignore_progress) -> Any:
         if command.map is not None:
-            existing = ExistingModelConfig(command.map, database=command.database, mesh=command.mesh)
+            files = {"database": command.database, "mesh": command.mesh}
+            existing = ExistingModelConfig(command.map, **files, frame=command.frame_options())
             mapping = MapConfig(extractor=command.mapping.extractor, existing=existing)
             replace(select_options(Map, command), mapping=mapping).run(log)
         return run(command, log, progress)

@@ -23,8 +23,9 @@ from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, describe_camera, draw_camera
 from wheretolook.geometry.poses import Float
-from wheretolook.mapping.config import ExistingModelConfig, MapConfig, ScaleConfig, place_name
+from wheretolook.mapping.config import ExistingModelConfig, MapConfig, place_name
 from wheretolook.mapping.georeference import read_scale
+from wheretolook.mapping.map_frame import IDENTITY, read_frame
 from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.confine import check_folder_name, path_within
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
@@ -35,10 +36,9 @@ from wheretolook.utils.files import fingerprint, size_and_time
 class Map(SceneOptions, LabelOptions):
     """Build a COLMAP map of every scene from renders, or of photographs: --images. Or import one: --model.
 
-    A model of your own, from COLMAP or hloc, in metres with z up, becomes a scene for sample, viewpoint-map and plan.
-    Mesh and database are optional. With --images its landmarks are triangulated again. --mapping.existing.level true
-    turns it upright by its cameras; --mapping.photographs.scale.positions FILE determines unit, axes and origin instead. Its
-    own camera is the scene's, unless --camera names one.
+    A model of your own, from COLMAP or hloc, becomes a scene for sample, viewpoint-map and plan, in metres with z up
+    according to --scale, --distance, --positions and --up. Mesh and database are optional. With --images its landmarks
+    are triangulated again. Its own camera is the scene's, unless --camera names one.
 
     Examples:
       wheretolook map --name photos --images FOLDER
@@ -53,6 +53,7 @@ class Map(SceneOptions, LabelOptions):
         "model": "mapping.existing.model",
         "mesh": "mapping.existing.mesh",
         "database": "mapping.existing.database",
+        **{name: f"mapping.existing.frame.{name}" for name in ("scale", "distance", "positions", "up")},
         "engine": "label.engine",
     }
 
@@ -74,9 +75,11 @@ class Map(SceneOptions, LabelOptions):
             return dataset
         refuse_release(self.root)
         scene, dataset = (_map_photographs if self.mapping.existing.model is None else _import_model)(self, log)
+        frame = read_frame(scene.map)
         scale = read_scale(scene.map)
         assert scale is not None
-        log(f"{scene.name}: {scale.describe()}; camera {describe_camera(scene.camera)}")
+        about = scale.describe() if frame is IDENTITY else "; ".join((frame.describe(), *frame.doubts))
+        log(f"{scene.name}: {about}; camera {describe_camera(scene.camera)}")
         dataset.save()
         progress(1)
         return dataset
@@ -177,8 +180,7 @@ def _map_photographs(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
 def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     """Make a scene of the model in `mapping.existing.model`: `<scene>/map/`, and `<scene>/mesh.glb` if a mesh is given.
 
-    Returns the scene, and the dataset with it. Raises what `map_existing` does, ConfigError for a mesh of a model that
-    is transformed, and SceneError if the mesh cannot be used.
+    Returns the scene, and the dataset with it. Raises what `map_existing` does, and SceneError if the mesh cannot be used.
     """
     from wheretolook.mapping.colmap_model import read_model
     from wheretolook.mapping.sources import choose_features
@@ -188,9 +190,6 @@ def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     folder = settings.model
     assert folder is not None
     scene = _new_scene(options, settings.name or place_name(folder))
-    if settings.mesh is not None and (settings.level or photographs.scale != ScaleConfig()):
-        fix = "Give a model and a mesh that are both in metres with z up."
-        raise ConfigError("a model that is turned or scaled leaves its mesh", value=str(settings.mesh), fix=fix)
     model = read_model(folder)
     if photographs.images is None:
         settings = replace(settings, database=choose_features(folder, model, settings.database))
@@ -198,7 +197,7 @@ def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     if options.camera == CameraConfig():
         scene = _with_own_camera(scene, model, settings)
     dataset = _with_scene(scene, options.root)
-    tables = [photographs.scale.marker_table, photographs.scale.positions, settings.database]
+    tables = [photographs.scale.marker_table, photographs.scale.positions, settings.frame.positions, settings.database]
     files = [*sorted(folder.iterdir()), *filter(None, tables)]
     if photographs.images is not None:
         names = [image.name for _, image in sorted(model.images.items())]
@@ -221,6 +220,7 @@ def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     report = map_existing(options.mapping, scene.map, *how, reconstruction=model)
     scene.mesh.unlink(missing_ok=True)
     if settings.mesh is not None and loaded is not None:
+        loaded = loaded.transformed(read_frame(scene.map).world_from_map)
         warn_of_mesh(settings.mesh, scene.read_landmarks().points, MeshRaycaster(loaded, options.warp_device))
         save_glb(loaded, scene.mesh)
     cache.store()

@@ -14,6 +14,7 @@ from wheretolook.commands.preconditions import load_dataset, open_scene
 from wheretolook.dataset.dataset_lock import reads_dataset
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.geometry.similarity import Similarity
 from wheretolook.planning.config import PlanConfig
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import joined, start_run
@@ -90,7 +91,7 @@ class Plan(SceneOrMapOptions):
         folder = (config.out or files.folder / "path").resolve()  # "." gets a name, too
         with hold(folder.with_name(f".{folder.name}.lock"), "plan", wait_s=WAIT_S):
             written = _draw(views, scene.landmarks.points, f"{scene.name}, {method}", folder, config.film)
-            table = _table(path, stopping=config.stops.looks > 1)
+            table = _table(path, scene.frame.world_from_map.inverse, stopping=config.stops.looks > 1)
             write_text(folder / "path.csv", table.to_csv(index=False, lineterminator="\n"))
             if config.rerun:
                 _record(views[method], scene.landmarks.points, scene.camera, folder / "path.rrd")
@@ -156,21 +157,25 @@ def _log(options: Plan, dataset: str, scene: str, methods: list[str], path: Plan
             client.log_artifact(run, str(file))
 
 
-def _table(path: PlannedPath, stopping: bool) -> pd.DataFrame:
+def _table(path: PlannedPath, map_from_world: Similarity, stopping: bool) -> pd.DataFrame:
     """Return a row a view: position, axis, its score (NaN if the method scores nothing), pose cam_from_world.
 
-    With stops, further looks are rows of the same location; `look` counts from 1, the path's own view, and `together`
-    is the joint score of all looks of the stop (NaN elsewhere).
+    All are in the map's own frame; where its unit is not the metre, positions are `x_units` instead of `x_m`. With
+    stops, further looks are rows of the same location; `look` counts from 1, the path's own view, and `together` is the
+    joint score of all looks of the stop (NaN elsewhere).
     """
     import pandas as pd
 
     from wheretolook.dataset.viewpoint_table import pose_columns
 
     places, looks = path.looks
-    at = path.positions[places]
-    along = path.all_axes
-    columns = dict(zip(("x_m", "y_m", "z_m", "axis_x", "axis_y", "axis_z"), (*at.T, *along.T), strict=True))
-    table = pd.DataFrame({**columns, "score": path.all_scores, **pose_columns(poses_looking_along(at, along))})
+    at = map_from_world.apply(path.positions[places])
+    along = path.all_axes @ map_from_world.rotation.T
+    unit = "m" if map_from_world.scale == 1 else "units"
+    names = (*(f"{axis}_{unit}" for axis in "xyz"), "axis_x", "axis_y", "axis_z")
+    columns = dict(zip(names, (*at.T, *along.T), strict=True))
+    poses = map_from_world.apply_to_poses(poses_looking_along(path.positions[places], path.all_axes))
+    table = pd.DataFrame({**columns, "score": path.all_scores, **pose_columns(poses)})
     if stopping:
         joint_scores = pd.Series({stop.place: stop.together for stop in path.stops}, dtype=float)
         table = table.assign(look=looks, together=joint_scores.reindex(places).to_numpy())

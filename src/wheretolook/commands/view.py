@@ -109,7 +109,8 @@ class View(CameraOptions):
             state = replace(state, method=self.method)
         paths = {} if self.path is None else read_paths(self.path, self.pair)
         viewed = self._open()
-        viewed.paths = paths
+        place = viewed.environment.frame.world_from_map.apply_to_poses
+        viewed.paths = {name: replace(path, cam_from_world=place(path.cam_from_world)) for name, path in paths.items()}
         if state.method and state.method not in viewed.weights.methods:
             fix = f"Use {', '.join(viewed.weights.methods)}."
             raise ConfigError("there is no such method here, or no weights of it", value=state.method, fix=fix)

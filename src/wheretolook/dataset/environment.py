@@ -17,7 +17,7 @@ from wheretolook.geometry.lattices import ViewLattice, VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.mapping.georeference import read_scale
-from wheretolook.mapping.map_frame import IDENTITY, MapFrame
+from wheretolook.mapping.map_frame import IDENTITY, MapFrame, read_frame
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError, MapError
@@ -235,6 +235,11 @@ class SceneEnvironment(Environment):
         """Whether the scene is known from photographs alone."""
         return self.files.is_photographed
 
+    @cached_property
+    def frame(self) -> MapFrame:
+        """The own frame of the model that the map was imported from."""
+        return read_frame(self.files.map)
+
     @property
     def source(self) -> Path:
         """The file that everything follows from: the mesh, or else the poses of the photographs."""
@@ -300,9 +305,10 @@ class SceneEnvironment(Environment):
         return self.tsdf_space if tsdf else self.sampled_space
 
     def require_metres(self) -> None:
-        """Raise MapError if the map is not known to be in metres, unless `assume_metric` is set."""
+        """Raise MapError if a map of photographs has no scale, unless `assume_metric` is set."""
         scale = read_scale(self.files.map)
-        if scale is not None and not scale.is_metric and not self.config.assume_metric:
+        photographs = self.frame is IDENTITY  # an imported model was scaled by the depth of its images
+        if scale is not None and photographs and not scale.is_metric and not self.config.assume_metric:
             fix = "Map it with marker sizes, a distance or positions (mapping.photographs.scale), or pass "
             fix += "--mapping.photographs.assume_metric true to take its unit for a metre."
             problem = "the map has no scale, and this needs metres"

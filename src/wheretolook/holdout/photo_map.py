@@ -19,7 +19,7 @@ from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.localization.versions import versions
 from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_arrays, read_model, registered_names
-from wheretolook.mapping.config import ExistingModelConfig, MapConfig, PhotographsConfig, place_name
+from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, PhotographsConfig, place_name
 from wheretolook.mapping.feature_files import DATABASE_FILE, read_descriptors
 from wheretolook.mapping.georeference import read_scale
 from wheretolook.mapping.gravity import estimate_gravity
@@ -222,7 +222,7 @@ def features_of(
         return out, out / DATABASE_FILE
     _check_photographs(model, model_dir)
     shutil.rmtree(out, ignore_errors=True)
-    existing = ExistingModelConfig(model=model_dir)
+    existing = ExistingModelConfig(model=model_dir, frame=FrameOptions(scale=1, up="z"))  # check scales it
     photographs = PhotographsConfig(images=images)
     config = MapConfig(existing=existing, photographs=photographs, extractor=extractor, keep_database=True)
     work.mkdir(parents=True, exist_ok=True)

@@ -118,7 +118,7 @@ class CheckReport:
         if source.is_turned:
             lines.append(
                 "the model was turned upright for this; other commands take its z for up: "
-                "`wheretolook map --model` with --mapping.existing.level true"
+                "`wheretolook map --model` with --up level"
             )
         if not self.parts:
             return [*lines, "no part of the map fails without its neighbours"]

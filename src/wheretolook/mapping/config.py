@@ -219,7 +219,7 @@ class PhotographsConfig:
 class ExistingModelConfig:
     """An existing COLMAP model with known poses, from which a scene is made instead of from a mesh or photographs.
 
-    Its world must be in metres, z up; `photographs.scale` and `level` make it so. With `photographs.images`, the
+    The scene is in metres, z up, according to `frame`, or to the markers of `photographs.scale`. With `photographs.images`, the
     folder of its images, its landmarks are triangulated again at its poses, from keypoints of `extractor`.
 
     Args:
@@ -231,7 +231,7 @@ class ExistingModelConfig:
             space follows `scenes.mapped_space`, and occlusion hidden-point removal.
         mesh_up: which axis of the mesh's file is the model's z: x, y or z, with a minus sign if it points down.
         camera_id: the query camera, if the model has several and `camera` names none.
-        level: turn the model upright by how its cameras were held.
+        frame: how the model's own frame is related to metres with z up.
         max_reprojection_error_px: landmarks with a larger mean reprojection error are removed; 0 keeps all.
     """
 
@@ -241,7 +241,7 @@ class ExistingModelConfig:
     mesh: Path | None = None
     mesh_up: str = "z"
     camera_id: int | None = None
-    level: bool = False
+    frame: FrameOptions = FrameOptions()
     max_reprojection_error_px: float = 0.0
 
     def __post_init__(self) -> None:
@@ -307,9 +307,13 @@ class MapConfig:
         if self.camera is not None and self.draw_camera:
             raise ConfigError("give camera or draw_camera, not both", value=self.camera)
         check_positive("max_reprojection_error_px", self.max_reprojection_error_px)
-        if self.existing.level and self.photographs.scale.positions is not None:
-            problem = "known positions determine the whole frame, so mapping.existing.level would have no effect"
-            raise ConfigError(problem, fix="Leave it out, and give positions with z up.")
+        frame = self.existing.frame
+        given = FrameOptions(
+            up=None if self.photographs.scale.positions else frame.up
+        )  # positions give what is up, too
+        if self.photographs.scale != ScaleConfig() and frame != given:
+            fix = "Leave out the options of mapping.photographs.scale."
+            raise ConfigError("the frame of the model is given twice", value=frame, fix=fix)
 
     def record(self) -> dict[str, Any]:
         """Settings and constants, from which the keys of finished maps are made."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,10 @@ from wheretolook.mapping.colmap_model import (
     read_model,
     registered_names,
 )
-from wheretolook.mapping.config import EXHAUSTIVE_UP_TO, PARTNERS, MapConfig
+from wheretolook.mapping.config import EXHAUSTIVE_UP_TO, PARTNERS, MapConfig, ScaleConfig
 from wheretolook.mapping.georeference import KnownScale, MapScale, find_scale
-from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.mapping.map_folder import DATABASE_FILE, MapDraft, MapReport, MapRun, finish_map, replacing_map
-from wheretolook.mapping.map_frame import IDENTITY
+from wheretolook.mapping.map_frame import IDENTITY, find_frame
 from wheretolook.mapping.sfm import PhotographFeatures, photograph_features
 from wheretolook.mapping.triangulation import choose_pairs, triangulate_model
 from wheretolook.utils.confine import path_within
@@ -46,6 +45,7 @@ class ExistingMapReport(MapReport):
     triangulated_anew: bool  # whether the landmarks were triangulated again, from the images
     has_descriptors: bool  # without them, ambiguity is unknown and nothing can be localized
     cameras: list[dict[str, Any]]  # COLMAP's intrinsics
+    frame: dict[str, Any]  # the model's own, see `MapFrame.record`
     scale: MapScale
 
 
@@ -87,11 +87,12 @@ def map_existing(
             model = _triangulate(model, photographs.images, turned, work, database, run)
             limit_px = limit_px or photographs.max_reprojection_error_px
         with run.clock("frame"):
-            rotation = estimate_gravity(colmap_poses("", model)).rotation if settings.level else np.eye(3)
-            upright = Similarity(1.0, rotation, np.zeros(3))
-            scale, to_world = find_scale(model, known, upright, photographs.images, turned, progress)
-            if scale.is_metric or settings.level:
-                to_world.transform_model(model)
+            frame = find_frame(settings.model, model, settings.frame)
+            if photographs.scale != ScaleConfig():
+                upright = Similarity(1.0, frame.world_from_map.rotation, np.zeros(3))
+                scale, similarity = find_scale(model, known, upright, photographs.images, turned, progress)
+                frame = replace(frame, world_from_map=similarity, scale=scale)
+            frame.world_from_map.transform_model(model)
         if limit_px and not all(point.has_error() for point in model.points3D.values()):
             model.update_point_3d_errors()
         draft = MapDraft(model, settings.model, limit_px, _FIX, database, search_device=device)
@@ -105,7 +106,8 @@ def map_existing(
             triangulated_anew=photographs.images is not None,
             has_descriptors=landmarks.descriptors is not None,
             cameras=describe_cameras(model),
-            scale=scale if scale.is_metric else MapScale("model"),
+            frame=frame.record(),
+            scale=frame.scale,
         )
         report.save(folder)
     IDENTITY.warn(settings.model, landmarks.mapping_distance_m, poses)

@@ -50,6 +50,12 @@ class MapFrame:
         centers = self.world_from_map.apply(arrays.image_centers)
         return replace(arrays, points=self.world_from_map.apply(arrays.points), image_centers=centers)
 
+    def record(self) -> dict[str, Any]:
+        """Return the frame as JSON values, from which `read_frame` makes it."""
+        similarity = self.world_from_map
+        arrays = {"rotation": similarity.rotation.tolist(), "translation": similarity.translation.tolist()}
+        return {"world_from_map": {"scale": similarity.scale, **arrays}, "gravity": self.gravity}
+
     def describe(self) -> str:
         """State the scale and the direction up in one clause."""
         up = "z" if self.gravity == "model" else f"({_rounded(self.world_from_map.rotation[2])}), {self.gravity}"
@@ -130,6 +136,20 @@ def reported_scale(model_dir: Path) -> MapScale | None:
     if scale is not None or not (model_dir / REPORT_FILE).is_file():
         return scale
     return MapScale("rendered") if "n_landmarks" in read_json_object(model_dir / REPORT_FILE) else None
+
+
+def read_frame(map_dir: Path) -> MapFrame:
+    """Read the own frame of the model that a map was imported from, from its report; `IDENTITY` of other maps.
+
+    Raises MapError if the report is damaged.
+    """
+    scale = read_scale(map_dir)
+    record = {} if scale is None else read_json_object(map_dir / REPORT_FILE).get("frame")
+    if scale is None or not record:
+        return IDENTITY
+    values = record["world_from_map"]
+    similarity = Similarity(values["scale"], np.array(values["rotation"]), np.array(values["translation"]))
+    return MapFrame(similarity, scale, record["gravity"])
 
 
 def median_depths(arrays: ModelArrays, cam_from_world: Float) -> Float:

@@ -108,8 +108,8 @@ class PlanConfig(MappedLattice):
 
     Args:
         scene: name of the scene.
-        start: where the path starts: x, y, z in metres.
-        goal: where it ends: x, y, z in metres.
+        start: where the path starts: x, y, z in the map's own frame, in metres unless --map is in another unit.
+        goal: where it ends.
         out: folder to write; empty for `<data>/<name>/<scene>/path`.
         method: method that scores the views; forward for the shortest path, looking ahead. Empty as for the viewpoint
             map.

@@ -31,9 +31,9 @@ def plan_by_methods(
     goal: ArrayLike,
     config: PlanConfig = PlanConfig(),
 ) -> dict[str, PlannedPath]:
-    """Plan a path from start to goal, (3,) m in the world, by each method, with progress bars.
+    """Plan a path from start to goal, (3,) in the map's own frame, by each method, with progress bars.
 
-    A method plans by its own viewpoint map, whose scores are of views from the centres of voxels. The scores of the
+    Returned paths are in the world: metres, z up. A method plans by its own viewpoint map, whose scores are of views from the centres of voxels. The scores of the
     returned path are of its exact poses, in the scorer's units; NaN for "forward". Its cost is still the planner's. If
     `config.stops` asks for them, paths get stops (`stops_along`) where the method's scores are probabilities; the last
     method's must be.
@@ -49,7 +49,9 @@ def plan_by_methods(
     stopping = config.stops.looks > 1
     if stopping and methods and methods[-1]:
         check_stopping(methods[-1])
-    check_ends(np.asarray([start, goal], dtype=np.float64), space, space.bounds)  # before maps are built
+    world_from_map = scene.frame.world_from_map
+    start, goal = ends = world_from_map.apply([start, goal])
+    check_ends(ends, space, space.bounds, world_from_map.inverse)  # before maps are built
     paths: dict[str, PlannedPath] = {}
     for number, method in enumerate(methods, 1):
         if method == FORWARD:

@@ -16,6 +16,8 @@ from tqdm.auto import tqdm
 from wheretolook.geometry.camera_turns import check_axis
 from wheretolook.geometry.lattices import VoxelGrid, axes_of_angles
 from wheretolook.geometry.poses import Float
+from wheretolook.geometry.similarity import Similarity
+from wheretolook.mapping.map_frame import IDENTITY
 from wheretolook.planning.config import PathConfig
 from wheretolook.planning.routes import IMPROVEMENT, SEARCH, SHORT_ROUTE, PlannedPath, RouteSamples, RouteViews
 from wheretolook.planning.view_sequence import between, lengths_along
@@ -187,8 +189,11 @@ def _short_route(request: PathRequest, budget: _TimeBudget, share: float, max_sh
     return _Problem(request, None).solve([(0.0, 0.0)], *seconds, budget.bar)[:, :3]
 
 
-def check_ends(ends: Float, space: Space, bounds: Float) -> None:
-    """Raise a PlanningError unless start and goal (2, 3) m are different positions in free space."""
+def check_ends(ends: Float, space: Space, bounds: Float, map_from_world: Similarity = IDENTITY.world_from_map) -> None:
+    """Raise a PlanningError unless start and goal (2, 3) m are different positions in free space.
+
+    The error has coordinates of the map.
+    """
     if not np.isfinite(ends).all():
         raise ValueError(f"start and goal must be finite, got {ends.tolist()}")
     low, high = bounds
@@ -197,11 +202,12 @@ def check_ends(ends: Float, space: Space, bounds: Float) -> None:
             there = low + (high - low) * np.random.default_rng(0).random((4096, 3))
             free = there[space.is_free(there)]
             near = free[np.linalg.norm(free - point, axis=1).argsort()[:1]]
-            such = f", such as {','.join(f'{value:.2f}' for value in near[0])}" if len(near) else ""
-            fix = f"Give a point where the camera can be{such}."
-            raise PlanningError(f"the {name} is not in free space", value=tuple(point.tolist()), fix=fix)
+            shown = ",".join(f"{value:.2f}" for value in map_from_world.apply(near[0])) if len(near) else ""
+            fix = f"Give a point where the camera can be{', such as ' * bool(shown)}{shown}."
+            value = tuple(map_from_world.apply(point).round(6).tolist())
+            raise PlanningError(f"the {name} is not in free space", value=value, fix=fix)
     if np.linalg.norm(ends[1] - ends[0]) < SAME_M:
-        raise PlanningError("the start is the goal", value=tuple(ends[0].tolist()))
+        raise PlanningError("the start is the goal", value=tuple(map_from_world.apply(ends[0]).tolist()))
 
 
 def are_separate(request: PathRequest) -> bool:

@@ -15,7 +15,7 @@ from wheretolook import WhereToLook as Exported
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import rotation_angle_deg, rotation_looking_along
-from wheretolook.io.poses import tum_text
+from wheretolook.io.poses import images_text, tum_text
 from wheretolook.scenes.loading import save_glb
 from wheretolook.scorers.base import Scorer
 from wheretolook.select.request import SelectionRequest
@@ -280,12 +280,13 @@ def test_limits_on_pan_are_relative_to_the_heading(look: WhereToLook, tmp_path: 
     np.savetxt(tmp_path / "robot.tum", robot)
     cameras = poses_looking_along(POINTS, np.column_stack([np.cos(2 * half), np.sin(2 * half), np.zeros(4)]))
     (tmp_path / "camera.tum").write_text(tum_text("0123", cameras))
+    (tmp_path / "images.txt").write_text(images_text("0123", cameras))
     table = np.column_stack([POINTS, heading])
     np.savetxt(tmp_path / "at.csv", table, delimiter=",", header="x,y,z,heading_deg", comments="")
     views = look.best(POINTS, 3, heading_deg=heading, pan_deg=(-20, 60))
     pan = (views.yaw_deg - np.repeat(heading, 3) + 180) % 360 - 180
     assert (pan >= -20 - 1e-6).all() and (pan <= 60 + 1e-6).all()
-    for name in ("robot.tum", "camera.tum", "at.csv"):
+    for name in ("robot.tum", "camera.tum", "images.txt", "at.csv"):
         same = look.best(read_waypoints(tmp_path / name), 3, pan_deg=(-20, 60))
         np.testing.assert_allclose(same.cam_from_world, views.cam_from_world, atol=1e-9)
     for options in ({"looks": 3}, {"max_turn_deg": 360.0}, {"max_turn_deg": 360.0, "looks": 3, "least_score": 0.9999}):

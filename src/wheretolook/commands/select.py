@@ -24,6 +24,7 @@ class Select(SelectionRequest, SelectorOptions):
       CSV          columns x, y, z, and id if there is one; with a line of names or without (then x,y,z alone)
       benchmark    "id x y z", the waypoints of the Active Localization Benchmark; or "x y z"
       TUM          "t x y z qx qy qz qw"; the views keep the time stamps
+      COLMAP       images.txt, world-to-camera: the camera centres
       numbers      --at 1,2,1.5 -0.5,2,1.5
 
     Headings (for --pan): the column heading_deg or yaw_deg, or the orientation, of a TUM trajectory or in columns

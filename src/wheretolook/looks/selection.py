@@ -94,7 +94,8 @@ def best_views(
         PlanningError: no such views can be reached.
     """
     if n > len(directions):
-        raise ConfigError(f"there are only {len(directions)} directions to choose from", value=n)
+        fix = "Ask for fewer views, score more directions, or widen the limits."
+        raise ConfigError("there are fewer directions than views", value=f"{len(directions)} for {n}", fix=fix)
     rows = candidates(directions, scores, max(CANDIDATES, n), max_turn_deg, start)
     axes = directions[rows]
     views = candidate_views(scorer, location, axes, scores[rows])

@@ -341,7 +341,7 @@ class WhereToLook:
         needed = request.looks or request.n
         if len(axes) < needed:
             fix = "Ask for fewer views, score more directions, or widen the limit on pitch."
-            raise ConfigError(f"there are only {len(axes)} directions to choose from", value=needed, fix=fix)
+            raise ConfigError("there are fewer directions than views", value=f"{len(axes)} for {needed}", fix=fix)
         return axes
 
     def _within_pan(self, waypoints: Waypoints, axes: Float, request: SelectionRequest) -> NDArray[np.bool_]:
@@ -363,7 +363,7 @@ def _separate_views(axes: Float, scores: Float, request: SelectionRequest) -> ND
     chosen = [separated(axes, order, request.n, request.apart_deg or 0) for order in best]
     if (least := min(map(len, chosen))) < request.n:
         fix = "Ask for fewer views, score more directions, or widen the limits."
-        raise ConfigError(f"a waypoint has only {least} views within the limits", value=request.n, fix=fix)
+        raise ConfigError("a waypoint has too few views within the limits", value=f"{least} of {request.n}", fix=fix)
     return np.array(chosen)
 
 

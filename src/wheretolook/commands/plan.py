@@ -112,7 +112,7 @@ def _summary(path: PlannedPath) -> str:
     from wheretolook.figures.path_film import score_text
     from wheretolook.planning.view_sequence import lengths_along
 
-    text = f"{path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, {len(path.positions)} views"
+    text = f"{path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, views: {len(path.positions)}"
     if not np.isnan(path.scores).any():
         text += f", mean score {score_text(float(np.mean(path.scores)))}"
     if path.stops:

@@ -123,9 +123,9 @@ def finish(command: SelectorOptions, selector: WhereToLook, views: SelectedViews
     scores = views.score[best]
     print(f"{locations}: {n_used}{skipped}; best scores {scores.min():.3g} to {scores.max():.3g}")
     counts = {
-        "best views see no landmark": views.n_visible[best] == 0,
-        "best views are outside the training distribution (column in_range)": ~views.in_range[best],
+        "no visible landmark": views.n_visible[best] == 0,
+        "outside the training distribution (column in_range)": ~views.in_range[best],
     }
     for what, rows in counts.items():
         if rows.any():
-            print(f"{rows.sum()} of the {what}")
+            print(f"best views, {what}: {rows.sum()} of {len(rows)}")

@@ -59,7 +59,7 @@ class Waypoints:
             forward = np.where(axes[:, 2, 2:] > BODY_UPRIGHT, axes[..., 0], axes[..., 2])
             yaw = np.degrees(pan_tilt_angles(forward)[0])
         for row in np.flatnonzero(~np.isfinite(yaw)).tolist():
-            fix = "Give a TUM trajectory or a CSV with the column heading_deg, in Python heading_deg; or leave pan out."
+            fix = "Give a TUM trajectory or a CSV with heading_deg or qw, qx, qy, qz, in Python heading_deg; or leave pan out."
             raise TableError("a limit on pan needs the heading", path=self.path, value=self.where(row), fix=fix)
         return yaw
 

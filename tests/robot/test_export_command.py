@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 
 from box_scenes import furnished_room
@@ -12,9 +13,13 @@ from selection.room import write_room
 from wheretolook.cli import main
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.geometry.similarity import Similarity
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.colmap_model import write_model
 from wheretolook.robot.wheretolook_robot import RobotScorer
 from wheretolook.scenes.loading import save_glb
+from wheretolook.select.where_to_look import WhereToLook
+from wheretolook.utils.errors import MapWarning
 from wheretolook.weights.resolve import load_scorer
 
 WEIGHTS = Path("data/release/weights/set.safetensors").absolute()
@@ -62,3 +67,21 @@ def test_a_mesh_and_the_camera_of_the_robot(model: Path, tmp_path: Path) -> None
 def test_invalid_options(options: tuple[str, ...], model: Path, tmp_path: Path) -> None:
     assert export(model, tmp_path / "robot", *options) == 2
     assert not (tmp_path / "robot").exists()
+
+
+def test_the_robot_gives_positions_in_the_frame_of_the_map(model: Path, tmp_path: Path) -> None:
+    turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # to y down
+    to_map = Similarity(20.0, turn, np.zeros(3))
+    other = pycolmap.Reconstruction(model)
+    to_map.transform_model(other)
+    write_model(other, tmp_path / "other")
+    with pytest.warns(MapWarning):  # the cameras are not level
+        assert export(tmp_path / "other", tmp_path / "robot", "--scale", "0.05") == 0
+    with pytest.warns(MapWarning):
+        look = WhereToLook.from_colmap(
+            tmp_path / "other", weights=WEIGHTS, occlusion="none", directions=100, device="cpu", scale=0.05
+        )
+    expected = look.best(to_map.apply((2.5, 2.5, 1.5)))
+    view = RobotScorer(tmp_path / "robot").best(to_map.apply((2.5, 2.5, 1.5)), directions=100)
+    np.testing.assert_allclose(view.cam_from_world, expected.cam_from_world[0], atol=1e-6)
+    np.testing.assert_allclose(view.score, expected.score[0], atol=1e-4)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from wheretolook.commands.options import CameraOptions
+from wheretolook.mapping.config import FrameOptions
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.shipped import or_shipped
 from wheretolook.utils.validation import check_positive
@@ -14,7 +15,7 @@ MAX_LOCATIONS = 20_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(CameraOptions):
+class Export(CameraOptions, FrameOptions):
     """Export what a robot needs to score views of a map with NumPy and onnxruntime, without PyTorch.
 
     The folder then holds the network (scorer.onnx), the landmarks (landmarks.npz), the camera (robot.json), and
@@ -29,7 +30,7 @@ class Export(CameraOptions):
       cd robot && python -c "from wheretolook_robot import RobotScorer; print(RobotScorer('.').best((1, 2, 1.5)))"
 
     Args:
-        map: folder of a COLMAP model, in metres with z up.
+        map: folder of a COLMAP model; the robot gives and gets positions in its own frame and unit.
         out: folder to write.
         weights: file of weights of the method set; by default the bundled ones for the features of the map.
         database: the map's database, as of `wheretolook select`.
@@ -46,6 +47,7 @@ class Export(CameraOptions):
 
     def __post_init__(self) -> None:
         check_positive("spacing", self.spacing)
+        self.frame_options()
         self.named_camera()
 
     def run(self) -> None:
@@ -55,7 +57,7 @@ class Export(CameraOptions):
         from wheretolook.select.waypoints import grid_waypoints
         from wheretolook.weights.resolve import resolve_weights
 
-        files = ColmapFiles(self.map, mesh=self.mesh, database=self.database)
+        files = ColmapFiles(self.map, mesh=self.mesh, database=self.database, frame=self.frame_options())
         occlusion = "none" if self.mesh is None else "mesh"
         environment = ColmapEnvironment(files, self.named_camera(), occlusion=occlusion)
         source = environment.localization_map
@@ -71,6 +73,7 @@ class Export(CameraOptions):
         weights = or_shipped(self.weights) if self.weights else resolve_weights("set", None, source.landmarks.features)
         assert weights is not None
         export_robot(source.of_camera(camera), weights, self.out, locations)
+        print(source.frame.describe())
         print(f"{len(source.landmarks):,} landmarks, a camera of {camera.width} x {camera.height} px: {self.out}")
         if locations is None:
             print("without --mesh the robot sees landmarks through walls")

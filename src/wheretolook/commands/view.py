@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wheretolook.commands.options import CameraOptions
+from wheretolook.mapping.config import FrameOptions
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.validation import reject
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(CameraOptions):
+class View(CameraOptions, FrameOptions):
     """View a scene or your own map in the browser, with the score of every view.
 
     The page shows mesh or landmarks, mapping cameras, and free space at one height, coloured by the best score at each
@@ -44,7 +45,7 @@ class View(CameraOptions):
         scene: a scene of a dataset, as `wheretolook map` leaves it.
         data: folder of the datasets.
         name: dataset of the scene, if several have such a scene.
-        map: instead, folder of a COLMAP model, in metres with z up.
+        map: instead, folder of a COLMAP model.
         mesh: a mesh of the map's scene (GLB, OBJ, PLY) in its frame.
         images: its photographs, shown next to views.
         path: a path to play.
@@ -79,12 +80,17 @@ class View(CameraOptions):
     device: str = "auto"
 
     def __post_init__(self) -> None:
-        of_map = self.mesh is not None or self.images is not None or self.camera_id is not None
+        own = (self.mesh, self.images, self.camera_id, *vars(self.frame_options()).values())
+        of_map = any(value is not None for value in own)
         record = self.record
         film = self.film
         reject(
             ((self.map is None) == (self.scene is None), "what is viewed is given by either --scene or --map", None),
-            (self.scene is not None and of_map, "--mesh, --images and --camera-id belong to --map", self.scene),
+            (
+                self.scene is not None and of_map,
+                "--mesh, --images, --camera-id and the map's scale and up belong to --map",
+                self.scene,
+            ),
             (record is not None and film is not None, "give either --record or --film", None),
             (record is not None and record.suffix != ".rrd", "a Rerun recording is a .rrd", str(record)),
             (film is not None and film.suffix not in (".webp", ".gif"), "a film is a .webp or a .gif", str(film)),
@@ -107,10 +113,9 @@ class View(CameraOptions):
         state = ViewState.parse(self.state)
         if self.method:
             state = replace(state, method=self.method)
-        paths = {} if self.path is None else read_paths(self.path, self.pair)
         viewed = self._open()
-        place = viewed.environment.frame.world_from_map.apply_to_poses
-        viewed.paths = {name: replace(path, cam_from_world=place(path.cam_from_world)) for name, path in paths.items()}
+        if self.path is not None:
+            viewed.paths = read_paths(self.path, self.pair, viewed.frame.world_from_map)
         if state.method and state.method not in viewed.weights.methods:
             fix = f"Use {', '.join(viewed.weights.methods)}."
             raise ConfigError("there is no such method here, or no weights of it", value=state.method, fix=fix)
@@ -161,7 +166,8 @@ class View(CameraOptions):
         device = usable_device(self.device)
         camera = self.named_camera()
         if self.map is not None:
-            return open_map(self.map, self.mesh, camera, self.images, self.weights, device, self.data)
+            given = (self.mesh, camera, self.images, self.weights, device, self.data, self.frame_options())
+            return open_map(self.map, *given)
         assert self.scene is not None and not isinstance(camera, int)
         return open_scene(self.data, self.scene, self.name, camera, self.weights, device)
 

@@ -29,6 +29,10 @@ class Similarity:
         rotation = poses[..., :3] @ self.rotation.T
         return np.concatenate([rotation, self.scale * poses[..., 3:] - rotation @ self.translation[:, None]], axis=-1)
 
+    def record(self) -> dict[str, Any]:
+        """Return it as JSON values."""
+        return {"scale": self.scale, "rotation": self.rotation.tolist(), "translation": self.translation.tolist()}
+
     @property
     def inverse(self) -> Similarity:
         """The similarity from target to source."""

@@ -71,6 +71,7 @@ def export_robot(
         "unoccluded": _unoccluded(localization_map, places, progress),
     }
     about = {"n_landmarks": len(landmarks), "weights_sha256": sha256(weights), **_description(trained, camera)}
+    about["world_from_map"] = localization_map.frame.world_from_map.record()
     write_bytes(out / "scorer.onnx", content)
     save_npz(out / "landmarks.npz", arrays)
     copy_file(Path(__file__).with_name("wheretolook_robot.py"), out / "wheretolook_robot.py")

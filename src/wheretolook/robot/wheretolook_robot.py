@@ -10,7 +10,8 @@ This file needs NumPy and onnxruntime, neither PyTorch nor the rest of wheretolo
         attributes  (N, M) float32, attributes of each landmark; NaN if unknown
         places      (L, 3) float64, locations with known occlusion; L = 0 without
         unoccluded  (L, ceil(N / 8)) uint8, bits packed by `numpy.packbits`: 1 if the landmark is unoccluded
-    robot.json      camera, names of the attributes, range of the training views
+    robot.json      camera, names of the attributes, range of the training views, and the similarity from the map's own
+                    frame to the world
 
 Usage, in that folder:
 
@@ -21,8 +22,9 @@ Usage, in that folder:
     view.direction, view.score              # where to look, and the probability to localize
     scorer.score(cam_from_world)            # (B,) for poses (B, 3, 4)
 
-Frames and units. The world is the map's: metres, z up. The camera's x axis is right, y down, z forward (OpenCV, COLMAP,
-the optical frame of ROS). A pose is the matrix `cam_from_world` = [R | t], (3, 4): a world point p is at R p + t in the
+Frames and units. Positions and poses are given and returned in the map's own frame and unit, which a similarity relates
+to the world: metres, z up. Pitch is that of the world. The camera's x axis is right, y down, z forward (OpenCV, COLMAP,
+the optical frame of ROS). A pose is the matrix `cam_from_world` = [R | t], (3, 4): a point p of the map is at R p + t in the
 camera, whose centre is -R^T t. Pixel (0.5, 0.5) is the centre of the top-left pixel. Focal lengths are in pixels,
 quaternions are xyzw as in ROS. The camera is a pinhole; for a lens with distortion, that of its rectified images.
 
@@ -73,9 +75,9 @@ class Views:
 class BestView:
     """The best view at a location; fields as in `Views`."""
 
-    direction: Array  # (3,) unit optical axis in the world
+    direction: Array  # (3,) unit optical axis in the map
     cam_from_world: Array  # (3, 4) pose without roll
-    quaternion_xyzw: Array  # (4,) orientation of the optical frame in the world, as in ROS
+    quaternion_xyzw: Array  # (4,) orientation of the optical frame in the map, as in ROS
     score: float
     n_visible: int
     expected_inliers: float
@@ -140,6 +142,12 @@ class RobotScorer:
             if not all(low <= high for low, high in self._range.values()):
                 raise ValueError(f"the range of the training views is not ascending: {self._range}")
             self._serves_camera = bool(about["serves_camera"])
+            frame = about["world_from_map"]
+            self._scale = float(frame["scale"])  # metres in a unit of the map
+            self._rotation = np.array(frame["rotation"], dtype=np.float64).reshape(3, 3)
+            self._translation = np.array(frame["translation"], dtype=np.float64).reshape(3)
+            if not (0 < self._scale < np.inf and np.isfinite([*self._rotation, self._translation]).all()):
+                raise ValueError(f"world_from_map is no similarity: {frame}")
             return n_landmarks
         except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
             problem = f"{error} is missing" if isinstance(error, KeyError) else str(error)
@@ -183,8 +191,8 @@ class RobotScorer:
         poses = poses[None] if poses.ndim == 2 else poses
         if poses.shape[1:] != (3, 4) or not np.isfinite(poses).all():
             raise ValueError(f"cam_from_world must be finite, (B, 3, 4), not {poses.shape}")
-        rotations = poses[:, :, :3]
-        centers = -np.einsum("bji,bj->bi", rotations, poses[:, :, 3])
+        centers = self._to_world(-np.einsum("bji,bj->bi", poses[:, :, :3], poses[:, :, 3]))
+        rotations = poses[:, :, :3] @ self._rotation.T
         # consecutive views at one location share what depends on the location
         moved = (np.abs(np.diff(centers, axis=0)) > 1e-8).any(axis=1)
         firsts = [0, *(np.flatnonzero(moved) + 1).tolist(), len(poses)] if len(poses) else []
@@ -199,7 +207,7 @@ class RobotScorer:
         unoccluded: ArrayLike | None = None,
         pitch_deg: tuple[float, float] = (-90.0, 90.0),
     ) -> BestView:
-        """Return the view with the highest score at a position (3,) m.
+        """Return the view with the highest score at a position (3,) of the map.
 
         `directions` are (D, 3), or a number of directions evenly spread over the sphere; only those with a pitch within
         `pitch_deg` (0 is level, 90 up) count. For `unoccluded` see `views`. Raises ValueError if no direction is left,
@@ -207,7 +215,7 @@ class RobotScorer:
         """
         at = np.asarray(position, dtype=np.float64)
         if at.shape != (3,) or not np.isfinite(at).all():
-            raise ValueError(f"a position is three finite numbers in metres, not {position!r}")
+            raise ValueError(f"a position is three finite numbers, not {position!r}")
         along = fibonacci_sphere(directions) if isinstance(directions, int) else np.asarray(directions, np.float64)
         lengths = np.linalg.norm(along, axis=1, keepdims=True)
         if not ((lengths > 0) & np.isfinite(lengths)).all():
@@ -218,12 +226,17 @@ class RobotScorer:
         if len(along) == 0:
             raise ValueError(f"no direction has a pitch within {pitch_deg} degrees")
         rotations = rotations_looking_along(along)
-        views = self._views_at(at, rotations, unoccluded)
+        views = self._views_at(self._to_world(at), rotations, unoccluded)
         first = int(np.argmax(views.score))
-        pose = np.concatenate([rotations[first], -rotations[first] @ at[:, None]], axis=1)
-        quaternion = quaternion_xyzw(rotations[first].T)
+        rotation = rotations[first] @ self._rotation
+        pose = np.concatenate([rotation, -rotation @ at[:, None]], axis=1)
+        quaternion = quaternion_xyzw(rotation.T)
         report = (getattr(views, field.name)[first].item() for field in fields(Views))
-        return BestView(along[first], pose, quaternion, *report)
+        return BestView(pose[2, :3], pose, quaternion, *report)
+
+    def _to_world(self, points: Array) -> Array:
+        """Transform points (..., 3) of the map to the world."""
+        return self._scale * points @ self._rotation.T + self._translation
 
     def _views_at(self, center: Array, rotations: Array, unoccluded: ArrayLike | None) -> Views:
         """Score views at one location (3,) m with cam_from_world rotations (D, 3, 3)."""

@@ -11,6 +11,7 @@ import numpy as np
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import axes_of_angles
 from wheretolook.geometry.poses import Float, poses_looking_along, quaternion_from_rotation, rotation_from_quaternion
+from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.view import drawing
 from wheretolook.view.controls import value_of
@@ -66,7 +67,7 @@ class LocationView:
         session.location = location
         session.update(place=tuple(position.tolist()))
         self._draw_location(location)
-        session.controls.summary.content = describe(location, session.state.threshold)
+        session.controls.summary.content = describe(location, session.state.threshold, session.viewed.frame)
         self.turn_to(location.best.axes[0] if angles is None else axes_of_angles(angles))
         session.controls.view.max = max(2, len(location.best))
 
@@ -183,12 +184,12 @@ def describe_reasons(counts: ReasonCounts) -> str:
     return f"of these {of_visible}; {counts.n_occluded[0]:,} more are occluded"
 
 
-def describe(location: ScoredLocation, threshold: float) -> str:
-    """Summarize the scores of a location."""
-    x, y, z = location.position
+def describe(location: ScoredLocation, threshold: float, frame: MapFrame) -> str:
+    """Summarize the scores of a location, whose coordinates are shown in the map's own frame."""
+    x, y, z = frame.world_from_map.inverse.apply(location.position)
     median = float(np.median(location.scores))
     median_text = f"{median:.2f}" if 0 <= median <= 1 else f"{median:.3g}"
-    summary = f"At {x:.2f}, {y:.2f}, {z:.2f} m: best {location.best.score[0]:.3g}, median {median_text}"
+    summary = f"At {x:.2f}, {y:.2f}, {z:.2f}: best {location.best.score[0]:.3g}, median {median_text}"
     if location.scores.max() > 1:
         return f"{summary}."
     return f"{summary}; {100 * np.mean(location.scores >= threshold):.0f} % of directions reach {threshold:.2f}."

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
+from wheretolook.geometry.similarity import Similarity
+from wheretolook.mapping.map_frame import IDENTITY
 from wheretolook.planning.config import FORWARD
 from wheretolook.utils.errors import TableError
 
@@ -38,10 +40,10 @@ Paths = dict[str, RecordedPath]
 """Paths by method."""
 
 
-def read_paths(path: Path, pair: int = 0) -> Paths:
+def read_paths(path: Path, pair: int = 0, world_from_map: Similarity = IDENTITY.world_from_map) -> Paths:
     """Read the views along a path by method; of compared paths those of one start-goal pair.
 
-    A single path is accompanied by `FORWARD`: the same locations seen by a camera that looks ahead. Raises TableError
+    Poses are moved from the map's own frame to the world. A single path is accompanied by `FORWARD`: the same locations seen by a camera that looks ahead. Raises TableError
     if the file is missing or has no valid poses.
     """
     from wheretolook.io.poses import read_poses
@@ -59,6 +61,8 @@ def read_paths(path: Path, pair: int = 0) -> Paths:
         finite = (np.abs(along.cam_from_world) < MAX_COORDINATE_M).all()  # False for NaN
         if not 2 <= len(along) <= MAX_POSES or not finite:
             raise TableError(f"a path has 2 to {MAX_POSES} finite poses", path=path, value=len(along), fix=_FIX)
+    place = world_from_map.apply_to_poses
+    paths = {name: replace(along, cam_from_world=place(along.cam_from_world)) for name, along in paths.items()}
     if len(paths) == 1:
         (only,) = paths.values()
         return {FORWARD: RecordedPath(looking_ahead(camera_centers(only.cam_from_world))), **paths}

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.geometry.similarity import Similarity
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.images import image_size
 
@@ -26,7 +27,7 @@ class Photographs:
     cam_from_world: Float  # (M, 3, 4)
 
     @classmethod
-    def of_model(cls, model: Path, folder: Path) -> Self | None:
+    def of_model(cls, model: Path, folder: Path, world_from_map: Similarity) -> Self | None:
         """Collect the registered images of a COLMAP model that exist in a folder; None if none does."""
         from wheretolook.mapping.colmap_model import read_model
         from wheretolook.mapping.sources import has_image
@@ -34,7 +35,8 @@ class Photographs:
         images = read_model(model).images.values()
         shown = [image for image in images if image.has_pose and has_image(folder, image.name)]
         poses = [image.cam_from_world().matrix() for image in shown]
-        return cls(folder, tuple(image.name for image in shown), np.array(poses)) if shown else None
+        names = tuple(image.name for image in shown)
+        return cls(folder, names, world_from_map.apply_to_poses(poses)) if shown else None
 
     def nearest(self, pose: Float) -> int:
         """Return the number of the photograph nearest to a view (3, 4), by distance plus weighted rotation."""

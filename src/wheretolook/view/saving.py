@@ -82,7 +82,8 @@ class WaypointList:
 
     def _draw(self) -> None:
         session = self.session
-        rows = [f"{k + 1}. {x:.2f}, {y:.2f}, {z:.2f}" for k, (x, y, z) in enumerate(self.points)]
+        places = session.viewed.frame.world_from_map.inverse.apply(self.points) if self.points else ()
+        rows = [f"{k + 1}. {x:.2f}, {y:.2f}, {z:.2f}" for k, (x, y, z) in enumerate(places)]
         session.controls.waypoints.content = "\n".join(rows) or "No waypoints yet."
         session.add_points("/waypoints", np.array(self.points), WAYPOINT_COLOR, 0.35 * session.viewed.marker_m)
 
@@ -97,7 +98,8 @@ class WaypointList:
         session = self.session
         views = []
         for selected in views_at(session.selector, points, session.state.n, format):
-            views.append(selected)
+            place = session.viewed.frame.world_from_map.inverse.apply_to_poses
+            views.append(replace(selected, cam_from_world=place(selected.cam_from_world), frame=session.viewed.frame))
             yield  # to other jobs
         content = views_file(views, format)
         session.client.send_file_download(f"views{FILES[format][1]}", content, save_immediately=True)

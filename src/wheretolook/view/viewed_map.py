@@ -20,6 +20,8 @@ from wheretolook.dataset.environment import (
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.mapping.config import FrameOptions
+from wheretolook.mapping.map_frame import IDENTITY, MapFrame
 from wheretolook.utils.errors import MapError, TableError, WhereToLookError
 from wheretolook.utils.shipped import or_shipped
 from wheretolook.view import drawing
@@ -66,6 +68,7 @@ class ViewedMap:
         self.paths: Paths = {}  # to play
         self.landmarks = environment.landmarks
         self.camera = environment.camera
+        self.frame = environment.frame  # the map's own, of coordinates that are read, shown or saved
         self.mapping_poses = environment.mapping_poses  # (M, 3, 4) cam_from_world
         self.mesh = environment.mesh if environment.has_mesh else None
         self.space = environment.space if environment.has_mesh else environment.mapped_space
@@ -193,8 +196,9 @@ def open_map(
     weights: Path | None = None,
     device: str = "cpu",
     data: Path = Path("data"),
+    frame: FrameOptions = FrameOptions(),
 ) -> ViewedMap:
-    """Open a COLMAP model in metres with z up, a mesh in its frame, and the folder of its images.
+    """Open a COLMAP model, a mesh in its frame, and the folder of its images.
 
     By default views are scored by weights adapted to the model in the folder `data`, or by bundled ones.
 
@@ -207,14 +211,14 @@ def open_map(
     from wheretolook.mapping.sanity import warn_of_mesh
 
     config = EnvironmentConfig(occlusion_cache_bytes=OCCLUSION_BYTES)
-    environment = ColmapEnvironment(ColmapFiles(path, mesh), camera, config=config, device=device)
+    environment = ColmapEnvironment(ColmapFiles(path, mesh, frame=frame), camera, config=config, device=device)
     landmarks = environment.landmarks
     if len(landmarks) == 0:
         raise MapError("the map has no landmarks", path=path, fix="Map it again.")
     if mesh is not None:
         warn_of_mesh(mesh, landmarks.points, environment.raycaster)
     own = {"given": or_shipped(weights)} if weights else map_weights(path, data, landmarks)
-    return ViewedMap(environment.name, environment, own, photographs=_photographs(path, images))
+    return ViewedMap(environment.name, environment, own, photographs=_photographs(path, images, environment.frame))
 
 
 def open_scene(
@@ -250,11 +254,13 @@ def open_scene(
     return ViewedMap(files.name, environment, own, labels, _photographs(files.map))
 
 
-def _photographs(model: Path, folder: Path | None = None) -> Photographs | None:
+def _photographs(model: Path, folder: Path | None = None, frame: MapFrame = IDENTITY) -> Photographs | None:
     """Find the photographs of a COLMAP model, in a folder or where it was mapped from."""
     from wheretolook.mapping.colmap_model import holds_model
     from wheretolook.mapping.sources import find_photographs
     from wheretolook.view.photographs import Photographs
 
     folder = folder or find_photographs(model)
-    return Photographs.of_model(model, folder) if folder is not None and holds_model(model) else None
+    return (
+        Photographs.of_model(model, folder, frame.world_from_map) if folder is not None and holds_model(model) else None
+    )

@@ -177,6 +177,15 @@ def test_nearest(wrong: str, meant: str | None) -> None:
     assert nearest(wrong, ["mapping.n_images", "label.localizer.max_ratio", "sample.grid"]) == meant
 
 
+def test_an_option_has_one_value() -> None:
+    with pytest.raises(ConfigError):
+        parse_command("select", ["--map", "m", "--at", "1,2,3", "--out", "v.csv", "--scale", "1", "--scale", "2"])
+    assert (
+        parse_command("select", ["--map", "m", "--at", "1,2,3", "--out", "v.csv", "--scale", "2", "--scale", "2"]).scale
+        == 2
+    )
+
+
 @pytest.mark.parametrize(("name", "gpus"), [("cuda", 0), ("cuda:3", 1)])
 def test_a_missing_gpu_is_an_error_before_any_work(
     name: str, gpus: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -168,7 +168,12 @@ def parse_command(name: str, arguments: Sequence[str]) -> Any:
     if not files and command.CONFIG:
         files = [str(shipped(f"configs/{command.CONFIG}.yaml"))]
     set_by_files = [setting for file in files for setting in read_settings(or_shipped(file), types)]
-    settings = [*set_by_files, *((option, value) for option, value in given if option != "config")]
+    options = [(option, value) for option, value in given if option != "config"]
+    chosen: dict[str, str] = {}
+    for option, value in options:
+        if chosen.setdefault(option, value) != value:
+            raise ConfigError(f"--{option} has two values", value=(chosen[option], value), fix="Give it once.")
+    settings = [*set_by_files, *options]
     parser = build_parser(name)
     try:
         parsed = vars(parser.instantiate(parser.parse_args([f"--{option}={value}" for option, value in settings])))

@@ -22,6 +22,7 @@ from wheretolook.holdout.holdout import without
 from wheretolook.holdout.holdout_blocks import KEPT, MIN_REST, choose_blocks, landmarks_kept
 from wheretolook.holdout.photo_map import open_map
 from wheretolook.mapping.colmap_model import model_arrays, observation_matrix, read_model
+from wheretolook.mapping.config import FrameOptions
 from wheretolook.scorers.adapted.network import AdaptedNetwork
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.trained_network import TrainedNetwork
@@ -40,7 +41,7 @@ def corridor(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 @pytest.fixture(scope="module")
 def checked(corridor: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("checked") / "out"
-    run(_arguments(*corridor, out, "--metres", "--also", "bins"))
+    run(_arguments(*corridor, out, "--scale", "1", "--also", "bins"))
     return out
 
 
@@ -87,7 +88,7 @@ def test_landmarks_are_triangulated_without_the_removed_photographs(corridor: tu
 
 
 def test_blocks_share_out_all_photographs_and_grow(corridor: tuple[Path, Path]) -> None:
-    source = open_map(*corridor, metric=True)
+    source = open_map(*corridor, frame=FrameOptions(scale=1))
     blocks = choose_blocks(source)
     parts = [block for block in blocks if block.is_part]
     assert len(parts) == 8 and 8 <= len(blocks) <= 12
@@ -144,7 +145,7 @@ def test_adapted_weights_are_checked_on_their_own_map_alone(
     network = AdaptedNetwork(base.network, base.scale, base.offset, 1.0, 4.0, 0, 256)  # changes no score
     points = np.array([point.xyz for _, point in sorted(read_model(corridor[0]).points3D.items())])
     path = tmp_path / "adapted.safetensors"
-    arguments = [*_arguments(*corridor, tmp_path / "out", "--metres"), "--weights", str(path)]
+    arguments = [*_arguments(*corridor, tmp_path / "out", "--scale", "1"), "--weights", str(path)]
     for offset_m in (0.0, 0.5):
         network.place = torch.from_numpy(points[:: len(points) // 256][:256] + offset_m)
         TrainedNetwork("adapted", network, base.camera, 1.0, 0.0, base.training_range).save(path, {"scene": "corridor"})
@@ -181,7 +182,7 @@ def test_finished_blocks_are_reused(checked: Path, corridor: tuple[Path, Path], 
     (work / "02" / "views.json").unlink()
     (work / "03" / "landmarks.npz").write_bytes(b"half a file")
     cached = (work / "01" / "views.json").stat().st_mtime_ns
-    run(_arguments(*corridor, tmp_path / "out", "--metres", "--also", "bins"))
+    run(_arguments(*corridor, tmp_path / "out", "--scale", "1", "--also", "bins"))
     for name in ("check.csv", "blocks.csv", "views.csv"):
         assert (tmp_path / "out" / name).read_bytes() == (checked / name).read_bytes(), name
     assert (work / "01" / "views.json").stat().st_mtime_ns == cached
@@ -195,7 +196,7 @@ def test_finished_blocks_are_reused(checked: Path, corridor: tuple[Path, Path], 
     "options, error",
     [
         ([], ConfigError),
-        (["--map", "{sparse}", "--mesh", "scan.glb"], ConfigError),
+        (["--map", "{sparse}", "--scale", "0"], ConfigError),
         (["--map", "{folder}/alone"], MapError),  # no database
         (["--map", "{folder}/nowhere"], MapError),
         (["--map", "{folder}/few/sparse", "--database", "{folder}/few/features.db"], MapError),
@@ -217,7 +218,7 @@ def test_invalid_input(options: list[str], error: type[Exception], corridor: tup
 def test_photographs_without_features_are_extracted_again(tmp_path: Path) -> None:
     write_rendered_room(tmp_path)
     arguments = ["--map", str(tmp_path / "sparse"), "--images", str(tmp_path / "photographs")]
-    arguments += ["--metres", "--workers", "1"]
+    arguments += ["--scale", "1", "--workers", "1"]
     run([*arguments, "--out", str(tmp_path / "out"), "--views", "8"])
     table = pd.read_csv(tmp_path / "out" / "check.csv")
     assert table["localized"].sum() >= 12 and table["n_observed"].median() > 50

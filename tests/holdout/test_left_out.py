@@ -19,6 +19,7 @@ from wheretolook.evaluation.report import score_markdown
 from wheretolook.holdout.holdout import hold_out_blocks
 from wheretolook.holdout.holdout_views import evaluated_photographs
 from wheretolook.holdout.photo_map import WORK, open_map
+from wheretolook.mapping.config import FrameOptions
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import finished_runs
@@ -41,7 +42,7 @@ def checked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]
     folder = tmp_path_factory.mktemp("place")
     sparse, database = write_corridor(folder / "corridor")
     where = ["--data", str(folder / "data"), "--occlusion", "none", "--workers", "1", "--device", "cpu"]
-    run(["--map", str(sparse), "--database", str(database), "--metres", *where])
+    run(["--map", str(sparse), "--database", str(database), "--scale", "1", *where])
     return sparse, database, folder / "data"
 
 
@@ -71,7 +72,7 @@ def test_underconfident_weights_are_adapted_by_photographs(
     assert logged.data.params["photographs"] == str(training["photographs"])
 
     # a check scores with them, on maps of few of the landmarks too, and reports what they were trained on
-    where = ["--map", str(sparse), "--database", str(database), "--metres", "--occlusion", "none", "--workers", "1"]
+    where = ["--map", str(sparse), "--database", str(database), "--scale", "1", "--occlusion", "none", "--workers", "1"]
     run([*where, "--data", str(data), "--device", "cpu", "--weights", str(adapted)])
     content = json.loads((data / "checks" / "corridor" / "check.json").read_text())
     assert content["method"] == "adapted" and content["ece"]["value"] < training["before"]["calibration_error"] / 2
@@ -80,7 +81,7 @@ def test_underconfident_weights_are_adapted_by_photographs(
 def test_photographs_have_their_own_rows(checked: tuple[Path, Path, Path], tmp_path: Path) -> None:
     sparse, database, data = checked
     rendered = make_dataset(tmp_path / "data" / "both", ("test",), n_locations=14, n_directions=16)
-    source = open_map(sparse, database, metric=True)
+    source = open_map(sparse, database, frame=FrameOptions(scale=1))
     blocks = hold_out_blocks(source, data / "checks" / "corridor" / "work")
     photographs = evaluated_photographs(rendered.scenes[0], source, blocks, NoOcclusion())
     config = EvaluateConfig(("random", "visible", "set"), weights=(SET,), resamples=50, top_n=(1,), photographs=True)

@@ -19,6 +19,7 @@ from wheretolook.holdout.photo_map import open_map
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer
 from wheretolook.mapping.colmap_model import colmap_poses, read_model
+from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import load_colmap_landmarks
 
@@ -78,7 +79,7 @@ def test_a_query_is_localized_by_the_images_that_see_the_same(corridor, tmp_path
 
 def test_held_out_photographs_of_a_map_of_learned_features_are_localized(corridor, tmp_path):
     """As `check` does, by what the database holds: nothing is extracted."""
-    source = open_map(corridor, corridor / "database.db", metric=True)
+    source = open_map(corridor, corridor / "database.db", frame=FrameOptions(scale=1))
     block = min(choose_blocks(source), key=lambda block: len(block.held_out))
     (found,) = hold_out_blocks(source, tmp_path, [block])
     assert found.landmarks.features == "aliked"

@@ -162,8 +162,8 @@ class Adapt(SceneOptions, LabelOptions):
 
         log(f"{name}: holding out blocks of photographs")
         given = (self.adapt.images, self.adapt.database)
-        mesh = occlusion.name == "mesh"
-        photographs, held_out = hold_out_photographs(self, "adapt", model, name, True, mesh, given, upright=True)
+        frame = FrameOptions(scale=1, up="z" if occlusion.name == "mesh" else None)
+        photographs, held_out = hold_out_photographs(self, "adapt", model, name, frame, given, upright=True)
         return photographed_views(photographs, held_out, weights, occlusion, self.warp_device)
 
     def _fit(self, target: _Target, views: LocalizedViews, points: Float, log: Log, progress: Progress) -> Path | None:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import os
 import time
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wheretolook.commands.options import OcclusionOptions, ScorerOptions
 from wheretolook.dataset.names import LOCK
 from wheretolook.features.config import ExtractorConfig
-from wheretolook.mapping.config import place_name
-from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.mapping.config import FrameOptions, place_name
+from wheretolook.utils.errors import MapError
 from wheretolook.utils.locks import hold
 from wheretolook.utils.validation import check_range, reject
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check(OcclusionOptions, ScorerOptions):
+class Check(OcclusionOptions, ScorerOptions, FrameOptions):
     """Check how well scores separate good from bad views of your own map, by its own photographs.
 
     Blocks of neighbouring photographs are held out of the map, and localized against what remains. The model's poses
@@ -37,8 +37,8 @@ class Check(OcclusionOptions, ScorerOptions):
 
     Metres: a photograph counts as localized within 5 cm and 0.4 degrees. Where metres are not known, it is 1 % of the
     median depth of the photograph instead of 5 cm, and the map is scored as if its median depth were 5 m. A map of this
-    project knows whether it is in metres; for another, give --metres. A map whose cameras are on their side is
-    turned upright first, unless it has a mesh.
+    project knows whether it is in metres; for another, give --scale (1 for metres), --distance or --positions. A map
+    whose cameras are clearly not level is turned upright first, unless --up states what is up.
 
     Results (--out):
       check.csv    one row for each photograph, blocks.csv for each block, views.csv for each photograph of each block
@@ -47,7 +47,7 @@ class Check(OcclusionOptions, ScorerOptions):
 
     Examples:
       wheretolook check --map sparse/0 --database database.db
-      wheretolook check --map sparse/0 --images photographs --metres
+      wheretolook check --map sparse/0 --images photographs --scale 1
       wheretolook check --scene photographs --weights my/weights/set.safetensors
 
     Args:
@@ -59,7 +59,6 @@ class Check(OcclusionOptions, ScorerOptions):
         images: instead, photographs, to extract features again.
         extractor: extractor for the images: opencv, colmap, aliked, disk or xfeat.
         extractor_weights: weights of a learned extractor; see docs/features.md.
-        metres: the map is in metres.
         out: folder of the results; by default data/checks/<name>.
         also: further methods to check, with the bundled weights.
         views: largest number of photographs of a block that are localized.
@@ -75,7 +74,6 @@ class Check(OcclusionOptions, ScorerOptions):
     images: Path | None = None
     extractor: str | None = None
     extractor_weights: str = ""
-    metres: bool = False
     out: Path | None = None
     also: tuple[str, ...] = ()
     views: int = 60
@@ -92,6 +90,7 @@ class Check(OcclusionOptions, ScorerOptions):
             (extracting and self.images is None, "an extractor needs --images, the photographs", self.extractor),
         )
         self._extractor()
+        self.frame_options()
 
     def _extractor(self) -> ExtractorConfig:
         return ExtractorConfig(self.extractor or "opencv", weights=self.extractor_weights)
@@ -107,7 +106,7 @@ class Check(OcclusionOptions, ScorerOptions):
             check_method(method)
         scene = None if self.scene is None else find_scene(self.data, self.scene, self.name)
         name = "-".join(filter(None, (self.name, self.scene))) if self.map is None else place_name(self.map)
-        if self.map is not None and self.mesh is None:  # with a mesh, missing metres are the first error
+        if self.map is not None:
             model_suffix(self.map)
         # the imports above are light, those below take seconds
         from wheretolook.figures.style import save_figure
@@ -148,22 +147,18 @@ class Check(OcclusionOptions, ScorerOptions):
     ) -> tuple[PhotographedMap, OcclusionModel]:
         """Open the map with its photographs' features, and the occlusion model; results go to `work`."""
         from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
-        from wheretolook.holdout.photo_map import features_of, open_map, says_metric
+        from wheretolook.holdout.photo_map import features_of, open_map
         from wheretolook.mapping.sources import find_features, find_photographs
 
         mesh = self.mesh
         model = self.map if scene is None else scene.map
         assert model is not None
-        metric = self.metres or says_metric(model) or not (scene is None or scene.is_photographed)
+        frame = self.frame_options()
+        if scene is not None and not scene.is_photographed:
+            frame = FrameOptions(scale=1, up="z")
         rendered = scene is not None and scene.mesh.is_file()
         if mesh is None and scene is not None and rendered:
             mesh = scene.mesh
-        if mesh is not None and not metric:
-            fix = "Give --metres if it is, or leave --mesh out."
-            raise ConfigError("a mesh is of use only for a map in metres", value=str(mesh), fix=fix)
-        occlusion = ColmapEnvironment(
-            ColmapFiles(model, mesh=mesh), occlusion=self.occlusion or "", device=device
-        ).occlusion
         if rendered and not any((self.images, self.database, find_features(model), find_photographs(model))):
             problem = "neither the features nor the photographs of this map are known"
             fix = "Map the scene again with `wheretolook map --mapping.keep_database true`, which keeps the features."
@@ -171,4 +166,8 @@ class Check(OcclusionOptions, ScorerOptions):
         given = (self.images, self.database)
         folder, features = features_of(model, *given, work, workers, device, self._extractor())
         name = self.scene or place_name(model)
-        return open_map(folder, features, metric, name, keep_frame=mesh is not None), occlusion
+        photographs = open_map(folder, features, name, frame, model)
+        if not photographs.is_metric:  # the depth of landmarks that were triangulated again is another
+            frame = replace(frame, scale=photographs.from_model.scale)
+        files = ColmapFiles(model, mesh=mesh, frame=frame)
+        return photographs, ColmapEnvironment(files, occlusion=self.occlusion or "", device=device).occlusion

@@ -14,6 +14,7 @@ from wheretolook.commands.preconditions import load_dataset, open_scene
 from wheretolook.dataset.dataset_lock import reading, reads_dataset
 from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.mapping.config import FrameOptions
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.store import check_store, kept_if_not_logged
 from wheretolook.utils.errors import MapError
@@ -91,14 +92,13 @@ def list_methods() -> None:
 def held_out_photographs(options: Evaluate, dataset: Dataset, log: Log) -> list[HeldOutPhotographs]:
     """Hold the photographs of the maps of a split's scenes out of these maps."""
     from wheretolook.holdout.holdout_views import evaluated_photographs
-    from wheretolook.holdout.photo_map import says_metric
 
     held_out = []
     for files in filter(knows_photographs, dataset.split(options.evaluate.split)):
         log(f"{files.name}: holding out blocks of photographs")
-        metric = options.mapping.photographs.assume_metric or not files.is_photographed or says_metric(files.map)
-        how = (check_name(options, files), metric, files.mesh.is_file())
-        source, views = hold_out_photographs(options, "evaluate", files.map, *how)
+        metric = options.mapping.photographs.assume_metric or not files.is_photographed
+        frame = FrameOptions(scale=1 if metric else None, up="z" if files.mesh.is_file() else None)
+        source, views = hold_out_photographs(options, "evaluate", files.map, check_name(options, files), frame)
         occlusion = open_scene(options, files).occlusion
         held_out.append(evaluated_photographs(files, source, views, occlusion, options.warp_device))
     if not held_out:

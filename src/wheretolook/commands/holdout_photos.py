@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from wheretolook.commands.options import LabelOptions
 from wheretolook.dataset.layout import SceneFolder
+from wheretolook.mapping.config import FrameOptions
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.locks import hold
 
@@ -37,8 +38,7 @@ def hold_out_photographs(
     stage: str,
     model: Path,
     name: str,
-    metric: bool,
-    keep_frame: bool,
+    frame: FrameOptions,
     given: tuple[Path | None, Path | None] = (None, None),
     upright: bool = False,
 ) -> tuple[PhotographedMap, list[HoldoutResult]]:
@@ -57,7 +57,7 @@ def hold_out_photographs(
     try:
         with hold(out / ".lock", stage):
             folder, features = features_of(model, *given, out / WORK, workers, device)
-            source = open_map(folder, features, metric, name, keep_frame=keep_frame)
+            source = open_map(folder, features, name, frame, model)
             if upright and source.is_turned:
                 fix = "Make a scene of it: `wheretolook map --name NAME --model SPARSE --up level`."
                 raise MapError("the map is on its side, and this needs z up", path=model, fix=fix)

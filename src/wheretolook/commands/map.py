@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections import Counter
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -74,7 +75,11 @@ class Map(SceneOptions, LabelOptions):
                 progress(1)
             return dataset
         refuse_release(self.root)
-        scene, dataset = (_map_photographs if self.mapping.existing.model is None else _import_model)(self, log)
+        if self.mapping.existing.model is not None:
+            scene, dataset = _import_model(self, log)
+        else:
+            scene = _map_photographs(self, log)
+            dataset = _with_scene(scene, self.root)
         frame = read_frame(scene.map)
         scale = read_scale(scene.map)
         assert scale is not None
@@ -142,10 +147,10 @@ def _seed(scene: SceneFolder) -> int:
     return zlib.crc32(scene.name.encode()) % 2**31
 
 
-def _map_photographs(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
+def _map_photographs(options: Map, log: Log) -> SceneFolder:
     """Map the photographs in `mapping.photographs.images`: `<scene>/map/`, with finished steps in `<scene>/photographs/`.
 
-    Returns the scene, and the dataset with it. Raises what `map_photographs` does.
+    Returns the scene, with the camera of most photographs unless one is configured. Raises what `map_photographs` does.
     """
     from wheretolook.mapping.photographs import list_photographs
 
@@ -153,7 +158,7 @@ def _map_photographs(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     folder = settings.images
     assert folder is not None
     scene = _new_scene(options, settings.name or place_name(folder))
-    dataset = _with_scene(scene, options.root)
+    _with_scene(scene, options.root)
     tables = [path for path in (settings.scale.marker_table, settings.scale.positions) if path is not None]
     for path in tables:
         if not path.is_file():
@@ -164,7 +169,7 @@ def _map_photographs(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     cache = scene.stage_cache("map", cache_key("map", [*used, options.mapping.keep_database, _seed(scene), *made_from]))
     if cache.is_current(scene.landmarks, scene.mapping_cameras):
         log(f"{scene.name}: reusing {scene.map}")
-        return scene, dataset
+        return _with_mapping_camera(options, scene)
     from wheretolook.mapping.photograph_map import map_photographs
 
     how = (scene.folder / "photographs", _seed(scene), options.n_workers, options.warp_device)
@@ -174,7 +179,7 @@ def _map_photographs(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     log(f"{scene.name}: {report.n_landmarks:,} landmarks from {used_images} -> {scene.map}")
     if report.unregistered:
         log(f"{scene.name}: not placed: {', '.join(report.unregistered)}")
-    return scene, dataset
+    return _with_mapping_camera(options, scene)
 
 
 def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
@@ -234,6 +239,18 @@ def _new_scene(options: Map, name: str) -> SceneFolder:
     """Return the scene of photographs or of a model. Raises ConfigError if the name cannot be a folder's."""
     check_folder_name("a scene's name, mapping.photographs.name or mapping.existing.name,", name, NOT_SCENES)
     return SceneFolder(options.root / name, "test", options.camera.camera)
+
+
+def _with_mapping_camera(options: Map, scene: SceneFolder) -> SceneFolder:
+    """Return the scene with the camera that took most of its photographs, unless the options configure one."""
+    from wheretolook.mapping.colmap_model import camera_of_model, read_model
+
+    if options.camera != CameraConfig():
+        return scene
+    model = read_model(scene.map)
+    taken = Counter(image.camera_id for image in model.images.values() if image.has_pose)
+    ((number, _),) = taken.most_common(1)
+    return replace(scene, camera=camera_of_model(model, scene.map, number), own_camera=True)
 
 
 def _with_own_camera(scene: SceneFolder, model: Any, settings: ExistingModelConfig) -> SceneFolder:

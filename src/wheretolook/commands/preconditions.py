@@ -12,9 +12,10 @@ from wheretolook.dataset.environment import EnvironmentConfig, SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.names import RELEASE_FILE
 from wheretolook.features.config import ExtractorConfig
-from wheretolook.geometry.camera import CameraConfig
+from wheretolook.geometry.camera import CameraConfig, describe_camera
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError
 from wheretolook.utils.files import fingerprint
+from wheretolook.utils.logs import LOG
 from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.records import from_record
 
@@ -54,6 +55,8 @@ def open_scene(options: SceneOptions, files: SceneFolder) -> SceneEnvironment:
     """Return a scene of the dataset with a command's occlusion, free space and device; nothing is read yet."""
     scenes = options.scenes
     assume_metric = options.mapping.photographs.assume_metric
+    if files.own_camera:
+        LOG.info("%s: the camera of its map, %s", files.name, describe_camera(files.camera))
     config = EnvironmentConfig(options.occlusion, scenes.free_space, scenes.mapped_space, assume_metric)
     return SceneEnvironment(files, config=config, device=options.device)
 

@@ -43,7 +43,7 @@ def check_figure(report: CheckReport) -> Figure:
 
 def _draw_map(axes: Axes, report: CheckReport) -> None:
     source = report.source
-    points = source.arrays.points / source.from_model.scale
+    points = (source.arrays.points - source.from_model.translation) / source.from_model.scale
     centers = source.own_centers @ source.from_model.rotation.T
     looks = source.poses[:, 2, :3]
     ends = np.concatenate([np.percentile(points[:, :2], (2, 98), axis=0), centers[:, :2]])

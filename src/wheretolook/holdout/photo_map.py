@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from wheretolook.dataset.thresholds import THRESHOLDS
@@ -21,9 +20,7 @@ from wheretolook.localization.versions import versions
 from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_arrays, read_model, registered_names
 from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, PhotographsConfig, place_name
 from wheretolook.mapping.feature_files import DATABASE_FILE, read_descriptors
-from wheretolook.mapping.georeference import read_scale
-from wheretolook.mapping.gravity import estimate_gravity
-from wheretolook.mapping.sanity import up_axis_warning
+from wheretolook.mapping.map_frame import DEPTH_M, IDENTITY, MapFrame, find_frame, median_depths
 from wheretolook.mapping.sources import find_features, find_photographs
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.confine import safe_child
@@ -33,9 +30,6 @@ from wheretolook.utils.logs import LOG
 
 MAX_ERROR_M, MAX_ERROR_DEG = THRESHOLDS[0]  # below both, a photograph counts as localized
 MAX_ERROR_OF_DEPTH = 0.01  # instead of MAX_ERROR_M where metres are unknown: of the photograph's median depth
-DEPTH_M = MAX_ERROR_M / MAX_ERROR_OF_DEPTH
-"""Median depth that a map without metres is scaled to. There the two limits on the position agree, and scorers, which
-were trained in rooms, see distances as in rooms."""
 PLACE_OF_DEPTH = 0.1
 """Views whose cameras are within this share of the map's median depth (0.5 m in a room of 5 m) share a place: what can
 be seen hardly changes within it, so that mostly the direction decides."""
@@ -58,8 +52,7 @@ class PhotographedMap:
         model: `pycolmap.Reconstruction`, turned and scaled.
         arrays: the same as arrays.
         features: COLMAP database or hloc's HDF5 file with keypoints and descriptors of the photographs.
-        is_metric: whether the unit is known to be a metre.
-        from_model: transform from the model's own frame.
+        own_frame: the model's own frame.
         frame: (I,) number, from 0, of the rig frame that each photograph belongs to.
         cameras: of each photograph.
         poses: (I, 3, 4) cam_from_world.
@@ -73,14 +66,23 @@ class PhotographedMap:
     model: Any
     arrays: ModelArrays
     features: Path
-    is_metric: bool
-    from_model: Similarity
+    own_frame: MapFrame
     frame: NDArray[np.int64]
     cameras: tuple[Camera, ...]
     poses: Float
     own_centers: Float
     depth_m: Float
     key: str
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether the scale is known."""
+        return self.own_frame.scale.is_metric
+
+    @property
+    def from_model(self) -> Similarity:
+        """Transform from the model's own frame."""
+        return self.own_frame.world_from_map
 
     @property
     def names(self) -> list[str]:
@@ -108,20 +110,20 @@ class PhotographedMap:
     @property
     def unit(self) -> str:
         """Name of the unit of the model's own frame."""
-        return "m" if self.is_metric else "map units"
+        return "m" if self.is_metric and self.from_model.scale == 1 else "map units"
 
 
 def open_map(
-    model_dir: Path, features: Path, metric: bool, name: str | None = "", keep_frame: bool = False
+    model_dir: Path, features: Path, name: str = "", frame: FrameOptions = FrameOptions(), source: Path | None = None
 ) -> PhotographedMap:
     """Open a COLMAP model and the features that it was built from as a map to check.
 
     Args:
         model_dir: folder of the model.
         features: of its photographs.
-        metric: whether the model is in metres.
         name: for results; by default the model's.
-        keep_frame: whether the model has z up, whatever its cameras look like.
+        frame: how the model's own frame is related to metres with z up.
+        source: folder of the map that the model was triangulated again from, whose report counts.
 
     Raises:
         MapError: the model or the features cannot be used or do not belong together, the features are of an unknown
@@ -140,10 +142,9 @@ def open_map(
         problem = f"half of the photographs observe fewer than {MIN_OBSERVED} landmarks"
         fix = "Give a model with tracks, and the photographs it was made from."
         raise MapError(problem, path=model_dir, value=observed, fix=fix)
-    rotation = np.eye(3) if keep_frame or not up_axis_warning(poses) else estimate_gravity(poses).rotation
-    scale = 1.0 if metric else DEPTH_M / float(np.nanmedian(_median_depths(arrays, poses)))
-    to_frame = Similarity(scale, rotation, np.zeros(3))
-    if scale != 1 or not np.array_equal(rotation, np.eye(3)):
+    own_frame = find_frame(source or model_dir, model, frame, arrays=arrays)
+    to_frame = own_frame.world_from_map
+    if to_frame.record() != IDENTITY.world_from_map.record():
         to_frame.transform_model(model)
         poses = colmap_poses(model_dir, model)
         arrays = model_arrays(model)
@@ -160,14 +161,13 @@ def open_map(
         model=model,
         arrays=arrays,
         features=features,
-        is_metric=metric,
-        from_model=to_frame,
+        own_frame=own_frame,
         frame=np.unique([image.frame_id for image in images], return_inverse=True)[1].reshape(-1).astype(np.int64),
         cameras=tuple(cameras[image.camera_id] for image in images),
         poses=poses,
         own_centers=own_centers,
-        depth_m=_median_depths(arrays, poses),
-        key=cache_key(_fingerprints(model_dir), size_and_time([features.resolve()]), metric, keep_frame),
+        depth_m=median_depths(arrays, poses),
+        key=cache_key(_fingerprints(model_dir), size_and_time([features.resolve()]), own_frame.record()),
     )
 
 
@@ -222,7 +222,7 @@ def features_of(
         return out, out / DATABASE_FILE
     _check_photographs(model, model_dir)
     shutil.rmtree(out, ignore_errors=True)
-    existing = ExistingModelConfig(model=model_dir, frame=FrameOptions(scale=1, up="z"))  # check scales it
+    existing = ExistingModelConfig(model=model_dir, frame=FrameOptions(scale=1, up="z"))  # in its own frame
     photographs = PhotographsConfig(images=images)
     config = MapConfig(existing=existing, photographs=photographs, extractor=extractor, keep_database=True)
     work.mkdir(parents=True, exist_ok=True)
@@ -231,17 +231,3 @@ def features_of(
         map_existing(config, out, work / "photographs", workers=workers, device=device, reconstruction=model)
     cache.store()
     return out, out / DATABASE_FILE
-
-
-def says_metric(model_dir: Path) -> bool:
-    """Whether the report next to a map states that it is in metres."""
-    scale = read_scale(model_dir)
-    return scale is not None and scale.is_metric
-
-
-def _median_depths(arrays: ModelArrays, poses: Float) -> Float:
-    """Median depth (I,) of the landmarks that each image observes, from poses (I, 3, 4); NaN where it observes none."""
-    point = np.repeat(arrays.points, np.diff(arrays.observation_start), axis=0)
-    axis = poses[arrays.observation_image, 2]
-    depth = pd.Series((axis[:, :3] * point).sum(1) + axis[:, 3])
-    return depth.groupby(arrays.observation_image).median().reindex(range(len(poses))).to_numpy()

@@ -116,10 +116,9 @@ class CheckReport:
         if numbers["share_in_range"] < 1:
             lines.append(f"{100 * (1 - numbers['share_in_range']):.0f} % of the views are outside the training range")
         if source.is_turned:
-            lines.append(
-                "the model was turned upright for this; other commands take its z for up: "
-                "`wheretolook map --model` with --up level"
-            )
+            lines.append("the model was turned upright; --up states another direction, --up z keeps the model's")
+        if not source.is_metric:
+            lines.extend(source.own_frame.doubts[:1])
         if not self.parts:
             return [*lines, "no part of the map fails without its neighbours"]
         lines.append(f"photograph again ({len(self.parts)} parts relocalize badly, {source.unit}):")

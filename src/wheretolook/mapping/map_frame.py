@@ -169,7 +169,7 @@ def median_depths(arrays: ModelArrays, cam_from_world: Float) -> Float:
 def _given_scale(model_dir: Path, options: FrameOptions, centers: dict[str, Float]) -> MapScale | None:
     """Return the scale that the options state, by camera centres; None if there is none, or positions give it."""
     if options.scale is not None:
-        return MapScale("given", options.scale)
+        return MapScale("given", float(options.scale))
     if options.distance is None:
         return None
     *ends, distance_m = options.distance

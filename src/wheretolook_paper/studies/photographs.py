@@ -29,12 +29,12 @@ from tqdm.auto import tqdm
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, camera_centers, invert_poses, pose_error
-from wheretolook.holdout.photo_map import open_map, says_metric
+from wheretolook.holdout.photo_map import open_map
 from wheretolook.holdout.report import check_map
 from wheretolook.holdout.scores import Scoring
 from wheretolook.io.depth import read_depth
 from wheretolook.mapping.colmap_model import colmap_poses, holds_model
-from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG, MapConfig, PhotographsConfig
+from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG, FrameOptions, MapConfig, PhotographsConfig
 from wheretolook.mapping.georeference import fit_similarity
 from wheretolook.mapping.map_folder import MapRun
 from wheretolook.mapping.photograph_map import map_photographs
@@ -192,7 +192,9 @@ def main(
             settings = MapConfig(photographs=PhotographsConfig(images=images), extractor=features)
             map_photographs(settings, model, work / "photographs", workers=workers)
     scene = source.resolve().name
-    photo_map = open_map(model, work / "photographs" / "database.db", poses is not None or says_metric(model), scene)
+    photo_map = open_map(
+        model, work / "photographs" / "database.db", scene, FrameOptions(scale=1 if poses is not None else None)
+    )
     scoring = Scoring(weights=weights, also=also)
     result = check_map(photo_map, work / "check" / "work", scoring, workers=workers)
     result.save(work / "check")

@@ -60,7 +60,7 @@ def test_underconfident_weights_are_adapted_by_photographs(
     bundled = TrainedNetwork.load(SET, SetNetwork, "set")
     replace(bundled, offset=bundled.offset - 4).save(tmp_path / "timid.safetensors", read_training(SET))
     before = {path: path.stat().st_mtime_ns for path in data.glob(f"checks/corridor/{WORK}/*/*/views.json")}
-    assert adapt(checked, tmp_path, "--weights", str(tmp_path / "timid.safetensors")) == 0
+    assert adapt(checked, tmp_path, "--scale", "1", "--weights", str(tmp_path / "timid.safetensors")) == 0
     said = capsys.readouterr().out
     adapted = data / "checks" / "corridor" / "adapted.safetensors"
     assert "the adapted weights are better" in said

@@ -27,6 +27,7 @@ from wheretolook.tracking.store import check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError, MapError, OutOfRangeWarning, SceneError, TableError
 from wheretolook.utils.files import fingerprint, storage_errors, write_text
 from wheretolook.utils.locks import hold
+from wheretolook.utils.validation import reject
 from wheretolook.weights.resolve import load_scorer, resolve_weights
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ class _Target:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Adapt(SceneOptions, LabelOptions):
+class Adapt(SceneOptions, LabelOptions, FrameOptions):
     """Adapt the bundled weights to one scene by views localized there; keep them only if they are better.
 
     Uses the photographs of a COLMAP model (--map) or of a scene made of photographs, held out in blocks as `wheretolook
@@ -93,9 +94,11 @@ class Adapt(SceneOptions, LabelOptions):
             ConfigError: no such scene. SceneError: it has neither labels, nor a mesh to render, nor photographs.
             TableError: it has too few viewpoints or photographs, or too few that localize, or that do not.
             WeightsError: the weights to start from are not of the method `set`.
-            MapError: the map is not in metres, or on its side, or its photographs' features are not known.
+            MapError: the map of a scene is not in metres, or its photographs' features are not known.
         """
         config = self.adapt
+        frame = self.frame_options()
+        reject((config.map is None and frame != FrameOptions(), "the map's scale and up belong to --map", vars(frame)))
         if config.map is not None:
             return self._adapt_map(config.map, log, progress)
         refuse_release(self.root)
@@ -111,7 +114,9 @@ class Adapt(SceneOptions, LabelOptions):
                 if files.is_photographed:
                     scene.require_metres()
                 try:
-                    held_out = self._held_out(files.map, check_name(self, files), scene.occlusion, target.weights, log)
+                    frame = FrameOptions(scale=1, up="z")
+                    where = (files.map, check_name(self, files), frame)
+                    held_out = self._held_out(*where, scene.occlusion, target.weights, log)
                     views = held_out if views is None else views.joined(held_out)
                 except MapError as error:
                     if views is None:
@@ -125,19 +130,19 @@ class Adapt(SceneOptions, LabelOptions):
         """Adapt to a COLMAP map by its photographs only."""
         from wheretolook.holdout.photo_map import folder_of_check
         from wheretolook.mapping.colmap_model import model_arrays, read_model
-        from wheretolook.mapping.georeference import read_scale
+        from wheretolook.mapping.map_frame import find_frame
 
         name = place_name(model)
         target = self._target(name, folder_of_check(self.data, name) / "adapted.safetensors")
-        scale = read_scale(model)
-        if scale is not None and not scale.is_metric and not self.mapping.photographs.assume_metric:
-            fix = "Map it with a scale (mapping.photographs.scale), or pass --mapping.photographs.assume_metric true."
-            raise MapError("the map has no scale, and this needs metres", path=model, value=scale.source, fix=fix)
-        points = model_arrays(read_model(model)).points
+        frame = self.frame_options()
         occlusion = "none" if self.occlusion.model == "none" else "hidden-points"
-        files = ColmapFiles(model, frame=FrameOptions(scale=1, up="z"))
-        environment = ColmapEnvironment(files, occlusion=occlusion, device=self.warp_device)
-        views = self._held_out(model, name, environment.occlusion, target.weights, log)
+        reconstruction = read_model(model)
+        arrays = model_arrays(reconstruction)
+        found = find_frame(model, reconstruction, frame, arrays=arrays)
+        points = found.of_arrays(arrays).points
+        log(f"{name}: {found.describe()}")
+        environment = ColmapEnvironment(ColmapFiles(model), occlusion=occlusion, device=self.warp_device)
+        views = self._held_out(model, name, frame, environment.occlusion, target.weights, log)
         _check_enough(views, model)
         with hold(target.path.with_name(f".{target.path.name}.lock"), "adapt"):
             return self._fit(target, views, points, log, progress)
@@ -156,14 +161,15 @@ class Adapt(SceneOptions, LabelOptions):
         check_store(self.tracking)
         return _Target(name, "" if dataset is None else dataset.name, weights, path)
 
-    def _held_out(self, model: Path, name: str, occlusion: OcclusionModel, weights: Path, log: Log) -> LocalizedViews:
+    def _held_out(
+        self, model: Path, name: str, frame: FrameOptions, occlusion: OcclusionModel, weights: Path, log: Log
+    ) -> LocalizedViews:
         """Return a map's photographs, held out in blocks that `wheretolook check` shares."""
         from wheretolook.holdout.holdout_views import photographed_views
 
         log(f"{name}: holding out blocks of photographs")
         given = (self.adapt.images, self.adapt.database)
-        frame = FrameOptions(scale=1, up="z" if occlusion.name == "mesh" else None)
-        photographs, held_out = hold_out_photographs(self, "adapt", model, name, frame, given, upright=True)
+        photographs, held_out = hold_out_photographs(self, "adapt", model, name, frame, given)
         return photographed_views(photographs, held_out, weights, occlusion, self.warp_device)
 
     def _fit(self, target: _Target, views: LocalizedViews, points: Float, log: Log, progress: Progress) -> Path | None:

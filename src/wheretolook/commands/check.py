@@ -170,4 +170,6 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
         if not photographs.is_metric:  # the depth of landmarks that were triangulated again is another
             frame = replace(frame, scale=photographs.from_model.scale)
         files = ColmapFiles(model, mesh=mesh, frame=frame)
-        return photographs, ColmapEnvironment(files, occlusion=self.occlusion or "", device=device).occlusion
+        camera_id = next(iter(photographs.model.cameras))  # occlusion depends on none
+        environment = ColmapEnvironment(files, camera_id, self.occlusion or "", device=device)
+        return photographs, environment.occlusion

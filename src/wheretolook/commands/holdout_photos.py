@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from wheretolook.commands.options import LabelOptions
 from wheretolook.dataset.layout import SceneFolder
 from wheretolook.mapping.config import FrameOptions
-from wheretolook.utils.errors import MapError
 from wheretolook.utils.locks import hold
 
 if TYPE_CHECKING:
@@ -40,13 +39,11 @@ def hold_out_photographs(
     name: str,
     frame: FrameOptions,
     given: tuple[Path | None, Path | None] = (None, None),
-    upright: bool = False,
 ) -> tuple[PhotographedMap, list[HoldoutResult]]:
     """Return a map and its photographs, held out in blocks; finished blocks are shared with `wheretolook check`.
 
-    `given` are the folder of the photographs and the database, if they are not next to the map. `upright` raises
-    MapError if the model's cameras seem to be on their side. See `wheretolook.holdout.photo_map.open_map` for the other
-    arguments and errors.
+    `given` are the folder of the photographs and the database, if they are not next to the map. See
+    `wheretolook.holdout.photo_map.open_map` for the other arguments and errors.
     """
     from wheretolook.holdout.holdout import hold_out_blocks
     from wheretolook.holdout.photo_map import WORK, features_of, folder_of_check, open_map
@@ -58,9 +55,6 @@ def hold_out_photographs(
         with hold(out / ".lock", stage):
             folder, features = features_of(model, *given, out / WORK, workers, device)
             source = open_map(folder, features, name, frame, model)
-            if upright and source.is_turned:
-                fix = "Make a scene of it: `wheretolook map --name NAME --model SPARSE --up level`."
-                raise MapError("the map is on its side, and this needs z up", path=model, fix=fix)
             return source, hold_out_blocks(source, out / WORK, workers=workers, device=device)
     finally:
         with suppress(OSError):  # created for the lock only

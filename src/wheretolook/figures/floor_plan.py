@@ -34,7 +34,7 @@ def floor_plan_figure(landmarks: Float, positions: Float, axes: Float, scores: F
         width, height = (high - low) / (high - low).max()
         figure = new_figure(2 + 7 * max(width, 0.3), 1 + 7 * max(height, 0.3))
         plan = figure.add_subplot()
-        plan.scatter(*drawn[:, :2].T, s=1.5, color=GREY, alpha=0.4, linewidths=0, label="landmarks")
+        plan.scatter(drawn[:, 0], drawn[:, 1], s=1.5, color=GREY, alpha=0.4, linewidths=0, label="landmarks")
         shown = plan.quiver(
             *positions[order, :2].T,
             *arrows[order].T,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.poses import Float
 
@@ -19,15 +19,16 @@ class Similarity:
     rotation: Float  # (3, 3)
     translation: Float  # (3,), in units of the target
 
-    def apply(self, points: ArrayLike) -> Float:
+    def apply(self, points: ArrayLike) -> NDArray[np.float64]:
         """Transform points (..., 3)."""
         return np.asarray(self.scale * np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation)
 
-    def apply_to_poses(self, poses: ArrayLike) -> Float:
+    def apply_to_poses(self, poses: ArrayLike) -> NDArray[np.float64]:
         """Transform cameras from world poses (..., 3, 4) of the source's frame to those of the target's."""
         poses = np.asarray(poses, dtype=np.float64)
         rotation = poses[..., :3] @ self.rotation.T
-        return np.concatenate([rotation, self.scale * poses[..., 3:] - rotation @ self.translation[:, None]], axis=-1)
+        translation = self.scale * poses[..., 3:] - rotation @ self.translation[:, None]
+        return np.asarray(np.concatenate([rotation, translation], axis=-1))
 
     def record(self) -> dict[str, Any]:
         """Return it as JSON values."""

@@ -51,4 +51,4 @@ class ReasonCounter:
             sums = torch.segment_reduce(hard, "sum", lengths=described.counts, axis=0, initial=0.0)
             counts[rows] = sums.cpu().numpy()
         too_far, too_oblique, repeated = counts.T
-        return ReasonCounts(n_occluded, too_far, too_oblique, repeated if self._has_descriptors else repeated * np.nan)
+        return ReasonCounts(n_occluded, too_far, too_oblique, repeated * (1.0 if self._has_descriptors else np.nan))

@@ -121,7 +121,7 @@ def _look(
     table: pd.DataFrame, row: int, cam_from_rig: Float, cameras: Camera | Mapping[int, Camera], n_points: int
 ) -> Look:
     if isinstance(cameras, Mapping):
-        cameras = cameras[int(table[CAMERA_ID].iat[row])] if CAMERA_ID in table else next(iter(cameras.values()))
+        cameras = cameras[table[CAMERA_ID].to_numpy()[row]] if CAMERA_ID in table else next(iter(cameras.values()))
     landmarks = np.asarray(table["matched_rows"].iat[row], dtype=np.int64)
     pixels = np.asarray(table[PIXELS].iat[row], dtype=np.float64).reshape(-1, 2)
     if landmarks.max(initial=0) >= n_points:

@@ -50,7 +50,7 @@ def plan_by_methods(
     if stopping and methods and methods[-1]:
         check_stopping(methods[-1])
     world_from_map = scene.frame.world_from_map
-    start, goal = ends = world_from_map.apply([start, goal])
+    start, goal = ends = world_from_map.apply(np.array([start, goal], dtype=np.float64))
     check_ends(ends, space, space.bounds, world_from_map.inverse)  # before maps are built
     paths: dict[str, PlannedPath] = {}
     for number, method in enumerate(methods, 1):

@@ -306,8 +306,8 @@ class WhereToLook:
 
         frame = self.frame.world_from_map
         landmarks = frame.inverse.apply(self.localization_map.landmarks.points)
-        upright = (points @ frame.rotation.T for points in (landmarks, views.positions, views.axes))
-        return floor_plan_figure(*upright, views.score, views.waypoint_id)
+        points, positions, axes = (points @ frame.rotation.T for points in (landmarks, views.positions, views.axes))
+        return floor_plan_figure(points, positions, axes, views.score, views.waypoint_id)
 
     @cached_property
     def reasons(self) -> ReasonCounter:
@@ -319,7 +319,8 @@ class WhereToLook:
         step = max(1, SIGHT_LINES // max(1, len(self.localization_map.landmarks)))
         poses = self.frame.world_from_map.apply_to_poses(views.cam_from_world)
         parts = [vars(self.reasons.count(poses[row : row + step])) for row in range(0, len(poses), step)]
-        return replace(views, **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+        counts: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return replace(views, **counts)
 
     def _candidate_scores(self, locations: Float, axes: Float, progress: bool) -> Float:
         """Score all directions (D, 3) at locations (L, 3), (L, D)."""

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from wheretolook.geometry.poses import Float, invert_poses, quaternion_from_rotation, rotation_from_quaternion
 from wheretolook.utils.errors import TableError
-from wheretolook.utils.reading import read_text
+from wheretolook.utils.reading import MAX_TEXT_BYTES, read_text
 
 QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
 TRANSLATION_COLUMNS = ("tx", "ty", "tz")
@@ -47,14 +47,14 @@ def poses_of_values(values: ArrayLike) -> Float:
     return np.concatenate([rotation_from_quaternion(table[..., :4]), table[..., 4:, None]], axis=-1)
 
 
-def read_rows(path: Path) -> list[tuple[int, list[str]]]:
-    """Read the rows of a text table as pairs of line number, from 1, and cells; lines starting with # are comments.
+def read_rows(path: Path, text: str | None = None) -> list[tuple[int, list[str]]]:
+    """Read the rows of a text table, or of the `text` that was read from it, as pairs of line number, from 1, and cells; lines starting with # are comments.
 
     If the first row has a semicolon or comma, cells are separated by it and may be quoted; else by blanks. Commas between
     semicolons are decimal points. Raises TableError if the file is missing, no UTF-8 text, too large, or has no rows.
     """
     try:
-        lines = enumerate(map(str.strip, read_text(path).removeprefix("\ufeff").splitlines()), 1)
+        lines = enumerate(map(str.strip, (read_text(path) if text is None else text).splitlines()), 1)
         rows = [*islice(((number, line) for number, line in lines if line and not line.startswith("#")), MAX_ROWS + 1)]
         if not rows:
             raise ValueError("it has no rows")
@@ -104,14 +104,14 @@ class NamedRows:
 
 def read_named_rows(path: Path) -> NamedRows:
     """Read a file in one of `FORMATS`, detected from its first row. Raises TableError if it is missing or another."""
-    rows = []
-    if path.suffix == ".txt":
-        try:
-            rows = _image_rows(path)
-        except (OSError, ValueError) as error:
-            raise TableError(f"the file cannot be read: {error}", path=path, fix="Give a text file of rows.") from error
+    may_be_images = path.suffix == ".txt"
+    try:  # once, since it may be a pipe
+        text = read_text(path, MAX_IMAGES_BYTES if may_be_images else MAX_TEXT_BYTES, pipes=True)
+    except (OSError, ValueError) as error:
+        raise TableError(f"the file cannot be read: {error}", path=path, fix="Give a text file of rows.") from error
+    rows = _image_rows(text) if may_be_images else []
     if not rows or len(rows[0][1]) < len(_IMAGE_COLUMNS):
-        rows = read_rows(path)
+        rows = read_rows(path, text)
     first = rows[0][1]
     names = _FIXED_COLUMNS.get(len(first), ())
     if len(first) > 1 and not any(map(_is_number, first)):
@@ -137,7 +137,12 @@ def read_poses(path: Path) -> NamedPoses:
     A CSV holds x, y, z, qw, qx, qy, qz (world_from_cam) or qw, qx, qy, qz, tx, ty, tz (cam_from_world). Raises
     TableError, with the line, if the file is missing or holds no poses.
     """
-    table = read_named_rows(path)
+    return poses_of_rows(read_named_rows(path))
+
+
+def poses_of_rows(table: NamedRows) -> NamedPoses:
+    """Return the poses in rows (see `read_poses`)."""
+    path = table.path
     quaternions = table.numbers(QUATERNION_COLUMNS)
     lengths = np.linalg.norm(quaternions, axis=1)
     for row in np.flatnonzero(np.abs(lengths - 1) > UNIT_TOLERANCE).tolist():
@@ -150,9 +155,9 @@ def read_poses(path: Path) -> NamedPoses:
     return NamedPoses(table.names, invert_poses(world_from_cam))
 
 
-def _image_rows(path: Path) -> list[tuple[int, list[str]]]:
+def _image_rows(text: str) -> list[tuple[int, list[str]]]:
     """Read the first line of each image in an images.txt; a second one, which may be empty, holds its keypoints."""
-    lines = enumerate(read_text(path, MAX_IMAGES_BYTES).splitlines(), 1)
+    lines = enumerate(text.splitlines(), 1)
     rows = []
     for number, line in lines:
         if line.strip() and not line.startswith("#"):

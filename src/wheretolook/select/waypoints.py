@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation, rotation_from_quaternion
-from wheretolook.io.poses import QUATERNION_COLUMNS, TRANSLATION_COLUMNS, read_named_rows, read_poses
+from wheretolook.io.poses import QUATERNION_COLUMNS, TRANSLATION_COLUMNS, poses_of_rows, read_named_rows
 from wheretolook.utils.errors import ConfigError, SceneError, TableError
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def read_waypoints(path: str | Path) -> Waypoints:
     kinds = (("heading_deg",), ("yaw_deg",), QUATERNION_COLUMNS)
     known = next((table.numbers(kind) for kind in kinds if {*kind} <= {*columns}), None)
     if "x" not in columns and columns.get("qw", len(columns)) < columns["tx"]:  # qw ... tx: world-to-camera, as COLMAP
-        poses = read_poses(Path(path)).cam_from_world
+        poses = poses_of_rows(table).cam_from_world
         points = camera_centers(poses)
         if known is not None and known.shape[1] == 4:
             known = quaternion_from_rotation(np.swapaxes(poses[:, :, :3], 1, 2))

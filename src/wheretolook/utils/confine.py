@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from pathlib import Path, PurePosixPath
 
 from wheretolook.utils.errors import ConfigError
@@ -10,9 +11,10 @@ from wheretolook.utils.errors import ConfigError
 
 def check_folder_name(whose: str, name: str, reserved: tuple[str, ...] = ()) -> None:
     """Raise ConfigError unless a name can be a new folder's and is not reserved."""
-    if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name) or name in reserved:
+    composed = unicodedata.normalize("NFC", name)  # of an accent and a letter, as macOS writes names
+    if not re.fullmatch(r"[\w-]([\w. -]*[\w.-])?", composed) or name in reserved:
         others = f", but not {', '.join(reserved)}" if reserved else ""
-        fix = f"Use letters, digits, '.', '_' and '-'{others}."
+        fix = f"Use letters, digits, spaces, '.', '_' and '-'{others}."
         raise ConfigError(f"{whose} becomes a folder's name", value=name, fix=fix)
 
 

@@ -26,6 +26,14 @@ class WhereToLookError(Exception):
             message += f". {fix}"
         super().__init__(message)
 
+    def __str__(self) -> str:
+        """Return the message; if a file could not be read for lack of permission, that is the message."""
+        cause = self.__cause__
+        while cause is not None and not isinstance(cause, PermissionError):
+            cause = cause.__cause__
+        denied = cause is not None and not isinstance(self, StorageError)
+        return f"{cause.filename or self.path}: Permission denied" if denied else super().__str__()
+
 
 class ConfigError(WhereToLookError):
     """A configuration has an unknown key or a value out of range."""

@@ -12,9 +12,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from wheretolook.utils.errors import StorageError
+from wheretolook.utils.errors import ConfigError, StorageError
 
 STORAGE_FIX = "Free disk space or fix permissions, then run again; finished work is kept."
+MAP_FILES = ("cameras", "images", "points3D", "rigs", "frames", "landmarks")  # without endings
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -38,6 +39,17 @@ def copy_file(source: Path, target: Path) -> None:
     """Copy a file's content with `atomic_write`. Raises OSError if the source cannot be read."""
     with source.open("rb") as file, atomic_write(target) as partial, partial.open("wb") as copy:
         shutil.copyfileobj(file, copy, 2**20)
+
+
+def check_output(path: Path, inputs: Iterable[Path] = ()) -> None:
+    """Raise ConfigError for an output that is a device, pipe, link to a file, an input or its map, or in a dataset."""
+    target = path.resolve()
+    replaced = {target, target.parent if target.stem in MAP_FILES else target}
+    is_special = os.path.lexists(path) and not path.is_dir() and (path.is_symlink() or not path.is_file())
+    in_dataset = any((folder / "dataset.json").is_file() for folder in (target, *target.parents))
+    if is_special or in_dataset or replaced & {given.resolve() for given in inputs}:
+        problem = "an output is a regular file or folder, no device, link to a file or input, and not in a dataset"
+        raise ConfigError(problem, path=path, fix="Give another path.")
 
 
 @contextmanager

@@ -21,10 +21,14 @@ MAX_RATIO = 100  # of expanded to stored bytes of arrays and tables; occlusion o
 FREE_BYTES = 128_000_000  # that any file of arrays may expand to
 
 
-def check_file(path: Path) -> os.stat_result:
-    """Return the status of a regular file. Raises ValueError for a folder, device or pipe, OSError if it is missing."""
+def check_file(path: Path, pipes: bool = False) -> os.stat_result:
+    """Return the status of a regular file or, if `pipes`, of one that the shell opened, such as /dev/stdin.
+
+    Raises ValueError for a folder, device or other pipe, OSError if it is missing.
+    """
     status = os.stat(path)
-    if not stat.S_ISREG(status.st_mode):
+    is_open_pipe = pipes and stat.S_ISFIFO(status.st_mode) and str(path).startswith("/dev/")
+    if not stat.S_ISREG(status.st_mode) and not is_open_pipe:
         raise ValueError("this is no regular file")
     return status
 
@@ -34,14 +38,14 @@ def max_expanded_bytes(n_bytes: int) -> int:
     return max(FREE_BYTES, MAX_RATIO * n_bytes)
 
 
-def read_text(path: Path, at_most: int = MAX_TEXT_BYTES) -> str:
-    """Read a UTF-8 text. Raises ValueError if it is none, no regular file, or has more bytes than `at_most`."""
-    check_file(path)
+def read_text(path: Path, at_most: int = MAX_TEXT_BYTES, pipes: bool = False) -> str:
+    """Read a UTF-8 text, without a byte-order mark (see `check_file`). Raises ValueError if it is none, no regular file, or has more bytes than `at_most`."""
+    check_file(path, pipes)
     with path.open("rb") as file:
         content = file.read(at_most + 1)
     if len(content) > at_most:
         raise ValueError(f"it has more than {at_most:,} bytes")
-    return content.decode("utf-8").replace("\r\n", "\n")
+    return content.decode("utf-8-sig").replace("\r\n", "\n")
 
 
 def parse_json(text: str) -> Any:

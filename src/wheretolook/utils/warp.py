@@ -24,10 +24,13 @@ def start_warp(device: str = "cpu") -> str:
     ConfigError if this machine has no such device.
     """
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-    with _without_driver_warning():
-        wp.init()
     try:
+        with _without_driver_warning():
+            wp.init()
         return str(wp.get_device(device))
+    except OSError as error:
+        fix = "Set WARP_CACHE_PATH to a folder that can be written."
+        raise ConfigError("kernels cannot be compiled here", path=error.filename, fix=fix) from None
     except (ValueError, RuntimeError) as error:
         available = ", ".join(str(found) for found in wp.get_devices())
         raise ConfigError("no such device", value=device, fix=f"Use one of: {available}") from error

@@ -1,0 +1,111 @@
+"""Outputs are regular files or folders, and never inputs; names and permissions are reported as what they are."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from wheretolook.cli import main
+from wheretolook.dataset.dataset_lock import changing
+from wheretolook.select.waypoints import read_waypoints
+from wheretolook.utils.confine import check_folder_name
+from wheretolook.utils.errors import ConfigError, MapError, TableError
+from wheretolook.utils.files import check_output
+from wheretolook.utils.reading import read_text
+
+
+def _fifo(folder: Path) -> Path:
+    os.mkfifo(folder / "fifo")
+    return folder / "fifo"
+
+
+def _link(folder: Path) -> Path:
+    (folder / "real").write_text("kept")
+    (folder / "link").symlink_to("real")
+    return folder / "link"
+
+
+def _in_dataset(folder: Path) -> Path:
+    (folder / "dataset.json").touch()
+    return folder / "room" / "map" / "views.csv"
+
+
+@pytest.mark.parametrize(
+    "make", [_fifo, _link, _in_dataset, lambda _: Path("/dev/null"), lambda f: f / "in", lambda f: f / "in/images.txt"]
+)
+def test_outputs_that_would_destroy_something(make: Callable[[Path], Path], tmp_path: Path) -> None:
+    with pytest.raises(ConfigError):
+        check_output(make(tmp_path), [tmp_path / "in"])
+
+
+def test_usual_outputs(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "linked").symlink_to("real")
+    for name in ("new.csv", "real", "linked", "in/views.csv"):
+        check_output(tmp_path / name, [tmp_path / "in"])
+
+
+def test_commands_check_their_outputs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    waypoints = tmp_path / "at.csv"
+    waypoints.write_text("1,2,3\n")
+    assert main(["select", "--map", str(tmp_path), "--at", str(waypoints), "--out", str(waypoints)]) == 2
+    assert main(["export", "--map", str(tmp_path), "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.count("an output is") == 2
+    assert waypoints.read_text() == "1,2,3\n"
+
+
+def test_scene_names() -> None:
+    for name in ("Büro 2. Stock", "Bu\u0308ro", "room-1"):
+        check_folder_name("a name", name)
+    for name in ("", " a", "a ", ".a", "a/b", "a\n", "a*"):
+        with pytest.raises(ConfigError):
+            check_folder_name("a name", name)
+
+
+def test_waypoints_from_pipes_and_with_byte_order_marks(tmp_path: Path) -> None:
+    reading, writing = os.pipe()
+    os.write(writing, b"x,y,z\n1,2,3\n")
+    os.close(writing)
+    assert read_waypoints(f"/dev/fd/{reading}").points.tolist() == [[1, 2, 3]]
+    os.close(reading)
+    with pytest.raises(TableError):  # of which no shell holds the other end
+        read_waypoints(_fifo(tmp_path))
+    (tmp_path / "bom.csv").write_bytes(b"\xef\xbb\xbfx,y,z\n1,2,3\n")
+    assert read_waypoints(tmp_path / "bom.csv").points.tolist() == [[1, 2, 3]]
+    assert read_text(tmp_path / "bom.csv").startswith("x")
+
+
+def test_permission_denied_is_not_damage() -> None:
+    try:
+        try:
+            raise ValueError("unreadable") from PermissionError(13, "Permission denied", "a.npz")
+        except ValueError as error:
+            raise MapError("damaged", path="a.npz", fix="Remove it.") from error
+    except MapError as error:
+        assert str(error).startswith("a.npz: Permission denied")
+        assert "Remove" not in str(error)
+
+
+def test_links_of_the_user_are_kept(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "a.partial").touch()
+    deep = tmp_path / "set" / "room" / "map"
+    deep.mkdir(parents=True)
+    (deep / "broken").symlink_to("nowhere")
+    (tmp_path / "set" / "linked").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "release").symlink_to("set")
+    with changing(tmp_path / "release", "label"):
+        pass
+    assert (deep / "broken").is_symlink()
+    assert (tmp_path / "elsewhere" / "a.partial").exists()
+
+
+def test_an_unwritable_home_names_the_variable_to_set() -> None:
+    code = "from wheretolook.utils.warp import start_warp; start_warp()"
+    environment = {k: v for k, v in os.environ.items() if k not in ("WARP_CACHE_PATH", "XDG_CACHE_HOME")}
+    run = [sys.executable, "-c", code]
+    done = subprocess.run(run, env=environment | {"HOME": "/dev/null/x"}, capture_output=True, text=True)
+    assert "ConfigError" in done.stderr and "WARP_CACHE_PATH" in done.stderr

@@ -216,6 +216,28 @@ def test_an_interrupt_exits_with_130(monkeypatch: pytest.MonkeyPatch) -> None:
     assert main(["scenes"]) == 130
 
 
+def test_sigterm_is_an_interrupt() -> None:
+    """COLMAP, whose handler of SIGTERM prints a native stack, is imported before it or after it."""
+    code = """
+import time
+from wheretolook import cli
+class Waiting:
+    def run(self):
+        import pycolmap
+        print("ready", flush=True)
+        time.sleep(60)
+cli.parse_command = lambda name, rest: Waiting()
+raise SystemExit(cli.main(["map"]))
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        process.terminate()
+        _, errors = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert errors.decode().strip().startswith("wheretolook: interrupted") and len(errors.splitlines()) == 2
+
+
 def test_debug_shows_the_traceback(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["scenes", "--camera.width", "0", "--debug"]) == 2
     assert "Traceback" in capsys.readouterr().err

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import sys
 import time
 import traceback
@@ -22,6 +23,7 @@ from wheretolook.utils.files import check_output
 from wheretolook.utils.images import MAX_PIXELS
 from wheretolook.utils.logs import quiet_libraries
 from wheretolook.utils.nearest import did_you_mean
+from wheretolook.utils.processes import on_sigterm
 from wheretolook.utils.shipped import or_shipped, shipped, shipped_configs
 from wheretolook.utils.version import VERSION
 
@@ -64,7 +66,7 @@ ENVIRONMENT = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line. Returns the exit code: 0, 2 for bad input, 130 when interrupted."""
+    """Run the command line. Returns the exit code: 0, 2 for bad input, 130 when interrupted by Ctrl-C or SIGTERM."""
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     given = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
@@ -97,6 +99,7 @@ def run_command(arguments: list[str]) -> None:
     else:
         start = time.monotonic()
         command = parse_command(name, rest)
+        on_sigterm(signal.default_int_handler)
         try:
             command.run()
         except ModuleNotFoundError as error:

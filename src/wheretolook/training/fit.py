@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import multiprocessing
 import signal
 import threading
 import time
@@ -193,6 +194,8 @@ def _quiet() -> Iterator[None]:
             yield
     except SystemExit as stop:
         if isinstance(stop.__context__, KeyboardInterrupt):
+            for process in multiprocessing.active_children():  # SIGTERM does not reach them, and Python waits for them
+                process.kill()
             raise KeyboardInterrupt from stop
         raise
     finally:

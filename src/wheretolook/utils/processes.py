@@ -138,6 +138,16 @@ def ignoring_sigint() -> Iterator[None]:
         signal.signal(signal.SIGINT, handler)
 
 
+def on_sigterm(handler: Any) -> None:
+    """Set the handler of SIGTERM in the main thread, in place of COLMAP's own, which prints a native stack."""
+    if in_main_thread():
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
+        import pycolmap  # noqa: F401
+
+        signal.signal(signal.SIGTERM, handler)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGTERM])
+
+
 def in_main_thread() -> bool:
     """Return whether the caller runs in the main thread."""
     return threading.current_thread() is threading.main_thread()
@@ -164,6 +174,7 @@ def _start_worker(numbers: Any, stopped: Connection, started_by_main_thread: boo
             ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     threading.Thread(target=_exit_when_stopped, args=(stopped,), daemon=True).start()
     _number = numbers.get()
+    on_sigterm(signal.SIG_DFL)
     use_one_core()
 
 

@@ -265,7 +265,10 @@ def test_usage_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
 HEAVY = ("torch", "warp", "scipy", "matplotlib", "mlflow", "pandas", "sklearn", "lightning", "cv2")
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["train", "--train.epoch", "10"], ["check", "--scene", "cellar"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [["--help"], ["train", "--train.epoch", "10"], ["check", "--scene", "cellar"], ["view", "--scene", "cellar"]],
+)
 def test_help_and_early_errors_import_nothing_heavy(arguments: list[str], tmp_path: Path) -> None:
     (tmp_path / "data" / "mine" / "hall").mkdir(parents=True)
     dataset = {"camera": {"width": 64, "height": 48, "focal_px": 32.0}, "scenes": [{"name": "hall", "split": "test"}]}

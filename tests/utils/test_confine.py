@@ -39,3 +39,12 @@ def test_datasets_scenes_and_releases_are_in_their_folders(name: str, tmp_path: 
         Experiment(data=tmp_path, name=name)
     with pytest.raises(ConfigError):
         with_also(Dataset(root, (SceneFolder(root / "room", "train"),)), [name])
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[1]", "{}", '{"mapped_floor": 3}', '{"mapped_floor": [[1, 2]]}', '{"mapped_floor": ["abcd"]}']
+)
+def test_a_damaged_description_of_a_scene_is_reported(text: str, tmp_path: Path) -> None:
+    (tmp_path / "scene.json").write_text(text)
+    with pytest.raises(TableError):
+        SceneFolder(tmp_path, "test").mapped_floor()

@@ -148,7 +148,11 @@ class View(CameraOptions, FrameOptions):
             viewer.stop()
 
     def _check_environment(self) -> None:
-        """Raise ConfigError for missing folders, packages and ports, before long imports."""
+        """Raise ConfigError for missing scenes, folders, packages and ports, before long imports."""
+        from wheretolook.dataset.layout import find_scene
+
+        if self.scene is not None and self.data.is_dir():
+            find_scene(self.data, self.scene, self.name)
         from wheretolook.utils.extras import require
         from wheretolook.view.server import check_port
 

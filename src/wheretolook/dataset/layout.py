@@ -126,10 +126,15 @@ class SceneFolder:
         return ArtifactCache(self.folder, key, stage, "stages.json", STAGES)
 
     def mapped_floor(self) -> MappedFloor:
-        """The floor that `save_mapped_floor` wrote."""
+        """The floor that `save_mapped_floor` wrote. Raises TableError if the file is damaged."""
         if not self._description.is_file():
             return ()
-        return tuple((x0, y0, x1, y1) for x0, y0, x1, y1 in read_json_object(self._description)["mapped_floor"])
+        try:
+            floor = read_json_object(self._description)["mapped_floor"]
+            return tuple((float(x0), float(y0), float(x1), float(y1)) for x0, y0, x1, y1 in floor)
+        except (ValueError, KeyError, TypeError) as error:
+            fix = "Run the scenes stage again."
+            raise TableError(f"damaged description: {error}", path=self._description, fix=fix) from error
 
     def save_mapped_floor(self, floor: MappedFloor) -> None:
         """Write the floor that the map is to be made from to `scene.json`, unless it is all."""

@@ -31,8 +31,9 @@ class WhereToLookError(Exception):
         cause = self.__cause__
         while cause is not None and not isinstance(cause, PermissionError):
             cause = cause.__cause__
-        denied = cause is not None and not isinstance(self, StorageError)
-        return f"{cause.filename or self.path}: Permission denied" if denied else super().__str__()
+        if cause is None or isinstance(self, StorageError):
+            return super().__str__()
+        return f"{cause.filename or self.path}: Permission denied"
 
 
 class ConfigError(WhereToLookError):

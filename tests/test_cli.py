@@ -58,7 +58,7 @@ def test_arguments_override_the_file() -> None:
         ("select", ["--map", "m", "--out", "o.csv", "--at", "a.csv", "--pitch", "-30", "30"], "pitch_deg", (-30.0, 30.0)),
         ("select", ["--map", "m", "--out", "o.csv", "--grid", "1", "--camera-id", "3", "--skip"], "skip", True),
         ("benchmark", ["a", "b", "--methods", "best", "set"], "scenes", (Path("a"), Path("b"))),
-        ("adapt", ["--map", "m", "--mapping.photographs.assume_metric", "true"], "adapt.map", Path("m")),
+        ("adapt", ["--map", "m", "--scale", "2"], "adapt.map", Path("m")),
     ],
 )  # fmt: skip
 def test_ways_to_write_options(command: str, arguments: list[str], name: str, value: object) -> None:

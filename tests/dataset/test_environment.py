@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -41,7 +40,7 @@ def test_parts_of_a_scene_share_one_ray_caster(files: SceneFolder, monkeypatch: 
     assert len(built) == 1
 
 
-def test_without_a_mesh_landmarks_hide_one_another_and_metres_are_needed(files: SceneFolder) -> None:
+def test_without_a_mesh_landmarks_hide_one_another_and_a_unit_is_needed(files: SceneFolder) -> None:
     files.mesh.unlink()
     with pytest.raises(ConfigError):
         _ = SceneEnvironment(files, CAMERA).occlusion
@@ -52,8 +51,8 @@ def test_without_a_mesh_landmarks_hide_one_another_and_metres_are_needed(files: 
     assert SceneEnvironment(files, CAMERA, none).occlusion_config.model == "none"
     with pytest.raises(MapError):
         _ = scene.space
-    with pytest.raises(MapError):
-        _ = SceneEnvironment(files, CAMERA, replace(none, assume_metric=True)).space
+    write_json(files.map / "report.json", {"scale": {"source": "unknown", "factor": 0.3}})  # scaled by its depth
+    assert SceneEnvironment(files, CAMERA).frame.doubts
 
 
 @pytest.mark.parametrize(

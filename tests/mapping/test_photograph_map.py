@@ -23,10 +23,11 @@ from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.viewpoint_table import UNLABELLED, poses
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping import sfm as incremental
-from wheretolook.mapping.colmap_model import colmap_poses
+from wheretolook.mapping.colmap_model import colmap_poses, model_arrays, read_model
 from wheretolook.mapping.config import KnownDistance, MapConfig, PhotographsConfig, ScaleConfig
-from wheretolook.mapping.georeference import fit_similarity
+from wheretolook.mapping.georeference import fit_similarity, median_depths
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.map_frame import read_frame
 from wheretolook.mapping.photograph_map import map_photographs
 from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.scorers.visible import VisibleScorer
@@ -123,7 +124,10 @@ def test_other_sources_of_scale_reuse_the_mapping(mapped, photographs: Path, tmp
 
     unknown = scaled()
     assert unknown.scale.source == "unknown" and not unknown.scale.is_metric
-    assert "UNKNOWN" in unknown.scale.describe()
+    depth = median_depths(model_arrays(read_model(tmp_path / "map")), colmap_poses(tmp_path / "map"))
+    assert np.median(depth) == pytest.approx(5, rel=0.01)  # landmarks were removed since
+    frame = read_frame(tmp_path / "map")
+    assert frame.world_from_map.scale == 1 and len(frame.doubts) == 1
     with pytest.raises(MapError):
         scaled(distance=KnownDistance("photo-00.png", "nowhere.png", 1.0))
     with pytest.raises(MapError):
@@ -157,7 +161,7 @@ def experiment(mapped, photographs: Path, tmp_path_factory: pytest.TempPathFacto
     shutil.copytree(mapped[0] / "work", experiment.root / "room" / "photographs")
     said: list[str] = []
     run(Map, experiment, said.append)
-    assert any("scale UNKNOWN" in line for line in said) and any("photo-99.png" in line for line in said)
+    assert any("scale unknown" in line for line in said) and any("photo-99.png" in line for line in said)
     return experiment
 
 
@@ -168,7 +172,7 @@ def test_a_scene_of_photographs_is_sampled_and_scored_but_not_labelled(experimen
     metric = replace(experiment, mapping=replace(experiment.mapping, photographs=photographs))
     said: list[str] = []
     run(Map, metric, said.append)
-    assert any("scale from markers" in line for line in said)
+    assert any("scale: markers" in line for line in said)
     dataset = run(Sample, metric, said.append)
     assert any("occlusion by hidden-points" in line for line in said)
     (scene,) = dataset.scenes

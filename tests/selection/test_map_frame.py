@@ -13,7 +13,8 @@ from selection.room import POINTS, WEIGHTS
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.colmap_model import colmap_poses, model_arrays, write_model
 from wheretolook.mapping.config import FrameOptions
-from wheretolook.mapping.map_frame import DEPTH_M, MapFrame, find_frame, median_depths
+from wheretolook.mapping.georeference import DEPTH_M, median_depths
+from wheretolook.mapping.map_frame import MapFrame, find_frame
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning, WhereToLookError
 

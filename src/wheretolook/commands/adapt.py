@@ -111,12 +111,9 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
             table = self._labelled(files, scene, has_photographs, log)
             views = None if table is None else labelled_views(files, scene, table, target.weights)
             if has_photographs:
-                if files.is_photographed:
-                    scene.require_metres()
                 try:
-                    frame = FrameOptions(scale=1, up="z")
-                    where = (files.map, check_name(self, files), frame)
-                    held_out = self._held_out(*where, scene.occlusion, target.weights, log)
+                    name = check_name(self, files)
+                    held_out = self._held_out(files.map, name, scene.occlusion, target.weights, log)
                     views = held_out if views is None else views.joined(held_out)
                 except MapError as error:
                     if views is None:
@@ -129,20 +126,16 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
     def _adapt_map(self, model: Path, log: Log, progress: Progress) -> Path | None:
         """Adapt to a COLMAP map by its photographs only."""
         from wheretolook.holdout.photo_map import folder_of_check
-        from wheretolook.mapping.colmap_model import model_arrays, read_model
-        from wheretolook.mapping.map_frame import find_frame
+        from wheretolook.mapping.colmap_model import read_model
 
         name = place_name(model)
         target = self._target(name, folder_of_check(self.data, name) / "adapted.safetensors")
-        frame = self.frame_options()
         occlusion = "none" if self.occlusion.model == "none" else "hidden-points"
-        reconstruction = read_model(model)
-        arrays = model_arrays(reconstruction)
-        found = find_frame(model, reconstruction, frame, arrays=arrays)
-        points = found.of_arrays(arrays).points
-        log(f"{name}: {found.describe()}")
-        environment = ColmapEnvironment(ColmapFiles(model), occlusion=occlusion, device=self.warp_device)
-        views = self._held_out(model, name, frame, environment.occlusion, target.weights, log)
+        files = ColmapFiles(model, frame=self.frame_options())
+        camera_id = next(iter(read_model(model).cameras))  # landmarks and occlusion depend on none
+        environment = ColmapEnvironment(files, camera_id, occlusion, device=self.warp_device)
+        points = environment.landmarks.points
+        views = self._held_out(model, name, environment.occlusion, target.weights, log)
         _check_enough(views, model)
         with hold(target.path.with_name(f".{target.path.name}.lock"), "adapt"):
             return self._fit(target, views, points, log, progress)
@@ -161,15 +154,13 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         check_store(self.tracking)
         return _Target(name, "" if dataset is None else dataset.name, weights, path)
 
-    def _held_out(
-        self, model: Path, name: str, frame: FrameOptions, occlusion: OcclusionModel, weights: Path, log: Log
-    ) -> LocalizedViews:
+    def _held_out(self, model: Path, name: str, occlusion: OcclusionModel, weights: Path, log: Log) -> LocalizedViews:
         """Return a map's photographs, held out in blocks that `wheretolook check` shares."""
         from wheretolook.holdout.holdout_views import photographed_views
 
         log(f"{name}: holding out blocks of photographs")
         given = (self.adapt.images, self.adapt.database)
-        photographs, held_out = hold_out_photographs(self, "adapt", model, name, frame, given)
+        photographs, held_out = hold_out_photographs(self, "adapt", model, name, self.frame_options(), given)
         return photographed_views(photographs, held_out, weights, occlusion, self.warp_device)
 
     def _fit(self, target: _Target, views: LocalizedViews, points: Float, log: Log, progress: Progress) -> Path | None:

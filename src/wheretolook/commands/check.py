@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -154,8 +154,6 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
         model = self.map if scene is None else scene.map
         assert model is not None
         frame = self.frame_options()
-        if scene is not None and not scene.is_photographed:
-            frame = FrameOptions(scale=1, up="z")
         rendered = scene is not None and scene.mesh.is_file()
         if mesh is None and scene is not None and rendered:
             mesh = scene.mesh
@@ -167,8 +165,6 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
         folder, features = features_of(model, *given, work, workers, device, self._extractor())
         name = self.scene or place_name(model)
         photographs = open_map(folder, features, name, frame, model)
-        if not photographs.is_metric:  # the depth of landmarks that were triangulated again is another
-            frame = replace(frame, scale=photographs.from_model.scale)
         files = ColmapFiles(model, mesh=mesh, frame=frame)
         camera_id = next(iter(photographs.model.cameras))  # occlusion depends on none
         environment = ColmapEnvironment(files, camera_id, self.occlusion or "", device=device)

@@ -14,7 +14,6 @@ from wheretolook.commands.preconditions import load_dataset, open_scene
 from wheretolook.dataset.dataset_lock import reading, reads_dataset
 from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.mapping.config import FrameOptions
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.store import check_store, kept_if_not_logged
 from wheretolook.utils.errors import MapError
@@ -96,9 +95,7 @@ def held_out_photographs(options: Evaluate, dataset: Dataset, log: Log) -> list[
     held_out = []
     for files in filter(knows_photographs, dataset.split(options.evaluate.split)):
         log(f"{files.name}: holding out blocks of photographs")
-        metric = options.mapping.photographs.assume_metric or not files.is_photographed
-        frame = FrameOptions(scale=1 if metric else None, up="z" if files.mesh.is_file() else None)
-        source, views = hold_out_photographs(options, "evaluate", files.map, check_name(options, files), frame)
+        source, views = hold_out_photographs(options, "evaluate", files.map, check_name(options, files))
         occlusion = open_scene(options, files).occlusion
         held_out.append(evaluated_photographs(files, source, views, occlusion, options.warp_device))
     if not held_out:

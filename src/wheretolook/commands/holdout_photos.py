@@ -37,7 +37,7 @@ def hold_out_photographs(
     stage: str,
     model: Path,
     name: str,
-    frame: FrameOptions,
+    frame: FrameOptions = FrameOptions(),
     given: tuple[Path | None, Path | None] = (None, None),
 ) -> tuple[PhotographedMap, list[HoldoutResult]]:
     """Return a map and its photographs, held out in blocks; finished blocks are shared with `wheretolook check`.

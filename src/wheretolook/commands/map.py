@@ -26,7 +26,7 @@ from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, des
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.config import ExistingModelConfig, MapConfig, place_name
 from wheretolook.mapping.georeference import read_scale
-from wheretolook.mapping.map_frame import IDENTITY, read_frame
+from wheretolook.mapping.map_frame import read_frame
 from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.confine import check_folder_name, path_within
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
@@ -81,9 +81,7 @@ class Map(SceneOptions, LabelOptions):
             scene = _map_photographs(self, log)
             dataset = _with_scene(scene, self.root)
         frame = read_frame(scene.map)
-        scale = read_scale(scene.map)
-        assert scale is not None
-        about = scale.describe() if frame is IDENTITY else "; ".join((frame.describe(), *frame.doubts))
+        about = "; ".join((frame.describe(), *frame.doubts))
         log(f"{scene.name}: {about}; camera {describe_camera(scene.camera)}")
         dataset.save()
         progress(1)
@@ -164,7 +162,7 @@ def _map_photographs(options: Map, log: Log) -> SceneFolder:
         if not path.is_file():
             raise ConfigError("there is no such table", path=path, fix="Check mapping.photographs.scale.")
     images = size_and_time([folder / name for name in list_photographs(folder)])
-    used = [replace(settings, assume_metric=False).record(), options.mapping.extractor.record()]
+    used = [settings.record(), options.mapping.extractor.record()]
     made_from = [images, [fingerprint(path) for path in tables]]
     cache = scene.stage_cache("map", cache_key("map", [*used, options.mapping.keep_database, _seed(scene), *made_from]))
     if cache.is_current(scene.landmarks, scene.mapping_cameras):

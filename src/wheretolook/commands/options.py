@@ -95,26 +95,13 @@ class SpaceOptions:
 
 
 @dataclass(frozen=True)
-class MetricOptions:
-    """Whether maps are in metres.
-
-    Args:
-        assume_metric: take a map of unknown scale for one in metres.
-    """
-
-    assume_metric: bool = False
-
-
-@dataclass(frozen=True)
 class MapUseOptions:
     """How an existing map is used.
 
     Args:
-        photographs: whether the map of photographs is in metres.
         extractor: where the weights of the map's extractor are, if they have moved since the map was made.
     """
 
-    photographs: MetricOptions = field(default_factory=MetricOptions)
     extractor: ExtractorConfig = field(default_factory=ExtractorConfig)
 
 

@@ -54,11 +54,12 @@ def load_dataset(
 def open_scene(options: SceneOptions, files: SceneFolder) -> SceneEnvironment:
     """Return a scene of the dataset with a command's occlusion, free space and device; nothing is read yet."""
     scenes = options.scenes
-    assume_metric = options.mapping.photographs.assume_metric
+    config = EnvironmentConfig(options.occlusion, scenes.free_space, scenes.mapped_space)
+    scene = SceneEnvironment(files, config=config, device=options.device)
     if files.own_camera:
-        LOG.info("%s: the camera of its map, %s", files.name, describe_camera(files.camera))
-    config = EnvironmentConfig(options.occlusion, scenes.free_space, scenes.mapped_space, assume_metric)
-    return SceneEnvironment(files, config=config, device=options.device)
+        camera = f"the camera of its map, {describe_camera(files.camera)}"
+        LOG.info("%s: %s", files.name, "; ".join((camera, *scene.frame.doubts)))
+    return scene
 
 
 def refuse_release(root: Path) -> None:

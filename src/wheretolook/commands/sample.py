@@ -61,7 +61,6 @@ def _key(scene: SceneEnvironment, config: SampleConfig) -> str:
     space = asdict(scene.config.free_space)
     stage = "scenes"
     if scene.is_photographed:
-        scene.require_metres()
         space = asdict(scene.config.mapped_space)
         stage = "map"
     elif files.is_scanned:

@@ -16,11 +16,10 @@ from wheretolook.geometry.camera import Camera, cameras_by_id, only_camera
 from wheretolook.geometry.lattices import ViewLattice, VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.mapping.config import FrameOptions, place_name
-from wheretolook.mapping.georeference import read_scale
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame, read_frame
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.utils.devices import usable_device
-from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.validation import check_positive
 from wheretolook.visibility.config import OCCLUSION_MODELS, OcclusionConfig, check_occlusion_names
 
@@ -44,7 +43,6 @@ class EnvironmentConfig:
     occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)
     free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)  # with a mesh or depth images
     mapped_space: MappedSpaceConfig = field(default_factory=MappedSpaceConfig)  # with photographs alone
-    assume_metric: bool = False  # take the unit of a map without a known scale for a metre
     occlusion_cache_bytes: int = 0  # memory for lines of sight that are asked for again
     renderer: str = "warp"  # name in `wheretolook.rendering.registry.RENDERERS`
 
@@ -237,7 +235,7 @@ class SceneEnvironment(Environment):
 
     @cached_property
     def frame(self) -> MapFrame:
-        """The own frame of the model that the map was imported from."""
+        """The own frame of the model that the map was imported from; of other maps, the scene's."""
         return read_frame(self.files.map)
 
     @property
@@ -279,7 +277,7 @@ class SceneEnvironment(Environment):
     @cached_property
     def mapped_space(self) -> MappedSpace:
         """Where a camera can be according to the photographs."""
-        self.require_metres()
+        _ = self.frame  # an error if the map's unit is unknown
         return super().mapped_space
 
     @cached_property
@@ -303,16 +301,6 @@ class SceneEnvironment(Environment):
         """Where a camera can be: with occlusion "tsdf" according to depth images, else `sampled_space`."""
         tsdf = self.config.occlusion.model == "tsdf" and not self.is_photographed
         return self.tsdf_space if tsdf else self.sampled_space
-
-    def require_metres(self) -> None:
-        """Raise MapError if a map of photographs has no scale, unless `assume_metric` is set."""
-        scale = read_scale(self.files.map)
-        photographs = self.frame is IDENTITY  # an imported model was scaled by the depth of its images
-        if scale is not None and photographs and not scale.is_metric and not self.config.assume_metric:
-            fix = "Map it with marker sizes, a distance or positions (mapping.photographs.scale), or pass "
-            fix += "--mapping.photographs.assume_metric true to take its unit for a metre."
-            problem = "the map has no scale, and this needs metres"
-            raise MapError(problem, path=self.files.map, value=scale.source, fix=fix)
 
     def free_voxels(self, views: ViewLattice, space: FreeSpace | MappedSpace) -> tuple[VoxelGrid, NDArray[np.int64]]:
         """The voxels of a lattice over `space` or `sampled_space`, and the ids of the free ones, ascending.

@@ -20,7 +20,8 @@ from wheretolook.localization.versions import versions
 from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_arrays, read_model, registered_names
 from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, PhotographsConfig, place_name
 from wheretolook.mapping.feature_files import DATABASE_FILE, read_descriptors
-from wheretolook.mapping.map_frame import DEPTH_M, IDENTITY, MapFrame, find_frame, median_depths
+from wheretolook.mapping.georeference import DEPTH_M, median_depths
+from wheretolook.mapping.map_frame import IDENTITY, MapFrame, find_frame
 from wheretolook.mapping.sources import find_features, find_photographs
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.confine import safe_child
@@ -123,7 +124,7 @@ def open_map(
         features: of its photographs.
         name: for results; by default the model's.
         frame: how the model's own frame is related to metres with z up.
-        source: folder of the map that the model was triangulated again from, whose report counts.
+        source: folder of the map that the model was triangulated again from, whose report and landmarks give the frame.
 
     Raises:
         MapError: the model or the features cannot be used or do not belong together, the features are of an unknown
@@ -142,7 +143,8 @@ def open_map(
         problem = f"half of the photographs observe fewer than {MIN_OBSERVED} landmarks"
         fix = "Give a model with tracks, and the photographs it was made from."
         raise MapError(problem, path=model_dir, value=observed, fix=fix)
-    own_frame = find_frame(source or model_dir, model, frame, arrays=arrays)
+    original = model if source in (None, model_dir) else read_model(source)
+    own_frame = find_frame(source or model_dir, original if original.num_points3D() else model, frame)
     to_frame = own_frame.world_from_map
     if to_frame.record() != IDENTITY.world_from_map.record():
         to_frame.transform_model(model)

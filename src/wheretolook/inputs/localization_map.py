@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from wheretolook.geometry.camera import Camera, ColmapCamera
 from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
+from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.landmarks import Landmarks, open_colmap
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame
 from wheretolook.mapping.sanity import warn_of_mesh
@@ -51,17 +52,19 @@ class LocalizationMap:
         max_reprojection_error_px: float | None = None,
         device: str = "cpu",
         database: str | Path | None = None,
+        **frame: Any,
     ) -> LocalizationMap:
-        """Open any COLMAP model (version 3 or 4, binary or text) in metres, z up.
+        """Open any COLMAP model (version 3 or 4, binary or text), of any unit and direction up.
 
-        A `MapWarning` says which points are left out, if the model seems not to be in metres or not to have z up, and
-        if the mesh seems to be in another frame.
+        Poses that scorers of it take are in the world, metres with z up: `frame.world_from_map` transforms them. A
+        `MapWarning` states which points are left out, what was assumed of an unknown unit or direction up, and that the
+        mesh seems to be in another frame.
 
         Args:
             model: folder of the model.
             camera: the camera to localize, which may differ from the mapping cameras: a camera, or the camera_id of one
                 of the model. None for the model's own, with its distortion, if it has but one.
-            mesh: a mesh of the scene, for true occlusion.
+            mesh: a mesh of the scene in the model's frame, for true occlusion.
             occlusion: another model, such as `HiddenPointRemoval()` where there is nothing but the landmarks, or
                 `TsdfOcclusion` where there are depth images. With neither, landmarks are seen through walls.
             max_reprojection_error_px: landmarks with a larger mean error are left out. None for all that the model's
@@ -69,6 +72,7 @@ class LocalizationMap:
             device: where kernels run.
             database: the COLMAP database the model was built from, or hloc's features in HDF5, for the landmarks'
                 ambiguity, which is unknown without; by default as `wheretolook.mapping.sources.choose_features`.
+            frame: scale, distance, positions or up, see `wheretolook.mapping.config.FrameOptions`.
 
         Raises:
             MapError: no usable model in the folder, no such camera in it, or several and none is named; or the database
@@ -78,16 +82,17 @@ class LocalizationMap:
         """
         if max_reprojection_error_px is not None:
             check_positive("max_reprojection_error_px", max_reprojection_error_px)
-        landmarks, camera, poses, _ = open_colmap(model, camera, database, max_reprojection_error_px, device)
+        opened = (model, camera, database, max_reprojection_error_px, device, FrameOptions(**frame))
+        landmarks, camera, poses, own_frame = open_colmap(*opened)
         if mesh is not None:
             from wheretolook.scenes.loading import load_mesh
             from wheretolook.space.free_space import FreeSpace
             from wheretolook.visibility.occlusion import MeshOcclusion
 
-            space = FreeSpace(load_mesh(Path(mesh), colored=False), device=device)
+            space = FreeSpace(load_mesh(Path(mesh), colored=False).transformed(own_frame.world_from_map), device=device)
             occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
             warn_of_mesh(mesh, landmarks.points, space.raycaster)
-        return cls(landmarks, camera, occlusion or NoOcclusion(), device, poses)
+        return cls(landmarks, camera, occlusion or NoOcclusion(), device, poses, own_frame)
 
     def of_camera(self, camera: Camera) -> LocalizationMap:
         """Return the same map for another camera."""

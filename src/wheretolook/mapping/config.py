@@ -187,7 +187,6 @@ class PhotographsConfig:
         up_in_camera: the direction up in the camera frame, if it is the same for all. (x, y, z) with x right, y down, z
             forward: (0, 0, -1) for cameras that look straight down. By default cameras are held level, with any pitch.
         scale: source of the scale.
-        assume_metric: treat a map without a scale as metric where metres are needed.
     """
 
     images: Path | None = None
@@ -200,7 +199,6 @@ class PhotographsConfig:
     max_reprojection_error_px: float = 2.0
     up_in_camera: tuple[float, float, float] | None = None
     scale: ScaleConfig = field(default_factory=ScaleConfig)
-    assume_metric: bool = False
 
     def __post_init__(self) -> None:
         check_range("max_side_px", self.max_side_px, 0)

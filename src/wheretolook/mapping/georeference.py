@@ -14,6 +14,7 @@ from tqdm.auto import tqdm
 
 from wheretolook.geometry.poses import Float
 from wheretolook.geometry.similarity import Similarity
+from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_arrays
 from wheretolook.mapping.config import SCALE_TOLERANCE_PERCENT, ScaleConfig
 from wheretolook.mapping.markers import Marker, MarkerView, detect_markers, marker_detector, place_marker
 from wheretolook.mapping.photographs import read_photograph
@@ -21,6 +22,8 @@ from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.reading import read_json_object, read_text
 
 REPORT_FILE = "report.json"
+DEPTH_M = 5.0
+"""Median depth of the images that a map of unknown scale is scaled to: scorers were trained in rooms."""
 _FLAT = 1e-6  # points whose second largest spread is below this share of the largest are on a line
 
 
@@ -28,9 +31,9 @@ _FLAT = 1e-6  # points whose second largest spread is below this share of the la
 class MapScale:
     """The scale of a map; `scale` in its `report.json`."""
 
-    # "model": that of an existing model; "unknown": the map is not in metres
+    # "model" is unknown, too: that of a model that an earlier version imported
     source: Literal["markers", "distance", "positions", "given", "depth", "rendered", "model", "unknown"] = "unknown"
-    factor: float = 1.0  # metres in a unit of COLMAP's frame
+    factor: float = 1.0  # metres in a unit of COLMAP's frame; where these are unknown, as `scale_from_depths`
     # Error of each marker's side (in percent) or photograph's position (in metres); empty for a single distance.
     residuals: dict[str, float] = field(default_factory=dict)
     unit: Literal["percent", "m", ""] = ""  # of the residuals
@@ -42,15 +45,16 @@ class MapScale:
     @property
     def is_metric(self) -> bool:
         """Whether the map is in metres."""
-        return self.source != "unknown"
+        return self.source not in ("unknown", "model")
+
+    @property
+    def is_missing(self) -> bool:
+        """Whether the map is in any unit, as an earlier version left maps of unknown scale."""
+        return not self.is_metric and self.factor == 1
 
     def describe(self) -> str:
         """One clause for a log."""
-        if not self.is_metric:
-            return "scale UNKNOWN: no markers, distance or positions were given, so lengths are not in metres"
-        if self.source == "model":
-            return "scale as in the model, whose unit is assumed to be the metre"
-        parts = [f"scale from {self.source}"]
+        parts = [f"scale: {self.source}"]
         if self.residuals:
             errors = np.abs(list(self.residuals.values()))
             parts.append(
@@ -109,7 +113,6 @@ def find_scale(
         for image in tqdm(images, "map: markers", disable=not progress, unit="image"):
             for marker, view in _marker_views(image, photographs / image.name, config.dictionary, turned).items():
                 views.setdefault(marker, []).append(view)
-    scale = MapScale()
     if config.has_marker_sizes:
         markers, unused = _place_markers(views, known.sizes_m)
         scale = scale_from_markers(markers, known.sizes_m, unused)
@@ -117,6 +120,8 @@ def find_scale(
         ends = (config.distance.first, config.distance.second)
         first, second = (_end_point(end, centers, views, photographs) for end in ends)
         scale = scale_from_distance(first, second, config.distance.distance_m)
+    else:
+        scale = scale_from_depths(model_arrays(model), colmap_poses("", model))
     return scale, replace(upright, scale=scale.factor, translation=scale.factor * upright.translation)
 
 
@@ -182,6 +187,27 @@ def scale_from_distance(first: ArrayLike, second: ArrayLike, distance_m: float) 
     if not length > 0:
         raise MapError("the two ends of the known distance coincide", value=length, fix="Name two different ends.")
     return MapScale("distance", distance_m / length)
+
+
+def scale_from_depths(arrays: ModelArrays, cam_from_world: Float) -> MapScale:
+    """The scale, unknown, at which the median depth of images with poses (I, 3, 4) is `DEPTH_M`; 1 without landmarks."""
+    depth = median_depths(arrays, cam_from_world)
+    depth = depth[depth > 0]  # none where nothing is observed
+    return MapScale("unknown", DEPTH_M / float(np.median(depth)) if len(depth) else 1.0)
+
+
+def median_depths(arrays: ModelArrays, cam_from_world: Float) -> Float:
+    """Median depth (I,) of the landmarks that each image observes, from poses (I, 3, 4); NaN where it observes none."""
+    point = np.repeat(arrays.points, np.diff(arrays.observation_start), axis=0)
+    axis = cam_from_world[arrays.observation_image, 2]
+    depth = (axis[:, :3] * point).sum(1) + axis[:, 3]
+    ordered = depth[np.lexsort((depth, arrays.observation_image))]
+    counts = np.bincount(arrays.observation_image, minlength=len(cam_from_world))
+    some = counts > 0
+    first = np.cumsum(counts)[some] - counts[some]
+    result = np.full(len(counts), np.nan)
+    result[some] = (ordered[first + (counts[some] - 1) // 2] + ordered[first + counts[some] // 2]) / 2
+    return result
 
 
 def scale_from_positions(centers: Mapping[str, Float], positions: Mapping[str, Float]) -> tuple[MapScale, Similarity]:

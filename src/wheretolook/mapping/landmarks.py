@@ -150,7 +150,7 @@ def open_colmap(
     database: str | Path | None = None,
     max_reprojection_error_px: float | None = None,
     device: str = "cpu",
-    frame: FrameOptions = FrameOptions(scale=1, up="z"),
+    frame: FrameOptions = FrameOptions(),
     depth_scale: float | None = None,
 ) -> ColmapSource:
     """Read a COLMAP model; arguments, errors and warnings are those of `LocalizationMap.from_colmap`.

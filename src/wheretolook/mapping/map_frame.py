@@ -15,10 +15,12 @@ from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_arrays
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.georeference import (
+    DEPTH_M,
     REPORT_FILE,
     MapScale,
     read_positions,
     read_scale,
+    scale_from_depths,
     scale_from_distance,
     scale_from_positions,
 )
@@ -27,8 +29,6 @@ from wheretolook.mapping.sanity import LOOKING_DOWN, scale_warning, up_axis_warn
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning
 from wheretolook.utils.reading import read_json_object
 
-DEPTH_M = 5.0
-"""Median depth of the images that a map of unknown scale is scaled to: scorers were trained in rooms."""
 MAX_RATIO = 1.05  # of two scales that agree
 MAX_DEPTH_RATIO = 1.2  # of a scale and that of depth images, whose sensors are less accurate
 MAX_TILT_DEG = 60.0  # median angle between a given up and the images' own, beyond which no camera was held like that
@@ -42,7 +42,7 @@ class MapFrame:
     """
 
     world_from_map: Similarity = Similarity(1.0, np.eye(3), np.zeros(3))
-    scale: MapScale = MapScale("model")  # its source; the factor is that of `world_from_map`
+    scale: MapScale = MapScale("given")  # its source; the factor is that of `world_from_map`
     gravity: Literal["given", "levelled", "model"] = "model"
 
     def of_arrays(self, arrays: ModelArrays) -> ModelArrays:
@@ -59,7 +59,7 @@ class MapFrame:
     def describe(self) -> str:
         """State the scale and the direction up in one clause."""
         up = "z" if self.gravity == "model" else f"({_rounded(self.world_from_map.rotation[2])}), {self.gravity}"
-        return f"1 unit of the map = {self.world_from_map.scale:.4g} m (scale: {self.scale.source}), up: {up}"
+        return f"1 unit of the map = {self.world_from_map.scale:.4g} m ({self.scale.describe()}), up: {up}"
 
     def warn(self, model: Path, mapping_distance_m: ArrayLike, cam_from_world: ArrayLike) -> None:
         """Issue a `MapWarning` for each of the `messages`."""
@@ -112,58 +112,43 @@ def find_frame(
     centers = {image.name: image.projection_center() for image in model.images.values() if image.has_pose}
     reported = reported_scale(model_dir)
     scale = _given_scale(model_dir, options, centers)
-    known = None if reported is None or not reported.is_metric else replace(reported, factor=1.0)
+    known = reported if reported is not None and reported.is_metric else None
     by_depth = None if depth_scale is None else MapScale("depth", depth_scale)
     if options.positions is not None:
         scale, similarity = scale_from_positions(centers, read_positions(options.positions))
         _check_agreement(scale, known, by_depth)
         return MapFrame(similarity, scale, "given")
     _check_agreement(scale or known, known, by_depth)
-    chosen = scale or known or by_depth
-    if chosen is None:
-        depth = median_depths(arrays or model_arrays(model), poses)
-        depth = depth[depth > 0]  # none where nothing is observed
-        chosen = MapScale("unknown", DEPTH_M / float(np.median(depth)) if len(depth) else 1.0)
-    gravity, rotation = _upright(
-        model_dir, poses, options, is_known=reported is not None and reported.source != "model"
-    )
+    chosen = scale or known or by_depth or reported or scale_from_depths(arrays or model_arrays(model), poses)
+    gravity, rotation = _upright(model_dir, poses, options, is_known=reported is not None)
     return MapFrame(Similarity(chosen.factor, rotation, np.zeros(3)), chosen, gravity)
 
 
 def reported_scale(model_dir: Path) -> MapScale | None:
-    """Read the scale that the report in a map's folder states; None without a report of this project."""
+    """Read how the scale of a map of this project is known, whose unit it is; None if it is in any unit."""
     scale = read_scale(model_dir)
-    if scale is not None or not (model_dir / REPORT_FILE).is_file():
-        return scale
-    return MapScale("rendered") if "n_landmarks" in read_json_object(model_dir / REPORT_FILE) else None
+    if scale is not None:
+        return None if scale.is_missing else replace(scale, factor=1.0)
+    path = model_dir / REPORT_FILE
+    return MapScale("rendered") if path.is_file() and "n_landmarks" in read_json_object(path) else None
 
 
 def read_frame(map_dir: Path) -> MapFrame:
-    """Read the own frame of the model that a map was imported from, from its report; `IDENTITY` of other maps.
+    """Read the own frame of the model that a map was imported from, from its report; of other maps, their own.
 
-    Raises MapError if the report is damaged.
+    Raises MapError if the report is damaged, or the map is in any unit.
     """
     scale = read_scale(map_dir)
-    record = {} if scale is None else read_json_object(map_dir / REPORT_FILE).get("frame")
-    if scale is None or not record:
+    if scale is None:
         return IDENTITY
+    record = read_json_object(map_dir / REPORT_FILE).get("frame")
+    if record is None:
+        if scale.is_missing:
+            raise MapError("the unit of this map is unknown", path=map_dir, fix="Run `wheretolook map` again.")
+        return MapFrame(scale=scale)
     values = record["world_from_map"]
     similarity = Similarity(values["scale"], np.array(values["rotation"]), np.array(values["translation"]))
     return MapFrame(similarity, scale, record["gravity"])
-
-
-def median_depths(arrays: ModelArrays, cam_from_world: Float) -> Float:
-    """Median depth (I,) of the landmarks that each image observes, from poses (I, 3, 4); NaN where it observes none."""
-    point = np.repeat(arrays.points, np.diff(arrays.observation_start), axis=0)
-    axis = cam_from_world[arrays.observation_image, 2]
-    depth = (axis[:, :3] * point).sum(1) + axis[:, 3]
-    ordered = depth[np.lexsort((depth, arrays.observation_image))]
-    counts = np.bincount(arrays.observation_image, minlength=len(cam_from_world))
-    some = counts > 0
-    first = np.cumsum(counts)[some] - counts[some]
-    result = np.full(len(counts), np.nan)
-    result[some] = (ordered[first + (counts[some] - 1) // 2] + ordered[first + counts[some] // 2]) / 2
-    return result
 
 
 def _given_scale(model_dir: Path, options: FrameOptions, centers: dict[str, Float]) -> MapScale | None:

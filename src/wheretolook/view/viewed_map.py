@@ -240,7 +240,7 @@ def open_scene(
     if not files.landmarks.is_file():
         raise MapError("this scene has no map yet", path=files.map, fix="Run `wheretolook map` for its dataset.")
     number, own_camera = next(iter(files.cameras().items()))
-    config = EnvironmentConfig(assume_metric=True, occlusion_cache_bytes=OCCLUSION_BYTES)
+    config = EnvironmentConfig(occlusion_cache_bytes=OCCLUSION_BYTES)
     environment = SceneEnvironment(files, camera or own_camera, config, device)
     landmarks = environment.landmarks
     own = {"given": or_shipped(weights)} if weights else scene_weights(files, landmarks)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wheretolook.mapping.config import KnownDistance, ScaleConfig
+from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, MarkerConfig, PhotographsConfig
 from wheretolook.mapping.georeference import (
     MapScale,
     fit_similarity,
@@ -123,10 +123,21 @@ def test_invalid_tables_are_rejected(tmp_path: Path, name: str, text: str | None
 
 
 def test_invalid_settings_are_rejected() -> None:
-    known = KnownDistance("a.jpg", "marker:7", 1.5)
-    assert known.marker_ids == (7,)
-    with pytest.raises(ConfigError):
-        KnownDistance("a.jpg", "a.jpg", 1.0)
-    for settings in ({"marker_size_m": 0.2, "distance": known}, {"marker_size_m": -1.0}):
+    known = FrameOptions(distance=("a.jpg", "marker:7", 1.5))
+    assert known.marker_ids == ["7"]
+    for ends in (("a.jpg", "a.jpg"), ("a.jpg", "marker:x")):
         with pytest.raises(ConfigError):
-            ScaleConfig(**settings)
+            FrameOptions(distance=(*ends, 1.0))
+    for settings in ({"marker_size_m": 0.2, "marker_table": Path("m.csv")}, {"marker_size_m": -1.0}):
+        with pytest.raises(ConfigError):
+            MarkerConfig(**settings)
+    sized = PhotographsConfig(Path("photos"), scale=MarkerConfig(marker_size_m=0.2))
+    of_model = ExistingModelConfig(Path("model"))
+    for settings in (
+        {"photographs": sized, "frame": known},
+        {"photographs": sized, "frame": FrameOptions(scale=2), "existing": of_model},
+        {"photographs": PhotographsConfig(Path("photos")), "frame": FrameOptions(scale=2)},
+        {"frame": FrameOptions(up="level")},
+    ):
+        with pytest.raises(ConfigError):
+            MapConfig(**settings)

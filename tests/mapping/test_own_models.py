@@ -83,10 +83,10 @@ def rig_model() -> pycolmap.Reconstruction:
 def test_a_rig_of_two_cameras_asks_which_one_looks(tmp_path, text):
     folder = written(rig_model(), tmp_path / "rig", text)
     with pytest.raises(MapError):
-        LocalizationMap.from_colmap(folder)
+        LocalizationMap.from_colmap(folder, scale=1)
     with pytest.raises(MapError):
-        LocalizationMap.from_colmap(folder, camera=7)
-    found = LocalizationMap.from_colmap(folder, camera=2)
+        LocalizationMap.from_colmap(folder, camera=7, scale=1)
+    found = LocalizationMap.from_colmap(folder, camera=2, scale=1)
     assert found.camera == PinholeCamera(320, 240, 160.0) and len(found.landmarks) == 12
     centers = camera_centers(found.mapping_poses.astype(np.float64))
     np.testing.assert_allclose(centers, [[0, 0, 1], [0.2, 0, 1], [1, 0, 1], [1.2, 0, 1]], atol=1e-6)
@@ -125,14 +125,14 @@ def test_all_points_are_landmarks_and_omitted_ones_are_counted(tmp_path, old):
         for name in ("rigs.bin", "frames.bin"):
             (folder / name).unlink()
     with pytest.warns(MapWarning, match="60 of 61 points"):
-        kept = LocalizationMap.from_colmap(folder, PinholeCamera())
+        kept = LocalizationMap.from_colmap(folder, PinholeCamera(), scale=1)
     assert len(kept.landmarks) == 60
     read = read_model(folder)
     read.update_point_3d_errors()
     n_bad = sum(point.error > 0.5 for point in read.points3D.values() if point.track.length())
     assert 0 < n_bad < 60
     with pytest.warns(MapWarning, match=f"{60 - n_bad} of 61 points"):
-        fewer = LocalizationMap.from_colmap(folder, PinholeCamera(), max_reprojection_error_px=0.5)
+        fewer = LocalizationMap.from_colmap(folder, PinholeCamera(), scale=1, max_reprojection_error_px=0.5)
     assert len(fewer.landmarks) == 60 - n_bad
 
 
@@ -157,7 +157,7 @@ def test_a_database_gives_ambiguity_and_is_not_written_to(tmp_path):
         db.execute("PRAGMA user_version = 3900")
     db.close()
     before = database.read_bytes()
-    found = LocalizationMap.from_colmap(folder, camera=1, database=database)
+    found = LocalizationMap.from_colmap(folder, camera=1, database=database, scale=1)
     np.testing.assert_array_equal(found.landmarks.ambiguity, expected)
     assert database.read_bytes() == before and sorted(path.name for path in tmp_path.iterdir()) == ["db.db", "model"]
 

@@ -24,7 +24,7 @@ from wheretolook.dataset.viewpoint_table import UNLABELLED, poses
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping import sfm as incremental
 from wheretolook.mapping.colmap_model import colmap_poses, model_arrays, read_model
-from wheretolook.mapping.config import KnownDistance, MapConfig, PhotographsConfig, ScaleConfig
+from wheretolook.mapping.config import FrameOptions, MapConfig, MarkerConfig, PhotographsConfig
 from wheretolook.mapping.georeference import fit_similarity, median_depths
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.map_frame import read_frame
@@ -47,11 +47,10 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def config_of(photographs: Path, **scale: object) -> MapConfig:
-    known = ScaleConfig(**scale)  # type: ignore[arg-type]
-    return MapConfig(
-        photographs=PhotographsConfig(photographs, camera_model="SIMPLE_PINHOLE", camera_params=PARAMS, scale=known)
-    )
+def config_of(photographs: Path, frame: FrameOptions = FrameOptions(), **markers: object) -> MapConfig:
+    known = MarkerConfig(**markers)  # type: ignore[arg-type]
+    camera = {"camera_model": "SIMPLE_PINHOLE", "camera_params": PARAMS}
+    return MapConfig(photographs=PhotographsConfig(photographs, scale=known, **camera), frame=frame)
 
 
 @pytest.fixture(scope="module")
@@ -103,15 +102,17 @@ def test_the_map_is_as_any_other(mapped) -> None:
 def test_other_sources_of_scale_reuse_the_mapping(mapped, photographs: Path, tmp_path: Path) -> None:
     folder, _ = mapped
 
-    def scaled(**scale: object):
-        return map_photographs(config_of(photographs, **scale), tmp_path / "map", folder / "work", progress=False)
+    def scaled(**frame: object):
+        return map_photographs(
+            config_of(photographs, FrameOptions(**frame)), tmp_path / "map", folder / "work", progress=False
+        )
 
     apart = float(np.linalg.norm(CENTERS[0] - CENTERS[10]))
-    by_cameras = scaled(distance=KnownDistance("photo-00.png", "photo-10.png", apart))
+    by_cameras = scaled(distance=("photo-00.png", "photo-10.png", apart))
     assert by_cameras.scale.source == "distance" and by_cameras.scale.residuals == {}
     assert fit_similarity(camera_centers(colmap_poses(tmp_path / "map")), CENTERS).scale == pytest.approx(1, abs=0.01)
     apart = float(np.linalg.norm(np.subtract(MARKERS[0].center, MARKERS[2].center)))
-    by_markers = scaled(distance=KnownDistance("marker:3", "marker:11", apart))
+    by_markers = scaled(distance=("marker:3", "marker:11", apart))
     assert by_markers.scale.factor == pytest.approx(by_cameras.scale.factor, rel=0.01)
 
     table = tmp_path / "positions.csv"
@@ -129,11 +130,12 @@ def test_other_sources_of_scale_reuse_the_mapping(mapped, photographs: Path, tmp
     frame = read_frame(tmp_path / "map")
     assert frame.world_from_map.scale == 1 and len(frame.doubts) == 1
     with pytest.raises(MapError):
-        scaled(distance=KnownDistance("photo-00.png", "nowhere.png", 1.0))
+        scaled(distance=("photo-00.png", "nowhere.png", 1.0))
     with pytest.raises(MapError):
-        scaled(distance=KnownDistance("photo-00.png", "marker:40", 1.0))
+        scaled(distance=("photo-00.png", "marker:40", 1.0))
     with pytest.raises(MapError):
-        scaled(marker_size_m=0.4, dictionary="DICT_APRILTAG_36H11")
+        config = config_of(photographs, marker_size_m=0.4, dictionary="DICT_APRILTAG_36H11")
+        map_photographs(config, tmp_path / "map", folder / "work", progress=False)
 
 
 def test_photographs_that_do_not_overlap_are_refused(tmp_path: Path) -> None:
@@ -167,7 +169,7 @@ def experiment(mapped, photographs: Path, tmp_path_factory: pytest.TempPathFacto
 
 @pytest.mark.slow
 def test_a_scene_of_photographs_is_sampled_and_scored_but_not_labelled(experiment: AllOptions) -> None:
-    scale = ScaleConfig(marker_size_m=MARKERS[0].size_m)
+    scale = MarkerConfig(marker_size_m=MARKERS[0].size_m)
     photographs = replace(experiment.mapping.photographs, scale=scale)
     metric = replace(experiment, mapping=replace(experiment.mapping, photographs=photographs))
     said: list[str] = []

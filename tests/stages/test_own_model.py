@@ -29,14 +29,7 @@ from wheretolook.geometry.camera import CameraConfig, PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.io.poses import read_poses
 from wheretolook.mapping.colmap_model import colmap_poses, read_model
-from wheretolook.mapping.config import (
-    ExistingModelConfig,
-    FrameOptions,
-    KnownDistance,
-    MapConfig,
-    PhotographsConfig,
-    ScaleConfig,
-)
+from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, MarkerConfig, PhotographsConfig
 from wheretolook.mapping.imported_map import map_existing
 from wheretolook.planning.config import PathConfig, PlanConfig, ViewpointMapConfig
 from wheretolook.rendering.raycasting import MeshRaycaster
@@ -96,7 +89,7 @@ def experiment_of(model: Path, data: Path, **existing: object) -> AllOptions:
         data=data,
         device="cpu",
         scenes=ScenesConfig(mapped_space=MappedSpaceConfig(max_camera_distance_m=0.6)),
-        mapping=MapConfig(existing=ExistingModelConfig(model, frame=FrameOptions(scale=1), **existing)),  # type: ignore[arg-type]
+        mapping=MapConfig(existing=ExistingModelConfig(model, **existing), frame=FrameOptions(scale=1)),  # type: ignore[arg-type]
         sample=SampleConfig(grid=(6, 5, 3), directions=40, keep=10, max_locations=6),
         viewpoint_map=ViewpointMapConfig(grid=(6, 5, 3), directions=30, method="visible"),
         tracking=TrackingConfig(str(data / "mlruns")),
@@ -202,28 +195,26 @@ def test_a_turned_and_scaled_model_warns_and_is_aligned(tmp_path):
     centers = camera_centers(colmap_poses("", model))
     turn = pycolmap.Rotation3d(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
     model.transform(pycolmap.Sim3d(37.0, turn, np.array([5.0, 0, 0])))
-    existing = ExistingModelConfig(save(model, tmp_path / "flat"), frame=FrameOptions(up="level"))
-    metric = replace(existing, frame=FrameOptions(scale=1, up="z"))
+    existing = ExistingModelConfig(save(model, tmp_path / "flat"))
+    metric = FrameOptions(scale=1, up="z")
     with pytest.warns(MapWarning) as warned:
-        map_existing(MapConfig(existing=metric), tmp_path / "map", tmp_path / "work")
+        map_existing(MapConfig(existing=existing, frame=metric), tmp_path / "map", tmp_path / "work")
     assert len([warning for warning in warned if warning.category is MapWarning]) == 2
 
-    distance = KnownDistance("000.jpg", "018.jpg", float(np.linalg.norm(centers[0] - centers[18])))
+    distance = ("000.jpg", "018.jpg", float(np.linalg.norm(centers[0] - centers[18])))
     table = tmp_path / "positions.csv"
     table.write_text("image,x,y,z\n" + "".join(f"{i:03d}.jpg,{x},{y},{z}\n" for i, (x, y, z) in enumerate(centers)))
-    for scale in (ScaleConfig(distance=distance), ScaleConfig(positions=table), ScaleConfig(marker_size_m=0.4)):
-        frame = FrameOptions(up="level" if scale.positions is None else None)
-        config = MapConfig(existing=replace(existing, frame=frame), photographs=PhotographsConfig(scale=scale))
-        if scale.marker_size_m:  # no photographs to detect markers in
-            with pytest.raises(ConfigError):
-                map_existing(config, tmp_path / "map", tmp_path / "work")
-            continue
+    markers = PhotographsConfig(scale=MarkerConfig(marker_size_m=0.4))
+    with pytest.raises(ConfigError):  # no photographs to detect markers in
+        map_existing(MapConfig(existing=existing, photographs=markers), tmp_path / "map", tmp_path / "work")
+    for frame in (FrameOptions(distance=distance, up="level"), FrameOptions(positions=table)):
+        config = MapConfig(existing=existing, frame=frame)
         map_existing(config, tmp_path / "map", tmp_path / "work")  # warnings are errors here
         report = json.loads((tmp_path / "map" / "report.json").read_text())
         assert report["scale"]["factor"] == pytest.approx(1 / 37)
         aligned = camera_centers(colmap_poses(tmp_path / "map"))
         np.testing.assert_allclose(np.ptp(aligned[:, 2]), 0, atol=1e-6)  # all at one height again
-        if scale.positions:
+        if frame.positions:
             np.testing.assert_allclose(aligned, centers, atol=1e-6)
 
 
@@ -241,8 +232,9 @@ def test_landmarks_are_triangulated_again_at_known_poses(tmp_path):
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
     folder = save(model, tmp_path / "flat")
     config = MapConfig(
-        existing=ExistingModelConfig(folder, frame=FrameOptions(up="z")),
-        photographs=PhotographsConfig(tmp_path / "photos", scale=ScaleConfig(marker_size_m=MARKERS[0].size_m)),
+        existing=ExistingModelConfig(folder),
+        frame=FrameOptions(up="z"),
+        photographs=PhotographsConfig(tmp_path / "photos", scale=MarkerConfig(marker_size_m=MARKERS[0].size_m)),
     )
     report = map_existing(config, tmp_path / "map", tmp_path / "work", progress=False)
     assert report.triangulated_anew and report.has_descriptors and report.n_points == 0

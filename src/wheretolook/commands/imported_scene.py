@@ -52,8 +52,8 @@ def imports_map(run: Callable[..., Any]) -> Callable[..., Any]:
     def run_on_scene(command: Any, log: Log = print, progress: Progress = ignore_progress) -> Any:
         if command.map is not None:
             files = {"database": command.database, "mesh": command.mesh}
-            existing = ExistingModelConfig(command.map, **files, frame=command.frame_options())
-            mapping = MapConfig(extractor=command.mapping.extractor, existing=existing)
+            existing = ExistingModelConfig(command.map, **files)
+            mapping = MapConfig(frame=command.frame_options(), extractor=command.mapping.extractor, existing=existing)
             replace(select_options(Map, command), mapping=mapping).run(log)
         return run(command, log, progress)
 

@@ -54,7 +54,7 @@ class Map(SceneOptions, LabelOptions):
         "model": "mapping.existing.model",
         "mesh": "mapping.existing.mesh",
         "database": "mapping.existing.database",
-        **{name: f"mapping.existing.frame.{name}" for name in ("scale", "distance", "positions", "up")},
+        **{name: f"mapping.frame.{name}" for name in ("scale", "distance", "positions", "up")},
         "engine": "label.engine",
     }
 
@@ -91,7 +91,13 @@ class Map(SceneOptions, LabelOptions):
 def _map_mesh(options: Map, files: SceneFolder, log: Log) -> None:
     """Map a scene by renders of its mesh, unless its map is current."""
     config = options.mapping
-    unused = ("photographs", "existing", "camera", "draw_camera")  # the mapping camera is a part of the key itself
+    unused = (
+        "photographs",
+        "existing",
+        "frame",
+        "camera",
+        "draw_camera",
+    )  # the mapping camera is a part of the key itself
     settings = {name: value for name, value in config.record().items() if name not in unused}
     scene = open_scene(options, files)
     seed = _seed(files)
@@ -157,12 +163,12 @@ def _map_photographs(options: Map, log: Log) -> SceneFolder:
     assert folder is not None
     scene = _new_scene(options, settings.name or place_name(folder))
     _with_scene(scene, options.root)
-    tables = [path for path in (settings.scale.marker_table, settings.scale.positions) if path is not None]
+    tables = [path for path in (settings.scale.marker_table, options.mapping.frame.positions) if path is not None]
     for path in tables:
         if not path.is_file():
-            raise ConfigError("there is no such table", path=path, fix="Check mapping.photographs.scale.")
+            raise ConfigError("there is no such table", path=path)
     images = size_and_time([folder / name for name in list_photographs(folder)])
-    used = [settings.record(), options.mapping.extractor.record()]
+    used = [settings.record(), options.mapping.extractor.record(), asdict(options.mapping.frame)]
     made_from = [images, [fingerprint(path) for path in tables]]
     cache = scene.stage_cache("map", cache_key("map", [*used, options.mapping.keep_database, _seed(scene), *made_from]))
     if cache.is_current(scene.landmarks, scene.mapping_cameras):
@@ -200,7 +206,7 @@ def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     if options.camera == CameraConfig():
         scene = _with_own_camera(scene, model, settings)
     dataset = _with_scene(scene, options.root)
-    tables = [photographs.scale.marker_table, photographs.scale.positions, settings.frame.positions, settings.database]
+    tables = [photographs.scale.marker_table, options.mapping.frame.positions, settings.database]
     files = [*sorted(folder.iterdir()), *filter(None, tables)]
     if photographs.images is not None:
         names = [image.name for _, image in sorted(model.images.items())]

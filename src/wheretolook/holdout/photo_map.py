@@ -224,9 +224,10 @@ def features_of(
         return out, out / DATABASE_FILE
     _check_photographs(model, model_dir)
     shutil.rmtree(out, ignore_errors=True)
-    existing = ExistingModelConfig(model=model_dir, frame=FrameOptions(scale=1, up="z"))  # in its own frame
+    existing = ExistingModelConfig(model=model_dir)
+    own = FrameOptions(scale=1, up="z")
     photographs = PhotographsConfig(images=images)
-    config = MapConfig(existing=existing, photographs=photographs, extractor=extractor, keep_database=True)
+    config = MapConfig(frame=own, existing=existing, photographs=photographs, extractor=extractor, keep_database=True)
     work.mkdir(parents=True, exist_ok=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MapWarning)  # about the frame, which `open_map` corrects

@@ -42,41 +42,14 @@ PARTNERS = 10  # images that each image is matched with; time grows with their n
 MAX_EPIPOLAR_ERROR_PX = 2.0  # matches farther from the epipolar line are dropped; keypoints are accurate to a pixel
 MIN_TRIANGULATION_ANGLE_DEG = 1.5  # COLMAP's own limit
 EXHAUSTIVE_UP_TO = 60  # photographs of which all pairs are matched, in minutes; more are matched by their order
+MARKER = "marker:"  # before the id of a marker as the end of a distance
 # Of a marker's side, or of the extent of known positions; a wrong size or name is off by more.
 SCALE_TOLERANCE_PERCENT = 5.0
 
 
 @dataclass(frozen=True)
-class KnownDistance:
-    """A distance measured by hand.
-
-    Args:
-        first: name of a photograph, which stands for its camera centre, or "marker:<id>" for a marker's centre.
-        second: the other end, in the same form.
-        distance_m: between the two, in metres.
-    """
-
-    first: str
-    second: str
-    distance_m: float
-
-    def __post_init__(self) -> None:
-        if not 0 < self.distance_m < inf or self.first == self.second:
-            value = (self.first, self.second, self.distance_m)
-            raise ConfigError("a known distance is a positive number of metres between two different ends", value=value)
-
-    @property
-    def marker_ids(self) -> tuple[int, ...]:
-        """Ids of the ends that are markers. Raises ConfigError if an id is not a number."""
-        names = [end.removeprefix("marker:") for end in (self.first, self.second) if end.startswith("marker:")]
-        if not all(name.isdecimal() for name in names):
-            raise ConfigError("a marker's id is a number", value=(self.first, self.second), fix="Write marker:7.")
-        return tuple(map(int, names))
-
-
-@dataclass(frozen=True)
-class ScaleConfig:
-    """Source of the scale of a map from photographs: markers, a distance, positions, or none.
+class MarkerConfig:
+    """Markers of known size in the photographs of a map, which give its scale.
 
     Args:
         dictionary: OpenCV's name of the markers' dictionary. DICT_4X4_50, DICT_APRILTAG_36H11, DICT_ARUCO_ORIGINAL
@@ -84,32 +57,21 @@ class ScaleConfig:
         marker_size_m: side of the black square of every marker, in metres; 0 for no markers.
         marker_table: CSV file of markers of different sizes, with the columns `id` and `size_m`. Other markers are
             ignored.
-        distance: one known distance, between photographs or markers.
-        positions: CSV or JSON file of camera positions. CSV with the columns `image`, `x`, `y`, `z`, or
-            JSON `{"image": [x, y, z]}`, in metres, z up. They determine the whole frame, not only its scale.
     """
 
     dictionary: str = "DICT_4X4_50"
     marker_size_m: float = 0.0
     marker_table: Path | None = None
-    distance: KnownDistance | None = None
-    positions: Path | None = None
 
     def __post_init__(self) -> None:
         check_range("marker_size_m", self.marker_size_m, 0)
-        sources = (self.marker_size_m > 0, self.marker_table, self.distance, self.positions)
-        if sum(source not in (None, False) for source in sources) > 1:
-            raise ConfigError("give marker_size_m, marker_table, distance or positions, not several", value=sources)
+        if self.marker_size_m > 0 and self.marker_table is not None:
+            raise ConfigError("give marker_size_m or marker_table, not both", value=self.marker_size_m)
 
     @property
-    def has_marker_sizes(self) -> bool:
+    def has_sizes(self) -> bool:
         """Whether the sizes of markers are known."""
         return self.marker_size_m > 0 or self.marker_table is not None
-
-    @property
-    def needs_markers(self) -> bool:
-        """Whether markers are to be detected, for their sizes or as ends of the distance."""
-        return self.has_marker_sizes or (self.distance is not None and len(self.distance.marker_ids) > 0)
 
 
 @dataclass(frozen=True)
@@ -118,7 +80,8 @@ class FrameOptions:
 
     Args:
         scale: metres in a unit of the map; 1 if it is in metres.
-        distance: instead, a measured distance: the names of two images, and the metres between their cameras.
+        distance: instead, a measured distance: the names of two images, and the metres between their cameras. With
+            photographs, marker:7 is the centre of marker 7.
         positions: instead, a CSV or JSON file of camera positions (image, x, y, z) in metres, z up.
         up: the direction up in the map: z, -y and the like, x,y,z, or level, as the cameras were held. By default z,
             unless the cameras are clearly not level.
@@ -140,9 +103,21 @@ class FrameOptions:
                 self.scale,
             ),
             (not 0 < distance_m < inf, "a distance is a positive number of metres", self.distance),
+            (len(set(self.ends)) == 1, "a distance is between two different ends", self.distance),
+            (not all(map(str.isdecimal, self.marker_ids)), "a marker's id is a number, as in marker:7", self.ends),
             (bool(self.up and self.positions), "positions give the direction up too: leave up out", self.up),
         )
         self.up_direction()
+
+    @property
+    def ends(self) -> tuple[str, ...]:
+        """Ends of the distance, if there is one."""
+        return self.distance[:2] if self.distance else ()
+
+    @property
+    def marker_ids(self) -> list[str]:
+        """Ids of the ends that are markers."""
+        return [end.removeprefix(MARKER) for end in self.ends if end.startswith(MARKER)]
 
     def frame_options(self) -> FrameOptions:
         """Return these options alone, checked, of a command that includes them."""
@@ -186,7 +161,7 @@ class PhotographsConfig:
             not reach the 0.5 px of rendered images.
         up_in_camera: the direction up in the camera frame, if it is the same for all. (x, y, z) with x right, y down, z
             forward: (0, 0, -1) for cameras that look straight down. By default cameras are held level, with any pitch.
-        scale: source of the scale.
+        scale: markers that give the scale.
     """
 
     images: Path | None = None
@@ -198,7 +173,7 @@ class PhotographsConfig:
     overlap: int = 10
     max_reprojection_error_px: float = 2.0
     up_in_camera: tuple[float, float, float] | None = None
-    scale: ScaleConfig = field(default_factory=ScaleConfig)
+    scale: MarkerConfig = field(default_factory=MarkerConfig)
 
     def __post_init__(self) -> None:
         check_range("max_side_px", self.max_side_px, 0)
@@ -217,7 +192,7 @@ class PhotographsConfig:
 class ExistingModelConfig:
     """An existing COLMAP model with known poses, from which a scene is made instead of from a mesh or photographs.
 
-    The scene is in metres, z up, according to `frame`, or to the markers of `photographs.scale`. With `photographs.images`, the
+    The scene is in metres, z up, according to `mapping.frame`, or to the markers of `photographs.scale`. With `photographs.images`, the
     folder of its images, its landmarks are triangulated again at its poses, from keypoints of `extractor`.
 
     Args:
@@ -229,7 +204,6 @@ class ExistingModelConfig:
             space follows `scenes.mapped_space`, and occlusion hidden-point removal.
         mesh_up: which axis of the mesh's file is the model's z: x, y or z, with a minus sign if it points down.
         camera_id: the query camera, if the model has several and `camera` names none.
-        frame: how the model's own frame is related to metres with z up.
         max_reprojection_error_px: landmarks with a larger mean reprojection error are removed; 0 keeps all.
     """
 
@@ -239,7 +213,6 @@ class ExistingModelConfig:
     mesh: Path | None = None
     mesh_up: str = "z"
     camera_id: int | None = None
-    frame: FrameOptions = FrameOptions()
     max_reprojection_error_px: float = 0.0
 
     def __post_init__(self) -> None:
@@ -281,8 +254,9 @@ class MapConfig:
             paper's 0.5 px).
         photographs: a folder of photographs to map instead of a mesh; of the other settings, only `extractor` and
             `keep_database` then count.
-        existing: an existing model to import instead; then only `extractor`, `keep_database` and `photographs.images`
-            and `.scale` also count.
+        existing: an existing model to import instead; then only `extractor`, `keep_database`, `frame` and
+            `photographs.images` and `.scale` also count.
+        frame: how the frame of an existing model, or of photographs, is related to metres with z up.
         camera: the mapping camera, if not the query camera, such as `{width: 1280, height: 720, fov_deg: 70}`.
         draw_camera: draw the mapping camera from the scene's seed, as `sample.cameras` draws query cameras.
         keep_images: keep the rendered images, as `images/` in the map's folder.
@@ -295,6 +269,7 @@ class MapConfig:
     max_reprojection_error_px: float = 0.5
     photographs: PhotographsConfig = field(default_factory=PhotographsConfig)
     existing: ExistingModelConfig = field(default_factory=ExistingModelConfig)
+    frame: FrameOptions = FrameOptions()
     camera: CameraConfig | None = None
     draw_camera: bool = False
     keep_images: bool = False
@@ -305,13 +280,14 @@ class MapConfig:
         if self.camera is not None and self.draw_camera:
             raise ConfigError("give camera or draw_camera, not both", value=self.camera)
         check_positive("max_reprojection_error_px", self.max_reprojection_error_px)
-        frame = self.existing.frame
-        given = FrameOptions(
-            up=None if self.photographs.scale.positions else frame.up
-        )  # positions give what is up, too
-        if self.photographs.scale != ScaleConfig() and frame != given:
-            fix = "Leave out the options of mapping.photographs.scale."
-            raise ConfigError("the frame of the model is given twice", value=frame, fix=fix)
+        frame = self.frame
+        has_scale = any((frame.scale, frame.distance, frame.positions))
+        of_photographs = "photographs have no unit or axes: give distance, positions or marker sizes, and up_in_camera"
+        no_model = self.existing.model is None
+        reject(
+            (self.photographs.scale.has_sizes and has_scale, "the scale is given twice: leave out marker sizes", frame),
+            (no_model and bool(frame.scale or frame.up), of_photographs, frame),
+        )
 
     def record(self) -> dict[str, Any]:
         """Settings and constants, from which the keys of finished maps are made."""

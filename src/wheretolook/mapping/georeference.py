@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from io import StringIO
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,8 +14,8 @@ from tqdm.auto import tqdm
 
 from wheretolook.geometry.poses import Float
 from wheretolook.geometry.similarity import Similarity
-from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_arrays
-from wheretolook.mapping.config import SCALE_TOLERANCE_PERCENT, ScaleConfig
+from wheretolook.mapping.colmap_model import ModelArrays
+from wheretolook.mapping.config import MARKER, SCALE_TOLERANCE_PERCENT, FrameOptions, MarkerConfig
 from wheretolook.mapping.markers import Marker, MarkerView, detect_markers, marker_detector, place_marker
 from wheretolook.mapping.photographs import read_photograph
 from wheretolook.utils.errors import ConfigError, MapError
@@ -69,60 +69,51 @@ class MapScale:
         return "; ".join(parts)
 
 
-@dataclass(frozen=True, eq=False)
-class KnownScale:
-    """Settings of the scale, with the content of the tables that they name."""
+class MarkedPhotographs(NamedTuple):
+    """Photographs in which markers are detected."""
 
-    config: ScaleConfig
-    sizes_m: Mapping[int, float] | float
-    positions: Mapping[str, Float]
-
-    @staticmethod
-    def read(config: ScaleConfig) -> KnownScale:
-        """Read the tables. Raises ConfigError if one is not valid, or OpenCV lacks the markers' dictionary."""
-        if config.needs_markers:
-            marker_detector(config.dictionary)
-        sizes = config.marker_size_m if config.marker_table is None else read_marker_table(config.marker_table)
-        return KnownScale(config, sizes, {} if config.positions is None else read_positions(config.positions))
+    markers: MarkerConfig = MarkerConfig()
+    folder: Path | None = None
+    turned: bool = True  # as EXIF says, see `read_photograph`
+    progress: bool = True
 
 
-def find_scale(
-    model: Any,
-    known: KnownScale,
-    upright: Similarity,
-    photographs: Path | None = None,
-    turned: bool = True,
-    progress: bool = True,
-) -> tuple[MapScale, Similarity]:
-    """The scale of a `pycolmap.Reconstruction`, and the similarity from its frame to the world.
+def check_tables(markers: MarkerConfig, frame: FrameOptions) -> None:
+    """Raise ConfigError if a table of markers or positions is not valid, or OpenCV lacks the markers' dictionary."""
+    if markers.has_sizes or frame.marker_ids:
+        marker_detector(markers.dictionary)
+    if markers.marker_table is not None:
+        read_marker_table(markers.marker_table)
+    if frame.positions is not None:
+        read_positions(frame.positions)
 
-    `upright` is that similarity without the scale; known positions overrule it. Markers are detected in the folder of
-    photographs, which are read by `read_photograph`. Raises MapError or ConfigError if there is no scale of the source
-    that was requested.
+
+def given_scale(model: Any, frame: FrameOptions, photographs: MarkedPhotographs, path: Path) -> MapScale | None:
+    """The scale of a `pycolmap.Reconstruction` in `path` by the options of its frame, or by markers of known size.
+
+    None if there is none, or positions give it. Raises MapError or ConfigError if the source does not give it.
     """
-    images = [image for _, image in sorted(model.images.items()) if image.has_pose]
-    centers = {image.name: image.projection_center() for image in images}
-    config = known.config
-    if known.positions:
-        return scale_from_positions(centers, known.positions)
+    if frame.scale is not None:
+        return MapScale("given", float(frame.scale))
+    markers = photographs.markers
     views: dict[int, list[MarkerView]] = {}
-    if config.needs_markers:
-        if photographs is None:
+    images = [image for _, image in sorted(model.images.items()) if image.has_pose]
+    if markers.has_sizes or frame.marker_ids:
+        if photographs.folder is None:
             fix = "Give the folder of the model's images, --images, or a distance between photographs, or positions."
             raise ConfigError("markers are detected in photographs, and none were given", fix=fix)
-        for image in tqdm(images, "map: markers", disable=not progress, unit="image"):
-            for marker, view in _marker_views(image, photographs / image.name, config.dictionary, turned).items():
+        for image in tqdm(images, "map: markers", disable=not photographs.progress, unit="image"):
+            for marker, view in _marker_views(image, photographs).items():
                 views.setdefault(marker, []).append(view)
-    if config.has_marker_sizes:
-        markers, unused = _place_markers(views, known.sizes_m)
-        scale = scale_from_markers(markers, known.sizes_m, unused)
-    elif config.distance is not None:
-        ends = (config.distance.first, config.distance.second)
-        first, second = (_end_point(end, centers, views, photographs) for end in ends)
-        scale = scale_from_distance(first, second, config.distance.distance_m)
-    else:
-        scale = scale_from_depths(model_arrays(model), colmap_poses("", model))
-    return scale, replace(upright, scale=scale.factor, translation=scale.factor * upright.translation)
+    if frame.distance is not None:
+        centers = {image.name: image.projection_center() for image in images}
+        first, second = (_end_point(end, centers, views, path) for end in frame.ends)
+        return scale_from_distance(first, second, frame.distance[2])
+    if not markers.has_sizes:
+        return None
+    sizes = markers.marker_size_m if markers.marker_table is None else read_marker_table(markers.marker_table)
+    placed, unused = _place_markers(views, sizes)
+    return scale_from_markers(placed, sizes, unused)
 
 
 def fit_similarity(source: ArrayLike, target: ArrayLike) -> Similarity:
@@ -144,7 +135,7 @@ def fit_similarity(source: ArrayLike, target: ArrayLike) -> Similarity:
 
 
 def scale_from_markers(
-    markers: Sequence[Marker], size_m: Mapping[int, float] | float, unused: Mapping[str, str] | None = None
+    markers: Sequence[Marker], size_m: Mapping[int, float] | float, unused: Mapping[str, str] = {}
 ) -> MapScale:
     """The median of true size over length in the map, over the sides of all markers.
 
@@ -152,7 +143,7 @@ def scale_from_markers(
     Raises MapError if there is no marker, or the error of a side exceeds the tolerance.
     """
     if not markers:
-        reasons = "; ".join((unused or {}).values()) or "no marker of a known size was detected"
+        reasons = "; ".join(unused.values()) or "no marker of a known size was detected"
         fix = "Check scale.dictionary and the sizes; at least two photographs must show a whole marker."
         raise MapError("no marker gives the map its scale", value=reasons, fix=fix)
     sizes = np.array([size_m if isinstance(size_m, float | int) else size_m[marker.marker_id] for marker in markers])
@@ -175,7 +166,7 @@ def scale_from_markers(
             f"{marker.name} side {i}": float(side) for marker in markers for i, side in enumerate(errors[marker])
         },
         unit="percent",
-        unused=dict(unused or {}),
+        unused=dict(unused),
         marker_error_px={marker.name: marker.error_px for marker in markers},
         marker_views={marker.name: len(set(marker.images)) for marker in markers},
     )
@@ -284,13 +275,15 @@ def read_scale(map_dir: Path) -> MapScale | None:
         raise MapError(f"the map's report is damaged: {error}", path=path, fix="Run the map stage again.") from error
 
 
-def _marker_views(image: Any, path: Path, dictionary: str, turned: bool) -> dict[int, MarkerView]:
+def _marker_views(image: Any, photographs: MarkedPhotographs) -> dict[int, MarkerView]:
     """Views of markers in the photograph of an image with a pose: detected at full size, in pixels of the map."""
     camera = image.camera
-    rgb = read_photograph(path, turned)
+    assert photographs.folder is not None
+    path = photographs.folder / image.name
+    rgb = read_photograph(path, photographs.turned)
     reduction = np.array([camera.width, camera.height]) / rgb.shape[1::-1]
     pose = image.cam_from_world().matrix()
-    corners = detect_markers(rgb, dictionary, path)
+    corners = detect_markers(rgb, photographs.markers.dictionary, path)
     return {marker: MarkerView(image.name, camera, pose, at * reduction) for marker, at in corners.items()}
 
 
@@ -309,16 +302,14 @@ def _place_markers(
     return markers, unused
 
 
-def _end_point(
-    end: str, centers: Mapping[str, Float], views: Mapping[int, list[MarkerView]], folder: Path | None
-) -> Float:
-    """Position (3,) of an end of a known distance, in COLMAP's frame."""
-    if end.startswith("marker:"):
-        number = int(end.removeprefix("marker:"))
+def _end_point(end: str, centers: Mapping[str, Float], views: Mapping[int, list[MarkerView]], path: Path) -> Float:
+    """Position (3,) of an end of a known distance, in the map's frame."""
+    if end.startswith(MARKER):
+        number = int(end.removeprefix(MARKER))
         if number not in views:
-            raise MapError(f"no photograph with a pose sees marker {number}", path=folder, fix="Name another one.")
+            raise MapError(f"no photograph with a pose sees marker {number}", path=path, fix="Name another one.")
         return place_marker(number, views[number]).center
     if end not in centers:
-        fix = "Name one that has a pose, relative to its folder; markers are written marker:7."
-        raise MapError("the map has no such photograph", path=folder, value=end, fix=fix)
+        fix = f"Name two of its images, such as {', '.join(sorted(centers)[:2])}; markers are written marker:7."
+        raise MapError("the map has no such image", path=path, value=end, fix=fix)
     return centers[end]

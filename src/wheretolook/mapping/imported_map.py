@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import camera_centers
-from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.colmap_model import (
     colmap_poses,
     describe_cameras,
@@ -19,10 +18,10 @@ from wheretolook.mapping.colmap_model import (
     read_model,
     registered_names,
 )
-from wheretolook.mapping.config import EXHAUSTIVE_UP_TO, PARTNERS, MapConfig, ScaleConfig
-from wheretolook.mapping.georeference import KnownScale, MapScale, find_scale
+from wheretolook.mapping.config import EXHAUSTIVE_UP_TO, PARTNERS, MapConfig
+from wheretolook.mapping.georeference import MapScale, MarkedPhotographs, check_tables
 from wheretolook.mapping.map_folder import DATABASE_FILE, MapDraft, MapReport, MapRun, finish_map, replacing_map
-from wheretolook.mapping.map_frame import IDENTITY, MapFrame, find_frame
+from wheretolook.mapping.map_frame import IDENTITY, find_frame
 from wheretolook.mapping.sfm import PhotographFeatures, photograph_features
 from wheretolook.mapping.triangulation import choose_pairs, triangulate_model
 from wheretolook.utils.confine import path_within
@@ -73,7 +72,7 @@ def map_existing(
         raise ConfigError("no model was named", fix="Set mapping.existing.model.")
     if photographs.images is not None and settings.database is not None:
         raise ConfigError("images give new keypoints, which a database does not describe", fix=_EITHER)
-    known = KnownScale.read(photographs.scale)
+    check_tables(photographs.scale, config.frame)
     with replacing_map(config, out_dir, seed, workers, device, progress) as (folder, run):
         with run.clock("read"):
             model = reconstruction or read_model(settings.model)
@@ -87,7 +86,8 @@ def map_existing(
             model = _triangulate(model, photographs.images, turned, work, database, run)
             limit_px = limit_px or photographs.max_reprojection_error_px
         with run.clock("frame"):
-            frame = _find_frame(model, config, known, turned, progress)
+            marked = MarkedPhotographs(photographs.scale, photographs.images, turned, progress)
+            frame = find_frame(settings.model, model, config.frame, photographs=marked)
             frame.world_from_map.transform_model(model)
         if limit_px and not all(point.has_error() for point in model.points3D.values()):
             model.update_point_3d_errors()
@@ -108,17 +108,6 @@ def map_existing(
         report.save(folder)
     IDENTITY.warn(settings.model, landmarks.mapping_distance_m, poses)
     return report
-
-
-def _find_frame(model: Any, config: MapConfig, known: KnownScale, turned: bool, progress: bool) -> MapFrame:
-    """Return the frame of a model by the options of its frame, or by those of the scale of photographs."""
-    assert config.existing.model is not None
-    frame = find_frame(config.existing.model, model, config.existing.frame)
-    if known.config == ScaleConfig():
-        return frame
-    upright = Similarity(1.0, frame.world_from_map.rotation, np.zeros(3))
-    scale, similarity = find_scale(model, known, upright, config.photographs.images, turned, progress)
-    return replace(frame, world_from_map=similarity, scale=scale)
 
 
 def _triangulate(source: Any, images: Path, turned: bool, work: Path, database: Path, run: MapRun) -> Any:

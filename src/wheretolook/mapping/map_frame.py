@@ -18,10 +18,11 @@ from wheretolook.mapping.georeference import (
     DEPTH_M,
     REPORT_FILE,
     MapScale,
+    MarkedPhotographs,
+    given_scale,
     read_positions,
     read_scale,
     scale_from_depths,
-    scale_from_distance,
     scale_from_positions,
 )
 from wheretolook.mapping.gravity import estimate_gravity, rotation_to_z
@@ -94,6 +95,7 @@ def find_frame(
     options: FrameOptions = FrameOptions(),
     depth_scale: float | None = None,
     arrays: ModelArrays | None = None,
+    photographs: MarkedPhotographs = MarkedPhotographs(),
 ) -> MapFrame:
     """Find the frame of a `pycolmap.Reconstruction`, which is not changed.
 
@@ -103,18 +105,19 @@ def find_frame(
         options: what the user states.
         depth_scale: metres in a unit of the model by depth images, if there are any.
         arrays: the reconstruction as arrays, if they are known.
+        photographs: its images, with markers of known size or at the ends of the distance.
 
     Raises:
         MapError: the options do not fit the images, or no camera agrees with the direction up.
         ConfigError: two sources of the scale disagree, or the file of positions is not valid.
     """
     poses = colmap_poses(model_dir, model)
-    centers = {image.name: image.projection_center() for image in model.images.values() if image.has_pose}
     reported = reported_scale(model_dir)
-    scale = _given_scale(model_dir, options, centers)
+    scale = given_scale(model, options, photographs, model_dir)
     known = reported if reported is not None and reported.is_metric else None
     by_depth = None if depth_scale is None else MapScale("depth", depth_scale)
     if options.positions is not None:
+        centers = {image.name: image.projection_center() for image in model.images.values() if image.has_pose}
         scale, similarity = scale_from_positions(centers, read_positions(options.positions))
         _check_agreement(scale, known, by_depth)
         return MapFrame(similarity, scale, "given")
@@ -149,20 +152,6 @@ def read_frame(map_dir: Path) -> MapFrame:
     values = record["world_from_map"]
     similarity = Similarity(values["scale"], np.array(values["rotation"]), np.array(values["translation"]))
     return MapFrame(similarity, scale, record["gravity"])
-
-
-def _given_scale(model_dir: Path, options: FrameOptions, centers: dict[str, Float]) -> MapScale | None:
-    """Return the scale that the options state, by camera centres; None if there is none, or positions give it."""
-    if options.scale is not None:
-        return MapScale("given", float(options.scale))
-    if options.distance is None:
-        return None
-    *ends, distance_m = options.distance
-    for end in ends:
-        if end not in centers:
-            fix = f"Name two of its images, such as {', '.join(sorted(centers)[:2])}."
-            raise MapError("the map has no such image", path=model_dir, value=end, fix=fix)
-    return scale_from_distance(centers[ends[0]], centers[ends[1]], distance_m)
 
 
 def _check_agreement(scale: MapScale | None, reported: MapScale | None, by_depth: MapScale | None) -> None:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from wheretolook.geometry.poses import camera_centers
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.colmap_model import colmap_poses, describe_cameras, registered_names
 from wheretolook.mapping.config import MapConfig
-from wheretolook.mapping.georeference import KnownScale, MapScale, find_scale
+from wheretolook.mapping.georeference import MapScale, MarkedPhotographs, check_tables
 from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.mapping.map_folder import MapDraft, MapReport, finish_map, replacing_map
+from wheretolook.mapping.map_frame import IDENTITY, find_frame
 from wheretolook.mapping.photographs import photograph_cameras
 from wheretolook.mapping.sfm import map_incrementally, photograph_features
 from wheretolook.utils.errors import ConfigError
@@ -56,7 +58,7 @@ def map_photographs(
     settings = config.photographs
     if settings.images is None:
         raise ConfigError("no folder of photographs was named", fix="Set mapping.photographs.images.")
-    known = KnownScale.read(settings.scale)  # a damaged table is reported before the work
+    check_tables(settings.scale, config.frame)  # before the work
     work.mkdir(parents=True, exist_ok=True)
     with replacing_map(config, out_dir, seed, workers, device, progress, before_replace) as (folder, run):
         with run.clock("extract"):
@@ -66,17 +68,19 @@ def map_photographs(
             mapped = map_incrementally(work, features, cameras, run)
         model = mapped.model
         with run.clock("gravity"):
-            gravity = estimate_gravity(colmap_poses(work, model), settings.up_in_camera)
-            centers = [model.images[number].projection_center() for number in registered_names(model)]
-            upright = Similarity(1.0, gravity.rotation, -gravity.rotation @ np.stack(centers).mean(0))
+            poses = colmap_poses(work, model)
+            gravity = estimate_gravity(poses, settings.up_in_camera)
+            center = camera_centers(poses).mean(0)
+            Similarity(1.0, gravity.rotation, -gravity.rotation @ center).transform_model(model)
         with run.clock("scale"):
-            scale, to_world = find_scale(model, known, upright, settings.images, progress=progress)
-            to_world.transform_model(model)
+            photographs = MarkedPhotographs(settings.scale, settings.images, progress=progress)
+            options = config.frame if config.frame.positions else replace(config.frame, up="z")
+            frame = find_frame(work, model, options, photographs=photographs)
+            frame.world_from_map.transform_model(model)
             model.update_point_3d_errors()
-        draft = MapDraft(
-            model, Path(out_dir), settings.max_reprojection_error_px, _FIX, mapped.database, features.colors
-        )
-        fields = finish_map(draft, folder, run)[1]
+        out_dir = Path(out_dir)
+        draft = MapDraft(model, out_dir, settings.max_reprojection_error_px, _FIX, mapped.database, features.colors)
+        landmarks, fields = finish_map(draft, folder, run)
         registered = set(registered_names(model).values())
         report = PhotographMapReport(
             n_images=len(features.names),
@@ -89,11 +93,12 @@ def map_photographs(
             cameras=describe_cameras(model),
             n_known_focal=cameras.n_known_focal,
             gravity={
-                "method": "positions" if known.positions else gravity.method,
+                "method": "positions" if config.frame.positions else gravity.method,
                 "median_deg": float(np.median(gravity.residual_deg)),
                 "max_deg": float(gravity.residual_deg.max()),
             },
-            scale=scale,
+            scale=frame.scale,
         )
         report.save(folder)
+    IDENTITY.warn(out_dir, landmarks.mapping_distance_m, colmap_poses(work, model))
     return report

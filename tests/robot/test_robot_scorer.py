@@ -154,13 +154,15 @@ def test_occlusion_is_that_of_the_nearest_place(room_map: LocalizationMap, folde
         views = robot.views(poses)
         np.testing.assert_allclose(views.score, scorer.score(poses), atol=TOLERANCE, rtol=0)
         np.testing.assert_array_equal(views.n_visible, np.diff(room_map.landmarks_in_view(poses).starts))
-        assert np.abs(views.place_m).max() < 1e-9
+        assert np.abs(views.place_distance).max() < 1e-9
         through_walls = without.views(poses)
-        assert np.isnan(through_walls.place_m).all()
+        assert np.isnan(through_walls.place_distance).all()
         assert through_walls.n_visible.sum() > views.n_visible.sum() + 50
         unoccluded = room_map.occlusion.unoccluded(at[None], room_map.landmarks.points)[0]
         np.testing.assert_array_equal(without.views(poses, unoccluded).score, views.score)
-    np.testing.assert_allclose(robot.views(poses_looking_along(PLACES[1] + (0.3, 0, -0.4), (0, 1, 0))).place_m, 0.5)
+    np.testing.assert_allclose(
+        robot.views(poses_looking_along(PLACES[1] + (0.3, 0, -0.4), (0, 1, 0))).place_distance, 0.5
+    )
 
 
 def test_the_best_view_at_a_location(room_map: LocalizationMap, folder: Path) -> None:
@@ -174,7 +176,7 @@ def test_the_best_view_at_a_location(room_map: LocalizationMap, folder: Path) ->
     np.testing.assert_allclose(
         Rotation.from_quat(view.quaternion_xyzw).as_matrix(), invert_poses(view.cam_from_world)[:, :3], atol=1e-12
     )
-    assert 0 < view.expected_inliers <= view.n_visible and view.place_m < 1e-9
+    assert 0 < view.expected_inliers <= view.n_visible and view.place_distance < 1e-9
     level = np.abs(np.degrees(np.arcsin(axes[:, 2]))) <= 10
     chosen = robot.best(PLACES[0], directions=axes, pitch_deg=(-10, 10))
     np.testing.assert_allclose(chosen.direction, axes[level][scores[level].argmax()], atol=1e-12)

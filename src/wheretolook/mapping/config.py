@@ -285,8 +285,8 @@ class MapConfig:
         of_photographs = "photographs have no unit or axes: give distance, positions or marker sizes, and up_in_camera"
         no_model = self.existing.model is None
         reject(
-            (self.photographs.scale.has_sizes and has_scale, "the scale is given twice: leave out marker sizes", frame),
-            (no_model and bool(frame.scale or frame.up), of_photographs, frame),
+            (self.photographs.scale.has_sizes and has_scale, "the scale is given twice: leave out marker sizes", None),
+            (no_model and bool(frame.scale or frame.up), of_photographs, frame.scale or frame.up),
         )
 
     def record(self) -> dict[str, Any]:

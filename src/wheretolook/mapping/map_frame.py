@@ -25,13 +25,14 @@ from wheretolook.mapping.georeference import (
     scale_from_depths,
     scale_from_positions,
 )
-from wheretolook.mapping.gravity import estimate_gravity, rotation_to_z
+from wheretolook.mapping.gravity import Gravity, estimate_gravity, rotation_to_z
 from wheretolook.mapping.sanity import LOOKING_DOWN, scale_warning, up_axis_warning
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning
 from wheretolook.utils.reading import read_json_object
 
 MAX_RATIO = 1.05  # of two scales that agree
 MAX_DEPTH_RATIO = 1.2  # of a scale and that of depth images, whose sensors are less accurate
+NOTABLE_DEG = 5.0  # smallest tilt that is stated
 MAX_TILT_DEG = 60.0  # median angle between a given up and the images' own, beyond which no camera was held like that
 
 
@@ -45,6 +46,7 @@ class MapFrame:
     world_from_map: Similarity = Similarity(1.0, np.eye(3), np.zeros(3))
     scale: MapScale = MapScale("given")  # its source; the factor is that of `world_from_map`
     gravity: Literal["given", "levelled", "model"] = "model"
+    tilt_deg: float = 0.0  # angle between z and up as estimated from the cameras' roll
 
     def of_arrays(self, arrays: ModelArrays) -> ModelArrays:
         """Return arrays of the model in the world."""
@@ -60,7 +62,9 @@ class MapFrame:
     def describe(self) -> str:
         """State the scale and the direction up in one clause."""
         up = "z" if self.gravity == "model" else f"({_rounded(self.world_from_map.rotation[2])}), {self.gravity}"
-        return f"1 unit of the map = {self.world_from_map.scale:.4g} m ({self.scale.describe()}), up: {up}"
+        unit = f"{'' if self.scale.is_metric else 'as if '}1 unit of the map = {self.world_from_map.scale:.4g} m"
+        tilt = f", {self.tilt_deg:.0f} degrees from that of its cameras" if self.tilt_deg > NOTABLE_DEG else ""
+        return f"{unit} ({self.scale.describe()}), up: {up}{tilt}"
 
     def warn(self, model: Path, mapping_distance_m: ArrayLike, cam_from_world: ArrayLike) -> None:
         """Issue a `MapWarning` for each of the `messages`."""
@@ -123,8 +127,10 @@ def find_frame(
         return MapFrame(similarity, scale, "given")
     _check_agreement(scale or known, known, by_depth)
     chosen = scale or known or by_depth or reported or scale_from_depths(arrays or model_arrays(model), poses)
-    gravity, rotation = _upright(model_dir, poses, options, is_known=reported is not None)
-    return MapFrame(Similarity(chosen.factor, rotation, np.zeros(3)), chosen, gravity)
+    level = estimate_gravity(poses)
+    gravity, rotation = _upright(model_dir, poses, options, level, is_known=reported is not None)
+    tilt_deg = float(np.degrees(np.arccos(np.clip(rotation[2] @ level.up, -1, 1))))
+    return MapFrame(Similarity(chosen.factor, rotation, np.zeros(3)), chosen, gravity, tilt_deg)
 
 
 def reported_scale(model_dir: Path) -> MapScale | None:
@@ -166,17 +172,17 @@ def _check_agreement(scale: MapScale | None, reported: MapScale | None, by_depth
 
 
 def _upright(
-    model_dir: Path, poses: Float, options: FrameOptions, is_known: bool
+    model_dir: Path, poses: Float, options: FrameOptions, level: Gravity, is_known: bool
 ) -> tuple[Literal["given", "levelled", "model"], Float]:
     """Return how the direction up is known, and the rotation (3, 3) that turns it to z.
 
-    Without options it is z if that is known, or unless the cameras, poses (M, 3, 4), are clearly not level. A user who
+    `level` is up as the cameras were held. Without options it is z if that is known, or unless the cameras, poses (M, 3, 4), are clearly not level. A user who
     states that z is up keeps it, however the cameras were held.
     """
     up = options.up_direction()
     if up is None:
         levels = options.up == "level" or not (is_known or not up_axis_warning(poses))
-        return ("levelled", estimate_gravity(poses).rotation) if levels else ("model", np.eye(3))
+        return ("levelled", level.rotation) if levels else ("model", np.eye(3))
     rotation = rotation_to_z(up)
     off_deg = np.degrees(np.arccos(np.clip(-poses[:, 1, :3] @ rotation[2], -1, 1)))
     looking_down = (poses[:, 2, :3] @ rotation[2]).mean() < -LOOKING_DOWN
@@ -184,7 +190,7 @@ def _upright(
         problem = (
             f"no camera agrees with this direction up: half were held {np.median(off_deg):.0f} degrees off or more"
         )
-        fix = f"The cameras were held as if up were ({_rounded(estimate_gravity(poses).up)}): give that, or --up level."
+        fix = f"The cameras were held as if up were ({_rounded(level.up)}): give that, or --up level."
         raise MapError(problem, path=model_dir, value=options.up, fix=fix)
     return "given", rotation
 

@@ -44,7 +44,7 @@ def mesh_warning(points: ArrayLike, raycaster: MeshRaycaster) -> str:
     far = f"{off_m:.2f} m or more" if np.isfinite(off_m) else f"more than {MESH_DISTANCE_M[1]:g} m"
     return (
         f"half of the landmarks are {far} from the mesh, so it seems to be in another frame or unit than the model. "
-        "Export both in the same frame, in metres; a mesh with y up (glTF's own) `wheretolook map --model` "
+        "Export both in the same frame and unit; a mesh with y up (glTF's own) `wheretolook map --model` "
         "turns with --mapping.existing.mesh_up y"
     )
 

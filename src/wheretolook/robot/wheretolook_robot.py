@@ -29,7 +29,7 @@ camera, whose centre is -R^T t. Pixel (0.5, 0.5) is the centre of the top-left p
 quaternions are xyzw as in ROS. The camera is a pinhole; for a lens with distortion, that of its rectified images.
 
 Occlusion is not computed here. With `places`, a view sees the landmarks that are unoccluded from the nearest of them
-(`Views.place_m` is the distance to it). Without, landmarks are visible through walls and scores behind walls are too
+(`Views.place_distance` is the distance to it). Without, landmarks are visible through walls and scores behind walls are too
 high. A robot with a better estimate passes `unoccluded`, (N,) bool.
 
 The computation, in the order of this file: select the landmarks in the image, compute their attributes for the view,
@@ -68,7 +68,7 @@ class Views:
     n_visible: Array  # (B,) int64, visible landmarks
     expected_inliers: Array  # (B,) float32, expected number of correctly matched landmarks
     in_range: Array  # (B,) bool, whether the view is within the range of the training views
-    place_m: Array  # (B,) float64, metres to the place whose occlusion was used; NaN without
+    place_distance: Array  # (B,) float64, to the place whose occlusion was used, in units of the map; NaN without
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class BestView:
     n_visible: int
     expected_inliers: float
     in_range: bool
-    place_m: float
+    place_distance: float
 
 
 class RobotScorer:
@@ -240,7 +240,7 @@ class RobotScorer:
 
     def _views_at(self, center: Array, rotations: Array, unoccluded: ArrayLike | None) -> Views:
         """Score views at one location (3,) m with cam_from_world rotations (D, 3, 3)."""
-        candidates, place_m = self._candidates(center, unoccluded)
+        candidates, distance = self._candidates(center, unoccluded)
         with np.errstate(over="ignore"):
             offsets = (self._columns[:, candidates] - center[:, None]).astype(np.float32)  # (3, F) m, in the world
         visible = self._in_image(offsets, rotations)
@@ -274,7 +274,7 @@ class RobotScorer:
             score[block], inliers[block] = self._session.run(OUTPUTS, inputs)
         in_range = self._serves_camera & self._within("distance_m", distance_m)
         in_range &= (n_visible == 0) | self._within("in_view", n_visible)
-        return Views(score, n_visible, inliers, in_range, np.full(len(rotations), place_m))
+        return Views(score, n_visible, inliers, in_range, np.full(len(rotations), distance / self._scale))
 
     def _candidates(self, center: Array, unoccluded: ArrayLike | None) -> tuple[Array, float]:
         """Return rows of the landmarks unoccluded from a location (3,) m, and the distance to the place used."""

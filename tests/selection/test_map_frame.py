@@ -105,7 +105,7 @@ def test_the_direction_up(sparse: Path, tmp_path: Path) -> None:
         ({"scale": 1, "distance": ("000.jpg", "001.jpg", 2.0)}, ConfigError),
         ({"scale": 2}, ConfigError),  # the report states metres
         ({"distance": ("000.jpg", "nothing.jpg", 2.0)}, MapError),
-        ({"distance": ("000.jpg", "000.jpg", 2.0)}, MapError),
+        ({"distance": ("000.jpg", "000.jpg", 2.0)}, ConfigError),
         ({"distance": ("000.jpg", "001.jpg", -2.0)}, ConfigError),
         ({"positions": Path("nothing.csv")}, ConfigError),
         ({"up": "w"}, ConfigError),

@@ -240,7 +240,7 @@ class RobotScorer:
 
     def _views_at(self, center: Array, rotations: Array, unoccluded: ArrayLike | None) -> Views:
         """Score views at one location (3,) m with cam_from_world rotations (D, 3, 3)."""
-        candidates, distance = self._candidates(center, unoccluded)
+        candidates, to_place = self._candidates(center, unoccluded)
         with np.errstate(over="ignore"):
             offsets = (self._columns[:, candidates] - center[:, None]).astype(np.float32)  # (3, F) m, in the world
         visible = self._in_image(offsets, rotations)
@@ -274,7 +274,7 @@ class RobotScorer:
             score[block], inliers[block] = self._session.run(OUTPUTS, inputs)
         in_range = self._serves_camera & self._within("distance_m", distance_m)
         in_range &= (n_visible == 0) | self._within("in_view", n_visible)
-        return Views(score, n_visible, inliers, in_range, np.full(len(rotations), distance / self._scale))
+        return Views(score, n_visible, inliers, in_range, np.full(len(rotations), to_place / self._scale))
 
     def _candidates(self, center: Array, unoccluded: ArrayLike | None) -> tuple[Array, float]:
         """Return rows of the landmarks unoccluded from a location (3,) m, and the distance to the place used."""

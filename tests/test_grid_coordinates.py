@@ -17,6 +17,7 @@ from selection.room import POINTS, WEIGHTS, write_room
 from twins.open3d_renderer import Open3DRenderer
 from wheretolook import WhereToLook
 from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.matching import Matches
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.local_origin import local_origin, poses_from
@@ -222,7 +223,7 @@ def test_a_pose_is_estimated_as_exactly_as_near_the_origin() -> None:
     rows = np.flatnonzero((transform(pose, points)[:, 2] > 0.1) & CAMERA.in_image(pixels))
     keypoints = Keypoints(pixels.astype(np.float32), np.zeros((200, 128), np.float32))
     landmarks = replace(room_landmarks(200), points=points + SHIFT, descriptors=np.ones((200, 128), np.uint8))
-    found = Localizer(landmarks, CAMERA).estimate(keypoints, rows, rows)
+    found = Localizer(landmarks, CAMERA).estimate(keypoints, Matches(rows, rows, np.zeros(200, np.float32)))
     assert found.status == "localized" and len(found.inlier_rows) == len(rows)
     error_m, error_deg = pose_error(found.cam_from_world, far_poses(pose))
     assert error_m < 1e-3 and error_deg < 1e-2

@@ -88,9 +88,9 @@ def localize(
     spent = 0.0
     for of_view, pose in zip(keypoints, poses, strict=True):
         start = time.process_time()
-        ((rows, landmarks),) = localizer.match([of_view])
+        (matches,) = localizer.match([of_view])
         spent += time.process_time() - start
-        result = localizer.estimate(of_view, rows, landmarks)
+        result = localizer.estimate(of_view, matches)
         estimate = np.full((3, 4), np.nan) if result.cam_from_world is None else result.cam_from_world
         error_m, error_deg = pose_error(estimate, pose)
         good.append(result.status == LOCALIZED and error_m < 0.05 and error_deg < 0.4)

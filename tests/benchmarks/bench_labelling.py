@@ -80,8 +80,8 @@ def time_steps(folder: SceneFolder, views: np.ndarray, batch: int, device: str) 
             with watch("match"):
                 matches = localizer.match(keypoints)
             with watch("pose"):
-                for of_image, (rows, landmarks) in zip(keypoints, matches, strict=True):
-                    localizer.estimate(of_image, rows, landmarks)
+                for of_image, matched in zip(keypoints, matches, strict=True):
+                    localizer.estimate(of_image, matched)
     steps = ", ".join(f"{step} {1000 * seconds / len(views):.2f}" for step, seconds in watch.seconds.items())
     peak = f"; peak {torch.cuda.max_memory_allocated() / 1e9:.2f} GB of PyTorch" if device != "cpu" else ""
     print(f"batches of {batch}, ms per view: {steps}{peak}", flush=True)

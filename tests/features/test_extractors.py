@@ -54,9 +54,11 @@ def test_mutual_nearest_neighbours_are_those_of_all_products(n, monkeypatch):
     images = [np.concatenate([noisy, unit(30, 64, 2)]).astype(np.float16), np.zeros((0, 64), np.float16)]
     matcher = SimilarityMatcher(landmarks)
     for limit in (-1.0, 0.5, 0.9):
-        (keypoints, rows), nothing = matcher.match(images, limit)
+        (keypoints, rows, nearest), nothing = matcher.match(images, limit)
         assert len(nothing[0]) == len(nothing[1]) == 0
         if n:
+            cosine = images[0].astype(float) @ landmarks.astype(float).T
+            np.testing.assert_allclose(nearest, 2 - 2 * cosine.max(1), atol=1e-5)
             expected = mutual_matches(images[0], landmarks, limit)
             found, plain = ({*zip(a.tolist(), b.tolist(), strict=True)} for a, b in ((keypoints, rows), expected))
             assert len(found ^ plain) <= n // 1000  # sums that agree up to single precision

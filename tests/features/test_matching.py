@@ -89,7 +89,7 @@ def test_matches_pass_lowes_test_and_take_each_landmark_once(device: str, max_ra
     landmarks = sift_like_descriptors(300)
     landmarks[10] = landmarks[11]  # twins never match: their keypoints are as near to the one as to the other
     queries = np.concatenate([views_of(landmarks, 200, noise) for noise in (0.0, 0.02, 0.06)])
-    ((keypoints, rows),) = match(DescriptorMatcher(landmarks, device), [queries], max_ratio)
+    ((keypoints, rows, _),) = match(DescriptorMatcher(landmarks, device), [queries], max_ratio)
     assert dict(zip(keypoints.tolist(), rows.tolist(), strict=True)) == lowe(queries, landmarks, max_ratio)
     assert 100 < len(rows) < len(queries)
     assert (np.diff(keypoints) > 0).all() and len(set(rows)) == len(rows) and not {10, 11} & set(rows)

@@ -13,6 +13,7 @@ from localization.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, map_ro
 from one_scene import label_viewpoints
 from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good, poses
 from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.matching import Matches
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import pose_error, transform
 from wheretolook.localization.config import LabelConfig
@@ -88,7 +89,8 @@ def test_a_pose_is_found_with_every_camera(room: MappedRoom, camera: Camera) -> 
     matched = rows.copy()
     matched[::2] = np.roll(matched[::2], 7)
     keypoints = replace(Keypoints.none(), pixels=found.astype(np.float32))
-    estimate = Localizer(landmarks, CAMERA).estimate(keypoints, np.arange(len(rows)), matched, camera)
+    matches = Matches(np.arange(len(rows)), matched, np.zeros(len(rows), np.float32))
+    estimate = Localizer(landmarks, CAMERA).estimate(keypoints, matches, camera)
     assert estimate.cam_from_world is not None and estimate.status == LOCALIZED
     (error_m,), (error_deg,) = pose_error(estimate.cam_from_world[None], pose[None])
     assert error_m < 0.02 and error_deg < 0.3 and len(estimate.inlier_rows) >= 0.4 * len(rows)

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.features.matching import Matches
-
 
 def nearest_two(
     queries: NDArray[np.uint8], descriptors: NDArray[np.uint8]
@@ -20,7 +18,7 @@ def nearest_two(
     return order[:, 0], best[:, 0], best[:, 1]
 
 
-def mutual_matches(queries: NDArray[Any], descriptors: NDArray[Any], min_similarity: float) -> Matches:
+def mutual_matches(queries: NDArray[Any], descriptors: NDArray[Any], min_similarity: float) -> tuple[NDArray[Any], ...]:
     """`SimilarityMatcher.match` for one image."""
     product = queries.astype(np.float64) @ descriptors.astype(np.float64).T
     rows = product.argmax(1)

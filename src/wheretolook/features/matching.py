@@ -4,14 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-Matches = tuple[NDArray[np.int64], NDArray[np.int64]]
-"""Rows of keypoints and rows of their landmarks, (M,) each, in ascending order of the keypoints."""
+
+class Matches(NamedTuple):
+    """2D-3D matches of one image.
+
+    Attributes:
+        keypoints: (M,) rows of keypoints, ascending.
+        landmarks: (M,) rows of their landmarks.
+        nearest: (K,) squared descriptor distance of each keypoint of the image to the nearest landmark.
+    """
+
+    keypoints: NDArray[np.int64]
+    landmarks: NDArray[np.int64]
+    nearest: NDArray[np.float32]
+
+    @classmethod
+    def none(cls, n_keypoints: int) -> Matches:
+        """No matches of an image with so many keypoints."""
+        rows = np.zeros(0, dtype=np.int64)
+        return cls(rows, rows, np.full(n_keypoints, np.inf, dtype=np.float32))
+
 
 GROUP = 32  # landmarks; the two best groups are selected first, and in them the two best landmarks
 # Size of a block of products. Products of few queries are slow; on a GPU, where each worker holds a block and its
@@ -110,7 +129,7 @@ def match(matcher: DescriptorMatcher, descriptors: Sequence[NDArray[np.uint8]], 
     """
     lengths = [len(of_image) for of_image in descriptors]
     if sum(lengths) == 0 or matcher.n_landmarks < 2:
-        return [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)) for _ in descriptors]
+        return [Matches.none(length) for length in lengths]
     rows, nearest, second = matcher.nearest_two(np.concatenate(descriptors))
     # squared distances between descriptors of length 512; rounding makes some a little longer, hence the maximum
     distance, next_distance = (np.maximum(2 * (512**2 - best), 0) for best in (nearest, second))
@@ -124,4 +143,4 @@ def _each_landmark_once(rows: NDArray[np.int64], distance: NDArray[np.int64], pa
     landmarks = rows[keypoints]
     order = np.lexsort((keypoints, distance[keypoints], landmarks))
     unique = np.sort(order[np.unique(landmarks[order], return_index=True)[1]])
-    return keypoints[unique], landmarks[unique]
+    return Matches(keypoints[unique], landmarks[unique], distance.astype(np.float32))

@@ -48,7 +48,7 @@ class SimilarityMatcher:
         images = len(counts)
         max_count = counts.max()
         if max_count == 0 or self.n_landmarks == 0:
-            return [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)) for _ in descriptors]
+            return [Matches.none(count) for count in counts]
         padded = np.zeros((images, max_count, self._descriptors.shape[1]), np.float16)
         for row, of_image in zip(padded, descriptors, strict=True):
             row[: len(of_image)] = of_image
@@ -70,7 +70,9 @@ class SimilarityMatcher:
         image, keypoint = (mutual & (best >= min_similarity) & ~missing[..., 0]).nonzero().unbind(1)
         matches = torch.stack([image, keypoint, rows[image, keypoint]]).cpu().numpy()
         ends = np.searchsorted(matches[0], np.arange(1, images))
-        return list(zip(np.split(matches[1], ends), np.split(matches[2], ends), strict=True))
+        nearest = (2 - 2 * best.float()).cpu().numpy()
+        pairs = zip(np.split(matches[1], ends), np.split(matches[2], ends), nearest, counts, strict=True)
+        return [Matches(keypoints, rows, distance[:count]) for keypoints, rows, distance, count in pairs]
 
     def _product(self, queries: Tensor, landmarks: Tensor) -> Tensor:
         if self.device.type == "cpu":

@@ -182,7 +182,7 @@ def _localize(job: _Job, landmarks: Landmarks) -> pd.DataFrame:
     estimates = []
     for camera, (pixels, descriptors) in zip(cameras, stored, strict=True):
         keypoints = Keypoints(pixels, kind.restore(descriptors))
-        estimates.append(localizer.estimate(keypoints, *localizer.match([keypoints])[0], camera=camera))
+        estimates.append(localizer.estimate(keypoints, localizer.match([keypoints])[0], camera))
     error_m, error_deg = localization_errors(estimates, source.poses[rows])
     status = np.array([one.status for one in estimates])
     limit_m = source.limit_m[rows]

@@ -16,6 +16,8 @@ class LocalizerConfig:
     """Settings of matching and pose estimation.
 
     Args:
+        method: "first" for the pose that RANSAC finds, as in the paper and its labels; "hypotheses" for the best of
+            several, each found among matches that the others do not explain, and matched again under its guidance.
         max_ratio: Lowe's ratio for SIFT: maximum ratio of the descriptor distances to the nearest and second nearest
             landmark.
         min_similarity: minimum cosine of mutual nearest neighbours for learned features; by default the extractor's.
@@ -34,6 +36,7 @@ class LocalizerConfig:
         max_trials: maximum trials of RANSAC, as in COLMAP: with a tenth of inliers it misses one pose in 20,000.
     """
 
+    method: Literal["first", "hypotheses"] = "first"
     max_ratio: float = 0.85
     min_similarity: float | None = None
     lightglue: str = ""
@@ -47,6 +50,7 @@ class LocalizerConfig:
     max_trials: int = field(default=10_000, init=False)
 
     def __post_init__(self) -> None:
+        check_choice("localizer method", self.method, ("first", "hypotheses"))
         check_range("max_ratio", self.max_ratio, 1e-9, 1)
         if self.min_similarity is not None:
             check_range("min_similarity", self.min_similarity, -1, 1)
@@ -58,6 +62,8 @@ class LocalizerConfig:
         """Settings that decide the labels, as JSON values."""
         record = asdict(self)
         # options at their defaults that older labels do not have
+        if self.method == "first":
+            del record["method"]
         if self.min_similarity is None:
             del record["min_similarity"]
         if not self.lightglue:

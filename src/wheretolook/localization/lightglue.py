@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.learned import kornia_feature, load_state, one_thread
-from wheretolook.features.matching import Matches
 from wheretolook.features.registry import all_extractors, all_kinds
 from wheretolook.mapping.colmap_model import model_arrays, read_model
 from wheretolook.mapping.feature_files import read_features
@@ -61,8 +60,8 @@ class LightGlueMatcher:
 
     def match(
         self, query: Keypoints, size: tuple[int, int], landmark_rows: NDArray[np.int64], n_images: int
-    ) -> Matches:
-        """2D-3D matches of a query of some width and height, given preliminary landmark matches (M,).
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows of keypoints and rows of their landmarks (M,) of a query of some width and height, given preliminary landmark matches (M,).
 
         If several images lead to different landmarks for a keypoint, or keypoints for a landmark, the best score wins.
         """

@@ -22,11 +22,16 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator
+from wheretolook.localization.guided_matching import GuidedMatcher, StoredKeypoints
+from wheretolook.localization.rig import Look
+from wheretolook.localization.rig_localization import JointLocalizer
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import MapError
 
 if TYPE_CHECKING:
     from wheretolook.localization.lightglue import LightGlueMatcher
+
+IDENTITY: Float = np.eye(3, 4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +42,8 @@ class Localization:
         status: "localized", "too_few_matches" or "no_pose".
         cam_from_world: (3, 4) estimated pose, None if RANSAC found none. A pose with too few inliers is kept, but its
             status is "no_pose".
-        inlier_rows: (I,) rows of the landmarks that were matched and agree with the pose.
-        matched_rows: (M,) rows of all matched landmarks.
+        inlier_rows: (I,) rows of the landmarks that agree with the pose; also of those matched only under its guidance.
+        matched_rows: (M,) rows of all landmarks matched with the whole map.
         matched_pixels: (M, 2) float32, their pixels in the image.
     """
 
@@ -101,7 +106,7 @@ class Localizer:
     def localize(self, rgb: NDArray[np.uint8]) -> Localization:
         """Localize one image (H, W, 3) uint8."""
         keypoints = self.extractor.extract(rgb)
-        return self.estimate(keypoints, *self.match([keypoints])[0])
+        return self.estimate(keypoints, self.match([keypoints])[0])
 
     def match(self, keypoints: Sequence[Keypoints], camera: Camera | None = None) -> list[Matches]:
         """Match keypoints of several images with landmarks. The result for an image does not depend on the others."""
@@ -116,31 +121,47 @@ class Localizer:
         camera = camera or self._camera
         size = (camera.width, camera.height)
         return [
-            self._guided.match(query, size, rows, self.config.lightglue_images)
-            for query, (_, rows) in zip(keypoints, matches, strict=True)
+            Matches(*self._guided.match(query, size, first.landmarks, self.config.lightglue_images), first.nearest)
+            for query, first in zip(keypoints, matches, strict=True)
         ]
 
-    def estimate(
-        self,
-        keypoints: Keypoints,
-        keypoint_rows: NDArray[np.int64],
-        landmark_rows: NDArray[np.int64],
-        camera: Camera | None = None,
-    ) -> Localization:
-        """Estimate the pose of an image from its matches, rows (M,) of keypoints and rows (M,) of landmarks."""
-        pixels = keypoints.pixels[keypoint_rows]
-        status = NO_POSE
-        result = None
-        if len(landmark_rows) < self.config.min_matches:
-            status = TOO_FEW_MATCHES
-        else:
-            result = self.estimator.estimate(pixels, landmark_rows, camera or self._camera)
+    def look(
+        self, keypoints: Keypoints, matches: Matches, camera: Camera | None = None, cam_from_rig: Float = IDENTITY
+    ) -> Look:
+        """Return a view of a rig, for `JointLocalizer`, from an image's keypoints and their matches."""
+        stored = StoredKeypoints(
+            keypoints.pixels.astype(np.float64), self.kind.store(keypoints.descriptors), matches.nearest
+        )
+        pixels = stored.pixels[matches.keypoints]
+        return Look(cam_from_rig, pixels, matches.landmarks, camera or self._camera, stored)
+
+    @cached_property
+    def guide(self) -> GuidedMatcher:
+        """Matches keypoints again under a pose."""
+        assert self.landmarks.descriptors is not None
+        return GuidedMatcher(self.estimator.points, self.landmarks.descriptors)
+
+    @cached_property
+    def joint(self) -> JointLocalizer:
+        """Localizes one view or several with exactly known rotations by several hypotheses."""
+        return JointLocalizer(self.estimator, guide=self.guide)
+
+    def estimate(self, keypoints: Keypoints, matches: Matches, camera: Camera | None = None) -> Localization:
+        """Estimate the pose of an image from its matches."""
+        pixels = keypoints.pixels[matches.keypoints]
+        rows = matches.landmarks
+        if len(rows) < self.config.min_matches:
+            return Localization(TOO_FEW_MATCHES, None, rows[:0], rows, pixels)
+        if self.config.method == "hypotheses":
+            best = self.joint.localize([self.look(keypoints, matches, camera)])
+            inlier_rows = best.looks[0].rows[best.inliers[0]] if best.inliers else rows[:0]
+            return Localization(best.status, best.rig_from_world, inlier_rows, rows, pixels)
+        result = self.estimator.estimate(pixels, rows, camera or self._camera)
         if result is None:
-            return Localization(status, None, landmark_rows[:0], landmark_rows, pixels)
+            return Localization(NO_POSE, None, rows[:0], rows, pixels)
         pose, inliers = result
-        if inliers.sum() >= self.config.min_inliers:
-            status = LOCALIZED
-        return Localization(status, pose, landmark_rows[inliers], landmark_rows, pixels)
+        status = LOCALIZED if inliers.sum() >= self.config.min_inliers else NO_POSE
+        return Localization(status, pose, rows[inliers], rows, pixels)
 
 
 def localization_errors(results: Sequence[Localization], true_poses: Float) -> tuple[Float, Float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,6 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, camera_centers, compose_poses, invert_poses
 from wheretolook.utils.errors import PoseError
+
+if TYPE_CHECKING:
+    from wheretolook.localization.guided_matching import StoredKeypoints
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +28,7 @@ class Look:
     pixels: Float  # (M, 2) in its image
     rows: NDArray[np.int64]  # (M,) of the landmarks
     camera: Camera
+    keypoints: StoredKeypoints | None = None  # all of its image, if they are to be matched again under each hypothesis
 
     def __post_init__(self) -> None:
         rotation = self.cam_from_rig[:, :3]

@@ -164,7 +164,7 @@ def label_rows(
 
     def estimate(batch: tuple[Camera, list[tuple[Keypoints, Matches]]]) -> list[Localization]:
         camera, matched = batch
-        return [localizer.estimate(keypoints, rows, landmarks, camera) for keypoints, (rows, landmarks) in matched]
+        return [localizer.estimate(keypoints, matches, camera) for keypoints, matches in matched]
 
     steps = [  # the camera of a batch goes with it from step to step
         Step("render", lambda batch: (batch[0], renderer.render(batch[0], true_poses[batch[1]]).rgb)),

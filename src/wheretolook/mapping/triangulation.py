@@ -203,7 +203,7 @@ def _match_by_similarity(
     with one_thread():
         for i, j in pairs.tolist():
             matches = SimilarityMatcher(stored[j][1]).match([stored[i][1]], kind.min_similarity)
-            results.append(np.column_stack(matches[0]).astype(np.uint32))
+            results.append(np.column_stack(matches[0][:2]).astype(np.uint32))
     return results
 
 

@@ -237,7 +237,7 @@ class SceneRound:
         keypoints = self._localizer.extractor.extract_batch(images)
         matches = self._localizer.match(keypoints)
         estimate = self._localizer.estimate
-        return [estimate(one, *matched).cam_from_world for one, matched in zip(keypoints, matches, strict=True)]
+        return [estimate(one, matched).cam_from_world for one, matched in zip(keypoints, matches, strict=True)]
 
     def _batches(self, rows: list[int], total: int, title: str) -> Iterator[list[int]]:
         """Yield batches of rows, with a progress bar of all."""

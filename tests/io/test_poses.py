@@ -41,6 +41,26 @@ def test_round_trips(tmp_path: Path) -> None:
     assert read_poses(tmp_path / "path.tum").names == ("0.5", "1")
 
 
+@pytest.mark.parametrize("time", ["t", "timestamp", None])
+def test_header_in_the_order_of_tum(time: str | None, tmp_path: Path) -> None:
+    """A camera at (1, 2, 3) that looks along the world's x, its image upright: quaternion xyzw -0.5, 0.5, -0.5, 0.5."""
+    names, values = "tx,ty,tz,qx,qy,qz,qw", "1,2,3,-0.5,0.5,-0.5,0.5"
+    path = tmp_path / "path.csv"
+    path.write_text(f"{names}\n{values}\n" if time is None else f"{time},{names}\n0.5,{values}\n")
+    ids, poses = read_poses(path)
+    assert ids == ("0" if time is None else "0.5",)
+    np.testing.assert_allclose(poses, poses_looking_along([(1, 2, 3)], [(1, 0, 0)]), atol=1e-12)
+    assert read_waypoints(path).points.tolist() == [[1, 2, 3]]
+
+
+@pytest.mark.parametrize("names", ["tx,ty,tz,qw,qx,qy,qz", "qx,qy,qz,qw,tx,ty,tz"])
+def test_header_in_an_order_of_no_convention(names: str, tmp_path: Path) -> None:
+    (tmp_path / "path.csv").write_text(f"{names}\n0.5,0.5,0.5,0.5,0.5,0.5,0.5\n")
+    for read in (read_poses, read_waypoints):
+        with pytest.raises(TableError, match=r"TUM.*camera-to-world.*COLMAP.*world-to-camera"):
+            read(tmp_path / "path.csv")
+
+
 def test_texts_keep_the_centre_of_a_camera_far_away() -> None:
     for exact, offset, limit in ((True, 0, 1e-15), (False, 0, 1e-8), (False, 1e6, 1e-8)):
         poses = poses_looking_along(camera_centers(POSES) + offset, POSES[:, 2, :3])

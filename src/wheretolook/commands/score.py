@@ -17,8 +17,8 @@ class Score(SelectorOptions):
     """Score poses of your own in a COLMAP model; needs no dataset.
 
     Poses (--poses), in the frame of the map; camera x right, y down, z forward:
-      CSV          x, y, z, qw, qx, qy, qz: camera-to-world; or qw, qx, qy, qz, tx, ty, tz: world-to-camera; and a name:
-                   id, waypoint, name, t or timestamp
+      CSV          x, y, z, qw, qx, qy, qz or TUM's tx, ty, tz, qx, qy, qz, qw: camera-to-world; COLMAP's
+                   qw, qx, qy, qz, tx, ty, tz: world-to-camera; and a name: id, waypoint, name, t or timestamp
       TUM          "t x y z qx qy qz qw", camera-to-world
       COLMAP       images.txt, world-to-camera
 

@@ -27,6 +27,7 @@ CSV with columns x, y, z (and id, if there is one; a line of names or none), the
 "id x y z", a TUM trajectory "t x y z qx qy qz qw", COLMAP's images.txt, or "x y z"; lines that start with # are comments"""
 NAME_COLUMNS = ("id", "waypoint", "name", "t", "timestamp")
 _TUM_COLUMNS = ("t", *"xyz", "qx", "qy", "qz", "qw")
+_TUM_ORDER = (*TRANSLATION_COLUMNS, "qx", "qy", "qz", "qw")
 _IMAGE_COLUMNS = ("image_id", *POSE_COLUMNS, "camera_id", "name")
 _FIXED_COLUMNS = {len(columns): columns for columns in (tuple("xyz"), ("id", *"xyz"), _TUM_COLUMNS, _IMAGE_COLUMNS)}
 MAX_ROWS = 500_000  # of a text table
@@ -134,8 +135,8 @@ class NamedPoses(NamedTuple):
 def read_poses(path: Path) -> NamedPoses:
     """Read poses and their names from a TUM trajectory, COLMAP's images.txt, or a CSV with a line of column names.
 
-    A CSV holds x, y, z, qw, qx, qy, qz (world_from_cam) or qw, qx, qy, qz, tx, ty, tz (cam_from_world). Raises
-    TableError, with the line, if the file is missing or holds no poses.
+    A CSV holds x, y, z and qw, qx, qy, qz, or in this order tx, ty, tz, qx, qy, qz, qw (world_from_cam); or in this order
+    qw, qx, qy, qz, tx, ty, tz (cam_from_world). Raises TableError, with the line, if the file is missing or holds no poses.
     """
     return poses_of_rows(read_named_rows(path))
 
@@ -148,11 +149,21 @@ def poses_of_rows(table: NamedRows) -> NamedPoses:
     for row in np.flatnonzero(np.abs(lengths - 1) > UNIT_TOLERANCE).tolist():
         value = f"line {table.rows[row][0]}: {lengths[row]:.4g}"
         raise TableError("a quaternion is not of length 1", path=path, value=value, fix="Correct the order of columns.")
-    if {*TRANSLATION_COLUMNS} <= {*table.columns}:
-        return NamedPoses(table.names, poses_of_values(table.numbers(POSE_COLUMNS)))
-    rotations = rotation_from_quaternion(quaternions)
-    world_from_cam = np.concatenate([rotations, table.numbers("xyz")[..., None]], axis=-1)
-    return NamedPoses(table.names, invert_poses(world_from_cam))
+    names = TRANSLATION_COLUMNS if {*TRANSLATION_COLUMNS} <= {*table.columns} else "xyz"
+    poses = poses_of_values(np.concatenate([quaternions, table.numbers(names)], axis=1))
+    return NamedPoses(table.names, poses if holds_cam_from_world(table) else invert_poses(poses))
+
+
+def holds_cam_from_world(table: NamedRows) -> bool:
+    """Return whether the columns are COLMAP's world-to-camera poses. Raises TableError for tx, ty, tz in another order than COLMAP's or TUM's."""
+    if not {*POSE_COLUMNS} <= {*table.columns}:
+        return False
+    order = tuple(sorted(POSE_COLUMNS, key=lambda name: table.columns[name]))
+    if order not in (POSE_COLUMNS, _TUM_ORDER):
+        problem = "the order of the columns does not show whether poses are camera-to-world or world-to-camera"
+        fix = f"Order them as TUM, {','.join(_TUM_ORDER)}, camera-to-world, or COLMAP, {','.join(POSE_COLUMNS)}, world-to-camera."
+        raise TableError(problem, path=table.path, value=",".join(order), fix=fix)
+    return order == POSE_COLUMNS
 
 
 def _image_rows(text: str) -> list[tuple[int, list[str]]]:

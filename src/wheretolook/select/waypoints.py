@@ -13,7 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation, rotation_from_quaternion
-from wheretolook.io.poses import QUATERNION_COLUMNS, TRANSLATION_COLUMNS, poses_of_rows, read_named_rows
+from wheretolook.io.poses import (
+    QUATERNION_COLUMNS,
+    TRANSLATION_COLUMNS,
+    holds_cam_from_world,
+    poses_of_rows,
+    read_named_rows,
+)
 from wheretolook.utils.errors import ConfigError, SceneError, TableError
 
 if TYPE_CHECKING:
@@ -108,7 +114,7 @@ def read_waypoints(path: str | Path) -> Waypoints:
     points = table.numbers("xyz" if "x" in columns else TRANSLATION_COLUMNS)
     kinds = (("heading_deg",), ("yaw_deg",), QUATERNION_COLUMNS)
     known = next((table.numbers(kind) for kind in kinds if {*kind} <= {*columns}), None)
-    if "x" not in columns and columns.get("qw", len(columns)) < columns["tx"]:  # qw ... tx: world-to-camera, as COLMAP
+    if "x" not in columns and holds_cam_from_world(table):
         poses = poses_of_rows(table).cam_from_world
         points = camera_centers(poses)
         if known is not None and known.shape[1] == 4:

@@ -13,7 +13,7 @@ import pytest
 
 import wheretolook
 from mapping.test_own_models import rig_model, written
-from wheretolook.mapping.colmap_model import read_model
+from wheretolook.mapping.colmap_model import colmap_poses, read_model, registered_names
 from wheretolook.utils.errors import MapError
 
 NAN = float("nan")
@@ -51,6 +51,8 @@ def test_corrupt_binary_models_are_rejected_by_file(tmp_path, name, offset, layo
         ("frames", "1 1 0.707", "1 1 nan 0.707"),
         ("cameras", "640 480 320 ", "640 480 -320 "),
         ("cameras", "SIMPLE_PINHOLE", "MAGIC"),
+        ("cameras", "640 480 320 ", "wide 480 320 "),
+        ("images", "1 0.707", "one 0.707"),
         ("points3D", "1 -1 2 0.5", "1 1e300 2 0.5"),
     ],
 )
@@ -62,6 +64,16 @@ def test_corrupt_text_models_are_rejected_by_file(tmp_path, name, old, new):
     with pytest.raises(MapError) as caught:
         read_model(path.parent)
     assert caught.value.path == path
+
+
+def test_text_models_with_marks_and_ends_of_lines_of_windows(tmp_path):
+    folder = written(rig_model(), tmp_path / "model", text=True)
+    for path in folder.glob("*.txt"):
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    read, model = read_model(folder), rig_model()
+    np.testing.assert_array_equal(colmap_poses(folder, read), colmap_poses(folder, model))
+    assert registered_names(read) == registered_names(model)
+    assert read.num_points3D() == model.num_points3D()
 
 
 FLIPS = """

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable
+from codecs import BOM_UTF8
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from struct import Struct
 from struct import error as StructError
@@ -20,18 +22,20 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import MAX_SIDE_PX
 from wheretolook.utils.errors import MapError
+from wheretolook.utils.files import temporary_folder
 
 REBUILD = "Copy or build the model again."
 # A point without its track. The track's elements follow: image id and index of the keypoint, uint32 each.
 POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("n", "<u8")])
+_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 _UINT32 = Struct("<I")
 _UINT64 = Struct("<Q")
 _MAX_COORDINATE = 1e12  # of a point or a camera; its square is still finite in single precision
 _ROTATION_TOLERANCE = 0.01  # of the entries of R R^T: some tools write few decimals
 # Patterns in pycolmap's errors, and the file that they are about.
 _FILES_BY_ERROR = (
-    ("Camera model|VerifyParams|cameras_", "cameras"),
-    ("point2D.point3D_id|line_stream2|utf-8", "images"),
+    (r"Camera model|VerifyParams|cameras_|camera\.camera_id", "cameras"),
+    ("point2D.point3D_id|line_stream[12]|utf-8", "images"),
     ("Image with ID|vector::|point3D.xyz", "points3D"),
     ("rig_from_world|data_id|unordered_map", "frames"),
     ("[Rr]ig|[Cc]amera|[Ss]ensor", "rigs"),
@@ -74,6 +78,19 @@ def read_points(path: Path) -> tuple[NDArray[Any], NDArray[np.uint32]]:
     return points, _records(data, at, np.dtype(("<u4", 2)))
 
 
+@contextmanager
+def without_marks(folder: Path, suffix: str) -> Iterator[Path]:
+    """Yield a model's folder, or a copy of its texts without the byte-order marks that pycolmap cannot read."""
+    texts = [path for name in _FILES if (path := folder / (name + suffix)).is_file()] if suffix == ".txt" else []
+    if not any(map(_has_mark, texts)):
+        yield folder
+        return
+    with temporary_folder() as copy:
+        for path in texts:
+            (copy / path.name).write_bytes(path.read_bytes().removeprefix(BOM_UTF8))
+        yield copy
+
+
 def check_text_complete(path: Path, n_read: int) -> None:
     """Raise MapError if fewer entries were read than the number that COLMAP writes at the top of a text file."""
     with path.open(errors="replace") as file:
@@ -113,6 +130,11 @@ def _records(data: NDArray[np.uint8], starts: NDArray[np.int64], dtype: np.dtype
     if len(starts) == 0:
         return np.zeros(0, dtype=dtype)
     return sliding_window_view(data, dtype.itemsize)[starts].view(dtype.base).reshape(-1, *dtype.shape)
+
+
+def _has_mark(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(BOM_UTF8)) == BOM_UTF8
 
 
 def _is_pose(rigid: Any) -> bool:

@@ -23,6 +23,7 @@ from wheretolook.mapping.colmap_files import (
     check_text_complete,
     model_error,
     read_points,
+    without_marks,
 )
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import MapError, MapWarning, StorageError
@@ -87,7 +88,8 @@ def read_model(model_dir: str | Path) -> Any:
             check_binary(folder)
         bar.update()
         try:
-            (model.read_binary if suffix == ".bin" else model.read_text)(str(folder))
+            with without_marks(folder, suffix) as readable:
+                (model.read_binary if suffix == ".bin" else model.read_text)(str(readable))
             check_cameras_and_images(model, folder, suffix)
         except (ValueError, LookupError, RuntimeError, MemoryError) as error:
             raise model_error(error, folder, suffix) from error

@@ -19,7 +19,6 @@ from typing import Any, get_type_hints
 
 from wheretolook.utils.errors import ConfigError, WhereToLookError
 from wheretolook.utils.extras import EXTRAS, missing_package
-from wheretolook.utils.files import check_output
 from wheretolook.utils.images import MAX_PIXELS
 from wheretolook.utils.logs import quiet_libraries
 from wheretolook.utils.nearest import did_you_mean
@@ -51,9 +50,6 @@ GROUP = "wheretolook.commands"
 NUMBERS = re.compile(r"tuple\[(int|float),")
 NUMBER = re.compile(r"[^\s,()\[\]]+")
 """Types of several numbers, and each of these where they are written 1 2 3, 1,2,3 or [1, 2, 3]."""
-
-OUTPUTS = re.compile(r"(\w+\.)?out|floor_plan|record|film")
-"""Options that are paths to write."""
 
 NEEDED = {"bool": "true or false", "int": "a whole number", "float": "a number"}
 """Descriptions of types by their names."""
@@ -180,10 +176,6 @@ def parse_command(name: str, arguments: Sequence[str]) -> Any:
     for option, value in options:
         if chosen.setdefault(option, value) != value:
             raise ConfigError(f"--{option} has two values", value=(chosen[option], value), fix="Give it once.")
-    inputs = [Path(value.strip('["]')) for option, value in options if not OUTPUTS.fullmatch(option)]
-    for option, value in options:
-        if OUTPUTS.fullmatch(option):
-            check_output(Path(value), inputs)
     settings = [*set_by_files, *options]
     parser = build_parser(name)
     try:

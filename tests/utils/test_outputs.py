@@ -9,11 +9,13 @@ from pathlib import Path
 import pytest
 
 from wheretolook.cli import main
+from wheretolook.commands.select import Select
+from wheretolook.commands.view import View
 from wheretolook.dataset.dataset_lock import changing
 from wheretolook.select.waypoints import read_waypoints
 from wheretolook.utils.confine import check_folder_name
 from wheretolook.utils.errors import ConfigError, MapError, TableError
-from wheretolook.utils.files import check_output
+from wheretolook.utils.files import check_output, write_text
 from wheretolook.utils.reading import read_text
 
 
@@ -53,7 +55,19 @@ def test_commands_check_their_outputs(tmp_path: Path, capsys: pytest.CaptureFixt
     waypoints.write_text("1,2,3\n")
     assert main(["select", "--map", str(tmp_path), "--at", str(waypoints), "--out", str(waypoints)]) == 2
     assert main(["export", "--map", str(tmp_path), "--out", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.count("an output is") == 2
+    settings = tmp_path / "settings.yaml"
+    settings.write_text(f"plan:\n  out: {waypoints}\n")
+    files = ["--config", str(settings), "--plan.weights", str(waypoints), "--data", str(tmp_path)]
+    assert main(["plan", *files, "--start", "0,0,0", "--goal", "1,1,1"]) == 2
+    assert capsys.readouterr().err.count("an output is") == 3
+    for command in (
+        Select(map=tmp_path, at=(str(waypoints),), out=waypoints),
+        View(map=tmp_path, record=_fifo(tmp_path).rename(tmp_path / "fifo.rrd")),
+    ):
+        with pytest.raises(ConfigError, match="an output is"):
+            command.run()
+    with pytest.raises(ConfigError, match="an output is"):
+        write_text(tmp_path / "fifo.rrd", "")
     assert waypoints.read_text() == "1,2,3\n"
 
 

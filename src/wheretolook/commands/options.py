@@ -1,8 +1,9 @@
 """Options that several commands share."""
 
 import os
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from functools import wraps
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -17,6 +18,7 @@ from wheretolook.tracking.config import TrackingConfig
 from wheretolook.utils.confine import safe_child
 from wheretolook.utils.devices import check_device_name, usable_device
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.files import check_output
 from wheretolook.visibility.config import OcclusionConfig
 
 T = TypeVar("T")
@@ -32,6 +34,34 @@ def ignore_progress(work: float) -> None:
     """Do nothing: for callers that show no progress."""
 
 
+OUTPUTS = ("out", "floor_plan", "record", "film")
+"""Options that are paths to write; all other paths are inputs."""
+
+
+def _checking_outputs(run: Callable[..., T]) -> Callable[..., T]:
+    @wraps(run)
+    def checked(command: Any, *args: Any, **kwargs: Any) -> T:
+        options = list(_texts(command))
+        inputs = [Path(text) for name, text in options if name not in OUTPUTS and os.path.exists(text)]
+        for name, text in options:
+            if name in OUTPUTS:
+                check_output(Path(text), inputs)
+        return run(command, *args, **kwargs)
+
+    return checked
+
+
+def _texts(options: Any) -> Iterator[tuple[str, str | Path]]:
+    """Yield the name of each option, also in groups, that is a path, or a text that may name a file, and its value."""
+    for option in fields(options):
+        value = getattr(options, option.name)
+        if is_dataclass(value):
+            yield from _texts(value)
+        for text in value if isinstance(value, tuple) else (value,):
+            if isinstance(text, Path) or (isinstance(text, str) and os.path.isfile(text)):
+                yield option.name, text
+
+
 @dataclass(frozen=True, kw_only=True)
 class Command:
     """Base of all commands."""
@@ -42,6 +72,11 @@ class Command:
     """Shorter names of options, as the command line writes them, without `--`."""
     POSITIONAL: ClassVar[str] = "config"
     """Option of the values before the first option."""
+
+    def __init_subclass__(cls) -> None:
+        """Let the command's `run` check its outputs first."""
+        if "run" in vars(cls):
+            cls.run = _checking_outputs(cls.run)  # type: ignore[method-assign]
 
     def run(self) -> Any:
         """Do the command's work."""

@@ -57,9 +57,12 @@ def atomic_write(path: Path, partial: Path | None = None) -> Iterator[Path]:
     """Yield a path to write to, which replaces `path` at the end of the block; after an error, `path` is unchanged.
 
     The parent folder is created if missing. `partial` is the path to write to, if it needs a certain ending; its
-    default is `path` with ".partial" appended. Raises StorageError, naming `path`, if it cannot be written.
+    default is `path` with ".partial" appended. Raises ConfigError for a device or pipe, StorageError, naming `path`, if
+    it cannot be written.
     """
     partial = partial or path.with_name(path.name + ".partial")
+    if path.exists() and not path.is_file() and not path.is_dir():  # a device or pipe
+        check_output(path)
     try:
         with storage_errors(path, partial):
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -217,19 +217,18 @@ def test_an_interrupt_exits_with_130(monkeypatch: pytest.MonkeyPatch) -> None:
     assert main(["scenes"]) == 130
 
 
-def test_sigterm_is_an_interrupt() -> None:
-    """COLMAP, whose handler of SIGTERM prints a native stack, is imported before it or after it."""
+@pytest.mark.parametrize("parse", ["lambda name, rest: Waiting()", "lambda name, rest: Waiting().run()"])
+def test_sigterm_is_an_interrupt(parse: str) -> None:
+    """While options are parsed and afterwards; COLMAP's own handler prints a native stack."""
     code = """
 import time
 from wheretolook import cli
 class Waiting:
     def run(self):
-        import pycolmap
         print("ready", flush=True)
         time.sleep(60)
-cli.parse_command = lambda name, rest: Waiting()
-raise SystemExit(cli.main(["map"]))
 """
+    code += f"cli.parse_command = {parse}\nraise SystemExit(cli.main(['map']))"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None
         process.stdout.readline()

@@ -22,7 +22,7 @@ from wheretolook.utils.extras import EXTRAS, missing_package
 from wheretolook.utils.images import MAX_PIXELS
 from wheretolook.utils.logs import quiet_libraries
 from wheretolook.utils.nearest import did_you_mean
-from wheretolook.utils.processes import on_sigterm
+from wheretolook.utils.processes import in_main_thread, on_sigterm
 from wheretolook.utils.shipped import or_shipped, shipped, shipped_configs
 from wheretolook.utils.version import VERSION
 
@@ -70,6 +70,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not debug:
         quiet_libraries()
     try:
+        if in_main_thread():
+            signal.signal(signal.SIGTERM, signal.default_int_handler)
         run_command([argument for argument in given if argument != "--debug"])
         return 0
     except KeyboardInterrupt:

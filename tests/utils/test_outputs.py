@@ -71,6 +71,17 @@ def test_commands_check_their_outputs(tmp_path: Path, capsys: pytest.CaptureFixt
     assert waypoints.read_text() == "1,2,3\n"
 
 
+@pytest.mark.parametrize("command", ["map", "check", "adapt"])
+def test_a_failed_import_leaves_no_folders(command: str, tmp_path: Path) -> None:
+    for name in ("cameras", "images", "points3D"):
+        (tmp_path / f"{name}.txt").write_text("no model\n")
+    data = tmp_path / "data"
+    option = "--model" if command == "map" else "--map"
+    tracking = ["--tracking.folder", str(tmp_path / "mlruns")] if command == "adapt" else []
+    assert main([command, option, str(tmp_path), "--data", str(data), *tracking]) == 2
+    assert not data.exists()
+
+
 def test_scene_names() -> None:
     for name in ("Büro 2. Stock", "Bu\u0308ro", "room-1"):
         check_folder_name("a name", name)

@@ -25,7 +25,7 @@ from wheretolook.scorers.adapted.config import AdaptConfig
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.store import check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError, MapError, OutOfRangeWarning, SceneError, TableError
-from wheretolook.utils.files import fingerprint, storage_errors, write_text
+from wheretolook.utils.files import fingerprint, missing_folders, remove_if_empty, storage_errors, write_text
 from wheretolook.utils.locks import hold
 from wheretolook.utils.validation import reject
 from wheretolook.weights.resolve import load_scorer, resolve_weights
@@ -149,8 +149,10 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         if path.suffix != ".safetensors" or path.is_dir() or path.resolve() == weights.resolve():
             fix = "Give --out the name of another file that ends in .safetensors."
             raise ConfigError("adapted weights cannot be written to this path", path=path, fix=fix)
+        created = missing_folders(path)
         with storage_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
+        remove_if_empty(created)
         check_store(self.tracking)
         return _Target(name, "" if dataset is None else dataset.name, weights, path)
 

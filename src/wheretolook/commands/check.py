@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -122,18 +122,14 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
         scoring = Scoring(self.method, self.weights, self.also, self.anywhere)
         scoring.check()
         out = self.out or folder_of_check(self.data, name)
-        try:
-            with ExitStack() as locks:
-                if scene is not None:  # no command may change it meanwhile
-                    locks.enter_context(hold(scene.folder.parent / LOCK, "check", shared=True))
-                locks.enter_context(hold(out / ".lock", "check"))
-                photographs, occlusion = self._open(scene, out / WORK, device, workers)
-                report = check_map(photographs, out / WORK, scoring, occlusion, self.views, workers, device)
-                report.save(out)
-                save_figure(check_figure(report), out / "check.png")
-        finally:
-            with suppress(OSError):  # created for the lock only
-                out.rmdir()
+        with ExitStack() as locks:
+            if scene is not None:  # no command may change it meanwhile
+                locks.enter_context(hold(scene.folder.parent / LOCK, "check", shared=True))
+            locks.enter_context(hold(out / ".lock", "check"))
+            photographs, occlusion = self._open(scene, out / WORK, device, workers)
+            report = check_map(photographs, out / WORK, scoring, occlusion, self.views, workers, device)
+            report.save(out)
+            save_figure(check_figure(report), out / "check.png")
         print("\n".join(report.lines()))
         if scoring.chosen is not None and read_training(scoring.chosen).get("photographs"):
             print(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -51,11 +50,7 @@ def hold_out_photographs(
     out = folder_of_check(options.data, name)
     workers = options.n_workers
     device = options.warp_device
-    try:
-        with hold(out / ".lock", stage):
-            folder, features = features_of(model, *given, out / WORK, workers, device)
-            source = open_map(folder, features, name, frame, model)
-            return source, hold_out_blocks(source, out / WORK, workers=workers, device=device)
-    finally:
-        with suppress(OSError):  # created for the lock only
-            out.rmdir()
+    with hold(out / ".lock", stage):
+        folder, features = features_of(model, *given, out / WORK, workers, device)
+        source = open_map(folder, features, name, frame, model)
+        return source, hold_out_blocks(source, out / WORK, workers=workers, device=device)

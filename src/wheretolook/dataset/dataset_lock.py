@@ -63,12 +63,8 @@ def _decorator(
         @wraps(function)
         def locked(*args: P.args, **kwargs: P.kwargs) -> R:
             command: Any = args[0]
-            try:
-                with lock(command.root, stage):
-                    return function(*args, **kwargs)
-            finally:
-                with suppress(OSError):  # made for the lock of a stage that then found nothing to work on
-                    command.root.rmdir()
+            with lock(command.root, stage):
+                return function(*args, **kwargs)
 
         return locked
 

@@ -72,7 +72,6 @@ def hold_out_blocks(
     `choose_blocks`.
     """
     blocks = choose_blocks(source) if blocks is None else blocks
-    work.mkdir(parents=True, exist_ok=True)
     limits = [source.limit_m.tolist(), MAX_ERROR_DEG, MIN_ANGLE_DEG, asdict(LocalizerConfig())]
     key = cache_key(_FORMAT, versions(), source.key, limits)
     folder = work / f"blocks-{key}"

@@ -228,7 +228,6 @@ def features_of(
     own = FrameOptions(scale=1, up="z")
     photographs = PhotographsConfig(images=images)
     config = MapConfig(frame=own, existing=existing, photographs=photographs, extractor=extractor, keep_database=True)
-    work.mkdir(parents=True, exist_ok=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MapWarning)  # about the frame, which `open_map` corrects
         map_existing(config, out, work / "photographs", workers=workers, device=device, reconstruction=model)

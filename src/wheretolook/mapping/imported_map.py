@@ -112,7 +112,6 @@ def map_existing(
 
 def _triangulate(source: Any, images: Path, turned: bool, work: Path, database: Path, run: MapRun) -> Any:
     """Triangulate new landmarks at the poses of a model, from keypoints of its images. Returns a new model."""
-    work.mkdir(parents=True, exist_ok=True)
     with run.clock("extract"):
         features = photograph_features(images, work, run, list(registered_names(source).values()), turned)
     with run.clock("pairs"):

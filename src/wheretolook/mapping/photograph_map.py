@@ -59,7 +59,6 @@ def map_photographs(
     if settings.images is None:
         raise ConfigError("no folder of photographs was named", fix="Set mapping.photographs.images.")
     check_tables(settings.scale, config.frame)  # before the work
-    work.mkdir(parents=True, exist_ok=True)
     with replacing_map(config, out_dir, seed, workers, device, progress, before_replace) as (folder, run):
         with run.clock("extract"):
             features = photograph_features(settings.images, work, run)

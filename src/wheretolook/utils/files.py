@@ -88,6 +88,7 @@ def atomic_folder(folder: Path, before_replace: Callable[[], None] = lambda: Non
         os.replace(old, folder)
     for leftover in (partial, old):
         shutil.rmtree(leftover, ignore_errors=True)
+    created = missing_folders(folder)
     with storage_errors(folder, partial):
         partial.mkdir(parents=True)
     try:
@@ -102,10 +103,23 @@ def atomic_folder(folder: Path, before_replace: Callable[[], None] = lambda: Non
         if old.exists() and not folder.exists():
             os.replace(old, folder)
         shutil.rmtree(partial, ignore_errors=True)
+        remove_if_empty(created)
         if isinstance(error, StorageError) and error.path and Path(error.path).is_relative_to(partial):
             path = folder / Path(error.path).relative_to(partial)
             raise StorageError(error.problem, path=path, value=error.value, fix=error.fix) from error
         raise
+
+
+def missing_folders(path: Path) -> list[Path]:
+    """Return the folders that contain a path and do not exist, the innermost first."""
+    return [folder for folder in path.parents if not folder.exists()]
+
+
+def remove_if_empty(folders: Iterable[Path]) -> None:
+    """Remove those of some folders that are empty."""
+    for folder in folders:
+        with suppress(OSError):
+            folder.rmdir()
 
 
 @contextmanager

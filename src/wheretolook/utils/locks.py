@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from wheretolook.utils.errors import InUseError, LockWarning
+from wheretolook.utils.files import missing_folders, remove_if_empty
 
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)
 _NOT_WRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOSPC)
@@ -20,7 +21,8 @@ _NOT_WRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENO
 
 @contextmanager
 def hold(lock: Path, what: str, *, shared: bool = False, wait_s: float = 0.0) -> Iterator[None]:
-    """Hold a lock (flock(2)) on a file within this block; the file is created if missing and removed at the end.
+    """Hold a lock (flock(2)) on a file within this block; the file is created if missing and removed at the end,
+    as are folders that were created for it and are empty then.
 
     Where nothing can be written, as in a read-only folder, the block runs without a lock; where the file system has no
     locks, a warning is issued. A lock does not nest.
@@ -34,6 +36,7 @@ def hold(lock: Path, what: str, *, shared: bool = False, wait_s: float = 0.0) ->
     Raises:
         InUseError: another process holds it. OSError: the file cannot be made.
     """
+    created = missing_folders(lock)
     deadline = time.monotonic() + wait_s
     file = _try_lock(lock, shared)
     while file == _HELD and time.monotonic() < deadline:
@@ -58,6 +61,7 @@ def hold(lock: Path, what: str, *, shared: bool = False, wait_s: float = 0.0) ->
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # only the last reader can and removes the file
             if _is_current(lock, file):
                 lock.unlink()
+                remove_if_empty(created)
         os.close(file)
 
 

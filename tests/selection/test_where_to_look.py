@@ -308,5 +308,5 @@ def test_best_views_apart(look: WhereToLook) -> None:
         cosines = (axes @ axes.T)[np.triu_indices(4, 1)]
         assert np.degrees(np.arccos(cosines)).min() >= 50
     assert (np.diff(apart.score.reshape(4, 4)) <= 0).all()
-    with pytest.raises(ConfigError):
+    with pytest.raises(ConfigError, match="waypoint 0 has too few views"):
         look.best(POINTS, 4, apart_deg=170)

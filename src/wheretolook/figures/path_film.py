@@ -15,6 +15,7 @@ from wheretolook.geometry.poses import Float
 from wheretolook.planning.routes import PathView
 from wheretolook.planning.view_sequence import lengths_along
 from wheretolook.scorers.styles import method_style
+from wheretolook.utils.markdown import counted
 
 PATH = "#CC3311"
 LANDMARKS = "#EE9900"
@@ -91,7 +92,7 @@ def _draw_view(axes: Axes, view: PathView, prefix: str = "") -> None:
     frame(axes, linewidth=0.8)
     stop = f"view {view.look} of {view.n_looks}: " if view.n_looks > 1 else ""
     score = "" if np.isnan(view.score) else f", score {score_text(view.score)}"
-    axes.set_title(f"{prefix}{stop}{len(view.pixels):,} landmarks{score}", fontsize=9)
+    axes.set_title(f"{prefix}{stop}{counted(len(view.pixels), 'landmark')}{score}", fontsize=9)
 
 
 def _draw_map(

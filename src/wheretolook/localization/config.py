@@ -79,7 +79,7 @@ class LabelConfig:
 
     Args:
         localizer: matching and pose estimation.
-        engine: local, in processes on this machine, or ray, on a Ray cluster (needs `pip install ray`). Both give the
+        engine: local, in processes on this machine, or ray, on a Ray cluster (needs `pip install 'wheretolook[ray]'`). Both give the
             same labels.
         ray_address: address of the Ray cluster, such as "auto" on one of its machines, or "ray://head:10001" from
             another (needs `pip install 'ray[client]'`); empty starts one on this machine.

@@ -20,6 +20,7 @@ import pandas as pd
 
 from wheretolook.localization.shard import LabelledShard, SceneJob, Shard, ShardWorker
 from wheretolook.utils.errors import ConfigError, WhereToLookError, WorkerError
+from wheretolook.utils.extras import require
 from wheretolook.utils.files import atomic_write
 
 MAX_RETRIES = 5
@@ -35,10 +36,9 @@ def run_ray(shards: Sequence[Shard], address: str = "") -> Iterator[tuple[Shard,
     is connected to, or starts one on this machine. Raises what a worker raises, ConfigError if Ray is not installed or
     the cluster cannot be used, WorkerError if a shard was lost more than `MAX_RETRIES` times.
     """
-    try:
-        import ray
-    except ImportError as error:
-        raise ConfigError("Ray is not installed", fix="pip install ray, or use --label.engine local.") from error
+    require("ray")
+    import ray
+
     connected = ray.is_initialized()
     try:
         if not connected:

@@ -241,11 +241,8 @@ def _kind_in_database(colmap_type: int, columns: int, named: DescriptorKind | No
 @contextmanager
 def _open_hdf5(path: Path) -> Iterator[Callable[[str], _Features]]:
     """Open hloc's features in HDF5: `keypoints` (K, 2) and `descriptors` (D, K) of each image."""
-    try:
-        import h5py
-    except ImportError as error:
-        fix = "pip install h5py, or omit the features."
-        raise MapError("features in HDF5 are read with h5py, which is not installed", path=path, fix=fix) from error
+    import h5py
+
     try:
         check_file(path)
         with h5py.File(path, "r") as file:

@@ -72,7 +72,11 @@ class Waypoints:
     def where(self, row: int) -> str:
         """Describe a waypoint by its line or name, and its coordinates."""
         at = ", ".join(f"{value:.10g}" for value in self.points[row])
-        return f"{f'line {self.lines[row]}' if self.lines else f'waypoint {self.ids[row]}'}: ({at})"
+        return f"{self.label(row)}: ({at})"
+
+    def label(self, row: int) -> str:
+        """Return the line of a waypoint, or its name."""
+        return f"line {self.lines[row]}" if self.lines else f"waypoint {self.ids[row]}"
 
     @classmethod
     def of(

@@ -229,7 +229,7 @@ class WhereToLook:
         if request.max_turn_deg is not None:
             chosen = best_sequence(scores, _turn_limit(axes, request.max_turn_deg)).direction_ids[:, None]
         elif request.apart_deg is not None or request.pan_deg is not None:
-            chosen = _separate_views(axes, scores, request)
+            chosen = _separate_views(waypoints, axes, scores, request)
         else:
             chosen = np.argsort(-scores, axis=1, kind="stable")[:, : request.n + SPARE]
         k = chosen.shape[1]
@@ -355,16 +355,18 @@ class WhereToLook:
         return np.asarray((pan >= request.pan_deg[0] - 1e-9) & (pan <= request.pan_deg[1] + 1e-9))
 
 
-def _separate_views(axes: Float, scores: Float, request: SelectionRequest) -> NDArray[np.int64]:
+def _separate_views(waypoints: Waypoints, axes: Float, scores: Float, request: SelectionRequest) -> NDArray[np.int64]:
     """Return rows (W, n) of axes (D, 3) with the best scores (W, D), above -inf, that are far enough from one another.
 
-    Raises ConfigError if there are fewer.
+    Raises ConfigError, which names the waypoint, if there are fewer.
     """
     best = [np.argsort(-values, kind="stable")[: np.isfinite(values).sum()] for values in scores]
     chosen = [separated(axes, order, request.n, request.apart_deg or 0) for order in best]
-    if (least := min(map(len, chosen))) < request.n:
-        fix = "Ask for fewer views, score more directions, or widen the limits."
-        raise ConfigError("a waypoint has too few views within the limits", value=f"{least} of {request.n}", fix=fix)
+    for row, views in enumerate(chosen):
+        if len(views) < request.n:
+            problem = f"{waypoints.label(row)} has too few views within the limits"
+            fix = "Ask for fewer views, score more directions, or widen the limits."
+            raise ConfigError(problem, path=waypoints.path, value=f"{len(views)} of {request.n}", fix=fix)
     return np.array(chosen)
 
 

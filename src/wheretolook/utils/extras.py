@@ -18,6 +18,7 @@ EXTRAS = {
     "kornia": "learned",
     "lightgbm": "paper",
     "jinja2": "paper",
+    "ray": "ray",
     "rerun": "view",
 }
 """Extras by module; of several that install it, the smallest."""

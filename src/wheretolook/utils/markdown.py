@@ -1,4 +1,4 @@
-"""Tables in Markdown."""
+"""Tables in Markdown, and numbers of things in texts."""
 
 from __future__ import annotations
 
@@ -12,3 +12,8 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(
         "| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in lines
     )
+
+
+def counted(number: float, noun: str) -> str:
+    """Return a rounded number and its noun, such as "1 landmark" and "1,260 landmarks"."""
+    return f"{number:,.0f} {noun}{'s' * (round(number) != 1)}"

@@ -13,6 +13,7 @@ from wheretolook.geometry.lattices import axes_of_angles
 from wheretolook.geometry.poses import Float, poses_looking_along, quaternion_from_rotation, rotation_from_quaternion
 from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.utils.errors import ConfigError, TableError
+from wheretolook.utils.markdown import counted
 from wheretolook.view import drawing
 from wheretolook.view.controls import value_of
 from wheretolook.view.scores import ScoredLocation, score_location
@@ -120,9 +121,9 @@ class LocationView:
         state = session.state
         pose = poses_looking_along(position, axis)
         report = session.selector.scorer.report(pose[None])
-        caption = f"**score {float(report.score[0]):.3g}** · {report.n_visible[0]:,} landmarks in view"
+        caption = f"**score {float(report.score[0]):.3g}** · {counted(report.n_visible[0], 'landmark')} in view"
         if np.isfinite(report.expected_inliers[0]):
-            caption += f" · {report.expected_inliers[0]:,.0f} expected inliers"
+            caption += f" · {counted(report.expected_inliers[0], 'expected inlier')}"
         if not report.in_range[0]:
             caption += " · outside the training distribution"
         c.picture_caption.content = caption
@@ -181,7 +182,7 @@ def describe_reasons(counts: ReasonCounts) -> str:
     """State how many landmarks are hard to match in a view, by reason."""
     names = {"too far": counts.n_too_far, "too oblique": counts.n_too_oblique, "repeated": counts.n_repeated}
     of_visible = ", ".join(f"{n[0]:,.0f} {name}" for name, n in names.items() if np.isfinite(n[0]))
-    return f"of these {of_visible}; {counts.n_occluded[0]:,} more are occluded"
+    return f"of these {of_visible}; {counts.n_occluded[0]:,} more occluded"
 
 
 def describe(location: ScoredLocation, threshold: float, frame: MapFrame) -> str:

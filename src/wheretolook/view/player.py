@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wheretolook.geometry.poses import camera_centers
+from wheretolook.utils.markdown import counted
 from wheretolook.view.controls import value_of
 from wheretolook.view.drawing import escape_markdown
 from wheretolook.view.session import Session
@@ -79,7 +80,7 @@ class Player:
             image, _ = session.viewed.picture(pose, landmarks)
             session.add_frustum(f"/path/{name}/camera", pose, 2.0, self._colors[name], image=image, thickness=3.0)
             score = float(report.score[row])
-            caption = f"**{escape_markdown(name)}**: score {score:.3g}, {report.n_visible[row]:,} landmarks"
+            caption = f"**{escape_markdown(name)}**: score {score:.3g}, {counted(report.n_visible[row], 'landmark')}"
             if path.localized is not None:
                 caption += LOCALIZED if path.localized[row] else LOST
             elif session.viewed.is_probability(state.method) and score < state.threshold:

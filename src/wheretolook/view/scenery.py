@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.utils.markdown import counted
 from wheretolook.view import drawing
 from wheretolook.view.controls import LIMITS
 from wheretolook.view.scores import FIRST_CELLS, Floor, score_in_blocks
@@ -163,7 +164,7 @@ class Scenery:
         colors = np.where(good[:, None], drawing.TRUE_POSITIVE, drawing.TRUE_NEGATIVE)
         colors[predicted & ~good] = drawing.FALSE_POSITIVE
         colors[good & ~predicted] = drawing.FALSE_NEGATIVE
-        summary = f"{len(good):,} labelled views, {100 * good.mean():.0f} % localize."
+        summary = f"{counted(len(good), 'labelled view')}, {100 * good.mean():.0f} % localize."
         if predicted is not good:
             summary += f" Wrong at {state.threshold:.2f}: {(predicted & ~good).sum()} predicted to localize but lost"
             summary += f" (orange), {(good & ~predicted).sum()} localized against the prediction (blue)."

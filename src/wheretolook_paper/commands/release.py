@@ -113,7 +113,7 @@ def release_settings(options: Experiment) -> dict[str, Any]:
     meshes = [{"name": mesh.scene_name, "split": mesh.split, "up": mesh.up} for mesh in options.scenes.meshes]
     groups = {
         "scenes": options.scenes,
-        "map": options.mapping,
+        "mapping": options.mapping,
         "occlusion": options.occlusion,
         "sample": options.sample,
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -225,6 +225,8 @@ def shipped() -> Dataset:
 
 def test_the_shipped_card_is_of_what_ships(shipped: Dataset) -> None:
     assert (shipped.root / releases.CARD).read_text() == card_of(shipped)
+    options = {field.name for field in fields(AllOptions)}
+    assert {*releases.read_about(shipped)["settings"]} == {*release_settings(AllOptions())} <= options
     assert sum(releases.sizes(shipped.root).values()) < releases.MAX_BYTES
     tables = [scene.read_table() for scene in shipped.split("train")]
     assert sum(map(len, tables)) > 200_000

@@ -98,6 +98,8 @@ def test_large_tables_are_rejected_without_reading_them(tmp_path: Path) -> None:
         b"0 1 2 3 1 0 0 0\n1 2 3 nan 0 0 0 1\n",
         b"x,y,z,yaw\n1,2,3,4\n",
         b"x,y,z,qw,qx,qy,qz\n",
+        b"x,y,z,qw,qx,qy,qz\n1,2,3,1,0,0,0,0\n",
+        b"x,x,y,z,qw,qx,qy,qz\n1,1,2,3,1,0,0,0\n",
         b"1 1 0 0 0 0 0 0 1 a.jpg\n\n2 3 0 0 0 0 0 0 1 b.jpg\n\n",
     ],
 )

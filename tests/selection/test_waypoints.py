@@ -49,6 +49,9 @@ def test_formats(text: str, ids: tuple[str, ...], lines: tuple[int, ...], tmp_pa
         "1 2 3 4 5\n",
         "x,y,z\n1,2,3\n1,nan,3\n",
         "1 2 inf\n",
+        "id,x,y,z\nw1,1,2,-0,5,1,2\n",  # decimal commas
+        "x,x,y,z\n1,1,2,3\n",
+        'id,x,y,z\n"a\nb",1,2,3\n',
     ],
 )
 def test_invalid_files_are_rejected(text: str, tmp_path: Path) -> None:
@@ -56,6 +59,14 @@ def test_invalid_files_are_rejected(text: str, tmp_path: Path) -> None:
     path.write_text(text)
     with pytest.raises(TableError):
         read_waypoints(path)
+
+
+def test_a_zero_quaternion_is_no_heading(tmp_path: Path) -> None:
+    path = tmp_path / "path.tum"
+    path.write_text("0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 0\n")
+    assert read_waypoints(path).points.tolist() == [[1, 2, 3]] * 2
+    with pytest.raises(TableError, match=r"needs the heading.*line 2"):
+        read_waypoints(path).heading_deg(np.eye(3))
 
 
 def test_points_from_text_and_arrays() -> None:

@@ -6,8 +6,9 @@ World in metres. TUM trajectories and tables of selected views hold world_from_c
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -22,9 +23,10 @@ from wheretolook.utils.reading import MAX_TEXT_BYTES, read_text
 QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
 TRANSLATION_COLUMNS = ("tx", "ty", "tz")
 POSE_COLUMNS = (*QUATERNION_COLUMNS, *TRANSLATION_COLUMNS)
-FORMATS = """\
-CSV with columns x, y, z (and id, if there is one; a line of names or none), the Active Localization Benchmark's text
-"id x y z", a TUM trajectory "t x y z qx qy qz qw", COLMAP's images.txt, or "x y z"; lines that start with # are comments"""
+FORMATS = (
+    "CSV with columns x, y, z (and id, if there is one; a line of names or none), the Active Localization Benchmark's text "
+    '"id x y z", a TUM trajectory "t x y z qx qy qz qw", COLMAP\'s images.txt, or "x y z"; lines that start with # are comments'
+)
 NAME_COLUMNS = ("id", "waypoint", "name", "t", "timestamp")
 _TUM_COLUMNS = ("t", *"xyz", "qx", "qy", "qz", "qw")
 _TUM_ORDER = (*TRANSLATION_COLUMNS, "qx", "qy", "qz", "qw")
@@ -66,7 +68,9 @@ def read_rows(path: Path, text: str | None = None) -> list[tuple[int, list[str]]
             return [(number, line.split()) for number, line in rows]
         if separator == ";":  # of spreadsheets where a comma is the decimal point
             rows = [(number, line.replace(",", ".")) for number, line in rows]
-        cells = csv.reader((line for _, line in rows), delimiter=separator, skipinitialspace=True)
+        cells = [*csv.reader((line for _, line in rows), delimiter=separator, skipinitialspace=True)]
+        if len(cells) < len(rows):
+            raise ValueError("a quoted cell has several lines")
         return [(number, [*map(str.strip, row)]) for (number, _), row in zip(rows, cells, strict=True)]
     except (OSError, ValueError, csv.Error) as error:
         raise TableError(f"the file cannot be read: {error}", path=path, fix="Give a text file of rows.") from error
@@ -77,8 +81,13 @@ class NamedRows:
     """Rows of a text table: pairs of line number, from 1, and cells."""
 
     path: Path
-    columns: Mapping[str, int]  # by name
+    header: tuple[str, ...]  # names of the columns
     rows: list[tuple[int, list[str]]]
+
+    @cached_property
+    def columns(self) -> dict[str, int]:
+        """Columns by name."""
+        return {name: column for column, name in enumerate(self.header)}
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -91,8 +100,10 @@ class NamedRows:
         table = np.empty((len(self.rows), len(names)))
         for row, (number, cells) in enumerate(self.rows):
             try:
-                if len(cells) != len(self.rows[0][1]):
-                    raise ValueError(f"{len(cells)} columns, unlike the first row's {len(self.rows[0][1])}")
+                if len(cells) != len(self.header):
+                    raise ValueError(
+                        f"{len(cells)} cells for {len(self.header)} columns (decimal commas need semicolons)"
+                    )
                 table[row] = [float(cells[self.columns[name]]) for name in names]
                 if not np.isfinite(table[row]).all():
                     raise ValueError("a value is not finite")
@@ -122,7 +133,9 @@ def read_named_rows(path: Path) -> NamedRows:
         raise TableError(
             "the file has no rows of a known format", path=path, value=" ".join(first)[:80], fix=f"Give {FORMATS}."
         )
-    return NamedRows(path, {name: column for column, name in reversed([*enumerate(names)])}, rows)
+    if twice := next((name for name in names if name and names.count(name) > 1), None):
+        raise TableError("two columns have the same name", path=path, value=twice, fix="Name or remove one.")
+    return NamedRows(path, names, rows)
 
 
 class NamedPoses(NamedTuple):

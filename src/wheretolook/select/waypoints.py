@@ -60,10 +60,11 @@ class Waypoints:
         a TableError if a heading is unknown.
         """
         yaw = np.full(len(self), np.nan) if self.headings is None else self.headings[:, 0]
-        if self.headings is not None and self.headings.shape[1] == 4 and np.linalg.norm(self.headings, axis=1).all():
-            axes = world_from_map @ rotation_from_quaternion(self.headings)
+        if self.headings is not None and self.headings.shape[1] == 4:
+            is_known = np.linalg.norm(self.headings, axis=1) > 0
+            axes = world_from_map @ rotation_from_quaternion(self.headings + ~is_known[:, None])
             forward = np.where(axes[:, 2, 2:] > BODY_UPRIGHT, axes[..., 0], axes[..., 2])
-            yaw = np.degrees(pan_tilt_angles(forward)[0])
+            yaw = np.where(is_known, np.degrees(pan_tilt_angles(forward)[0]), np.nan)
         for row in np.flatnonzero(~np.isfinite(yaw)).tolist():
             fix = "Give a TUM trajectory or a CSV with heading_deg or qw, qx, qy, qz, in Python heading_deg; or leave pan out."
             raise TableError("a limit on pan needs the heading", path=self.path, value=self.where(row), fix=fix)
@@ -115,7 +116,7 @@ def read_waypoints(path: str | Path) -> Waypoints:
     """
     table = read_named_rows(Path(path))
     columns = table.columns
-    points = table.numbers("xyz" if "x" in columns else TRANSLATION_COLUMNS)
+    points = table.numbers(TRANSLATION_COLUMNS if "x" not in columns and "tx" in columns else "xyz")
     kinds = (("heading_deg",), ("yaw_deg",), QUATERNION_COLUMNS)
     known = next((table.numbers(kind) for kind in kinds if {*kind} <= {*columns}), None)
     if "x" not in columns and holds_cam_from_world(table):

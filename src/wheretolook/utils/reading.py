@@ -45,7 +45,10 @@ def read_text(path: Path, at_most: int = MAX_TEXT_BYTES, pipes: bool = False) ->
         content = file.read(at_most + 1)
     if len(content) > at_most:
         raise ValueError(f"it has more than {at_most:,} bytes")
-    return content.decode("utf-8-sig").replace("\r\n", "\n")
+    try:
+        return content.decode("utf-8-sig").replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        raise ValueError("it is no text in UTF-8") from error
 
 
 def parse_json(text: str) -> Any:

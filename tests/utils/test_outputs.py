@@ -9,9 +9,13 @@ from pathlib import Path
 import pytest
 
 from wheretolook.cli import main
+from wheretolook.commands.export import Export
+from wheretolook.commands.plan import Plan
 from wheretolook.commands.select import Select
 from wheretolook.commands.view import View
+from wheretolook.commands.viewpoint_map import BuildViewpointMap
 from wheretolook.dataset.dataset_lock import changing
+from wheretolook.planning.config import PlanConfig, ViewpointMapConfig
 from wheretolook.select.waypoints import read_waypoints
 from wheretolook.utils.confine import check_folder_name
 from wheretolook.utils.errors import ConfigError, MapError, TableError
@@ -30,13 +34,19 @@ def _link(folder: Path) -> Path:
     return folder / "link"
 
 
+def _loop(folder: Path) -> Path:
+    (folder / "loop").symlink_to("loop")
+    return folder / "loop"
+
+
 def _in_dataset(folder: Path) -> Path:
     (folder / "dataset.json").touch()
     return folder / "room" / "map" / "views.csv"
 
 
 @pytest.mark.parametrize(
-    "make", [_fifo, _link, _in_dataset, lambda _: Path("/dev/null"), lambda f: f / "in", lambda f: f / "in/images.txt"]
+    "make",
+    [_fifo, _link, _loop, _in_dataset, lambda _: Path("/dev/null"), lambda f: f / "in", lambda f: f / "in/images.txt"],
 )
 def test_outputs_that_would_destroy_something(make: Callable[[Path], Path], tmp_path: Path) -> None:
     with pytest.raises(ConfigError):
@@ -62,10 +72,20 @@ def test_commands_check_their_outputs(tmp_path: Path, capsys: pytest.CaptureFixt
     assert capsys.readouterr().err.count("an output is") == 3
     for command in (
         Select(map=tmp_path, at=(str(waypoints),), out=waypoints),
+        Select(map=tmp_path, at=("1,2,3",), out=tmp_path / "a.png", floor_plan=tmp_path / "a.png", format="csv"),
         View(map=tmp_path, record=_fifo(tmp_path).rename(tmp_path / "fifo.rrd")),
     ):
         with pytest.raises(ConfigError, match="an output is"):
             command.run()
+    for command in (
+        Export(map=tmp_path / "model", out=tmp_path),
+        Plan(data=tmp_path / "data", plan=PlanConfig(out=tmp_path)),
+        BuildViewpointMap(data=tmp_path / "data", viewpoint_map=ViewpointMapConfig(out=waypoints)),
+    ):
+        with pytest.raises(ConfigError, match="this holds something else"):
+            command.run()
+    for out in ("/", str(tmp_path), str(waypoints / "a")):
+        assert main(["select", "--map", str(tmp_path / "model"), "--at", "1,2,3", "--out", out]) == 2
     with pytest.raises(ConfigError, match="an output is"):
         write_text(tmp_path / "fifo.rrd", "")
     assert waypoints.read_text() == "1,2,3\n"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 from wheretolook.commands.options import CameraOptions
 from wheretolook.mapping.config import FrameOptions
@@ -37,6 +38,8 @@ class Export(CameraOptions, FrameOptions):
         mesh: a mesh of the scene, for occlusion.
         spacing: of the grid, in metres.
     """
+
+    WRITES: ClassVar = "robot.json"
 
     map: Path
     out: Path

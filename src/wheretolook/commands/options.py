@@ -18,7 +18,7 @@ from wheretolook.tracking.config import TrackingConfig
 from wheretolook.utils.confine import safe_child
 from wheretolook.utils.devices import check_device_name, usable_device
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.files import check_output
+from wheretolook.utils.files import check_output, check_output_folder
 from wheretolook.visibility.config import OcclusionConfig
 
 T = TypeVar("T")
@@ -46,6 +46,9 @@ def _checking_outputs(run: Callable[..., T]) -> Callable[..., T]:
         for name, text in options:
             if name in OUTPUTS:
                 check_output(Path(text), inputs)
+                inputs.append(Path(text))
+            if name == "out" and command.WRITES:
+                check_output_folder(Path(text), (Path(text) / command.WRITES).is_file())
         return run(command, *args, **kwargs)
 
     return checked
@@ -72,6 +75,8 @@ class Command:
     """Shorter names of options, as the command line writes them, without `--`."""
     POSITIONAL: ClassVar[str] = "config"
     """Option of the values before the first option."""
+    WRITES: ClassVar[str] = ""
+    """If `out` is a folder: a file in it, by which the command knows a folder that it wrote."""
 
     def __init_subclass__(cls) -> None:
         """Let the command's `run` check its outputs first."""

@@ -52,6 +52,8 @@ class Plan(SceneOrMapOptions):
         "stops": "plan.stops.looks",
     }
 
+    WRITES: ClassVar = "path.csv"
+
     plan: PlanConfig = field(default_factory=PlanConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 

@@ -38,6 +38,8 @@ class BuildViewpointMap(SceneOrMapOptions):
 
     SHORT: ClassVar = {name: f"viewpoint_map.{name}" for name in ("scene", "method", "weights", "out")}
 
+    WRITES: ClassVar = "viewpoint_map.json"
+
     viewpoint_map: ViewpointMapConfig = field(default_factory=ViewpointMapConfig)
 
     @imports_map

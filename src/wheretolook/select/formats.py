@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from wheretolook.mapping.colmap_model import holds_model
 from wheretolook.utils.errors import ConfigError, StorageError
+from wheretolook.utils.files import check_output_folder
 from wheretolook.utils.validation import check_choice
 
 FORMATS = {
@@ -34,8 +34,8 @@ def check_format(path: Path, format: str | None, n: int) -> str:
         raise ConfigError(f"a file of the format {chosen} has one view of each waypoint", value=n, fix=fix)
     if path.is_dir() and chosen != "colmap":
         raise ConfigError("this is a folder", path=path, fix="Name a file.")
-    if chosen == "colmap" and not path.suffix and holds_model(path) and not _is_ours(path):
-        raise ConfigError("this folder holds a COLMAP model", path=path, fix="Name another folder.")
+    if chosen == "colmap" and not path.suffix:
+        check_output_folder(path, _is_ours(path))
     folder = next(parent for parent in path.absolute().parents if parent.exists())
     if not folder.is_dir() or not os.access(folder, os.W_OK):
         raise StorageError("cannot write views there", path=folder, fix="Name a file in another folder.")

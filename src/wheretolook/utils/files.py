@@ -43,13 +43,19 @@ def copy_file(source: Path, target: Path) -> None:
 
 def check_output(path: Path, inputs: Iterable[Path] = ()) -> None:
     """Raise ConfigError for an output that is a device, pipe, link to a file, an input or its map, or in a dataset."""
-    target = path.resolve()
+    target = Path(os.path.realpath(path))
     replaced = {target, target.parent if target.stem in MAP_FILES else target}
     is_special = os.path.lexists(path) and not path.is_dir() and (path.is_symlink() or not path.is_file())
     in_dataset = any((folder / "dataset.json").is_file() for folder in (target, *target.parents))
-    if is_special or in_dataset or replaced & {given.resolve() for given in inputs}:
+    if is_special or in_dataset or replaced & {Path(os.path.realpath(given)) for given in inputs}:
         problem = "an output is a regular file or folder, no device, link to a file or input, and not in a dataset"
         raise ConfigError(problem, path=path, fix="Give another path.")
+
+
+def check_output_folder(folder: Path, is_own: bool) -> None:
+    """Raise ConfigError for a folder to write that is a file or holds files, unless the same command wrote them."""
+    if not is_own and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ConfigError("this holds something else", path=folder, fix="Name a new or an empty folder.")
 
 
 @contextmanager

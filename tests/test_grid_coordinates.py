@@ -223,7 +223,7 @@ def test_a_pose_is_estimated_as_exactly_as_near_the_origin() -> None:
     rows = np.flatnonzero((transform(pose, points)[:, 2] > 0.1) & CAMERA.in_image(pixels))
     keypoints = Keypoints(pixels.astype(np.float32), np.zeros((200, 128), np.float32))
     landmarks = replace(room_landmarks(200), points=points + SHIFT, descriptors=np.ones((200, 128), np.uint8))
-    found = Localizer(landmarks, CAMERA).estimate(keypoints, Matches(rows, rows, np.zeros(200, np.float32)))
+    found = Localizer(landmarks, CAMERA).estimate(keypoints, Matches.none(200)._replace(keypoints=rows, landmarks=rows))
     assert found.status == "localized" and len(found.inlier_rows) == len(rows)
     error_m, error_deg = pose_error(found.cam_from_world, far_poses(pose))
     assert error_m < 1e-3 and error_deg < 1e-2

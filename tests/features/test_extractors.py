@@ -54,11 +54,13 @@ def test_mutual_nearest_neighbours_are_those_of_all_products(n, monkeypatch):
     images = [np.concatenate([noisy, unit(30, 64, 2)]).astype(np.float16), np.zeros((0, 64), np.float16)]
     matcher = SimilarityMatcher(landmarks)
     for limit in (-1.0, 0.5, 0.9):
-        (keypoints, rows, nearest), nothing = matcher.match(images, limit)
+        (keypoints, rows, near, squared), nothing = matcher.match(images, limit, 16)
         assert len(nothing[0]) == len(nothing[1]) == 0
         if n:
             cosine = images[0].astype(float) @ landmarks.astype(float).T
-            np.testing.assert_allclose(nearest, 2 - 2 * cosine.max(1), atol=1e-5)
+            expected = -np.sort(-cosine, axis=1)[:, :16]
+            np.testing.assert_allclose(squared[:, : expected.shape[1]], 2 - 2 * expected, atol=1e-5)
+            np.testing.assert_allclose(np.take_along_axis(cosine, near[:, : expected.shape[1]], 1), expected, atol=1e-5)
             expected = mutual_matches(images[0], landmarks, limit)
             found, plain = ({*zip(a.tolist(), b.tolist(), strict=True)} for a, b in ((keypoints, rows), expected))
             assert len(found ^ plain) <= n // 1000  # sums that agree up to single precision

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from twins.features import nearest_two
+from twins.features import nearest
 from wheretolook.features import matching
 from wheretolook.features.descriptors import quantize_descriptors, unit_descriptors
 from wheretolook.features.matching import DescriptorMatcher, match
@@ -46,31 +46,35 @@ def views_of(landmarks: Descriptors, n: int, noise: float, seed: int = 1) -> Des
 KINDS = pytest.mark.parametrize("make", [random_descriptors, extreme_descriptors, sift_like_descriptors])
 
 
-def assert_nearest_two(device: str, queries: Descriptors, landmarks: Descriptors) -> None:
-    rows, nearest, second = DescriptorMatcher(landmarks, device).nearest_two(queries)
-    assert rows.dtype == nearest.dtype == second.dtype == np.int64
-    assert rows.shape == nearest.shape == second.shape == (len(queries),)
-    plain_rows, plain_nearest, plain_second = nearest_two(queries, landmarks)
-    np.testing.assert_array_equal(nearest, plain_nearest)
-    np.testing.assert_array_equal(second, plain_second)
-    apart = plain_nearest > plain_second  # of several equally near, any may be named
-    np.testing.assert_array_equal(rows[apart], plain_rows[apart])
-    of_named = (queries.astype(np.int64) * landmarks[rows]).sum(1)
-    np.testing.assert_array_equal(of_named, plain_nearest)
+def assert_nearest(device: str, queries: Descriptors, landmarks: Descriptors, count: int = 2) -> None:
+    rows, products = DescriptorMatcher(landmarks, device).products(queries, count)
+    assert rows.dtype == products.dtype == np.int64 and rows.shape == products.shape == (len(queries), count)
+    plain_rows, plain_products = nearest(queries, landmarks, count + 1)
+    there = min(count, len(landmarks))
+    np.testing.assert_array_equal(products[:, :there], plain_products[:, :there])
+    assert (products[:, there:] < -(2**27)).all()
+    of_named = (queries.astype(np.int64)[:, None] * landmarks[rows[:, :there]]).sum(2)
+    np.testing.assert_array_equal(of_named, plain_products[:, :there])
+    # of several equally near, any may be named
+    padded = np.pad(plain_products[:, :there], ((0, 0), (1, 1)), constant_values=-1)
+    padded[:, -1] = plain_products[:, there] if plain_products.shape[1] > there else -1
+    apart = (padded[:, 1:-1] != padded[:, :-2]) & (padded[:, 1:-1] != padded[:, 2:])
+    np.testing.assert_array_equal(rows[:, :there][apart], plain_rows[:, :there][apart])
 
 
 @KINDS
 def test_nearest_two_agree_with_their_twin_at_every_size(device: str, make) -> None:  # type: ignore[no-untyped-def]
     for n in [*range(2, 71), 5_000]:
-        assert_nearest_two(device, make(40, seed=n + 1), make(n, seed=n))
+        assert_nearest(device, make(40, seed=n + 1), make(n, seed=n))
+        assert_nearest(device, make(40, seed=n + 1), make(n, seed=n), 16)
 
 
 @pytest.mark.parametrize("n", [1, 63, 64, 65, 127, 128, 129, 500])
 def test_blocks_leave_no_seam(device: str, n: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks of 64 descriptors, or of one where the product of more does not fit."""
     for block in (64, 1):
-        monkeypatch.setattr(matching, "_PRODUCT_BYTES", dict.fromkeys(("cpu", "cuda"), 4 * 320 * block))
-        assert_nearest_two(device, sift_like_descriptors(n, seed=1), sift_like_descriptors(300))
+        monkeypatch.setattr(matching, "_PRODUCT_BYTES", dict.fromkeys(("cpu", "cuda"), 4 * 512 * block))
+        assert_nearest(device, sift_like_descriptors(n, seed=1), sift_like_descriptors(300))
 
 
 def lowe(queries: Descriptors, landmarks: Descriptors, max_ratio: float) -> dict[int, int]:
@@ -89,7 +93,7 @@ def test_matches_pass_lowes_test_and_take_each_landmark_once(device: str, max_ra
     landmarks = sift_like_descriptors(300)
     landmarks[10] = landmarks[11]  # twins never match: their keypoints are as near to the one as to the other
     queries = np.concatenate([views_of(landmarks, 200, noise) for noise in (0.0, 0.02, 0.06)])
-    ((keypoints, rows, _),) = match(DescriptorMatcher(landmarks, device), [queries], max_ratio)
+    ((keypoints, rows, *_),) = match(DescriptorMatcher(landmarks, device), [queries], max_ratio)
     assert dict(zip(keypoints.tolist(), rows.tolist(), strict=True)) == lowe(queries, landmarks, max_ratio)
     assert 100 < len(rows) < len(queries)
     assert (np.diff(keypoints) > 0).all() and len(set(rows)) == len(rows) and not {10, 11} & set(rows)
@@ -112,7 +116,7 @@ def test_a_cpu_whose_byte_products_saturate_finds_the_same(instructions: str) ->
         "from features import test_matching as tests\n"
         "for make in (tests.random_descriptors, tests.extreme_descriptors, tests.sift_like_descriptors):\n"
         "    for n, k in ((3, 1), (64, 17), (70, 5), (1000, 300)):\n"
-        "        tests.assert_nearest_two('cpu', make(k, seed=1), make(n))\n"
+        "        tests.assert_nearest('cpu', make(k, seed=1), make(n))\n"
         "print('done')\n"
     )
     assert run_python(code, ONEDNN_MAX_CPU_ISA=instructions) == "done"

@@ -89,7 +89,7 @@ def test_a_pose_is_found_with_every_camera(room: MappedRoom, camera: Camera) -> 
     matched = rows.copy()
     matched[::2] = np.roll(matched[::2], 7)
     keypoints = replace(Keypoints.none(), pixels=found.astype(np.float32))
-    matches = Matches(np.arange(len(rows)), matched, np.zeros(len(rows), np.float32))
+    matches = Matches.none(len(rows))._replace(keypoints=np.arange(len(rows)), landmarks=matched)
     estimate = Localizer(landmarks, CAMERA).estimate(keypoints, matches, camera)
     assert estimate.cam_from_world is not None and estimate.status == LOCALIZED
     (error_m,), (error_deg,) = pose_error(estimate.cam_from_world[None], pose[None])

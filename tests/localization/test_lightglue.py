@@ -65,7 +65,7 @@ def test_a_query_is_localized_by_the_images_that_see_the_same(corridor, tmp_path
     config = LocalizerConfig(lightglue=str(weights), lightglue_images=2)
     localizer = Localizer(landmarks, camera, config, map_dir=corridor)
     (matches,) = localizer.match([query])
-    keypoints, rows, _ = matches
+    keypoints, rows, *_ = matches
     assert (np.diff(keypoints) > 0).all() and len(set(rows.tolist())) == len(rows)
     of_image = model.images[11].points2D
     true = {k: point.point3D_id for k, point in enumerate(of_image) if point.has_point3D()}
@@ -75,7 +75,7 @@ def test_a_query_is_localized_by_the_images_that_see_the_same(corridor, tmp_path
     error_m, error_deg = pose_error(found.cam_from_world, colmap_poses(corridor)[10])
     assert found.status == "localized" and error_m < 0.02 and error_deg < 0.3
     nothing = Keypoints.none(KIND.dimension)
-    assert [len(part) for part in localizer.match([nothing])[0]] == [0, 0, 0]
+    assert [len(part) for part in localizer.match([nothing])[0]] == [0, 0, 0, 0]
 
 
 def test_held_out_photographs_of_a_map_of_learned_features_are_localized(corridor, tmp_path):

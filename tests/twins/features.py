@@ -8,14 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def nearest_two(
-    queries: NDArray[np.uint8], descriptors: NDArray[np.uint8]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """`DescriptorMatcher.nearest_two`."""
+def nearest(
+    queries: NDArray[np.uint8], descriptors: NDArray[np.uint8], count: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """`DescriptorMatcher.products`."""
     product = queries.astype(np.int64) @ descriptors.astype(np.int64).T
-    order = np.argsort(-product, axis=1, kind="stable")
-    best = np.take_along_axis(product, order[:, :2], axis=1)
-    return order[:, 0], best[:, 0], best[:, 1]
+    order = np.argsort(-product, axis=1, kind="stable")[:, :count]
+    return order, np.take_along_axis(product, order, axis=1)
 
 
 def mutual_matches(queries: NDArray[Any], descriptors: NDArray[Any], min_similarity: float) -> tuple[NDArray[Any], ...]:

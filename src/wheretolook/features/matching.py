@@ -18,21 +18,26 @@ class Matches(NamedTuple):
     Attributes:
         keypoints: (M,) rows of keypoints, ascending.
         landmarks: (M,) rows of their landmarks.
-        nearest: (K,) squared descriptor distance of each keypoint of the image to the nearest landmark.
+        near: (K, C) rows of the landmarks whose descriptors are nearest to each keypoint's.
+        squared: (K, C) their squared distances, ascending.
     """
 
     keypoints: NDArray[np.int64]
     landmarks: NDArray[np.int64]
-    nearest: NDArray[np.float32]
+    near: NDArray[np.int64]
+    squared: NDArray[np.float32]
 
     @classmethod
     def none(cls, n_keypoints: int) -> Matches:
         """No matches of an image with so many keypoints."""
         rows = np.zeros(0, dtype=np.int64)
-        return cls(rows, rows, np.full(n_keypoints, np.inf, dtype=np.float32))
+        return cls(rows, rows, np.zeros((n_keypoints, 0), dtype=np.int64), np.zeros((n_keypoints, 0), dtype=np.float32))
 
 
-GROUP = 32  # landmarks; the two best groups are selected first, and in them the two best landmarks
+GROUP = 32  # landmarks; the best groups are selected first, and in them the best landmarks
+MAX_NEAREST = 16  # landmarks that `DescriptorMatcher.nearest` returns at most
+MISSING_PRODUCT = -(2**28)
+MISSING = 2**28  # squared distance
 # Size of a block of products. Products of few queries are slow; on a GPU, where each worker holds a block and its
 # intermediate results, blocks of 1 GiB are no faster.
 _PRODUCT_BYTES = {"cpu": 2**24, "cuda": 2**27}
@@ -52,34 +57,38 @@ class DescriptorMatcher:
         n, length = descriptors.shape
         self.n_landmarks = n
         self._in_bytes = self.device.type == "cpu" and _byte_products_are_fast()
-        padded = -(-max(n, 2 * GROUP) // GROUP) * GROUP
+        padded = -(-max(n, MAX_NEAREST * GROUP) // GROUP) * GROUP
         whole = torch.zeros((padded, length), dtype=torch.int32)
         whole[:n] = torch.from_numpy(descriptors.astype(np.int32))
         if self._in_bytes:  # in signed bytes: q.d = (q - 128).(d - 128) + 128 (sum of d) + terms that depend on q only
             self._descriptors = (whole - 128).to(torch.int8).T
             self._bias = 128 * whole.sum(1, dtype=torch.int32)
-            self._bias[n:] = -(2**28)  # rows of padding are never nearest
+            self._bias[n:] = MISSING_PRODUCT  # rows of padding are never nearest
         else:
             number = torch.float32 if self.device.type == "cpu" else torch.float16
             self._descriptors = whole.to(self.device, number).T
 
-    def nearest_two(
-        self, descriptors: NDArray[np.uint8]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Row of the nearest landmark of each descriptor (K, 128), and its products with the two nearest; (K,) each.
+    def nearest(self, descriptors: NDArray[np.uint8], count: int = 2) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows of the nearest landmarks of each descriptor (K, 128) and their squared distances, ascending; (K, count).
 
-        Ties are broken arbitrarily. With fewer than two landmarks, a missing product is -2^28.
+        Ties are broken arbitrarily. With fewer landmarks, the missing ones have distances above `MISSING`.
         """
+        rows, products = self.products(descriptors, count)
+        # of descriptors of length 512; rounding makes some a little longer, hence the maximum
+        return rows, np.maximum(2 * (512**2 - products), 0)
+
+    def products(self, descriptors: NDArray[np.uint8], count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows of the nearest landmarks and their scalar products with each descriptor, descending; (K, count)."""
         # OpenMP's limit is per thread: without this, the first product in a new thread would start a thread per core.
         torch.set_num_threads(torch.get_num_threads())
         queries = torch.from_numpy(descriptors).to(self.device)
         block = max(1, _PRODUCT_BYTES[self.device.type] // (4 * self._descriptors.shape[1]))
-        parts = [self._best_two(part) for part in queries.split(block)]
+        parts = [self._best(part, count) for part in queries.split(block)]
         rows, best = (torch.cat([part[i] for part in parts]).cpu().long().numpy() for i in (0, 1))
-        return rows, best[:, 0], best[:, 1]
+        return rows, best
 
-    def _best_two(self, queries: Tensor) -> tuple[Tensor, Tensor]:
-        """Row of the nearest landmark, (k,), and the two largest products, (k, 2)."""
+    def _best(self, queries: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """Rows of the nearest landmarks and their products, descending; (k, count)."""
         query_bias = torch.zeros((), device=self.device)
         if self._in_bytes:
             whole = queries.to(torch.int32)
@@ -90,15 +99,22 @@ class DescriptorMatcher:
                 product = queries.float() @ self._descriptors
             else:
                 product = torch.mm(queries.to(torch.float16), self._descriptors, out_dtype=torch.float32)
-            product[:, self.n_landmarks :] = -(2**28)
-        # A group's landmarks are a stride apart: maxima of neighbours in memory take a GPU several times as long.
-        groups = product.view(len(product), GROUP, self._descriptors.shape[1] // GROUP)
-        best_groups = groups.amax(1).topk(2, dim=1).indices
-        candidates = groups.gather(2, best_groups[:, None].expand(-1, GROUP, -1)).flatten(1)  # of both groups in turns
-        best, best_candidates = candidates.topk(2, dim=1)
-        first = best_candidates[:, :1]
-        rows = (best_groups.gather(1, first % 2) + first // 2 * groups.shape[2])[:, 0]
+            product[:, self.n_landmarks :] = MISSING_PRODUCT
+        rows, best = largest(product, count)
         return rows, best + query_bias
+
+
+def largest(product: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Columns of the largest numbers of each row of (k, n), and the numbers, descending; (k, count).
+
+    `n` is a multiple of `GROUP`, of at least `count` groups.
+    """
+    # A group's columns are a stride apart: maxima of neighbours in memory take a GPU several times as long.
+    groups = product.view(len(product), GROUP, product.shape[1] // GROUP)
+    best_groups = groups.amax(1).topk(count, dim=1).indices
+    candidates = groups.gather(2, best_groups[:, None].expand(-1, GROUP, -1)).flatten(1)  # of all groups in turns
+    best, best_candidates = candidates.topk(count, dim=1)
+    return best_groups.gather(1, best_candidates % count) + best_candidates // count * groups.shape[2], best
 
 
 @cache
@@ -121,8 +137,10 @@ def _byte_products_are_fast() -> bool:
     return torch.equal(product.long(), left @ right)
 
 
-def match(matcher: DescriptorMatcher, descriptors: Sequence[NDArray[np.uint8]], max_ratio: float) -> list[Matches]:
-    """2D-3D matches of several images, from their descriptors (K_i, 128) uint8.
+def match(
+    matcher: DescriptorMatcher, descriptors: Sequence[NDArray[np.uint8]], max_ratio: float, count: int = 2
+) -> list[Matches]:
+    """2D-3D matches of several images, from their descriptors (K_i, 128) uint8, with each keypoint's nearest landmarks.
 
     A match passes Lowe's ratio test (IJCV 2004, Sec. 7.1): the nearest landmark's distance is less than `max_ratio` of
     the second nearest's. A landmark keeps only its nearest keypoint. With a single landmark, nothing matches.
@@ -130,17 +148,16 @@ def match(matcher: DescriptorMatcher, descriptors: Sequence[NDArray[np.uint8]], 
     lengths = [len(of_image) for of_image in descriptors]
     if sum(lengths) == 0 or matcher.n_landmarks < 2:
         return [Matches.none(length) for length in lengths]
-    rows, nearest, second = matcher.nearest_two(np.concatenate(descriptors))
-    # squared distances between descriptors of length 512; rounding makes some a little longer, hence the maximum
-    distance, next_distance = (np.maximum(2 * (512**2 - best), 0) for best in (nearest, second))
-    passed = distance < max_ratio**2 * next_distance
-    parts = (np.split(values, np.cumsum(lengths)[:-1]) for values in (rows, distance, passed))
-    return [_each_landmark_once(*of_image) for of_image in zip(*parts, strict=True)]
+    near, squared = matcher.nearest(np.concatenate(descriptors), count)
+    ends = np.cumsum(lengths)[:-1]
+    return [
+        _by_ratio(*of_image, max_ratio) for of_image in zip(np.split(near, ends), np.split(squared, ends), strict=True)
+    ]
 
 
-def _each_landmark_once(rows: NDArray[np.int64], distance: NDArray[np.int64], passed: NDArray[np.bool_]) -> Matches:
-    keypoints = np.flatnonzero(passed)
-    landmarks = rows[keypoints]
-    order = np.lexsort((keypoints, distance[keypoints], landmarks))
+def _by_ratio(near: NDArray[np.int64], squared: NDArray[np.int64], max_ratio: float) -> Matches:
+    keypoints = np.flatnonzero(squared[:, 0] < max_ratio**2 * squared[:, 1])
+    landmarks = near[keypoints, 0]
+    order = np.lexsort((keypoints, squared[keypoints, 0], landmarks))
     unique = np.sort(order[np.unique(landmarks[order], return_index=True)[1]])
-    return Matches(keypoints[unique], landmarks[unique], distance.astype(np.float32))
+    return Matches(keypoints[unique], landmarks[unique], near, squared.astype(np.float32))

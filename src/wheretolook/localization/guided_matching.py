@@ -8,74 +8,54 @@ make it more accurate, and a wrong pose gains few.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from wheretolook.geometry.poses import Float, transform
+from wheretolook.features.matching import Matches
+from wheretolook.geometry.poses import Float
+from wheretolook.localization.estimation import squared_errors
 from wheretolook.localization.rig import Look
 
 MAX_NEAREST_RATIO = 1.15
-"""Maximum ratio of the descriptor distances to the predicted landmark and to the nearest landmark of the map."""
-
-MAX_CANDIDATES = 16
-"""Maximum number of projected landmarks near a keypoint whose descriptors are compared."""
-
-MIN_DEPTH = 0.05  # of landmarks in front of the camera, in metres
+"""Maximum ratio of the descriptor distances to a candidate and to the nearest landmark of the map."""
 
 
 @dataclass(frozen=True, eq=False)
-class StoredKeypoints:
-    """All keypoints of an image, with descriptors as the map stores them.
+class Candidates:
+    """Landmarks whose descriptors are about as near to a keypoint's as the nearest of the map, by increasing distance.
 
     Attributes:
-        pixels: (K, 2) in the image.
-        descriptors: (K, D), see `DescriptorKind.store`.
-        nearest: (K,) squared descriptor distance to the nearest landmark of the map.
+        pixels: (K, 2) of all keypoints of an image.
+        keypoints: (M,) rows of keypoints.
+        landmarks: (M,) rows of their candidates.
     """
 
     pixels: Float
-    descriptors: NDArray[Any]
-    nearest: Float
+    keypoints: NDArray[np.int64]
+    landmarks: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, pixels: Float, matches: Matches) -> Candidates:
+        """Select from the nearest landmarks of keypoints at pixels (K, 2)."""
+        near = matches.squared <= MAX_NEAREST_RATIO**2 * matches.squared[:, :1]
+        keypoints, column = np.nonzero(near)
+        order = np.argsort(matches.squared[keypoints, column], kind="stable")
+        keypoints = keypoints[order]
+        return cls(np.asarray(pixels, dtype=np.float64), keypoints, matches.near[keypoints, column[order]])
 
 
-class GuidedMatcher:
-    """Matches keypoints with landmarks near them under a pose, from points (N, 3) m and their descriptors (N, D)."""
+def match_under(look: Look, points: Float, cam_from_world: Float, radius_px: float) -> Look:
+    """Return a view with the matches of all its keypoints that agree with a pose up to a radius in pixels.
 
-    def __init__(self, points: Float, descriptors: NDArray[Any]) -> None:
-        self.points = points
-        self.descriptors = descriptors
-
-    def match(self, look: Look, cam_from_world: Float, radius_px: float) -> Look:
-        """Return the view with the matches of all its keypoints that agree with a pose up to a radius in pixels.
-
-        A keypoint matches the landmark nearest in descriptor space among those projected within the radius, if no
-        landmark of the map is nearer by more than `MAX_NEAREST_RATIO`; a landmark keeps its nearest keypoint.
-        """
-        keypoints = look.keypoints
-        assert keypoints is not None
-        rows, pixels = self._in_image(look, cam_from_world, radius_px)
-        if not len(rows) or not len(keypoints.pixels):
-            return replace(look, pixels=keypoints.pixels[:0], rows=rows[:0])
-        count = min(MAX_CANDIDATES, len(rows))
-        distance, near = cKDTree(pixels).query(keypoints.pixels, count, distance_upper_bound=radius_px)
-        keypoint, candidate = np.nonzero(np.isfinite(distance.reshape(-1, count)))
-        landmark = rows[near.reshape(-1, count)[keypoint, candidate]]
-        difference = keypoints.descriptors[keypoint].astype(np.float32) - self.descriptors[landmark]
-        squared = np.einsum("md,md->m", difference, difference)
-        kept = squared <= MAX_NEAREST_RATIO**2 * keypoints.nearest[keypoint]
-        order = np.flatnonzero(kept)[np.argsort(squared[kept], kind="stable")]
-        for values in (keypoint, landmark):  # each keypoint once, then each landmark once
-            order = order[np.sort(np.unique(values[order], return_index=True)[1])]
-        return replace(look, pixels=keypoints.pixels[keypoint[order]], rows=landmark[order])
-
-    def _in_image(self, look: Look, cam_from_world: Float, margin_px: float) -> tuple[NDArray[np.int64], Float]:
-        """Rows (M,) and pixels (M, 2) of the landmarks that a pose projects into the image, or nearly."""
-        in_camera = transform(cam_from_world, self.points)
-        rows = np.flatnonzero(in_camera[:, 2] > MIN_DEPTH)
-        pixels = look.camera.project(in_camera[rows])
-        size = look.camera.width + margin_px, look.camera.height + margin_px
-        inside = (pixels > -margin_px).all(axis=1) & (pixels < size).all(axis=1)
-        return rows[inside], pixels[inside]
+    A keypoint matches the nearest of its candidates that the pose projects within the radius; a landmark keeps its
+    nearest keypoint. `points` (N, 3) m are those of the map.
+    """
+    candidates = look.candidates
+    assert candidates is not None
+    pixels = candidates.pixels[candidates.keypoints]
+    squared = squared_errors(look.camera, pixels, points[candidates.landmarks], cam_from_world)
+    order = np.flatnonzero(squared < radius_px**2)
+    for values in (candidates.keypoints, candidates.landmarks):  # each keypoint once, then each landmark once
+        order = order[np.sort(np.unique(values[order], return_index=True)[1])]
+    return replace(look, pixels=pixels[order], rows=candidates.landmarks[order])

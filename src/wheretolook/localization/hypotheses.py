@@ -10,11 +10,10 @@ import numpy as np
 import poselib
 from numpy.typing import NDArray
 
-from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.pose_information import N_NUMBERS, bearing_numbers, information_matrices
-from wheretolook.geometry.poses import Float, camera_centers, compose_poses, invert_poses, pose_error, transform
-from wheretolook.localization.estimation import REFINEMENT, PoseEstimator, poselib_camera
-from wheretolook.localization.guided_matching import GuidedMatcher
+from wheretolook.geometry.poses import Float, camera_centers, compose_poses, invert_poses, pose_error
+from wheretolook.localization.estimation import REFINEMENT, PoseEstimator, poselib_camera, squared_errors
+from wheretolook.localization.guided_matching import match_under
 from wheretolook.localization.joint_refinement import refine_rotations
 from wheretolook.localization.rig import Look
 
@@ -143,11 +142,12 @@ class RigMatches:
             hypotheses.append(replace(evaluated, inliers=(mask,)))
         return hypotheses
 
-    def guided(self, hypothesis: Hypothesis, matcher: GuidedMatcher) -> Hypothesis:
+    def guided(self, hypothesis: Hypothesis) -> Hypothesis:
         """Match all keypoints again under a hypothesis and refine it, with a radius that decreases."""
         for radius_px in GUIDED_RADII_PX:
             cams = hypothesis.cams_from_world
-            looks = [matcher.match(look, pose, radius_px) for look, pose in zip(self.looks, cams, strict=True)]
+            pairs = zip(self.looks, cams, strict=True)
+            looks = [match_under(look, self.estimator.points, pose, radius_px) for look, pose in pairs]
             rig = RigMatches(self.estimator, looks, self.turn_noise_deg)
             if sum(len(look.rows) for look in looks) < MIN_MATCHES:
                 return hypothesis
@@ -226,16 +226,6 @@ def distinct(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
         if all(hypothesis.differs_from(other) for other in kept):
             kept.append(hypothesis)
     return kept
-
-
-def squared_errors(camera: Camera, pixels: Float, points: Float, cam_from_world: Float) -> Float:
-    """Squared reprojection errors (M,) of points (M, 3) at pixels (M, 2) of a pose's image; infinite behind it."""
-    in_camera = transform(cam_from_world, points)
-    fisheye = camera.colmap.model.endswith("FISHEYE")
-    ahead = np.ones(len(in_camera), dtype=bool) if fisheye else in_camera[:, 2] > 1e-6
-    projected = camera.project(np.where(ahead[:, None], in_camera, (0.0, 0.0, 1.0)))
-    squared = ((projected - pixels) ** 2).sum(1)
-    return np.where(ahead & np.isfinite(squared), squared, np.inf)
 
 
 def _poselib_pose(pose: Float) -> poselib.CameraPose:

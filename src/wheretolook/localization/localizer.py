@@ -15,14 +15,14 @@ from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, TOO_FEW_MATC
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import Keypoints
-from wheretolook.features.matching import DescriptorMatcher, Matches, match
+from wheretolook.features.matching import MAX_NEAREST, DescriptorMatcher, Matches, match
 from wheretolook.features.registry import all_kinds, kind_of
 from wheretolook.features.similarity import SimilarityMatcher
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator
-from wheretolook.localization.guided_matching import GuidedMatcher, StoredKeypoints
+from wheretolook.localization.guided_matching import Candidates
 from wheretolook.localization.rig import Look
 from wheretolook.localization.rig_localization import JointLocalizer
 from wheretolook.mapping.landmarks import Landmarks
@@ -111,17 +111,23 @@ class Localizer:
     def match(self, keypoints: Sequence[Keypoints], camera: Camera | None = None) -> list[Matches]:
         """Match keypoints of several images with landmarks. The result for an image does not depend on the others."""
         descriptors = [self.kind.store(of_image.descriptors) for of_image in keypoints]
+        several = self.config.method == "hypotheses"
         if isinstance(self._matcher, SimilarityMatcher):
             limit = self.config.min_similarity
-            matches = self._matcher.match(descriptors, self.kind.min_similarity if limit is None else limit)
+            limit = self.kind.min_similarity if limit is None else limit
+            matches = self._matcher.match(descriptors, limit, MAX_NEAREST if several else 1)
         else:
-            matches = match(self._matcher, descriptors, self.config.max_ratio)
+            matches = match(self._matcher, descriptors, self.config.max_ratio, MAX_NEAREST if several else 2)
         if self._guided is None:
             return matches
         camera = camera or self._camera
         size = (camera.width, camera.height)
         return [
-            Matches(*self._guided.match(query, size, first.landmarks, self.config.lightglue_images), first.nearest)
+            Matches(
+                *self._guided.match(query, size, first.landmarks, self.config.lightglue_images),
+                first.near,
+                first.squared,
+            )
             for query, first in zip(keypoints, matches, strict=True)
         ]
 
@@ -129,22 +135,14 @@ class Localizer:
         self, keypoints: Keypoints, matches: Matches, camera: Camera | None = None, cam_from_rig: Float = IDENTITY
     ) -> Look:
         """Return a view of a rig, for `JointLocalizer`, from an image's keypoints and their matches."""
-        stored = StoredKeypoints(
-            keypoints.pixels.astype(np.float64), self.kind.store(keypoints.descriptors), matches.nearest
-        )
-        pixels = stored.pixels[matches.keypoints]
-        return Look(cam_from_rig, pixels, matches.landmarks, camera or self._camera, stored)
-
-    @cached_property
-    def guide(self) -> GuidedMatcher:
-        """Matches keypoints again under a pose."""
-        assert self.landmarks.descriptors is not None
-        return GuidedMatcher(self.estimator.points, self.landmarks.descriptors)
+        candidates = Candidates.of(keypoints.pixels, matches)
+        pixels = candidates.pixels[matches.keypoints]
+        return Look(cam_from_rig, pixels, matches.landmarks, camera or self._camera, candidates)
 
     @cached_property
     def joint(self) -> JointLocalizer:
         """Localizes one view or several with exactly known rotations by several hypotheses."""
-        return JointLocalizer(self.estimator, guide=self.guide)
+        return JointLocalizer(self.estimator)
 
     def estimate(self, keypoints: Keypoints, matches: Matches, camera: Camera | None = None) -> Localization:
         """Estimate the pose of an image from its matches."""

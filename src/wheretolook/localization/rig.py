@@ -14,7 +14,7 @@ from wheretolook.geometry.poses import Float, camera_centers, compose_poses, inv
 from wheretolook.utils.errors import PoseError
 
 if TYPE_CHECKING:
-    from wheretolook.localization.guided_matching import StoredKeypoints
+    from wheretolook.localization.guided_matching import Candidates
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class Look:
     pixels: Float  # (M, 2) in its image
     rows: NDArray[np.int64]  # (M,) of the landmarks
     camera: Camera
-    keypoints: StoredKeypoints | None = None  # all of its image, if they are to be matched again under each hypothesis
+    candidates: Candidates | None = None  # for all its keypoints, if they are to be matched again under each hypothesis
 
     def __post_init__(self) -> None:
         rotation = self.cam_from_rig[:, :3]

@@ -18,7 +18,6 @@ from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, TOO_FEW_MATC
 from wheretolook.geometry.local_origin import poses_from
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.estimation import PoseEstimator
-from wheretolook.localization.guided_matching import GuidedMatcher
 from wheretolook.localization.hypotheses import (
     MIN_MATCHES,
     RIVAL_TRIALS,
@@ -87,8 +86,8 @@ class JointLocalizer:
     """Localizes views jointly against the points of a `PoseEstimator`.
 
     Hypotheses come from PoseLib's LO-RANSAC (generalized P3P) over all matches, over those that agree with no earlier
-    hypothesis, and from each view as a single image. Each is refined on the inliers of all views; with `guide`, on the
-    matches found again under it. The one with the most unique support wins (`pose_ambiguity`): where the map resembles
+    hypothesis, and from each view as a single image. Each is refined on the inliers of all views; if views have
+    candidates, on the matches found again under it. The one with the most unique support wins (`pose_ambiguity`): where the map resembles
     itself, a wrong pose may have more inliers, but most of them the right pose explains, too. Errors are pixels of each
     view's own image, not angles, with which RANSAC would be twice as lenient near the border of an image.
 
@@ -96,13 +95,10 @@ class JointLocalizer:
     one standard deviation, about each axis, of the known rotations between views.
     """
 
-    def __init__(
-        self, estimator: PoseEstimator, turn_noise_deg: float = 0.0, guide: GuidedMatcher | None = None
-    ) -> None:
+    def __init__(self, estimator: PoseEstimator, turn_noise_deg: float = 0.0) -> None:
         check_range("the noise of rotations in degrees", turn_noise_deg, 0, 90)
         self.estimator = estimator
         self.turn_noise_deg = turn_noise_deg
-        self.guide = guide
 
     @cached_property
     def ambiguity(self) -> PoseAmbiguity:
@@ -149,8 +145,8 @@ class JointLocalizer:
             hypotheses = rig.first_poses(single_view_poses[0])
         else:
             hypotheses = rig.hypotheses(single_view_poses)
-            if self.guide is not None and all(look.keypoints is not None for look in looks):
-                hypotheses = distinct([rig.guided(hypothesis, self.guide) for hypothesis in hypotheses])
+            if all(look.candidates is not None for look in looks):
+                hypotheses = distinct([rig.guided(hypothesis) for hypothesis in hypotheses])
         if not hypotheses:
             return JointLocalization(NO_POSE, tuple(looks), n_matches)
         return self._ranked(hypotheses, n_matches, first)

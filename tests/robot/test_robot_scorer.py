@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -292,6 +293,20 @@ def test_damaged_folders_are_rejected_by_file(damage, folder: Path, tmp_path: Pa
     damage(copy)
     with pytest.raises(ValueError, match=f"^{copy}.*Export again"):
         RobotScorer(copy)
+
+
+def test_devices_and_bombs_are_rejected(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    monkeypatch.setattr("wheretolook.robot.wheretolook_robot.FREE_BYTES", 1000)
+    with np.load(copy / "landmarks.npz") as stored:
+        np.savez_compressed(copy / "landmarks.npz", **{**stored, "places": np.zeros((200_000, 3))})
+    with pytest.raises(ValueError, match="would expand"):
+        RobotScorer(copy)
+    for name in ("landmarks.npz", "robot.json"):
+        (copy / name).unlink()
+        os.mkfifo(copy / name)
+        with pytest.raises(FileNotFoundError):
+            RobotScorer(copy)
 
 
 def test_cameras_and_weights_that_cannot_be_exported(room_map: LocalizationMap, tmp_path: Path) -> None:

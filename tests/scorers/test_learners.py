@@ -110,7 +110,17 @@ def test_detection_is_learned_and_the_set_network_starts_from_it(
 
 
 @pytest.mark.parametrize(
-    "change", [{"format_version": 99}, {"method": "bins"}, {"camera": {"width": 0}}, {"scale": "x"}, None]
+    "change",
+    [
+        {"format_version": 99},
+        {"method": "bins"},
+        {"camera": {"width": 0}},
+        {"scale": "x"},
+        {"scale": -1},
+        {"range": "x"},
+        {},
+        None,
+    ],
 )
 def test_damaged_weights(
     change: dict[str, Any] | None, trained: dict[str, TrainedModel], dataset: Dataset, tmp_path: Path
@@ -121,6 +131,9 @@ def test_damaged_weights(
     tensors = load_file(whole)
     if change is None:
         tensors.pop(sorted(tensors)[0])
+    if change == {}:
+        name = sorted(tensors)[0]
+        tensors[name] = tensors[name] * np.inf
     path = tmp_path / "damaged.safetensors"
     localization_map = dataset.scenes[0].localization_map(CAMERA)
     save_file(tensors, path, metadata={METADATA_KEY: json.dumps(header | (change or {}))})

@@ -55,6 +55,8 @@ CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 COMPUTED = {"across", "down", "distance", "mapped_angle", "distance_ratio", "pixel_angle", "pixel_size_ratio"}
 INPUTS = {"values", "taken", "n_visible", "axis_height"}
 OUTPUTS = ("probability", "expected_inliers")
+FREE_BYTES = 128_000_000  # that landmarks.npz may expand to, whatever its size
+MAX_RATIO = 100  # of its expanded to its stored bytes
 BLOCK = 1 << 15  # landmarks per call of the network, which fit into the cache
 
 Array = NDArray[Any]
@@ -99,6 +101,9 @@ class RobotScorer:
 
     def __init__(self, folder: str | Path, threads: int = 1) -> None:
         folder = Path(folder)
+        for path in (folder / "robot.json", folder / "landmarks.npz", folder / "scorer.onnx"):
+            if not path.is_file():  # missing, a folder, device or pipe
+                raise FileNotFoundError(f"{path}: no such file. Export again.")
         n_landmarks = self._read_settings(folder / "robot.json")
         self._read_landmarks(folder / "landmarks.npz", n_landmarks)
         self._columns = np.ascontiguousarray(self.points.T)  # (3, N): contiguous coordinates are faster
@@ -106,11 +111,9 @@ class RobotScorer:
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads release the core
-        path = str(folder / "scorer.onnx")
-        if not Path(path).is_file():
-            raise FileNotFoundError(f"{path}: no such file. Export again.")
+        path = folder / "scorer.onnx"
         try:
-            self._session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
             shapes = {value.name: value.shape for value in self._session.get_inputs()}
             outputs = {value.name for value in self._session.get_outputs()}
             if {*shapes} != INPUTS or shapes["values"][-1] != len(self._names) or not {*OUTPUTS} <= outputs:
@@ -158,6 +161,9 @@ class RobotScorer:
         shapes = {"points": (n, 3), "directions": (n, 3), "attributes": (n, len(self._map_names))}
         try:
             with np.load(path, allow_pickle=False) as stored:
+                n_bytes = sum(member.file_size for member in stored.zip.infolist())
+                if n_bytes > max(FREE_BYTES, MAX_RATIO * path.stat().st_size):
+                    raise ValueError(f"it would expand to {n_bytes:,} bytes")
                 arrays = {name: stored[name] for name in (*shapes, "places", "unoccluded")}
             shapes |= {"places": (len(arrays["places"]), 3), "unoccluded": (len(arrays["places"]), (n + 7) // 8)}
             for name, array in arrays.items():
@@ -167,8 +173,6 @@ class RobotScorer:
                 unusable = np.isinf if name == "attributes" else lambda values: ~np.isfinite(values)
                 if unusable(array).any():
                     raise ValueError(f"{name} is not finite")
-        except FileNotFoundError:
-            raise
         except Exception as error:  # a damaged archive raises errors of many kinds
             raise ValueError(f"{path}: the landmarks cannot be used: {error}. Export again.") from error
         self.points: Array = arrays["points"]

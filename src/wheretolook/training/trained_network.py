@@ -84,6 +84,8 @@ class TrainedNetwork(Generic[NetworkT]):
             network.stored.load_state_dict(tensors)
             camera = None if header["camera"] is None else camera_of_record(header["camera"])
             scale = finite(header.get("scale", 1.0))
+            if scale <= 0:
+                raise ValueError(f"the scale of the logits is {scale:g}")
             offset = finite(header.get("offset", 0.0))
             training_range = TrainingRange.of_record(header["range"]) if "range" in header else None
         except (KeyError, TypeError, ValueError, IndexError, AttributeError, RuntimeError, ConfigError) as error:

@@ -72,7 +72,8 @@ class TrainingRange:
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> TrainingRange:
         """Return the range of a `record`; KeyError, TypeError, IndexError or ValueError if it is invalid."""
-        return cls({name: (float(record[name][0]), float(record[name][1])) for name in QUANTITIES if name in record})
+        bounds = dict(record)
+        return cls({name: (float(bounds[name][0]), float(bounds[name][1])) for name in QUANTITIES if name in bounds})
 
     def record(self) -> dict[str, list[float]]:
         """Return the bounds as JSON values."""

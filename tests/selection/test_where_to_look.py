@@ -16,6 +16,7 @@ from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import rotation_angle_deg, rotation_looking_along
 from wheretolook.io.poses import images_text, tum_text
+from wheretolook.scans.depth_images import read_depth_images
 from wheretolook.scenes.loading import save_glb
 from wheretolook.scorers.base import Scorer
 from wheretolook.select.request import SelectionRequest
@@ -157,6 +158,29 @@ def test_depth_images(sparse: Path, tmp_path: Path) -> None:
     assert look.localization_map.occlusion.name == "tsdf" and len(look.best(POINTS)) == 4
     with pytest.raises(SceneError):
         WhereToLook.from_colmap(sparse, weights=WEIGHTS, depth=tmp_path, device="cpu")
+
+
+def test_depth_images_of_a_camera_with_distortion(tmp_path: Path) -> None:
+    """A wall at 2 m and x > 0.8 m, in images twice as large as their depth images; colours are next to the depths."""
+    import cv2
+    import pycolmap
+
+    lens = pycolmap.Camera(model="SIMPLE_RADIAL", width=400, height=300, params=[300, 200, 150, -0.2], camera_id=1)
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(lens)
+    image = pycolmap.Image(name="a.color.png", camera_id=1, image_id=1)
+    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    model.write_text(tmp_path)
+    rows, columns = np.mgrid[0:150, 0:200]
+    rays = lens.cam_from_img(np.stack([columns * 2 + 1.0, rows * 2 + 1.0], axis=-1).reshape(-1, 2))
+    depth = np.where(2 * rays[:, 0] > 0.8, 2000, 0).reshape(150, 200).astype(np.uint16)
+    (tmp_path / "depth").mkdir()
+    cv2.imwrite(str(tmp_path / "depth/a.depth.png"), depth)
+    cv2.imwrite(str(tmp_path / "depth/a.color.png"), np.zeros((300, 400, 3), np.uint8))
+    (read,) = read_depth_images(tmp_path, tmp_path / "depth")
+    points = read.points(10)
+    assert len(points) > 4000 and np.allclose(points[:, 2], 2)
+    assert points[:, 0].min() == pytest.approx(0.8, abs=2 / 150)
 
 
 def test_cameras(sparse: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +25,17 @@ def read_depth_images(model: Path, folder: Path, scale: float = 1000.0) -> list[
     """Read the depth images of a COLMAP model's images from a folder (see `read_depth` for formats and `scale`).
 
     A depth image has the name of its image, apart from the ending and with "depth" in place of "color" or "rgb" if
-    need be. It is registered to the image and may have another size; the camera must have no distortion. Raises a
-    SceneError if there are none or one cannot be read, a ConfigError if the camera has distortion.
+    need be. It is registered to the image and may have another size; distortion is removed. Raises a SceneError if
+    there are none or one cannot be read.
     """
     reconstruction = read_model(model)
     cameras = cameras_by_id(reconstruction.cameras, model)
+    rectify = cache(lambda camera_id, size: _rectified(cameras[camera_id], *size))
     images = []
     for image, depth_m in _depth_of_images(reconstruction, folder, scale):
-        camera = _scaled(cameras[image.camera_id], depth_m.shape[1], depth_m.shape[0])
+        camera, shown = rectify(image.camera_id, depth_m.shape[::-1])
+        if shown is not None:
+            depth_m = np.append(depth_m, np.float32(0))[shown]
         images.append(DepthImage(depth_m, camera, image.cam_from_world().matrix()))
     if not images:
         fix = "Name each as its image, with the ending of a depth image, such as .png."
@@ -71,7 +75,7 @@ def _depth_of_images(
     files = {p.relative_to(folder).with_suffix("").as_posix(): p for p in sorted(folder.rglob("*")) if p.is_file()}
     for _, image in sorted(reconstruction.images.items())[::step]:
         stem = Path(image.name).with_suffix("").as_posix()
-        stems = [stem, *(stem.replace(word, "depth") for word in ("color", "colour", "rgb"))]
+        stems = [*({stem.replace(word, "depth") for word in ("color", "colour", "rgb")} - {stem}), stem]
         path = next((files[name] for name in stems if name in files), None)
         if path is not None and image.has_pose:
             try:
@@ -82,9 +86,23 @@ def _depth_of_images(
             yield image, depth_m
 
 
-def _scaled(camera: Camera, width: int, height: int) -> PinholeCamera:
-    """Scale a camera without distortion to another size."""
-    across = width / camera.width
-    down = height / camera.height
-    ((fx, _, cx), (_, fy, cy), _) = camera.matrix.tolist()
-    return PinholeCamera(width, height, fx * across, fy * down, (cx * across, cy * down))
+def _rectified(camera: Camera, width: int, height: int) -> tuple[PinholeCamera, NDArray[np.int64] | None]:
+    """Return the pinhole of a camera's rectified images of another size, and which pixel of an image each pixel shows.
+
+    These are (height, width) rows of the flat image, width * height outside of it; None for a camera without distortion.
+    """
+    is_pinhole = isinstance(camera, PinholeCamera) or camera.model in ("SIMPLE_PINHOLE", "PINHOLE")
+    fx = fy = camera.mean_focal_px
+    if is_pinhole:
+        fx, fy = np.diag(camera.matrix)[:2].tolist()
+    size = np.array([width, height])
+    scale = size / (camera.width, camera.height)
+    cx, cy = (scale * camera.principal_point).tolist()
+    pinhole = PinholeCamera(width, height, float(fx * scale[0]), float(fy * scale[1]), (cx, cy))
+    if is_pinhole:
+        return pinhole, None
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + 0.5
+    at = camera.project(pinhole.unproject(pixels)) * scale
+    inside = np.asarray(((at >= 0) & (at < size)).all(axis=-1))
+    column, row = np.moveaxis(np.where(inside[..., None], at, 0).astype(np.int64), -1, 0)
+    return pinhole, np.where(inside, row * width + column, width * height)

@@ -100,6 +100,14 @@ def test_rigid_transforms_of_any_shape_and_no_others() -> None:
 def test_invalid_locations_and_poses() -> None:
     with pytest.raises(PoseError):
         geo.poses_looking_along([(0, 0, 1), (0, np.nan, 1)], (1, 0, 0))
+    for locations in ([], [(0, 0, 1), (0, 1, 1)], [("a", 0, 1)] * 3, [(1j, 0, 1)] * 3, [(0, 1)] * 3):
+        with pytest.raises(PoseError):
+            geo.poses_looking_along(locations, [(1, 0, 0)] * 3)
+    for given in (np.stack([np.eye(3, 4), np.full((3, 4), 1e300)]), "a", {"a": 1}, [[1, 2], [3]], np.eye(4) + 0j):
+        with pytest.raises(PoseError):
+            geo.rigid_poses(given)
+    same = geo.poses_looking_along([(0, 0, 1), (0, 1, 1)], [(1, 0, 0)] * 2)
+    np.testing.assert_array_equal(geo.poses_looking_along([(0, 0, 1), (0, 1, 1)], (1, 0, 0)), same)
     for poses in (np.stack([np.eye(3, 4), np.full((3, 4), np.nan)]), np.eye(4)):
         with pytest.raises(PoseError):
             geo.check_poses(poses)

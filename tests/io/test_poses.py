@@ -107,4 +107,4 @@ def test_invalid_files(content: bytes, tmp_path: Path) -> None:
     for name in ("path.tum", "path.csv", "images.txt"):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(TableError):
-            read_poses(tmp_path / name)
+            read_poses(str(tmp_path / name))

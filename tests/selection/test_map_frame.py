@@ -86,7 +86,13 @@ def test_the_unit_is_stated_or_measured(sparse: Path, tmp_path: Path) -> None:
 
 def test_the_direction_up(sparse: Path, tmp_path: Path) -> None:
     in_other_units(sparse, tmp_path, 1.0, Y_DOWN)
-    for up, gravity in ((None, "levelled"), ("level", "levelled"), ("-y", "given"), ("0,-1,0.01", "given")):
+    for up, gravity in (
+        (None, "levelled"),
+        ("level", "levelled"),
+        ("-y", "given"),
+        ("0,-1,0.01", "given"),
+        ((0, -1, 0), "given"),
+    ):
         frame = frame_of(tmp_path, scale=1, up=up)
         assert frame.gravity == gravity
         np.testing.assert_allclose(frame.world_from_map.rotation[2], (0, -1, 0), atol=0.02)
@@ -108,7 +114,9 @@ def test_the_direction_up(sparse: Path, tmp_path: Path) -> None:
         ({"distance": ("000.jpg", "000.jpg", 2.0)}, ConfigError),
         ({"distance": ("000.jpg", "001.jpg", -2.0)}, ConfigError),
         ({"positions": Path("nothing.csv")}, ConfigError),
+        ({"distance": ("000.jpg", "001.jpg")}, ConfigError),
         ({"up": "w"}, ConfigError),
+        ({"up": (0, 0, 0)}, ConfigError),
         ({"up": "0,0,0"}, ConfigError),
         ({"up": "1,2"}, ConfigError),
         ({"up": "level", "positions": Path("nothing.csv")}, ConfigError),

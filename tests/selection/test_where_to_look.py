@@ -280,6 +280,8 @@ def test_a_turn_in_radians_is_rejected(look: WhereToLook) -> None:
         {"looks": 2, "max_turn_deg": 30},
         {"max_total_turn_deg": 30},
         {"pitch_deg": (30, -30)},
+        {"pitch_deg": 10},
+        {"pan_deg": (1, 2, 3)},
         {"pan_deg": (30, -30)},
         {"pan_deg": (-190, 30)},
         {"apart_deg": 20},

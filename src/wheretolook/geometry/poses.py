@@ -15,6 +15,7 @@ from wheretolook.utils.errors import PoseError
 
 Float = NDArray[np.floating[Any]]
 
+MAX_ENTRY = 1e12  # of a pose
 RIGID_TOLERANCE = 1e-3  # of the entries of R R^T
 
 
@@ -57,7 +58,7 @@ def rotation_looking_along(directions: ArrayLike) -> Float:
     straight up or down, the image's x axis is the world's. Directions need not be of unit length. Raises PoseError if
     one has no length, or entries that are not finite.
     """
-    forward = np.asarray(directions, dtype=np.float64)
+    forward = _numbers(directions)
     length = np.linalg.norm(forward, axis=-1, keepdims=True)
     usable = (length > 0) & np.isfinite(length)
     if not usable.all():
@@ -74,11 +75,20 @@ def rotation_looking_along(directions: ArrayLike) -> Float:
 def poses_looking_along(locations: ArrayLike, directions: ArrayLike) -> Float:
     """cam_from_world poses (..., 3, 4) of cameras at `locations` (..., 3) m looking along `directions` (..., 3).
 
-    Raises PoseError if a location is not finite, or a direction is not or has no length.
+    They are broadcast to each other. Raises PoseError if they cannot be, a location is not finite, or a direction is not
+    or has no length.
     """
-    rotation = rotation_looking_along(directions)
-    center = check_locations(locations)
-    return np.concatenate([rotation, -rotation @ center[..., None]], axis=-1)
+    at = _numbers(locations)
+    along = _numbers(directions)
+    try:
+        shape = np.broadcast_shapes(at.shape, along.shape)
+    except ValueError:
+        shape = ()
+    if {at.shape[-1:], along.shape[-1:], shape[-1:]} != {(3,)}:
+        raise PoseError("as many locations (..., 3) as directions are needed", value=(at.shape, along.shape))
+    rotation = rotation_looking_along(along)
+    translation = -rotation @ check_locations(at)[..., None]
+    return np.concatenate([np.broadcast_to(rotation, (*shape, 3)), translation], axis=-1)
 
 
 def quaternion_from_rotation(rotation: ArrayLike) -> Float:
@@ -119,14 +129,22 @@ def pose_error(cam_from_world_a: ArrayLike, cam_from_world_b: ArrayLike) -> tupl
     return error_m, rotation_angle_deg(a[..., :3], b[..., :3])
 
 
+def _numbers(values: ArrayLike) -> NDArray[np.float64]:
+    """Return values as float64. Raises PoseError for text, complex numbers and lists of different lengths."""
+    try:
+        return np.asarray(values).astype(np.float64, casting="same_kind", copy=False)
+    except (TypeError, ValueError) as error:
+        raise PoseError(f"these are no numbers: {error}") from error
+
+
 def check_poses(cam_from_world: ArrayLike) -> NDArray[np.float64]:
-    """The poses as float64 (B, 3, 4). Raises PoseError, a ValueError, on another shape or entries not finite."""
-    poses = np.asarray(cam_from_world, dtype=np.float64)
+    """The poses as float64 (B, 3, 4). Raises PoseError, a ValueError, on another shape or entries not finite or too large."""
+    poses = _numbers(cam_from_world)
     if poses.ndim != 3 or poses.shape[1:] != (3, 4):
         raise PoseError("cam_from_world must have shape (B, 3, 4)", value=poses.shape)
-    invalid = np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2)))
+    invalid = np.flatnonzero(~(np.abs(poses) <= MAX_ENTRY).all(axis=(1, 2)))
     if len(invalid):
-        raise PoseError(f"pose {invalid[0]} has NaN or infinite entries", value=poses[invalid[0]].tolist())
+        raise PoseError(f"pose {invalid[0]} has NaN, infinite or too large entries", value=poses[invalid[0]].tolist())
     return poses
 
 
@@ -135,7 +153,7 @@ def rigid_poses(poses: ArrayLike) -> NDArray[np.float64]:
 
     Raises PoseError, as `check_poses`, and if one is no rigid transform.
     """
-    matrices = np.asarray(poses, dtype=np.float64)
+    matrices = _numbers(poses)
     if matrices.ndim == 2:
         matrices = matrices[None]
     homogeneous = matrices.ndim == 3 and matrices.shape[1:] == (4, 4)
@@ -153,7 +171,7 @@ def rigid_poses(poses: ArrayLike) -> NDArray[np.float64]:
 
 def check_locations(locations: ArrayLike) -> NDArray[np.float64]:
     """The locations as float64 (..., 3). Raises PoseError, a ValueError, on entries that are not finite."""
-    at = np.asarray(locations, dtype=np.float64)
+    at = _numbers(locations)
     finite = np.isfinite(at).all(axis=-1)
     if not finite.all():
         raise PoseError("a camera's location is NaN or infinite", value=at[~finite].reshape(-1, 3)[0].tolist())

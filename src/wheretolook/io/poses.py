@@ -114,8 +114,9 @@ class NamedRows:
         return table
 
 
-def read_named_rows(path: Path) -> NamedRows:
+def read_named_rows(path: str | Path) -> NamedRows:
     """Read a file in one of `FORMATS`, detected from its first row. Raises TableError if it is missing or another."""
+    path = Path(path)
     may_be_images = path.suffix == ".txt"
     try:  # once, since it may be a pipe
         text = read_text(path, MAX_IMAGES_BYTES if may_be_images else MAX_TEXT_BYTES, pipes=True)
@@ -145,7 +146,7 @@ class NamedPoses(NamedTuple):
     cam_from_world: Float  # (N, 3, 4)
 
 
-def read_poses(path: Path) -> NamedPoses:
+def read_poses(path: str | Path) -> NamedPoses:
     """Read poses and their names from a TUM trajectory, COLMAP's images.txt, or a CSV with a line of column names.
 
     A CSV holds x, y, z and qw, qx, qy, qz, or in this order tx, ty, tz, qx, qy, qz, qw (world_from_cam); or in this order

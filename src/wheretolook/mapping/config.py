@@ -94,6 +94,8 @@ class FrameOptions:
 
     def __post_init__(self) -> None:
         sources = [value for value in (self.scale, self.distance, self.positions) if value is not None]
+        three = self.distance is None or len(self.distance) == 3
+        reject((not three, "a distance is two ends and the metres between", self.distance))
         distance_m = self.distance[2] if self.distance else 1.0
         reject(
             (len(sources) > 1, "the scale is given by one of scale, distance and positions", sources),
@@ -127,12 +129,13 @@ class FrameOptions:
         """Return the given direction up in the map; None for "level" or none."""
         if self.up is None or self.up == "level":
             return None
-        sign = -1.0 if self.up.startswith("-") else 1.0
-        axis = self.up.lstrip("+-")
+        text = self.up if isinstance(self.up, str) else ",".join(map(str, self.up))  # in Python also numbers
+        sign = -1.0 if text.startswith("-") else 1.0
+        axis = text.lstrip("+-")
         try:
             if axis in ("x", "y", "z"):
                 return tuple(sign * (axis == name) for name in "xyz")
-            up = tuple(map(float, self.up.split(",")))
+            up = tuple(map(float, text.split(",")))
         except ValueError:
             up = ()
         if len(up) != 3 or not 0 < sum(map(abs, up)) < inf:

@@ -7,7 +7,7 @@ from numbers import Integral
 
 from wheretolook.looks.selection import MAX_VIEWS
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.validation import check_pitch, check_range, reject
+from wheretolook.utils.validation import check_limits, check_pitch, check_range, reject
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class SelectionRequest:
 
     def __post_init__(self) -> None:
         check_pitch("pitch_deg", self.pitch_deg or (-90.0, 90.0))
-        low, high = self.pan_deg or (-180.0, 180.0)
+        low, high = check_limits("pan_deg", self.pan_deg or (-180.0, 180.0))
         fix = "Give degrees from -180 to 180, the lowest first, such as -60 60."
         if not -180 <= low < high <= 180:
             raise ConfigError("pan_deg is a lowest and a highest yaw", value=(low, high), fix=fix)

@@ -114,7 +114,7 @@ def read_waypoints(path: str | Path) -> Waypoints:
 
     Raises a TableError, with the line, if the file is missing, empty, has other columns, or a value is not a number.
     """
-    table = read_named_rows(Path(path))
+    table = read_named_rows(path)
     columns = table.columns
     points = table.numbers(TRANSLATION_COLUMNS if "x" not in columns and "tx" in columns else "xyz")
     kinds = (("heading_deg",), ("yaw_deg",), QUATERNION_COLUMNS)

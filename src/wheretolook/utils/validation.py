@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from math import degrees, inf, pi
+from typing import Any
 
 from wheretolook.utils.errors import ConfigError
 
@@ -21,9 +22,18 @@ def check_range(name: str, value: float, low: float, high: float = inf) -> None:
         raise ConfigError(f"{name} must be {limits}", value=value)
 
 
+def check_limits(name: str, limits: Any) -> tuple[float, float]:
+    """Return two numbers, the lowest and the highest. Raises ConfigError for anything else."""
+    try:
+        low, high = map(float, limits)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{name} are two numbers", value=limits, fix="Such as (-30, 30).") from error
+    return low, high
+
+
 def check_pitch(name: str, limits: tuple[float, float]) -> None:
     """Raise ConfigError unless limits are a lowest and a highest pitch in degrees, or if they seem to be radians."""
-    low, high = limits
+    low, high = check_limits(name, limits)
     largest = max(abs(low), abs(high))
     radians = f"{name} is in degrees: for radians give {degrees(low):.0f} {degrees(high):.0f}, for level views -10 10"
     reject(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -236,6 +237,27 @@ class Waiting:
         _, errors = process.communicate(timeout=30)
     assert process.returncode == 130
     assert errors.decode().strip().startswith("wheretolook: interrupted") and len(errors.splitlines()) == 2
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_during_an_import_is_not_swallowed(number: signal.Signals, tmp_path: Path) -> None:
+    module = "import time\nprint('ready', flush=True)\ntry:\n    time.sleep(1)\nexcept BaseException:\n    pass\n"
+    (tmp_path / "swallowing.py").write_text(module)
+    code = """
+import time
+from wheretolook import cli
+class Waiting:
+    def run(self):
+        import swallowing
+        time.sleep(60)
+cli.parse_command = lambda name, rest: Waiting()
+raise SystemExit(cli.main(["map"]))
+"""
+    with subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        process.send_signal(number)
+        assert process.wait(timeout=30) == 130
 
 
 def test_debug_shows_the_traceback(capsys: pytest.CaptureFixture[str]) -> None:

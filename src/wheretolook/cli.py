@@ -22,7 +22,7 @@ from wheretolook.utils.extras import EXTRAS, missing_package
 from wheretolook.utils.images import MAX_PIXELS
 from wheretolook.utils.logs import quiet_libraries
 from wheretolook.utils.nearest import did_you_mean
-from wheretolook.utils.processes import in_main_thread, on_sigterm
+from wheretolook.utils.processes import in_main_thread, interrupt, on_sigterm
 from wheretolook.utils.shipped import or_shipped, shipped, shipped_configs
 from wheretolook.utils.version import VERSION
 
@@ -71,7 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         quiet_libraries()
     try:
         if in_main_thread():
-            signal.signal(signal.SIGTERM, signal.default_int_handler)
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM):
+                signal.signal(number, interrupt)
         run_command([argument for argument in given if argument != "--debug"])
         return 0
     except KeyboardInterrupt:
@@ -97,7 +98,7 @@ def run_command(arguments: list[str]) -> None:
     else:
         start = time.monotonic()
         command = parse_command(name, rest)
-        on_sigterm(signal.default_int_handler)
+        on_sigterm(interrupt)
         try:
             command.run()
         except ModuleNotFoundError as error:

@@ -14,7 +14,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from itertools import islice
 from multiprocessing.connection import Connection
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import Any, TypeVar
 
 from wheretolook.utils.errors import WorkerError
@@ -22,6 +22,7 @@ from wheretolook.utils.errors import WorkerError
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+RETRY_S = 0.05  # until an interrupt is handled that came during an import
 _PR_SET_PDEATHSIG = 1  # sys/prctl.h
 _M_TRIM_THRESHOLD = -1  # malloc.h
 _M_MMAP_THRESHOLD = -3
@@ -146,6 +147,16 @@ def on_sigterm(handler: Any) -> None:
 
         signal.signal(signal.SIGTERM, handler)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGTERM])
+
+
+def interrupt(number: int, frame: FrameType | None) -> None:
+    """Handle a signal by KeyboardInterrupt; during an import, which might swallow it, after that, by SIGALRM."""
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            signal.setitimer(signal.ITIMER_REAL, RETRY_S)
+            return
+        frame = frame.f_back
+    raise KeyboardInterrupt
 
 
 def in_main_thread() -> bool:

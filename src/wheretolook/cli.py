@@ -39,6 +39,7 @@ COMMANDS = {
     "demo": "wheretolook.commands.demo:Demo",
     "select": "wheretolook.commands.select:Select",
     "score": "wheretolook.commands.score:Score",
+    "localize": "wheretolook.commands.localize:Localize",
     "check": "wheretolook.commands.check:Check",
     "view": "wheretolook.commands.view:View",
     "export": "wheretolook.commands.export:Export",

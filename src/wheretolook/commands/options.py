@@ -34,7 +34,7 @@ def ignore_progress(work: float) -> None:
     """Do nothing: for callers that show no progress."""
 
 
-OUTPUTS = ("out", "floor_plan", "record", "film")
+OUTPUTS = ("out", "floor_plan", "figure", "record", "film")
 """Options that are paths to write; all other paths are inputs."""
 
 

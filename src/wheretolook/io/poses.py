@@ -27,7 +27,7 @@ FORMATS = (
     "CSV with columns x, y, z (and id, if there is one; a line of names or none), the Active Localization Benchmark's text "
     '"id x y z", a TUM trajectory "t x y z qx qy qz qw", COLMAP\'s images.txt, or "x y z"; lines that start with # are comments'
 )
-NAME_COLUMNS = ("id", "waypoint", "name", "t", "timestamp")
+NAME_COLUMNS = ("image", "id", "waypoint", "name", "t", "timestamp")
 _TUM_COLUMNS = ("t", *"xyz", "qx", "qy", "qz", "qw")
 _TUM_ORDER = (*TRANSLATION_COLUMNS, "qx", "qy", "qz", "qw")
 _IMAGE_COLUMNS = ("image_id", *POSE_COLUMNS, "camera_id", "name")
@@ -155,16 +155,20 @@ def read_poses(path: str | Path) -> NamedPoses:
     return poses_of_rows(read_named_rows(path))
 
 
-def poses_of_rows(table: NamedRows) -> NamedPoses:
-    """Return the poses in rows (see `read_poses`)."""
+def poses_of_rows(table: NamedRows, orientations_only: bool = False) -> NamedPoses:
+    """Return the poses in rows (see `read_poses`); with `orientations_only` positions may be missing, and are then 0."""
     path = table.path
     quaternions = table.numbers(QUATERNION_COLUMNS)
     lengths = np.linalg.norm(quaternions, axis=1)
     for row in np.flatnonzero(np.abs(lengths - 1) > UNIT_TOLERANCE).tolist():
         value = f"line {table.rows[row][0]}: {lengths[row]:.4g}"
         raise TableError("a quaternion is not of length 1", path=path, value=value, fix="Correct the order of columns.")
-    names = TRANSLATION_COLUMNS if {*TRANSLATION_COLUMNS} <= {*table.columns} else "xyz"
-    poses = poses_of_values(np.concatenate([quaternions, table.numbers(names)], axis=1))
+    if orientations_only and not {"x", "tx"} & {*table.columns}:
+        locations = np.zeros((len(quaternions), 3))
+    else:
+        names = TRANSLATION_COLUMNS if {*TRANSLATION_COLUMNS} <= {*table.columns} else "xyz"
+        locations = table.numbers(names)
+    poses = poses_of_values(np.concatenate([quaternions, locations], axis=1))
     return NamedPoses(table.names, poses if holds_cam_from_world(table) else invert_poses(poses))
 
 

@@ -180,13 +180,15 @@ def load_colmap_landmarks(
     reconstruction: pycolmap.Reconstruction | None = None,
     progress: bool = True,
     arrays: ModelArrays | None = None,
+    ambiguity: bool = True,
 ) -> Landmarks:
     """Compute the landmarks of a COLMAP model (binary or text) in metres, with their attributes.
 
     The features that the model was built from (`read_descriptors`) give descriptors and ambiguity, by a search of the
     nearest descriptors on a torch device. All points of the model are landmarks, unless a largest mean reprojection
     error is given; a `MapWarning` counts the points that are left out. `reconstruction` is the model, if it was read
-    before, and `arrays` what is taken of it, if that is transformed; its images may have many cameras.
+    before, and `arrays` what is taken of it, if that is transformed; its images may have many cameras. `ambiguity`
+    False leaves the ambiguity out, which takes minutes for a large map.
 
     Raises MapError if the folder, a file or the database is missing, corrupt or does not match, or no landmark remains.
     """
@@ -209,12 +211,13 @@ def load_colmap_landmarks(
     model = _select_points(model, keep)
     kind = SIFT
     descriptors = None
-    ambiguity = np.full(len(model.points), np.nan, dtype=np.float32)
+    cosine = np.full(len(model.points), np.nan, dtype=np.float32)
     observations = None if database is None else read_descriptors(database, reconstruction, model)
     if observations is not None:
         kind, of_observations = observations
         descriptors = _mean_descriptors(model, of_observations, kind)
-        ambiguity = max_cosine_to_other(descriptors, device, progress)
+        if ambiguity:
+            cosine = max_cosine_to_other(descriptors, device, progress)
     return Landmarks(
         ids=model.point_ids,
         points=model.points,
@@ -222,7 +225,7 @@ def load_colmap_landmarks(
         reprojection_error_px=model.errors_px.astype(np.float32),
         **_viewing_geometry(model),
         descriptors=descriptors,
-        ambiguity=ambiguity,
+        ambiguity=cosine,
         described_by=None if kind is SIFT else kind.name,
     )
 

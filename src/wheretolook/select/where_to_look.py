@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from wheretolook.scorers.base import Scorer
+    from wheretolook.select.image_localizer import Image, ImageLocalizer
+    from wheretolook.select.localized import Localized
 
 VIEWS_PER_STEP = {"cpu": 1 << 13, "cuda": 1 << 17}  # of the progress bar, in whole waypoints
 
@@ -61,9 +63,12 @@ class WhereToLook:
     roll. `space` is where a camera can be in the world, for grids; None for the space near the mapping cameras.
     """
 
-    def __init__(self, scorer: Scorer, directions: ArrayLike | None = None, space: Any = None) -> None:
+    def __init__(
+        self, scorer: Scorer, directions: ArrayLike | None = None, space: Any = None, files: ColmapFiles | None = None
+    ) -> None:
         self.scorer = scorer
         self._space = space
+        self._files = files
         axes = direction_lattice(500) if directions is None else np.asarray(directions, dtype=np.float64)
         self.directions = axes / np.linalg.norm(axes, axis=1, keepdims=True)
 
@@ -131,8 +136,8 @@ class WhereToLook:
         here = environment.localization_map
         weights = resolve_weights(method, weights, here.landmarks.features)
         if not method:
-            return cls(load_scorer(weights, here, anywhere), axes, environment.space)
-        return cls(make_scorer(method, here, weights=weights, anywhere=anywhere), axes, environment.space)
+            return cls(load_scorer(weights, here, anywhere), axes, environment.space, files)
+        return cls(make_scorer(method, here, weights=weights, anywhere=anywhere), axes, environment.space, files)
 
     @property
     def localization_map(self) -> LocalizationMap:
@@ -143,6 +148,36 @@ class WhereToLook:
     def frame(self) -> MapFrame:
         """The map's own frame: its unit and direction up, and how they are known."""
         return self.localization_map.frame
+
+    def localize(
+        self,
+        images: Image | Sequence[Image],
+        turns: str | Path | ArrayLike | None = None,
+        camera: Camera | str | int | None = None,
+        prior: Sequence[float] | None = None,
+    ) -> Localized:
+        """Localize an image, or several from one location with `turns`, in the map; needs its descriptors.
+
+        Args:
+            images: files, or arrays (H, W, 3) uint8 RGB.
+            turns: rotations `cam_from_rig` (N, 3, 3) of several images, or a file of them.
+            camera: of the images, or its camera_id in the model; None for the model's, or a pinhole of the EXIF focal
+                length.
+            prior: rough x, y, z of the camera, and perhaps yaw in degrees: one more hypothesis.
+
+        Raises errors as `wheretolook.select.image_localizer.ImageLocalizer.open` and `.localize`.
+        """
+        camera = parse_camera(camera) if isinstance(camera, str) else camera
+        return self._localizer.localize(images, turns, camera, prior)
+
+    @cached_property
+    def _localizer(self) -> ImageLocalizer:
+        from wheretolook.select.image_localizer import ImageLocalizer
+
+        if self._files is None:
+            raise ConfigError("only a map opened by from_colmap localizes images")
+        files = self._files
+        return ImageLocalizer.open(files.model, files.database, files.frame, device=self.localization_map.device)
 
     @property
     def space(self) -> Any:

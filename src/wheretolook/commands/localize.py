@@ -1,0 +1,167 @@
+"""`wheretolook localize`: poses of your own images in your own map."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from wheretolook.commands.options import CameraOptions
+from wheretolook.features.config import ExtractorConfig
+from wheretolook.figures import KINDS
+from wheretolook.mapping.config import FrameOptions
+from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.validation import check_choice
+
+if TYPE_CHECKING:
+    from wheretolook.select.image_localizer import ImageLocalizer
+    from wheretolook.select.localized import Localized
+
+
+@dataclass(frozen=True, kw_only=True)
+class Localize(CameraOptions, FrameOptions):
+    """Localize images in a COLMAP or hloc map; needs no dataset and no weights.
+
+    Each image is localized alone, or with --turns all as one rig: views from one location, with known rotations.
+
+    Map: its descriptors are those of a COLMAP database or of hloc's features in HDF5, by default the ones in the model's
+    folder or above it. Images are described by the extractor of these.
+    Camera: by default the model's, for an image of the same name or proportions; else a pinhole of the EXIF focal
+    length. Images are reduced to the size of the map's.
+
+    Rotations (--turns), a row for each image: its name in the column image, or the nearest time stamp for images that
+    are named by their time, or in the order of the images:
+      CSV          yaw, pitch, roll in degrees (to the left, upwards, clockwise); or qw, qx, qy, qz: camera-to-rig, of a
+                   camera that looks along z, and perhaps x, y, z in metres
+      TUM          odometry, "t x y z qx qy qz qw", of the camera, or of a robot (x forward, z up) with a camera along x
+
+    Results (--out), in the map's own frame and unit; a row for each image:
+      csv, json    x, y, z: camera centre; qw, qx, qy, qz: camera-to-world; json with all rivals
+      images.txt   COLMAP's, world-to-camera, the localized images only
+    probability is that of the pose to be within 5 cm and 0.4 degrees; in a map of unknown unit, within 1 % of its median
+    depth. deviation is one standard deviation of the position. Rivals are other poses that matches support. An image
+    that is not localized has the reason.
+
+    Examples:
+      wheretolook localize --map sparse/0 --images query.jpg --out pose.csv --figure pose.png
+      wheretolook localize --map sparse/0 --images queries --out images.txt
+      wheretolook localize --map sparse/0 --images a.jpg b.jpg --turns turns.csv --scale 1 --out pose.json
+
+    Args:
+        map: folder of a COLMAP model.
+        images: images, or folders of them; also without --images, before the other options.
+        turns: rotations of the images, which are then localized together.
+        out: file of the poses: .csv, .json or images.txt.
+        figure: also draw matches, pose and rivals: a file .png, .pdf or .svg; for several images a folder.
+        prior: rough x,y,z of the camera in the map, and perhaps its yaw in degrees: one more hypothesis.
+        database: COLMAP's database.db or hloc's feats-*.h5.
+        extractor: extractor for the images: opencv, colmap, aliked, disk or xfeat.
+        extractor_weights: weights of a learned extractor; see docs/features.md.
+        device: where to compute: auto, cpu, cuda, or cuda:<index>.
+    """
+
+    POSITIONAL: ClassVar = "images"
+
+    map: Path
+    images: tuple[Path, ...]
+    turns: Path | None = None
+    out: Path | None = None
+    figure: Path | None = None
+    prior: tuple[float, ...] | None = None
+    database: Path | None = None
+    extractor: str | None = None
+    extractor_weights: str = ""
+    device: str = "auto"
+
+    def __post_init__(self) -> None:
+        from wheretolook.select.formats import check_format
+
+        self.frame_options()
+        self.named_camera()
+        if self.out is not None:
+            check_format(self.out, None, 1)
+        if self.figure is not None and self.figure.suffix:
+            check_choice("format of figures", self.figure.suffix[1:].lower(), KINDS)
+        if self.extractor_weights and self.extractor is None:
+            raise ConfigError("extractor_weights need an extractor", value=self.extractor_weights)
+        _ = self._extractor
+
+    @property
+    def _extractor(self) -> ExtractorConfig | None:
+        return None if self.extractor is None else ExtractorConfig(self.extractor, weights=self.extractor_weights)
+
+    def run(self) -> list[Localized]:
+        """Localize the images, write `out` and `figure`, and print a summary."""
+        from wheretolook.select.localized import check_localized_format, save_localized
+        from wheretolook.utils.devices import usable_device
+
+        start = time.monotonic()
+        if self.out is not None:
+            check_localized_format(self.out)
+        paths = self._paths()
+        if self.figure is not None and self.figure.suffix and len(paths) > 1 and self.turns is None:
+            raise ConfigError("several images need a folder of figures", path=self.figure, fix="Name a folder.")
+        from wheretolook.select.image_localizer import ImageLocalizer
+
+        device = usable_device(self.device)
+        localizer = ImageLocalizer.open(self.map, self.database, self.frame_options(), self._extractor, device)
+        landmarks = f"{len(localizer.landmarks):,} landmarks ({localizer.landmarks.features})"
+        print(f"{localizer.frame.describe()}; {landmarks}")
+        results = []
+        for result in self._results(localizer, paths):
+            results.append(result)
+            if self.figure is not None and result.images:
+                self._draw(result, localizer)
+        if self.out is not None:
+            save_localized(results, self.out)
+        self._summarize(results)
+        where = "" if self.out is None else f": {self.out}"
+        print(f"{len(paths)} images in {time.monotonic() - start:.1f} s{where}")
+        return results
+
+    def _paths(self) -> list[Path]:
+        """Return the files of all images. Raises MapError if one is missing, or a folder has none."""
+        from wheretolook.mapping.photographs import SUFFIXES
+
+        paths: list[Path] = []
+        for path in self.images:
+            if not path.is_dir():
+                if not path.is_file():
+                    raise MapError("there is no such image", path=path, fix="Give images, or folders of them.")
+                paths.append(path)
+                continue
+            found = sorted(file for file in path.rglob("*") if file.is_file() and file.suffix.lower() in SUFFIXES)
+            if not found:
+                raise MapError("this folder has no images", path=path, fix=f"They end in {', '.join(SUFFIXES)}.")
+            paths += found
+        return paths
+
+    def _results(self, localizer: ImageLocalizer, paths: list[Path]) -> Iterable[Localized]:
+        """Yield the result of the rig, or of each image, with a progress bar."""
+        from tqdm.auto import tqdm
+
+        camera = self.named_camera()
+        if self.turns is not None or len(paths) == 1:
+            yield localizer.localize(paths, self.turns, camera, self.prior)
+            return
+        for path in tqdm(paths, desc="localize", unit="image"):
+            yield localizer.localize_or_fail(path, camera, self.prior)
+
+    def _draw(self, result: Localized, localizer: ImageLocalizer) -> None:
+        from wheretolook.figures.style import save_figure
+        from wheretolook.select.localized import figure_of
+
+        assert self.figure is not None
+        path = self.figure if self.figure.suffix else self.figure / f"{Path(result.names[0]).stem}.png"
+        save_figure(figure_of(result, localizer.landmarks.points), path)
+
+    def _summarize(self, results: list[Localized]) -> None:
+        """Print each result if they are few, and how many are localized."""
+        if len(results) <= 10:
+            for result in results:
+                print(f"{', '.join(result.names)}: {result.describe()}")
+        found = [result for result in results if result.cam_from_world is not None]
+        sure = sum(result.probability >= 0.95 for result in found)
+        print(f"localized: {len(found)} of {len(results)}, {sure} with a probability of at least 95 %")

@@ -1,0 +1,58 @@
+"""Matches of an image with the landmarks that a rough prior of its location allows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.features.matching import Matches
+from wheretolook.geometry.camera import Camera, field_of_view_deg
+from wheretolook.geometry.poses import Float
+from wheretolook.mapping.landmarks import Landmarks
+
+MAX_DISTANCE_RATIO = 2.0  # distance over the mean mapping distance: farther landmarks are hardly detected
+YAW_MARGIN_DEG = 30.0  # how far the yaw may be off
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """A rough location (3,) m in the world of the map, and the yaw of an image in degrees, if known."""
+
+    location: tuple[float, float, float]
+    yaw_deg: float | None = None
+
+    def allows(self, landmarks: Landmarks, camera: Camera) -> NDArray[np.bool_]:
+        """Return which landmarks (N,) the camera may detect from near the prior, whatever its pitch."""
+        offset: Float = landmarks.points - np.asarray(self.location)
+        allowed = np.linalg.norm(offset, axis=1) <= MAX_DISTANCE_RATIO * landmarks.mapping_distance_m
+        if self.yaw_deg is not None:
+            angle = np.degrees(np.arctan2(offset[:, 1], offset[:, 0])) - self.yaw_deg
+            limit = max(field_of_view_deg(camera)) / 2 + YAW_MARGIN_DEG
+            allowed &= np.abs((angle + 180) % 360 - 180) <= limit
+        return np.asarray(allowed)
+
+
+def matches_among(matches: Matches, allowed: NDArray[np.bool_], max_ratio: float | None) -> Matches:
+    """Match keypoints again with the allowed (N,) of their nearest landmarks.
+
+    With a maximum ratio, the nearest allowed landmark is compared with the second nearest allowed one, or with the last
+    of the nearest if there is none. A landmark keeps its nearest keypoint.
+    """
+    near = allowed[matches.near]
+    keypoints = np.flatnonzero(near.any(axis=1))
+    near = near[keypoints]
+    squared = matches.squared[keypoints]
+    rows = np.arange(len(keypoints))
+    first = near.argmax(axis=1)
+    near[rows, first] = False
+    second = np.where(near.any(axis=1), near.argmax(axis=1), near.shape[1] - 1)
+    distance = squared[rows, first]
+    if max_ratio is not None:
+        kept = np.flatnonzero(distance < max_ratio**2 * squared[rows, second])
+        keypoints, first, distance = keypoints[kept], first[kept], distance[kept]
+    landmarks = matches.near[keypoints, first]
+    order = np.argsort(distance, kind="stable")
+    unique = np.sort(order[np.unique(landmarks[order], return_index=True)[1]])
+    return matches._replace(keypoints=keypoints[unique], landmarks=landmarks[unique])

@@ -1,0 +1,99 @@
+"""Reads how the images of a rig were oriented relative to one another, from a table or odometry."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path, PurePath
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from wheretolook.geometry.poses import Float, camera_centers, rigid_poses, rotation_looking_along
+from wheretolook.io.poses import NAME_COLUMNS, QUATERNION_COLUMNS, NamedRows, poses_of_rows, read_named_rows
+from wheretolook.utils.errors import TableError
+
+MAX_STAMP_DIFFERENCE_S = 0.02  # between an image named by its time and its row of the odometry
+BODY_UPRIGHT = 0.7  # z of a robot's own z axis in odometry, from which on it is no camera
+CAM_FROM_BODY = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # a camera that looks along x of a body whose z is up
+
+
+def read_turns(path: Path, images: Sequence[str]) -> Float:
+    """Read cam_from_rig (N, 3, 4) of images, by their names; the rig's origin is the first image.
+
+    The file has columns yaw, pitch and perhaps roll in degrees (yaw to the left, pitch upwards, roll clockwise), or qw,
+    qx, qy, qz (camera-to-rig), and perhaps positions in metres; or is a TUM trajectory of the camera (z forward) or of
+    a robot (x forward, z up) whose camera looks along x. Rows belong to the images of the same name, in the column
+    image, or of the nearest time stamp, if images are named by their time. Otherwise they are in the order of the
+    images.
+
+    Raises TableError if the file cannot be read, an image has no row, or a row is no rotation.
+    """
+    table = read_named_rows(path)
+    poses = _poses(table)
+    poses = poses[_rows_of(table, [PurePath(name) for name in images])]
+    centers = camera_centers(poses)
+    poses[:, :, 3] = -np.einsum("nij,nj->ni", poses[:, :, :3], centers - centers[0])
+    return poses
+
+
+def checked_turns(turns: ArrayLike, n_images: int) -> Float:
+    """Return rotations (N, 3, 3) or poses (N, 3, 4) of the cameras in the rig as poses (N, 3, 4).
+
+    Raises PoseError if one is not rigid, TableError if there are more or fewer than images.
+    """
+    poses = np.asarray(turns, dtype=np.float64)
+    if poses.shape[1:] == (3, 3):
+        poses = np.pad(poses, ((0, 0), (0, 0), (0, 1)))
+    poses = rigid_poses(poses)
+    if len(poses) != n_images:
+        raise TableError("each image needs a rotation", value=f"{len(poses)} rotations of {n_images} images")
+    return poses
+
+
+def _poses(table: NamedRows) -> Float:
+    """Return cam_from_rig (R, 3, 4) of all rows."""
+    if {*QUATERNION_COLUMNS} <= {*table.columns}:
+        poses = poses_of_rows(table, orientations_only=True).cam_from_world
+        if table.header[0] == "t" and (poses[:, 2, 2] > BODY_UPRIGHT).all():
+            poses = CAM_FROM_BODY @ poses
+        return poses
+    names = [f"{name}_deg" if f"{name}_deg" in table.columns else name for name in ("yaw", "pitch", "roll")]
+    known = [name for name in names if name != "roll" or name in table.columns]
+    yaw, pitch, *rest = np.radians(table.numbers(known)).T
+    roll = rest[0] if rest else np.zeros(len(yaw))
+    level = rotation_looking_along(
+        np.stack([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)], -1)
+    )
+    straight = np.abs(np.cos(pitch)) < 1e-9  # no direction of the optical axis states the yaw
+    level[straight, 0] = np.stack([np.sin(yaw), -np.cos(yaw), np.zeros_like(yaw)], -1)[straight]
+    level[:, 1] = np.cross(level[:, 2], level[:, 0])
+    right = np.cos(roll)[:, None] * level[:, 0] + np.sin(roll)[:, None] * level[:, 1]
+    rotations = np.stack([right, np.cross(level[:, 2], right), level[:, 2]], axis=1)
+    return np.pad(rotations, ((0, 0), (0, 0), (0, 1)))
+
+
+def _rows_of(table: NamedRows, images: Sequence[PurePath]) -> list[int]:
+    """Return the row of each image: by name, by time, or in order."""
+    is_named = any(name in table.columns for name in NAME_COLUMNS) and len({*table.names}) == len(table.names)
+    rows = {name: row for row, name in enumerate(table.names)} if is_named else {}
+    found = [next((rows[text] for text in (str(path), path.name, path.stem) if text in rows), None) for path in images]
+    if None in found and is_named:
+        found = _rows_by_time(table, images) or found
+    if not any(row is not None for row in found) and len(table.names) == len(images):
+        found = [*range(len(images))]
+    for path, row in zip(images, found, strict=True):
+        if row is None:
+            fix = f"Name it in the column image, or give {len(images)} rows in the order of the images."
+            raise TableError("there is no rotation of this image", path=table.path, value=str(path), fix=fix)
+    return [row for row in found if row is not None]
+
+
+def _rows_by_time(table: NamedRows, images: Sequence[PurePath]) -> list[int | None]:
+    """Return the row of the nearest time stamp of each image; empty if names are no times or one has no row."""
+    try:
+        stamps = np.array(table.names, dtype=float)
+        times = np.array([path.stem for path in images], dtype=float)
+    except ValueError:
+        return []
+    difference = np.abs(stamps - times[:, None])
+    return difference.argmin(1).tolist() if (difference.min(1) <= MAX_STAMP_DIFFERENCE_S).all() else []

@@ -1,0 +1,205 @@
+"""Localizes images in a COLMAP map whose descriptors are known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.matching import Matches
+from wheretolook.features.registry import kind_of, runnable_extractors
+from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.poses import Float
+from wheretolook.localization.confidence import ConfidenceModel
+from wheretolook.localization.config import LocalizerConfig
+from wheretolook.localization.localizer import Localizer
+from wheretolook.localization.prior import PosePrior, matches_among
+from wheretolook.localization.rig_localization import JointLocalizer
+from wheretolook.localization.turns import checked_turns, read_turns
+from wheretolook.mapping.colmap_model import model_arrays, read_model
+from wheretolook.mapping.config import FrameOptions
+from wheretolook.mapping.georeference import REPORT_FILE
+from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
+from wheretolook.mapping.map_folder import LANDMARKS_FILE
+from wheretolook.mapping.map_frame import MapFrame, find_frame
+from wheretolook.mapping.sources import find_features
+from wheretolook.select.localized import FAILED, Localized
+from wheretolook.select.query_images import QueryImage, QueryImages
+from wheretolook.utils.errors import ConfigError, MapError, WhereToLookError
+from wheretolook.utils.reading import read_json_object
+from wheretolook.utils.records import from_record
+
+Image = str | Path | NDArray[np.uint8]
+
+TURN_NOISE_DEG = 0.2  # of given rotations, one standard deviation about each axis
+MAX_MOVE_M = 0.1  # of a camera that turns in place
+
+
+@dataclass(frozen=True, eq=False)
+class ImageLocalizer:
+    """Localizes images, one at a time or as a rig, by several hypotheses and guided matching.
+
+    `landmarks` are in the world; images and poses of users are in the map's own `frame`.
+    """
+
+    landmarks: Landmarks
+    frame: MapFrame
+    images: QueryImages
+    extractor: ExtractorConfig
+    device: str = "cpu"
+
+    @classmethod
+    def open(
+        cls,
+        path: Path,
+        database: Path | None = None,
+        frame: FrameOptions = FrameOptions(),
+        extractor: ExtractorConfig | None = None,
+        device: str = "cpu",
+    ) -> ImageLocalizer:
+        """Open a COLMAP model with its descriptors: a database or HDF5 file, by default the one near the model.
+
+        A map of this project has them in its file of landmarks. Raises MapError if the model cannot be read, or there
+        are no descriptors, or none of the extractor's kind; ConfigError if an option is invalid.
+        """
+        model = read_model(path)
+        arrays = model_arrays(model)
+        own = find_frame(path, model, frame, arrays=arrays)
+        arrays = own.of_arrays(arrays)
+        stored = None if database is not None or not (path / LANDMARKS_FILE).is_file() else path / LANDMARKS_FILE
+        kept = None if stored is None else Landmarks.load(stored)
+        features = None
+        if kept is None or kept.descriptors is None:
+            kept = None
+            features = database or find_features(path, model)
+        landmarks = load_colmap_landmarks(path, features, None, device, model, arrays=arrays, ambiguity=False)
+        if kept is not None:
+            if not np.array_equal(kept.ids, landmarks.ids):
+                problem = "the file has other landmarks than the model"
+                raise MapError(problem, path=stored, fix="Give --database, or run the map stage again.")
+            landmarks = replace(landmarks, descriptors=kept.descriptors, described_by=kept.described_by)
+        if landmarks.descriptors is None:
+            fix = "Give --database: the model's database.db, or hloc's feats-*.h5."
+            raise MapError("the landmarks have no descriptors, so nothing can be localized", path=path, fix=fix)
+        extractor = extractor or _extractor_of(path, landmarks)
+        result = cls(landmarks, own, QueryImages(model, path), extractor, device)
+        _ = result._localizer  # so that descriptors of another kind are reported before images are read
+        return result
+
+    @cached_property
+    def _localizer(self) -> Localizer:
+        config = LocalizerConfig(method="hypotheses")
+        return Localizer(self.landmarks, next(iter(self.images.by_id.values())), config, self.extractor, self.device)
+
+    @cached_property
+    def _rigs(self) -> JointLocalizer:
+        return JointLocalizer(self._localizer.estimator, TURN_NOISE_DEG)
+
+    def localize(
+        self,
+        images: Image | Sequence[Image],
+        turns: str | Path | ArrayLike | None = None,
+        camera: Camera | int | None = None,
+        prior: Sequence[float] | None = None,
+    ) -> Localized:
+        """Localize an image, or several from one location of which the rotations are known.
+
+        Args:
+            images: a file, or an array (H, W, 3) uint8 RGB; with `turns` several.
+            turns: rotations `cam_from_rig` (N, 3, 3), or poses (N, 3, 4) in metres; or a file, see
+                `wheretolook.localization.turns.read_turns`.
+            camera: of the images, or its camera_id in the model; None for the model's, or a pinhole of the EXIF focal
+                length, see `QueryImages`.
+            prior: rough location x, y, z of the camera in the map, and perhaps yaw in degrees of an image: one more
+                hypothesis, which wins only if the matches support it best.
+
+        Raises:
+            MapError, PoseError, ConfigError: an image cannot be read or is none, its camera is unknown or other than
+                given, or there are several without turns.
+            TableError, PoseError: the file of turns, or a rotation, is not valid.
+        """
+        given = [images] if isinstance(images, (str, Path, np.ndarray)) else list(images)
+        if len(given) != 1 and turns is None:
+            fix = "Give turns, or localize one image after another."
+            raise ConfigError("several images are localized together by their rotations", value=len(given), fix=fix)
+        names = [str(n) if isinstance(image, np.ndarray) else str(image) for n, image in enumerate(given)]
+        cam_from_rig = np.eye(3, 4)[None]
+        if turns is not None:
+            is_file = isinstance(turns, (str, Path))
+            poses = read_turns(Path(turns), names) if is_file else checked_turns(turns, len(given))
+            cam_from_rig = self._in_place(poses)
+        queries = [self.images.read(image, Path(name).name, camera) for image, name in zip(given, names, strict=True)]
+        return self._localized(queries, cam_from_rig, None if prior is None else self._prior(prior))
+
+    def localize_or_fail(
+        self, image: Path, camera: Camera | int | None = None, prior: Sequence[float] | None = None
+    ) -> Localized:
+        """Localize an image of a batch: an error becomes the reason why it is not localized."""
+        try:
+            return self.localize(image, None, camera, prior)
+        except WhereToLookError as error:
+            return Localized((image.name,), FAILED, str(error), frame=self.frame)
+
+    def _localized(self, queries: Sequence[QueryImage], cam_from_rig: Float, prior: PosePrior | None) -> Localized:
+        keypoints = [self._localizer.extractor.extract(query.rgb) for query in queries]
+        matches = self._localizer.match(keypoints)
+        rig = self._rigs if len(queries) > 1 else self._localizer.joint
+        looks = []
+        poses = []
+        for query, of_image, matched, pose in zip(queries, keypoints, matches, cam_from_rig, strict=True):
+            looks.append(self._localizer.look(of_image, matched, query.camera, pose))
+            poses.append(rig.single_view_poses(looks[-1], 2 if len(queries) > 1 else 4))
+            if prior is not None:
+                near = self._near(matched, query.camera, prior)
+                look = self._localizer.look(of_image, near, query.camera, pose)
+                poses[-1] += rig.single_view_poses(look, 1)
+        joint = rig.localize(looks, poses)
+        model = ConfidenceModel.bundled()
+        probabilities = np.array([model.of(pose) for pose in (joint, *joint.rivals)])
+        return Localized.of(queries, joint, probabilities, self.frame)
+
+    def _near(self, matches: Matches, camera: Camera, prior: PosePrior) -> Matches:
+        """Return the matches with landmarks that the prior allows."""
+        max_ratio = self._localizer.config.max_ratio if self._localizer.kind.in_bytes else None
+        return matches_among(matches, prior.allows(self.landmarks, camera), max_ratio)
+
+    def _prior(self, values: Sequence[float]) -> PosePrior:
+        """Return the prior of x, y, z and perhaps yaw, in the map. Raises ConfigError."""
+        numbers = np.asarray(values, dtype=np.float64)
+        if numbers.shape not in ((3,), (4,)) or not np.isfinite(numbers).all():
+            fix = "Give x,y,z in the map, and perhaps the yaw in degrees."
+            raise ConfigError("this is no prior of the pose", value=values, fix=fix)
+        location = self.frame.world_from_map.apply(numbers[:3]).tolist()
+        return PosePrior(tuple(location), float(numbers[3]) if len(numbers) == 4 else None)
+
+    def _in_place(self, cam_from_rig: Float) -> Float:
+        """Return poses in a rig with positions only if the map's unit is known. Raises ConfigError if they are needed."""
+        if self.frame.scale.is_metric:
+            return cam_from_rig
+        moved = float(np.linalg.norm(cam_from_rig[:, :, 3] - cam_from_rig[0, :, 3], axis=1).max())
+        if moved > MAX_MOVE_M:
+            problem = "the camera moved between the images, and the unit of the map is unknown"
+            raise ConfigError(problem, value=f"{moved:.2g} m", fix="Give --scale.")
+        return cam_from_rig * (1, 1, 1, 0)
+
+
+def _extractor_of(path: Path, landmarks: Landmarks) -> ExtractorConfig:
+    """Return the extractor in the report of a map of this project, or the first that gives descriptors of its kind."""
+    try:
+        stated: Any = read_json_object(path / REPORT_FILE)["config"]["extractor"]
+        recorded = from_record(ExtractorConfig, stated)
+        if kind_of(recorded.method).name == landmarks.features:  # not if the descriptors come from elsewhere
+            return recorded
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    for name in runnable_extractors():
+        if kind_of(name).name == landmarks.features:
+            return ExtractorConfig(name)
+    problem = "no extractor for the descriptors of this map can be run here"
+    raise MapError(problem, path=path, value=landmarks.features, fix="Map with SIFT, ALIKED, DISK or XFeat.")

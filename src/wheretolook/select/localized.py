@@ -1,0 +1,193 @@
+"""Poses of localized images in the map's own frame, and their files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE
+from wheretolook.geometry.camera_turns import pan_tilt_angles
+from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation
+from wheretolook.io.poses import images_text
+from wheretolook.localization.rig_localization import JointLocalization
+from wheretolook.mapping.map_frame import IDENTITY, MapFrame
+from wheretolook.select.formats import check_format
+from wheretolook.select.query_images import QueryImage
+from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.files import write_json, write_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FORMATS = ("csv", "json", "colmap")
+FAILED = "error"  # status of an image that cannot be read, or whose camera is unknown
+
+
+@dataclass(frozen=True, eq=False)
+class Localized:
+    """The pose of one image, or of N images of a rig, in the map's own frame and unit, and the rival poses.
+
+    Attributes:
+        names: N names of the images.
+        status: "localized"; "too_few_matches" or "no_pose"; "error" in a batch, for an image that cannot be used.
+        reason: why it is not localized, in words.
+        cam_from_world: (N, 3, 4), world-to-camera; camera x right, y down, z forward. None unless localized.
+        probability: that the pose is right (`wheretolook.localization.confidence`).
+        n_matches: matches of all images with the map.
+        n_inliers: of these, or of those found again under the pose, the ones that agree with it.
+        deviation: one standard deviation of the position, in the map's unit, and of the orientation in degrees.
+        rivals: other poses that matches support, the most probable first, without rivals of their own.
+        frame: the map's own frame.
+        images: the images as keypoints were extracted.
+        joint: the result in the world: metres, z up.
+    """
+
+    names: tuple[str, ...]
+    status: str
+    reason: str = ""
+    cam_from_world: Float | None = None
+    probability: float = 0.0
+    n_matches: int = 0
+    n_inliers: int = 0
+    deviation: tuple[float, float] = (np.inf, np.inf)
+    rivals: tuple[Localized, ...] = ()
+    frame: MapFrame = IDENTITY
+    images: tuple[QueryImage, ...] = ()
+    joint: JointLocalization | None = field(default=None, repr=False)
+
+    @classmethod
+    def of(
+        cls, images: Sequence[QueryImage], joint: JointLocalization, probabilities: Float, frame: MapFrame
+    ) -> Localized:
+        """Convert a joint localization and the probabilities (1 + rivals,) of its poses to the map's own frame."""
+        names = tuple(image.name for image in images)
+        unit = frame.world_from_map.scale
+        values: dict[str, Any] = {"names": names, "frame": frame, "images": tuple(images), "joint": joint}
+        values |= {"n_matches": joint.n_matches, "n_inliers": joint.n_inliers}
+        if joint.status != LOCALIZED:
+            found = f"{joint.n_inliers} of {joint.n_matches} matches agree with the best pose"
+            reason = found if joint.status == NO_POSE else f"{joint.n_matches} matches with the map"
+            return cls(status=joint.status, reason=reason, **values)
+        assert joint.cams_from_world is not None
+        rivals = [
+            cls.of(images, rival, p, frame) for rival, p in zip(joint.rivals, probabilities[1:, None], strict=True)
+        ]
+        rivals = [rival for rival in rivals if rival.status == LOCALIZED]
+        return cls(
+            status=LOCALIZED,
+            cam_from_world=frame.world_from_map.inverse.apply_to_poses(joint.cams_from_world),
+            probability=float(probabilities[0]),
+            deviation=(joint.deviation[0] / unit, joint.deviation[1]),
+            rivals=tuple(sorted(rivals, key=lambda rival: -rival.probability)),
+            **values,
+        )
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def positions(self) -> Float:
+        """Camera centres in the map (N, 3); NaN unless localized."""
+        return np.full((len(self), 3), np.nan) if self.cam_from_world is None else camera_centers(self.cam_from_world)
+
+    def describe(self) -> str:
+        """State the pose and its probability, or why there is none, in one line."""
+        if self.cam_from_world is None:
+            return f"not localized: {self.reason}"
+        at = ", ".join(f"{value:.3f}" for value in self.positions[0])
+        matches = f"{self.n_inliers} inliers, {self.n_matches} matches"
+        rivals = "" if not self.rivals else f" (of rivals at most {self.rivals[0].probability:.3f})"
+        return f"({at}), probability {self.probability:.3f}{rivals}; {matches}"
+
+    def save(self, path: str | Path) -> None:
+        """Write a CSV, a JSON file, or COLMAP's images.txt, by the name of the file. Raises ConfigError for others."""
+        save_localized([self], Path(path))
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return a row of the table for each image; without a pose, its values are None."""
+        rows = []
+        for n, name in enumerate(self.names):
+            row = {"image": name, "status": self.status, "probability": self.probability}
+            row |= dict.fromkeys(POSE_COLUMNS) | ({} if self.cam_from_world is None else self._pose(n))
+            row |= {"n_matches": self.n_matches, "n_inliers": self.n_inliers, "n_rivals": len(self.rivals)}
+            row["rival_probability"] = self.rivals[0].probability if self.rivals else None
+            rows.append(row | {"reason": self.reason})
+        return rows
+
+    def _pose(self, n: int) -> dict[str, float | None]:
+        """Return `POSE_COLUMNS` of an image."""
+        assert self.cam_from_world is not None
+        pose = self.cam_from_world[n]
+        angles = np.degrees(pan_tilt_angles(self.frame.world_from_map.rotation @ pose[2, :3]))
+        deviation = [value if np.isfinite(value) else None for value in self.deviation]
+        values = [*self.positions[n], *angles, *quaternion_from_rotation(pose[:, :3].T), *deviation]
+        return {key: None if value is None else float(value) for key, value in zip(POSE_COLUMNS, values, strict=True)}
+
+
+POSE_COLUMNS = (*"xyz", "yaw_deg", "pitch_deg", "qw", "qx", "qy", "qz", "deviation", "deviation_deg")
+
+
+def check_localized_format(path: Path) -> str:
+    """Return the format that a file's name stands for. Raises ConfigError, StorageError if it cannot be written."""
+    chosen = check_format(path, None, 1)
+    if chosen not in FORMATS or not path.suffix:
+        fix = "Name it .csv, .json or images.txt."
+        raise ConfigError("poses of images cannot be written in this format", path=path, fix=fix)
+    return chosen
+
+
+def save_localized(results: Sequence[Localized], path: Path) -> None:
+    """Write results to a file of the format of its name, atomically; images.txt has the localized ones only."""
+    import pandas as pd
+
+    chosen = check_localized_format(path)
+    rows = [row for result in results for row in result.records()]
+    if chosen == "csv":
+        write_text(path, pd.DataFrame(rows).to_csv(index=False, lineterminator="\n", float_format="%.9g"))
+    elif chosen == "json":
+        frame = results[0].frame
+        about = "x, y, z: camera centre in the map, in its unit; qw, qx, qy, qz: camera-to-world; camera z forward"
+        scale = {"scale": frame.scale.source, "metres_per_unit": frame.world_from_map.scale}
+        write_json(path, {"frames": about, **scale, "images": [row for result in results for row in _nested(result)]})
+    else:
+        found = [result for result in results if result.cam_from_world is not None]
+        poses = [pose for result in found for pose in np.asarray(result.cam_from_world)]
+        write_text(
+            path, images_text([name for result in found for name in result.names], np.array(poses).reshape(-1, 3, 4))
+        )
+
+
+def _nested(result: Localized) -> list[dict[str, Any]]:
+    """Return rows with the camera and the rivals' rows."""
+    rivals = [rival.records() for rival in result.rivals]
+    cameras = [image.camera.colmap.record() for image in result.images] or [None] * len(result)
+    pairs = zip(result.records(), cameras, strict=True)
+    return [row | {"camera": camera, "rivals": [rival[n] for rival in rivals]} for n, (row, camera) in enumerate(pairs)]
+
+
+def figure_of(result: Localized, landmarks: Float) -> Figure:
+    """Draw the matches of a result, and its pose and rivals on a plan of landmarks (N, 3) in the world."""
+    from wheretolook.figures.localization import DrawnImage, localization_figure
+
+    images = []
+    rival = result.rivals[0].joint if result.rivals else None
+    for n, image in enumerate(result.images):
+        assert result.joint is not None
+        look = result.joint.looks[n]
+        inliers = result.joint.inliers[n] if result.joint.inliers else np.zeros(len(look.rows), dtype=bool)
+        other = np.zeros((0, 2)) if rival is None else rival.looks[n].pixels[rival.inliers[n]]
+        images.append(DrawnImage(image.name, image.rgb, look.pixels, inliers, other))
+    to_world = result.frame.world_from_map
+    points = to_world.inverse.apply(landmarks) @ to_world.rotation.T
+    found = [one for one in (result, *result.rivals) if one.cam_from_world is not None]
+    poses = np.array([np.asarray(one.cam_from_world)[0] for one in found]).reshape(-1, 3, 4)
+    positions, axes = camera_centers(poses) @ to_world.rotation.T, poses[:, 2, :3] @ to_world.rotation.T
+    low, high = np.quantile(points, (0.01, 0.99), axis=0)
+    off = np.abs(positions - (low + high) / 2).max(axis=1, initial=0)
+    drawn = np.flatnonzero((off < (high - low).max()) | (np.arange(len(off)) == 0))  # wrong poses may be far away
+    probabilities = np.array([found[row].probability for row in drawn])
+    return localization_figure(images, points, positions[drawn], axes[drawn], probabilities)

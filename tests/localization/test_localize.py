@@ -1,0 +1,153 @@
+"""`wheretolook localize`: images of a rendered room against its map, alone and as a rig."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+
+from localization.rooms import CAMERA, MappedRoom
+from wheretolook.cli import main
+from wheretolook.geometry.poses import Float, pose_error, poses_looking_along
+from wheretolook.geometry.similarity import Similarity
+from wheretolook.localization.turns import read_turns
+from wheretolook.mapping.colmap_model import read_model
+from wheretolook.mapping.config import FrameOptions
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.scenes.loading import load_mesh
+from wheretolook.select.image_localizer import ImageLocalizer
+from wheretolook.select.localized import figure_of
+from wheretolook.utils.errors import ConfigError, MapError, PoseError, TableError
+
+AXES = np.array([(-1, 0.3, 0), (-1, -0.3, 0.1), (0.2, 1, 0)])
+POSES = poses_looking_along(np.tile((2.0, 2.0, 1.4), (3, 1)), AXES)
+
+
+@pytest.fixture(scope="module")
+def photos(room: MappedRoom, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Images of `POSES`: a.png, b.png and c.png."""
+    folder = tmp_path_factory.mktemp("photos")
+    for name, rgb in zip("abc", WarpRenderer(load_mesh(room.mesh)).render(CAMERA, POSES).rgb, strict=True):
+        cv2.imwrite(str(folder / f"{name}.png"), rgb[..., ::-1])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def localizer(room: MappedRoom) -> ImageLocalizer:
+    return ImageLocalizer.open(room.landmarks.parent)
+
+
+def assert_near(poses: Float | None, expected: Float) -> None:
+    assert poses is not None
+    error_m, error_deg = pose_error(poses, expected)
+    assert (error_m < 0.05).all() and (error_deg < 0.4).all()
+
+
+def test_a_batch_is_localized_and_an_unreadable_image_is_a_row_with_its_reason(
+    room: MappedRoom, photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "broken.png").write_bytes(b"no image")
+    out = tmp_path / "poses.csv"
+    images = [str(photos), str(tmp_path / "broken.png")]
+    command = ["localize", *images, "--map", str(room.landmarks.parent), "--out", str(out)]
+    assert main([*command, "--figure", str(tmp_path / "figures")]) == 0
+    table = pd.read_csv(out)
+    assert table["image"].tolist() == ["a.png", "b.png", "c.png", "broken.png"]
+    assert table["status"].tolist()[-1] == "error" and "broken.png" in table["reason"].iloc[-1]
+    found = table[table["status"] == "localized"]
+    assert len(found) >= 2
+    assert np.allclose(found[["x", "y", "z"]], (2, 2, 1.4), atol=0.05)
+    assert f"localized: {len(found)} of 4" in capsys.readouterr().out
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"a.png", "b.png", "c.png"}
+
+
+def test_a_rig_by_yaw_and_pitch_has_the_pose_of_each_image(room: MappedRoom, photos: Path, tmp_path: Path) -> None:
+    yaw = np.degrees(np.arctan2(AXES[:, 1], AXES[:, 0]))
+    pitch = np.degrees(np.arcsin(AXES[:, 2] / np.linalg.norm(AXES, axis=1)))
+    pd.DataFrame({"image": ["c.png", "a.png", "b.png"], "yaw": yaw[[2, 0, 1]] - 50, "pitch": pitch[[2, 0, 1]]}).to_csv(
+        tmp_path / "turns.csv", index=False
+    )
+    out = tmp_path / "pose.json"
+    given = ["--map", str(room.landmarks.parent), "--turns", str(tmp_path / "turns.csv"), "--out", str(out)]
+    assert main(["localize", str(photos), *given]) == 0
+    rows = json.loads(out.read_text())["images"]
+    assert [row["status"] for row in rows] == 3 * ["localized"]
+    assert all(np.allclose([row["x"], row["y"], row["z"]], (2, 2, 1.4), atol=0.05) for row in rows)
+    assert np.allclose([row["yaw_deg"] for row in rows], yaw, atol=0.4)
+    assert rows[0]["probability"] > 0.9
+
+
+def test_results_are_in_the_maps_own_frame_and_unit(room: MappedRoom, photos: Path, tmp_path: Path) -> None:
+    centimetres = Similarity(100.0, np.array([(1.0, 0, 0), (0, 0, -1), (0, 1, 0)]), np.array((50.0, 0, 0)))  # z to -y
+    model = read_model(room.landmarks.parent)
+    centimetres.transform_model(model)
+    model.write(str(tmp_path))
+    (tmp_path / "landmarks.npz").write_bytes(room.landmarks.read_bytes())
+    localizer = ImageLocalizer.open(tmp_path, frame=FrameOptions(scale=0.01, up="-y"))
+    result = localizer.localize(photos / "a.png", prior=(250, -140, 200, 180))
+    assert result.cam_from_world is not None
+    assert_near(centimetres.inverse.apply_to_poses(result.cam_from_world), POSES[:1])
+    assert 0.001 < result.deviation[0] < 5
+    figure = figure_of(result, localizer.landmarks.points)
+    image, plan, _ = figure.get_axes()
+    assert image.get_title() == "a.png" and plan.get_xlabel() == "x, map unit"
+
+
+def test_a_prior_is_a_hypothesis_and_an_array_an_image(localizer: ImageLocalizer, photos: Path) -> None:
+    rgb = np.ascontiguousarray(cv2.imread(str(photos / "b.png"))[..., ::-1])
+    assert_near(localizer.localize(rgb, prior=(2.3, 1.8, 1.4, -160)).cam_from_world, POSES[1:2])
+    with pytest.raises(PoseError, match="array"):
+        localizer.localize(rgb.astype(float))  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="prior"):
+        localizer.localize(rgb, prior=(1, 2))
+    with pytest.raises(ConfigError, match="rotations"):
+        localizer.localize([rgb, rgb])
+    with pytest.raises(PoseError):
+        localizer.localize([rgb, rgb], turns=np.ones((2, 3, 3)))
+
+
+def test_an_image_of_another_camera_needs_it(localizer: ImageLocalizer, photos: Path) -> None:
+    square = np.zeros((100, 100, 3), dtype=np.uint8)
+    with pytest.raises(ConfigError, match="the camera of this image of 100 x 100 px is unknown"):
+        localizer.localize(square)
+    with pytest.raises(ConfigError, match="proportions"):
+        localizer.localize(square, camera=CAMERA)
+    assert localizer.localize(np.zeros((240, 320, 3), dtype=np.uint8)).reason == "0 matches with the map"
+    twice = cv2.resize(cv2.imread(str(photos / "a.png"))[..., ::-1], None, fx=2, fy=2)
+    assert_near(localizer.localize(twice).cam_from_world, POSES[:1])  # reduced to the size of the map's images
+
+
+def test_a_map_without_descriptors_or_with_others_is_an_error(room: MappedRoom, tmp_path: Path) -> None:
+    folder = tmp_path / "map"
+    folder.mkdir()
+    for path in room.landmarks.parent.iterdir():
+        if path.suffix in (".bin", ".json"):
+            (folder / path.name).write_bytes(path.read_bytes())
+    with pytest.raises(MapError, match="no descriptors"):
+        ImageLocalizer.open(folder)
+    Landmarks.load(room.landmarks).save(folder / "landmarks.npz", compact=True)
+    with pytest.raises(MapError, match="no descriptors"):
+        ImageLocalizer.open(folder)
+
+
+def test_turns_of_odometry_and_tables(tmp_path: Path) -> None:
+    path = tmp_path / "turns.tum"
+    half = np.sqrt(0.5)
+    path.write_text(f"10.0 1 2 0 0 0 0 1\n10.5 1 2 0 0 0 {half} {half}\n")
+    along = read_turns(path, ["10.001.png", "10.5.png"])[:, 2, :3]  # optical axes in the rig
+    np.testing.assert_allclose(along, [(1, 0, 0), (0, 1, 0)], atol=1e-9)
+    table = tmp_path / "turns.csv"
+    table.write_text("image,yaw,pitch,roll\na.png,0,0,90\nb.png,90,30,0\n")
+    turned, level = read_turns(table, ["x/a.png", "x/b.png"])
+    np.testing.assert_allclose(turned[:, :3], [(0, 0, -1), (0, 1, 0), (1, 0, 0)], atol=1e-9)  # x down, y to the left
+    np.testing.assert_allclose(level[2, :3], (0, np.sqrt(0.75), 0.5), atol=1e-9)
+    with pytest.raises(TableError, match="no rotation of this image"):
+        read_turns(table, ["a.png", "c.png"])
+    table.write_text("image,qw,qx,qy,qz\na.png,2,0,0,0\n")
+    with pytest.raises(TableError, match="length 1"):
+        read_turns(table, ["a.png"])

@@ -170,6 +170,23 @@ def test_one_command_plans_a_path_in_the_folder_of_a_model(tmp_path, capsys, uni
     assert scene.camera == LOOKS and scene.read_table()["location_id"].nunique() == 3
 
 
+def test_a_scene_is_replaced_by_no_other_source(tmp_path):
+    data = tmp_path / "data"
+    (scene,) = run(Map, experiment_of(save(room_model(), tmp_path / "flat"), data)).scenes
+    content = (scene.map / "points3D.bin").read_bytes()
+    other = save(room_model(cameras=(OTHER,)), tmp_path / "other" / "flat")
+    (tmp_path / "photos" / "flat").mkdir(parents=True)
+    photographs = MapConfig(photographs=PhotographsConfig(tmp_path / "photos" / "flat"))
+    for experiment in (
+        experiment_of(other, data),
+        replace(experiment_of(other, data), mapping=photographs),
+        experiment_of(scene.map, data, name=scene.name),  # the scene's own map
+    ):
+        with pytest.raises(ConfigError, match=r"made from another source|would be replaced"):
+            run(Map, experiment)
+    assert (scene.map / "points3D.bin").read_bytes() == content
+
+
 def test_one_of_several_cameras_is_chosen(tmp_path):
     folder = save(room_model(cameras=(LOOKS, OTHER)), tmp_path / "flat")
     with pytest.raises((ConfigError, MapError)):

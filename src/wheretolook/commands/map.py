@@ -27,6 +27,7 @@ from wheretolook.geometry.poses import Float
 from wheretolook.mapping.config import ExistingModelConfig, MapConfig, place_name
 from wheretolook.mapping.georeference import read_scale
 from wheretolook.mapping.map_frame import read_frame
+from wheretolook.mapping.sources import source_of_map
 from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.confine import check_folder_name, path_within
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
@@ -161,7 +162,7 @@ def _map_photographs(options: Map, log: Log) -> SceneFolder:
     settings = options.mapping.photographs
     folder = settings.images
     assert folder is not None
-    scene = _new_scene(options, settings.name or place_name(folder))
+    scene = _new_scene(options, folder, settings.name or place_name(folder))
     _with_scene(scene, options.root)
     tables = [path for path in (settings.scale.marker_table, options.mapping.frame.positions) if path is not None]
     for path in tables:
@@ -198,7 +199,7 @@ def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     photographs = options.mapping.photographs
     folder = settings.model
     assert folder is not None
-    scene = _new_scene(options, settings.name or place_name(folder))
+    scene = _new_scene(options, folder, settings.name or place_name(folder))
     model = read_model(folder)
     if photographs.images is None:
         settings = replace(settings, database=choose_features(folder, model, settings.database))
@@ -239,10 +240,21 @@ def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     return scene, dataset
 
 
-def _new_scene(options: Map, name: str) -> SceneFolder:
-    """Return the scene of photographs or of a model. Raises ConfigError if the name cannot be a folder's."""
+def _new_scene(options: Map, source: Path, name: str) -> SceneFolder:
+    """Return the scene of a folder of photographs or a model.
+
+    Raises ConfigError if the name cannot be a folder's, or the scene's map would be replaced by one of another source.
+    """
     check_folder_name("a scene's name, mapping.photographs.name or mapping.existing.name,", name, NOT_SCENES)
-    return SceneFolder(options.root / name, "test", options.camera.camera)
+    scene = SceneFolder(options.root / name, "test", options.camera.camera)
+    if source.resolve().is_relative_to(scene.folder.resolve()):
+        fix = f"Name the scene instead of its map: --name {options.name} --scene {name}."
+        raise ConfigError("this is a part of a scene, which would be replaced", path=source, fix=fix)
+    known = source_of_map(scene.map)
+    if known is not None and known.resolve() != source.resolve():
+        fix = f"Give another dataset, --name, or remove {scene.folder}."
+        raise ConfigError(f"the scene {name} was made from another source", path=known, value=str(source), fix=fix)
+    return scene
 
 
 def _with_mapping_camera(options: Map, scene: SceneFolder) -> SceneFolder:

@@ -96,6 +96,11 @@ def _kind_or_problem(path: Path, reconstruction: Any) -> tuple[DescriptorKind | 
     return kind, "" if kind else f"{path} has no descriptors of a known kind"
 
 
+def source_of_map(map_dir: Path) -> Path | None:
+    """Return the model or the photographs that a scene's map was made from; None for a rendered map, or none."""
+    return _reported(map_dir, "existing", "model") or _reported(map_dir, "photographs", "images")
+
+
 def _reported(model_dir: Path, group: str, name: str) -> Path | None:
     """A path among the settings in a map's report; None if there is none."""
     try:

@@ -17,6 +17,7 @@ from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room, 
 from wheretolook.cli import main
 from wheretolook.commands.label import Label
 from wheretolook.commands.map import Map
+from wheretolook.commands.options import MapUseOptions, select_options
 from wheretolook.commands.plan import Plan
 from wheretolook.commands.preconditions import extractor_of
 from wheretolook.commands.sample import Sample
@@ -193,6 +194,9 @@ def test_one_of_several_cameras_is_chosen(tmp_path):
         run(Map, experiment_of(folder, tmp_path / "data"))
     (scene,) = run(Map, experiment_of(folder, tmp_path / "data", camera_id=2)).scenes
     assert scene.camera == OTHER
+    sampled = select_options(Sample, experiment_of(folder, tmp_path / "sampled"))
+    sampled = replace(sampled, name="mine", map=folder, scale=1, camera_id=2, mapping=MapUseOptions())
+    assert sampled.run().scenes[0].camera == OTHER
     named = replace(experiment_of(folder, tmp_path / "data"), camera=CameraConfig(400, 300, fov_deg=80.0))
     (scene,) = run(Map, named).scenes
     assert scene.camera == named.camera.camera and not scene.own_camera

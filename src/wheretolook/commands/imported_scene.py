@@ -23,17 +23,19 @@ class SceneOrMapOptions(SceneOptions, FrameOptions):
         map: instead of a scene: folder of a COLMAP model, imported first as `wheretolook map --model` does.
         mesh: a mesh of the map's scene (GLB, OBJ, PLY) in its frame.
         database: the map's features: COLMAP's database.db, or hloc's feats-*.h5.
+        camera_id: the camera_id of one of the map's cameras, if it has several.
     """
 
     name: str = ""
     map: Path | None = None
     mesh: Path | None = None
     database: Path | None = None
+    camera_id: int | None = None
 
     def __post_init__(self) -> None:
         frame = self.frame_options()
-        of_map = next(filter(None, (self.mesh, self.database, *vars(frame).values())), None)
-        names = "--mesh, --database, --scale, --distance, --positions and --up"
+        of_map = next(filter(None, (self.mesh, self.database, self.camera_id, *vars(frame).values())), None)
+        names = "--mesh, --database, --camera-id, --scale, --distance, --positions and --up"
         reject((self.map is None and of_map is not None, f"{names} belong to --map", str(of_map)))
         if not self.name:
             object.__setattr__(self, "name", self.imported_name or DatasetOptions.name)
@@ -52,7 +54,7 @@ def imports_map(run: Callable[..., Any]) -> Callable[..., Any]:
     def run_on_scene(command: Any, log: Log = print, progress: Progress = ignore_progress) -> Any:
         if command.map is not None:
             files = {"database": command.database, "mesh": command.mesh}
-            existing = ExistingModelConfig(command.map, **files)
+            existing = ExistingModelConfig(command.map, **files, camera_id=command.camera_id)
             mapping = MapConfig(frame=command.frame_options(), extractor=command.mapping.extractor, existing=existing)
             replace(select_options(Map, command), mapping=mapping).run(log)
         return run(command, log, progress)

@@ -55,6 +55,7 @@ class Map(SceneOptions, LabelOptions):
         "model": "mapping.existing.model",
         "mesh": "mapping.existing.mesh",
         "database": "mapping.existing.database",
+        "camera-id": "mapping.existing.camera_id",
         **{name: f"mapping.frame.{name}" for name in ("scale", "distance", "positions", "up")},
         "engine": "label.engine",
     }
@@ -277,9 +278,7 @@ def _with_own_camera(scene: SceneFolder, model: Any, settings: ExistingModelConf
     try:
         return replace(scene, camera=camera_of_model(model, settings.model, settings.camera_id), own_camera=True)
     except MapError as error:
-        fix = (
-            "Name one of the model's, --mapping.existing.camera_id 1, or describe another, such as --camera.fov_deg 70."
-        )
+        fix = "Name one of the model's, such as --camera-id 1, or describe another, such as --camera.fov_deg 70."
         raise MapError(error.problem, path=error.path, value=error.value, fix=fix) from error
 
 

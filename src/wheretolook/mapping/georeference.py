@@ -130,7 +130,8 @@ def fit_similarity(source: ArrayLike, target: ArrayLike) -> Similarity:
     sim3d = pycolmap.estimate_sim3d(a, b) if len(a) >= 3 and min(ranks) >= 2 else None
     if sim3d is None:
         fix = "Give the positions of three photographs or more, not on a line."
-        raise MapError("these positions do not determine a frame", value=len(a), fix=fix)
+        problem = "these positions do not determine a frame" if len(a) else "no position has the name of an image"
+        raise MapError(problem, value=len(a), fix=fix)
     return Similarity(float(sim3d.scale), np.asarray(sim3d.rotation.matrix()), np.asarray(sim3d.translation))
 
 

@@ -16,6 +16,7 @@ import wheretolook
 from selection.room import POINTS, WEIGHTS
 from wheretolook.cli import main
 from wheretolook.select.where_to_look import WhereToLook
+from wheretolook.utils.errors import MapWarning
 
 SOURCE = {**os.environ, "PYTHONPATH": str(Path(wheretolook.__file__).parents[1])}  # for other processes
 QUICK = ["--weights", str(WEIGHTS), "--directions", "60", "--device", "cpu"]
@@ -51,6 +52,9 @@ def test_scores_of_poses(sparse: Path, at: Path, capsys: pytest.CaptureFixture[s
     assert "waypoint 7: (1000, 0, 0)" in capsys.readouterr().err
     assert main(["score", "--poses", "far.tum", "--out", "scores.csv", "--skip", *given]) == 0
     assert pd.read_csv("scores.csv")["waypoint"].tolist() == [0, 1, 2, 3]
+    Path("robot.tum").write_text("".join(f"{row} {x} {y} {z} 0 0 0 1\n" for row, (x, y, z) in enumerate(POINTS)))
+    with pytest.warns(MapWarning, match="every camera looks up"):
+        assert main(["score", "--poses", "robot.tum", "--out", "scores.csv", *given]) == 0
 
 
 def test_a_floor_plan(sparse: Path, at: Path, look: WhereToLook) -> None:

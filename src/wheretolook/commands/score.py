@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wheretolook.commands.selector_options import SelectorOptions, finish
+from wheretolook.utils.errors import MapWarning
 
 if TYPE_CHECKING:
     from wheretolook.select.views import SelectedViews
+
+
+BODY_PITCH_DEG = 60.0  # of all poses, from which on they seem to be of a robot whose z is up
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +54,11 @@ class Score(SelectorOptions):
         names, cam_from_world = read_poses(self.poses)
         selector = self.open_map()
         views = selector.report(cam_from_world, names, self.skip)
+        if (views.pitch_deg > BODY_PITCH_DEG).all():
+            text = (
+                "every camera looks up; are these a robot's orientations, x ahead and z up? Give its camera's, z ahead"
+            )
+            warnings.warn(f"{self.poses}: {text} and y down", MapWarning, stacklevel=2)
         finish(self, selector, views, len(names), "poses")
         print(f"scores: {self.out}")
         return views

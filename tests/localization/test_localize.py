@@ -18,6 +18,7 @@ from wheretolook.localization.turns import read_turns
 from wheretolook.mapping.colmap_model import read_model
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.photographs import read_photograph
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.select.image_localizer import ImageLocalizer
@@ -99,7 +100,7 @@ def test_results_are_in_the_maps_own_frame_and_unit(room: MappedRoom, photos: Pa
 
 
 def test_a_prior_is_a_hypothesis_and_an_array_an_image(localizer: ImageLocalizer, photos: Path) -> None:
-    rgb = np.ascontiguousarray(cv2.imread(str(photos / "b.png"))[..., ::-1])
+    rgb = read_photograph(photos / "b.png")
     assert_near(localizer.localize(rgb, prior=(2.3, 1.8, 1.4, -160)).cam_from_world, POSES[1:2])
     with pytest.raises(PoseError, match="array"):
         localizer.localize(rgb.astype(float))  # type: ignore[arg-type]
@@ -118,7 +119,7 @@ def test_an_image_of_another_camera_needs_it(localizer: ImageLocalizer, photos: 
     with pytest.raises(ConfigError, match="proportions"):
         localizer.localize(square, camera=CAMERA)
     assert localizer.localize(np.zeros((240, 320, 3), dtype=np.uint8)).reason == "0 matches with the map"
-    twice = cv2.resize(cv2.imread(str(photos / "a.png"))[..., ::-1], None, fx=2, fy=2)
+    twice = np.asarray(cv2.resize(read_photograph(photos / "a.png"), None, fx=2, fy=2), dtype=np.uint8)
     assert_near(localizer.localize(twice).cam_from_world, POSES[:1])  # reduced to the size of the map's images
 
 

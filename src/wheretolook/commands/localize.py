@@ -76,12 +76,8 @@ class Localize(CameraOptions, FrameOptions):
     device: str = "auto"
 
     def __post_init__(self) -> None:
-        from wheretolook.select.formats import check_format
-
         self.frame_options()
         self.named_camera()
-        if self.out is not None:
-            check_format(self.out, None, 1)
         if self.figure is not None and self.figure.suffix:
             check_choice("format of figures", self.figure.suffix[1:].lower(), KINDS)
         if self.extractor_weights and self.extractor is None:
@@ -142,7 +138,7 @@ class Localize(CameraOptions, FrameOptions):
         """Yield the result of the rig, or of each image, with a progress bar."""
         from tqdm.auto import tqdm
 
-        camera = self.named_camera()
+        camera = localizer.images.known_camera(self.named_camera())
         if self.turns is not None or len(paths) == 1:
             yield localizer.localize(paths, self.turns, camera, self.prior)
             return

@@ -15,7 +15,8 @@ from wheretolook.figures.style import BLUE, GREY, RC, VERMILION, frame, new_figu
 from wheretolook.geometry.poses import Float
 
 HEIGHT_IN = 5.0
-COLUMNS = 3  # of images
+PLAN_IN = 6.5
+COLUMNS = 2  # of images
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,14 +39,13 @@ def localization_figure(
     """
     columns = min(len(images), COLUMNS)
     rows = -(-len(images) // columns)
-    width_in = sum(HEIGHT_IN / rows * image.rgb.shape[1] / image.rgb.shape[0] for image in images[:columns])
+    widths = [HEIGHT_IN / rows * image.rgb.shape[1] / image.rgb.shape[0] for image in images[:columns]]
+    widths += [PLAN_IN] if len(positions) else []
     with context(RC):
-        figure = new_figure(width_in + (6.5 if len(positions) else 0), HEIGHT_IN + 0.6)
-        panels = figure.subfigures(1, 2, width_ratios=(width_in, 6.5)) if len(positions) else [figure]
-        grid = panels[0].subplots(rows, columns, squeeze=False)
-        for panel in grid.flat[len(images) :]:
-            panel.remove()
-        for image, panel in zip(images, grid.flat[: len(images)], strict=True):
+        figure = new_figure(sum(widths), HEIGHT_IN + 0.6 * rows)
+        grid = figure.add_gridspec(rows, len(widths), width_ratios=widths)
+        for n, image in enumerate(images):
+            panel = figure.add_subplot(grid[divmod(n, columns)])
             panel.imshow(image.rgb)
             others = image.pixels[~image.inliers]
             for pixels, color, label in (
@@ -61,6 +61,6 @@ def localization_figure(
             frame(panel)
         if len(positions):
             names = ["pose", *(f"rival {n}" for n in range(1, len(positions)))]
-            plan = panels[1].subplots()
+            plan = figure.add_subplot(grid[:, -1])
             draw_floor_plan(plan, landmarks, positions, axes, probabilities, names, "probability")
         return figure

@@ -163,11 +163,9 @@ def poses_of_rows(table: NamedRows, orientations_only: bool = False) -> NamedPos
     for row in np.flatnonzero(np.abs(lengths - 1) > UNIT_TOLERANCE).tolist():
         value = f"line {table.rows[row][0]}: {lengths[row]:.4g}"
         raise TableError("a quaternion is not of length 1", path=path, value=value, fix="Correct the order of columns.")
-    if orientations_only and not {"x", "tx"} & {*table.columns}:
-        locations = np.zeros((len(quaternions), 3))
-    else:
-        names = TRANSLATION_COLUMNS if {*TRANSLATION_COLUMNS} <= {*table.columns} else "xyz"
-        locations = table.numbers(names)
+    locations: Float = np.zeros((len(quaternions), 3))
+    if not orientations_only or {"x", "tx"} & {*table.columns}:
+        locations = table.numbers(TRANSLATION_COLUMNS if {*TRANSLATION_COLUMNS} <= {*table.columns} else "xyz")
     poses = poses_of_values(np.concatenate([quaternions, locations], axis=1))
     return NamedPoses(table.names, poses if holds_cam_from_world(table) else invert_poses(poses))
 

@@ -50,9 +50,8 @@ def matches_among(matches: Matches, allowed: NDArray[np.bool_], max_ratio: float
     second = np.where(near.any(axis=1), near.argmax(axis=1), near.shape[1] - 1)
     distance = squared[rows, first]
     if max_ratio is not None:
-        kept = np.flatnonzero(distance < max_ratio**2 * squared[rows, second])
-        keypoints, first, distance = keypoints[kept], first[kept], distance[kept]
+        rows = np.flatnonzero(distance < max_ratio**2 * squared[rows, second])
     landmarks = matches.near[keypoints, first]
-    order = np.argsort(distance, kind="stable")
-    unique = np.sort(order[np.unique(landmarks[order], return_index=True)[1]])
-    return matches._replace(keypoints=keypoints[unique], landmarks=landmarks[unique])
+    rows = rows[np.argsort(distance[rows], kind="stable")]
+    rows = np.sort(rows[np.unique(landmarks[rows], return_index=True)[1]])
+    return matches._replace(keypoints=keypoints[rows], landmarks=landmarks[rows])

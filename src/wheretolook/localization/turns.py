@@ -7,8 +7,9 @@ from pathlib import Path, PurePath
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
-from wheretolook.geometry.poses import Float, camera_centers, rigid_poses, rotation_looking_along
+from wheretolook.geometry.poses import Float, camera_centers, rigid_poses
 from wheretolook.io.poses import NAME_COLUMNS, QUATERNION_COLUMNS, NamedRows, poses_of_rows, read_named_rows
 from wheretolook.utils.errors import TableError
 
@@ -20,7 +21,7 @@ CAM_FROM_BODY = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # a camera that
 def read_turns(path: Path, images: Sequence[str]) -> Float:
     """Read cam_from_rig (N, 3, 4) of images, by their names; the rig's origin is the first image.
 
-    The file has columns yaw, pitch and perhaps roll in degrees (yaw to the left, pitch upwards, roll clockwise), or qw,
+    The file has columns yaw and perhaps pitch and roll in degrees (yaw to the left, pitch upwards, roll clockwise), or qw,
     qx, qy, qz (camera-to-rig), and perhaps positions in metres; or is a TUM trajectory of the camera (z forward) or of
     a robot (x forward, z up) whose camera looks along x. Rows belong to the images of the same name, in the column
     image, or of the nearest time stamp, if images are named by their time. Otherwise they are in the order of the
@@ -54,21 +55,18 @@ def _poses(table: NamedRows) -> Float:
     """Return cam_from_rig (R, 3, 4) of all rows."""
     if {*QUATERNION_COLUMNS} <= {*table.columns}:
         poses = poses_of_rows(table, orientations_only=True).cam_from_world
-        if table.header[0] == "t" and (poses[:, 2, 2] > BODY_UPRIGHT).all():
-            poses = CAM_FROM_BODY @ poses
-        return poses
-    names = [f"{name}_deg" if f"{name}_deg" in table.columns else name for name in ("yaw", "pitch", "roll")]
-    known = [name for name in names if name != "roll" or name in table.columns]
-    yaw, pitch, *rest = np.radians(table.numbers(known)).T
-    roll = rest[0] if rest else np.zeros(len(yaw))
-    level = rotation_looking_along(
-        np.stack([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)], -1)
-    )
-    straight = np.abs(np.cos(pitch)) < 1e-9  # no direction of the optical axis states the yaw
-    level[straight, 0] = np.stack([np.sin(yaw), -np.cos(yaw), np.zeros_like(yaw)], -1)[straight]
-    level[:, 1] = np.cross(level[:, 2], level[:, 0])
-    right = np.cos(roll)[:, None] * level[:, 0] + np.sin(roll)[:, None] * level[:, 1]
-    rotations = np.stack([right, np.cross(level[:, 2], right), level[:, 2]], axis=1)
+        of_body = table.header[0] == "t" and (poses[:, 2, 2] > BODY_UPRIGHT).all()
+        return CAM_FROM_BODY @ poses if of_body else poses
+    angles = np.zeros((len(table.rows), 3))
+    for column, name in enumerate(("yaw", "pitch", "roll")):
+        given = [known for known in (name, f"{name}_deg") if known in table.columns]
+        if given:
+            angles[:, column] = table.numbers(given[:1])[:, 0]
+        elif name == "yaw":
+            fix = "Give qw, qx, qy, qz, or yaw and perhaps pitch and roll in degrees."
+            raise TableError("the columns state no rotation", path=table.path, value=",".join(table.header), fix=fix)
+    rotated = Rotation.from_euler("xz", -angles[:, 1:], degrees=True).as_matrix() @ CAM_FROM_BODY
+    rotations = rotated @ Rotation.from_euler("z", -angles[:, :1], degrees=True).as_matrix()
     return np.pad(rotations, ((0, 0), (0, 0), (0, 1)))
 
 

@@ -95,7 +95,7 @@ class ImageLocalizer:
     @cached_property
     def _localizer(self) -> Localizer:
         config = LocalizerConfig(method="hypotheses")
-        return Localizer(self.landmarks, next(iter(self.images.by_id.values())), config, self.extractor, self.device)
+        return Localizer(self.landmarks, next(iter(self.images.cameras.values())), config, self.extractor, self.device)
 
     @cached_property
     def _rigs(self) -> JointLocalizer:
@@ -125,15 +125,16 @@ class ImageLocalizer:
             TableError, PoseError: the file of turns, or a rotation, is not valid.
         """
         given = [images] if isinstance(images, (str, Path, np.ndarray)) else list(images)
-        if len(given) != 1 and turns is None:
+        names = [str(n) if isinstance(image, np.ndarray) else str(image) for n, image in enumerate(given)]
+        cam_from_rig: Float = np.eye(3, 4)[None]
+        if isinstance(turns, (str, Path)):
+            cam_from_rig = self._usable(read_turns(Path(turns), names))
+        elif turns is not None:
+            cam_from_rig = self._usable(checked_turns(turns, len(given)))
+        elif len(given) != 1:
             fix = "Give turns, or localize one image after another."
             raise ConfigError("several images are localized together by their rotations", value=len(given), fix=fix)
-        names = [str(n) if isinstance(image, np.ndarray) else str(image) for n, image in enumerate(given)]
-        cam_from_rig = np.eye(3, 4)[None]
-        if turns is not None:
-            is_file = isinstance(turns, (str, Path))
-            poses = read_turns(Path(turns), names) if is_file else checked_turns(turns, len(given))
-            cam_from_rig = self._in_place(poses)
+        camera = self.images.known_camera(camera)
         queries = [self.images.read(image, Path(name).name, camera) for image, name in zip(given, names, strict=True)]
         return self._localized(queries, cam_from_rig, None if prior is None else self._prior(prior))
 
@@ -178,7 +179,7 @@ class ImageLocalizer:
         location = self.frame.world_from_map.apply(numbers[:3]).tolist()
         return PosePrior(tuple(location), float(numbers[3]) if len(numbers) == 4 else None)
 
-    def _in_place(self, cam_from_rig: Float) -> Float:
+    def _usable(self, cam_from_rig: Float) -> Float:
         """Return poses in a rig with positions only if the map's unit is known. Raises ConfigError if they are needed."""
         if self.frame.scale.is_metric:
             return cam_from_rig

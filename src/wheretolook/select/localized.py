@@ -15,15 +15,14 @@ from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_ro
 from wheretolook.io.poses import images_text
 from wheretolook.localization.rig_localization import JointLocalization
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame
-from wheretolook.select.formats import check_format
 from wheretolook.select.query_images import QueryImage
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import write_json, write_text
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
 
-FORMATS = ("csv", "json", "colmap")
 FAILED = "error"  # status of an image that cannot be read, or whose camera is unknown
 
 
@@ -107,66 +106,73 @@ class Localized:
         """Write a CSV, a JSON file, or COLMAP's images.txt, by the name of the file. Raises ConfigError for others."""
         save_localized([self], Path(path))
 
-    def records(self) -> list[dict[str, Any]]:
-        """Return a row of the table for each image; without a pose, its values are None."""
-        rows = []
-        for n, name in enumerate(self.names):
-            row = {"image": name, "status": self.status, "probability": self.probability}
-            row |= dict.fromkeys(POSE_COLUMNS) | ({} if self.cam_from_world is None else self._pose(n))
-            row |= {"n_matches": self.n_matches, "n_inliers": self.n_inliers, "n_rivals": len(self.rivals)}
-            row["rival_probability"] = self.rivals[0].probability if self.rivals else None
-            rows.append(row | {"reason": self.reason})
-        return rows
+    def table(self) -> pd.DataFrame:
+        """Return a row for each image; NaN where there is no pose."""
+        import pandas as pd
 
-    def _pose(self, n: int) -> dict[str, float | None]:
-        """Return `POSE_COLUMNS` of an image."""
-        assert self.cam_from_world is not None
-        pose = self.cam_from_world[n]
-        angles = np.degrees(pan_tilt_angles(self.frame.world_from_map.rotation @ pose[2, :3]))
-        deviation = [value if np.isfinite(value) else None for value in self.deviation]
-        values = [*self.positions[n], *angles, *quaternion_from_rotation(pose[:, :3].T), *deviation]
-        return {key: None if value is None else float(value) for key, value in zip(POSE_COLUMNS, values, strict=True)}
+        values = np.full((len(self), len(POSE_COLUMNS)), np.nan)
+        if self.cam_from_world is not None:
+            quaternions = quaternion_from_rotation(np.swapaxes(self.cam_from_world[:, :, :3], 1, 2))
+            angles = np.degrees(pan_tilt_angles(self.cam_from_world[:, 2, :3] @ self.frame.world_from_map.rotation.T))
+            deviation = np.tile(self.deviation, (len(self), 1))
+            values = np.column_stack([self.positions, *angles, quaternions, deviation])
+        rival = self.rivals[0].probability if self.rivals else np.nan
+        return pd.DataFrame(
+            {
+                "image": self.names,
+                "status": self.status,
+                "probability": self.probability,
+                **dict(zip(POSE_COLUMNS, values.T, strict=True)),
+                "n_matches": self.n_matches,
+                "n_inliers": self.n_inliers,
+                "n_rivals": len(self.rivals),
+                "rival_probability": rival,
+                "reason": self.reason,
+            }
+        )
 
 
 POSE_COLUMNS = (*"xyz", "yaw_deg", "pitch_deg", "qw", "qx", "qy", "qz", "deviation", "deviation_deg")
 
 
 def check_localized_format(path: Path) -> str:
-    """Return the format that a file's name stands for. Raises ConfigError, StorageError if it cannot be written."""
-    chosen = check_format(path, None, 1)
-    if chosen not in FORMATS or not path.suffix:
+    """Return the format that a file's name stands for, "csv", "json" or "txt". Raises ConfigError for another name."""
+    suffix = path.suffix[1:].lower()
+    if suffix not in ("csv", "json") and path.name != "images.txt":
         fix = "Name it .csv, .json or images.txt."
         raise ConfigError("poses of images cannot be written in this format", path=path, fix=fix)
-    return chosen
+    return suffix
 
 
 def save_localized(results: Sequence[Localized], path: Path) -> None:
     """Write results to a file of the format of its name, atomically; images.txt has the localized ones only."""
     import pandas as pd
 
-    chosen = check_localized_format(path)
-    rows = [row for result in results for row in result.records()]
-    if chosen == "csv":
-        write_text(path, pd.DataFrame(rows).to_csv(index=False, lineterminator="\n", float_format="%.9g"))
-    elif chosen == "json":
-        frame = results[0].frame
+    suffix = check_localized_format(path)
+    if suffix == "csv":
+        table = pd.concat([result.table() for result in results])
+        write_text(path, table.to_csv(index=False, lineterminator="\n", float_format="%.9g"))
+    elif suffix == "json":
         about = "x, y, z: camera centre in the map, in its unit; qw, qx, qy, qz: camera-to-world; camera z forward"
+        frame = results[0].frame
         scale = {"scale": frame.scale.source, "metres_per_unit": frame.world_from_map.scale}
-        write_json(path, {"frames": about, **scale, "images": [row for result in results for row in _nested(result)]})
+        write_json(path, {"frames": about, **scale, "images": [row for result in results for row in _records(result)]})
     else:
         found = [result for result in results if result.cam_from_world is not None]
+        names = [name for result in found for name in result.names]
         poses = [pose for result in found for pose in np.asarray(result.cam_from_world)]
-        write_text(
-            path, images_text([name for result in found for name in result.names], np.array(poses).reshape(-1, 3, 4))
-        )
+        write_text(path, images_text(names, np.reshape(poses, (-1, 3, 4))))
 
 
-def _nested(result: Localized) -> list[dict[str, Any]]:
-    """Return rows with the camera and the rivals' rows."""
-    rivals = [rival.records() for rival in result.rivals]
-    cameras = [image.camera.colmap.record() for image in result.images] or [None] * len(result)
-    pairs = zip(result.records(), cameras, strict=True)
-    return [row | {"camera": camera, "rivals": [rival[n] for rival in rivals]} for n, (row, camera) in enumerate(pairs)]
+def _records(result: Localized) -> list[dict[str, Any]]:
+    """Return the rows as JSON values, each with its camera and the rows of the rivals."""
+    table = result.table().replace([np.inf, np.nan], None)
+    rivals = [_records(rival) for rival in result.rivals]
+    rows: list[Any] = table.to_dict("records")
+    for n, row in enumerate(rows):
+        row["camera"] = result.images[n].camera.colmap.record() if result.images else None
+        row["rivals"] = [rival[n] for rival in rivals]
+    return rows
 
 
 def figure_of(result: Localized, landmarks: Float) -> Figure:

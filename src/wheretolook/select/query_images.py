@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of, cameras_by_id, describe_camera
-from wheretolook.mapping.colmap_model import registered_names
+from wheretolook.mapping.colmap_model import camera_of_model, registered_names
 from wheretolook.mapping.photographs import read_photograph, reduce_photograph
 from wheretolook.utils.colmap import quiet_colmap
-from wheretolook.utils.errors import ConfigError, MapError, PoseError
+from wheretolook.utils.errors import ConfigError, PoseError
 
 MAX_SIDE_PX = 1600  # larger images are reduced
 MAX_SIDE_RATIO = 1.01  # of the proportions of an image and of its camera
@@ -39,18 +39,21 @@ class QueryImages:
 
     def __init__(self, model: Any, folder: Path) -> None:
         self.folder = folder
-        self.by_id = cameras_by_id(model.cameras, folder)
+        self.model = model
+        self.cameras = cameras_by_id(model.cameras, folder)
         names = registered_names(model)
-        self.by_name = {name: self.by_id[model.images[number].camera_id] for number, name in names.items()}
+        self.by_name = {name: self.cameras[model.images[number].camera_id] for number, name in names.items()}
 
-    def read(self, image: str | Path | NDArray[np.uint8], name: str, camera: Camera | int | None = None) -> QueryImage:
-        """Read a file, or take an array (H, W, 3) uint8 RGB, of a camera or a camera_id of the model.
+    def known_camera(self, camera: Camera | int | None) -> Camera | None:
+        """Return a camera, given as one or by its camera_id. Raises MapError if the model has no such camera."""
+        return camera_of_model(self.model, self.folder, camera) if isinstance(camera, int) else camera
 
-        Raises MapError if the file cannot be read or the model has no such camera, PoseError for an array that is no
-        image, ConfigError if the camera is unknown or has other proportions.
+    def read(self, image: str | Path | NDArray[np.uint8], name: str, camera: Camera | None = None) -> QueryImage:
+        """Read a file, or take an array (H, W, 3) uint8 RGB, of a given or known camera.
+
+        Raises MapError if the file cannot be read, PoseError for an array that is no image, ConfigError if the camera
+        is unknown or has other proportions.
         """
-        if isinstance(camera, int):
-            camera = self._by_id(camera)
         if isinstance(image, np.ndarray):
             if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
                 raise PoseError("an image is an array (H, W, 3) uint8", value=(image.shape, str(image.dtype)))
@@ -62,12 +65,6 @@ class QueryImages:
             stored = read_photograph(path, turned=False)  # as some versions of COLMAP read photographs
             rgb = stored if _has_proportions(expected, stored) else rgb
         return _fitted(name, rgb, self._camera(path, rgb, camera))
-
-    def _by_id(self, camera_id: int) -> Camera:
-        if camera_id not in self.by_id:
-            fix = f"It has {', '.join(map(str, self.by_id))}."
-            raise MapError("the model has no such camera", path=self.folder, value=camera_id, fix=fix)
-        return self.by_id[camera_id]
 
     def _named(self, path: Path) -> Camera | None:
         """Return the camera of the mapping image of the same name: of the longest end of the path, at least the file name."""
@@ -84,7 +81,7 @@ class QueryImages:
                 raise ConfigError(problem, path=path, value=describe_camera(given), fix="Correct --camera.")
             return given
         named = None if path is None else self._named(path)
-        alike = [camera for camera in self.by_id.values() if _has_proportions(camera, rgb)]
+        alike = [camera for camera in self.cameras.values() if _has_proportions(camera, rgb)]
         if named is not None and named in alike:
             alike = [named]
         focal = np.array([camera.colmap.mean_focal_px / camera.width for camera in alike])

@@ -283,7 +283,7 @@ def test_a_turn_in_radians_is_rejected(look: WhereToLook) -> None:
         {"pitch_deg": 10},
         {"pan_deg": (1, 2, 3)},
         {"pan_deg": (30, -30)},
-        {"pan_deg": (-190, 30)},
+        {"pan_deg": (-190, 200)},
         {"apart_deg": 20},
         {"n": 2, "apart_deg": -1},
         {"n": 2, "apart_deg": float("nan")},
@@ -322,6 +322,9 @@ def test_limits_on_pan_are_relative_to_the_heading(look: WhereToLook, tmp_path: 
     for points, options in ((POINTS, {}), (POINTS, {"heading_deg": [0, np.nan, 0, 0]}), (POINTS, {"heading_deg": [0]})):
         with pytest.raises(TableError):
             look.best(points, pan_deg=(-20, 60), **options)
+    views = look.best(POINTS, heading_deg=heading, pan_deg=(150, 210))
+    back = (views.yaw_deg - heading) % 360
+    assert (back >= 150 - 1e-6).all() and (back <= 210 + 1e-6).all()
     with pytest.raises(ConfigError):
         look.best(POINTS, heading_deg=heading, pan_deg=(0, 0.01))
 

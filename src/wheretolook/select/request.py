@@ -41,8 +41,8 @@ class SelectionRequest:
     def __post_init__(self) -> None:
         check_pitch("pitch_deg", self.pitch_deg or (-90.0, 90.0))
         low, high = check_limits("pan_deg", self.pan_deg or (-180.0, 180.0))
-        fix = "Give degrees from -180 to 180, the lowest first, such as -60 60."
-        if not -180 <= low < high <= 180:
+        fix = "Give degrees, the lowest first, such as -60 60, or 150 210 for the back."
+        if not (-360 <= low < high <= 360 and high - low <= 360):
             raise ConfigError("pan_deg is a lowest and a highest yaw", value=(low, high), fix=fix)
         joint = self.looks is not None
         in_order = self.max_turn_deg is not None

@@ -48,6 +48,7 @@ scores of all directions are computed from other samples of them."""
 
 CONFIG = EnvironmentConfig(occlusion_cache_bytes=1 << 30)
 
+PAN_TOLERANCE_DEG = 1e-9
 SIGHT_LINES = 1 << 24  # lines of sight tested at once
 
 
@@ -386,8 +387,8 @@ class WhereToLook:
             return np.ones((len(waypoints), len(axes)), dtype=bool)
         heading = waypoints.heading_deg(self.frame.world_from_map.rotation)
         pan = np.degrees(pan_tilt_angles(axes)[0]) - heading[:, None]
-        pan = (pan + 180) % 360 - 180
-        return np.asarray((pan >= request.pan_deg[0] - 1e-9) & (pan <= request.pan_deg[1] + 1e-9))
+        low, high = request.pan_deg
+        return np.asarray((pan - low + PAN_TOLERANCE_DEG) % 360 <= high - low + 2 * PAN_TOLERANCE_DEG)
 
 
 def _separate_views(waypoints: Waypoints, axes: Float, scores: Float, request: SelectionRequest) -> NDArray[np.int64]:

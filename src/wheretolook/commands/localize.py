@@ -107,9 +107,9 @@ class Localize(CameraOptions, FrameOptions):
         print(f"{localizer.frame.describe()}; {landmarks}")
         results = []
         for result in self._results(localizer, paths):
-            results.append(result)
             if self.figure is not None and result.images:
                 self._draw(result, localizer)
+            results.append(result.without_images())
         if self.out is not None:
             save_localized(results, self.out)
         self._summarize(results)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE
+from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation
 from wheretolook.io.poses import images_text
@@ -41,7 +42,8 @@ class Localized:
         deviation: one standard deviation of the position, in the map's unit, and of the orientation in degrees.
         rivals: other poses that matches support, the most probable first, without rivals of their own.
         frame: the map's own frame.
-        images: the images as keypoints were extracted.
+        cameras: of the images, as keypoints were extracted.
+        images: the images themselves.
         joint: the result in the world: metres, z up.
     """
 
@@ -54,8 +56,9 @@ class Localized:
     n_inliers: int = 0
     deviation: tuple[float, float] = (np.inf, np.inf)
     rivals: tuple[Localized, ...] = ()
-    frame: MapFrame = IDENTITY
-    images: tuple[QueryImage, ...] = ()
+    frame: MapFrame = field(default=IDENTITY, repr=False)
+    cameras: tuple[Camera, ...] = field(default=(), repr=False)
+    images: tuple[QueryImage, ...] = field(default=(), repr=False)
     joint: JointLocalization | None = field(default=None, repr=False)
 
     @classmethod
@@ -66,6 +69,7 @@ class Localized:
         names = tuple(image.name for image in images)
         unit = frame.world_from_map.scale
         values: dict[str, Any] = {"names": names, "frame": frame, "images": tuple(images), "joint": joint}
+        values["cameras"] = tuple(image.camera for image in images)
         values |= {"n_matches": joint.n_matches, "n_inliers": joint.n_inliers}
         if joint.status != LOCALIZED:
             found = f"{joint.n_inliers} of {joint.n_matches} matches agree with the best pose"
@@ -101,6 +105,11 @@ class Localized:
         matches = f"{self.n_inliers} inliers, {self.n_matches} matches"
         rivals = "" if not self.rivals else f" (of rivals at most {self.rivals[0].probability:.3f})"
         return f"({at}), probability {self.probability:.3f}{rivals}; {matches}"
+
+    def without_images(self) -> Localized:
+        """Return the result without the images and `joint`, which take megabytes."""
+        rivals = tuple(rival.without_images() for rival in self.rivals)
+        return replace(self, images=(), joint=None, rivals=rivals)
 
     def save(self, path: str | Path) -> None:
         """Write a CSV, a JSON file, or COLMAP's images.txt, by the name of the file. Raises ConfigError for others."""
@@ -170,7 +179,7 @@ def _records(result: Localized) -> list[dict[str, Any]]:
     rivals = [_records(rival) for rival in result.rivals]
     rows: list[Any] = table.to_dict("records")
     for n, row in enumerate(rows):
-        row["camera"] = result.images[n].camera.colmap.record() if result.images else None
+        row["camera"] = result.cameras[n].colmap.record() if result.cameras else None
         row["rivals"] = [rival[n] for rival in rivals]
     return rows
 

@@ -100,7 +100,7 @@ def load_state(
     name: str,
     urls: Sequence[str],
     prepare: Callable[[dict[str, Any]], dict[str, Any]] = dict,
-    option: str = "--mapping.extractor.weights",
+    option: str = "--mapping.extractor.weights (of check and localize --extractor-weights)",
 ) -> nn.Module:
     """Load the weights of a network from a file, or kornia's copy from its cache or the URLs.
 

@@ -89,7 +89,7 @@ class ImageLocalizer:
             raise MapError("the landmarks have no descriptors, so nothing can be localized", path=path, fix=fix)
         extractor = extractor or _extractor_of(path, landmarks)
         result = cls(landmarks, own, QueryImages(model, path), extractor, device)
-        _ = result._localizer  # so that descriptors of another kind are reported before images are read
+        _ = result._localizer.extractor  # so that another extractor and missing weights are reported once
         return result
 
     @cached_property

@@ -23,6 +23,7 @@ from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.select.image_localizer import ImageLocalizer
 from wheretolook.select.localized import figure_of
+from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import ConfigError, MapError, PoseError, TableError
 
 AXES = np.array([(-1, 0.3, 0), (-1, -0.3, 0.1), (0.2, 1, 0)])
@@ -110,6 +111,16 @@ def test_a_prior_is_a_hypothesis_and_an_array_an_image(localizer: ImageLocalizer
         localizer.localize([rgb, rgb])
     with pytest.raises(PoseError):
         localizer.localize([rgb, rgb], turns=np.ones((2, 3, 3)))
+
+
+def test_where_to_look_localizes_in_the_map_that_it_opened(room: MappedRoom, photos: Path) -> None:
+    look = WhereToLook.from_colmap(room.landmarks.parent, method="visible", directions=60, device="cpu")
+    rotations = POSES[:, :, :3] @ POSES[0, :, :3].T
+    result = look.localize([photos / f"{name}.png" for name in "abc"], rotations, "SIMPLE_PINHOLE,640,480,320,320,240")
+    assert_near(result.cam_from_world, POSES)
+    assert result.table()["image"].tolist() == ["a.png", "b.png", "c.png"]
+    with pytest.raises(ConfigError, match="from_colmap"):
+        WhereToLook(look.scorer).localize(photos / "a.png")
 
 
 def test_an_image_of_another_camera_needs_it(localizer: ImageLocalizer, photos: Path) -> None:

@@ -200,7 +200,8 @@ def figure_of(result: Localized, landmarks: Float) -> Figure:
     points = to_world.inverse.apply(landmarks) @ to_world.rotation.T
     found = [one for one in (result, *result.rivals) if one.cam_from_world is not None]
     poses = np.array([np.asarray(one.cam_from_world)[0] for one in found]).reshape(-1, 3, 4)
-    positions, axes = camera_centers(poses) @ to_world.rotation.T, poses[:, 2, :3] @ to_world.rotation.T
+    positions = camera_centers(poses) @ to_world.rotation.T
+    axes = poses[:, 2, :3] @ to_world.rotation.T
     low, high = np.quantile(points, (0.01, 0.99), axis=0)
     off = np.abs(positions - (low + high) / 2).max(axis=1, initial=0)
     drawn = np.flatnonzero((off < (high - low).max()) | (np.arange(len(off)) == 0))  # wrong poses may be far away

@@ -49,6 +49,7 @@ class Select(SelectionRequest, SelectorOptions):
       wheretolook select --map sparse/0 --at path.tum --max-turn 30 --pitch -30 30 --out views.tum
       wheretolook select --map sparse/0 --at path.tum --max-turn 30 --looks 3 --least-score 0.7 --out views.csv
       wheretolook select --map sparse/0 --at path.tum --pan -60 60 --n 3 --apart 20 --out views.csv
+      wheretolook select --map sparse/0 --at waypoints.csv --sigma 0.5 --yaw-sigma 5 --out views.csv
       wheretolook select --map sparse/0 --grid 0.5 --mesh house.glb --fov 60 --out views.csv
 
     Args:
@@ -63,6 +64,8 @@ class Select(SelectionRequest, SelectorOptions):
         "pan": "pan_deg",
         "apart": "apart_deg",
         "max-turn": "max_turn_deg",
+        "sigma": "sigma_m",
+        "yaw-sigma": "yaw_sigma_deg",
         "max-total-turn": "max_total_turn_deg",
     }
 

@@ -25,6 +25,8 @@ class SelectionRequest:
         max_total_turn_deg: with looks, how far the camera turns in all from the first to the last.
         least_score: with max_turn_deg and looks: where the sequence's view scores less, the waypoint becomes a stop
             with the fewest further looks that reach this score jointly, `looks` in all at most.
+        sigma_m: standard deviation in metres of the robot's x and y each: reports the views' expected scores.
+        yaw_sigma_deg: the same of its yaw in degrees.
         skip: leave out waypoints outside the map or inside geometry.
     """
 
@@ -36,6 +38,8 @@ class SelectionRequest:
     max_turn_deg: float | None = None
     max_total_turn_deg: float | None = None
     least_score: float | None = None
+    sigma_m: float | None = None
+    yaw_sigma_deg: float | None = None
     skip: bool = False
 
     def __post_init__(self) -> None:
@@ -47,7 +51,7 @@ class SelectionRequest:
         joint = self.looks is not None
         in_order = self.max_turn_deg is not None
         stopping = self.least_score is not None
-        for name in ("max_turn_deg", "max_total_turn_deg"):
+        for name in ("max_turn_deg", "max_total_turn_deg", "sigma_m", "yaw_sigma_deg"):
             check_range(name, getattr(self, name) or 0, 0)
         reject(
             (self.apart_deg is not None and self.n == 1, "apart_deg needs an n of at least 2", self.apart_deg),

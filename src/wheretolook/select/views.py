@@ -49,6 +49,9 @@ class SelectedViews:
     n_too_far: NDArray[np.int64] | None = None
     n_too_oblique: NDArray[np.int64] | None = None
     n_repeated: Float | None = None
+    # (V,) mean score over draws of an uncertain pose, if asked for, and the highest such mean of any allowed direction
+    expected_score: Float | None = None
+    best_expected_score: Float | None = None
 
     def __len__(self) -> int:
         return len(self.score)
@@ -151,6 +154,7 @@ def _table(views: SelectedViews) -> pd.DataFrame:
         "pitch_deg": views.pitch_deg,
         "score": views.score,
         **({} if views.set_score is None else {"set_score": views.set_score}),
+        **{name: values for name in EXPECTED if (values := getattr(views, name)) is not None},
         "expected_inliers": views.expected_inliers,
         "n_visible": views.n_visible,
         **{name: getattr(views, name) for name in REASONS},
@@ -161,12 +165,15 @@ def _table(views: SelectedViews) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
+EXPECTED = ("expected_score", "best_expected_score")
 REASONS = ("n_occluded", "n_too_far", "n_too_oblique", "n_repeated")
 _DIGITS = {
     "yaw_deg": ".3f",
     "pitch_deg": ".3f",
     "score": ".9g",
     "set_score": ".9g",
+    "expected_score": ".9g",
+    "best_expected_score": ".9g",
     "expected_inliers": ".2f",
     "n_repeated": ".0f",
 }

@@ -1,0 +1,45 @@
+"""Expected scores where the robot's pose is uncertain."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from selection.room import POINTS
+from wheretolook.select.pose_prior import PosePrior
+from wheretolook.select.where_to_look import WhereToLook
+
+
+def expected(prior: PosePrior, score: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Compute expected scores of a view along x at the origin, where only the direction y is allowed."""
+    scorer: Any = SimpleNamespace(score_directions=score)
+    chosen = np.array([0]), np.array([[1.0, 0.0, 0.0]])
+    return prior.expected_scores(scorer, np.zeros((1, 3)), np.array([[0.0, 1.0, 0.0]]), np.ones((1, 1), bool), chosen)
+
+
+def test_means_of_known_scores() -> None:
+    along_x = expected(PosePrior(0.0, 45.0), lambda points, axes: axes[None, :, 0])
+    np.testing.assert_allclose(along_x[0], np.exp(-(np.radians(45) ** 2) / 2), atol=0.12)  # E cos of a normal angle
+    squared = expected(PosePrior(2.0, 0.0), lambda points, axes: np.tile((points**2).sum(1)[:, None], (1, len(axes))))
+    np.testing.assert_allclose(squared[0], 2 * 2.0**2, rtol=0.35)  # two coordinates: no error of height
+    sideways = expected(PosePrior(0.0, 0.0), lambda points, axes: axes[None, :, 1])
+    np.testing.assert_allclose(sideways, [[0.0], [1.0]])
+
+
+def test_views_report_expected_scores(look: WhereToLook, tmp_path: Path) -> None:
+    plain, uncertain = look.best(POINTS, 2), look.best(POINTS, 2, sigma_m=0.5, yaw_sigma_deg=5)
+    assert plain.expected_score is None
+    np.testing.assert_array_equal(uncertain.cam_from_world, plain.cam_from_world)
+    assert uncertain.expected_score is not None and uncertain.best_expected_score is not None
+    assert (uncertain.expected_score <= uncertain.best_expected_score).all()
+    certain = look.best(POINTS, 2, sigma_m=1e-9)
+    assert certain.expected_score is not None
+    np.testing.assert_allclose(certain.expected_score, certain.score, atol=1e-4)
+    uncertain.save(tmp_path / "views.csv")
+    table = pd.read_csv(tmp_path / "views.csv")
+    np.testing.assert_allclose(table["expected_score"], uncertain.expected_score, rtol=1e-6)
+    np.testing.assert_allclose(table["best_expected_score"], uncertain.best_expected_score, rtol=1e-6)

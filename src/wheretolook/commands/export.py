@@ -37,6 +37,8 @@ class Export(CameraOptions, FrameOptions):
         database: the map's database, as of `wheretolook select`.
         mesh: a mesh of the scene, for occlusion.
         spacing: of the grid, in metres.
+        localize: also write the SIFT descriptors and the package wheretolook_localization, which localizes views with
+            NumPy, SciPy and PoseLib.
     """
 
     WRITES: ClassVar = "robot.json"
@@ -47,6 +49,7 @@ class Export(CameraOptions, FrameOptions):
     database: Path | None = None
     mesh: Path | None = None
     spacing: float = 0.5
+    localize: bool = False
 
     def __post_init__(self) -> None:
         check_positive("spacing", self.spacing)
@@ -75,6 +78,10 @@ class Export(CameraOptions, FrameOptions):
             print("the map's camera has distortion, the robot's is the pinhole of its rectified images")
         weights = or_shipped(self.weights) if self.weights else resolve_weights("set", None, source.landmarks.features)
         assert weights is not None
+        if self.localize:
+            from wheretolook.robot.localizer_export import export_localizer
+
+            export_localizer(source.landmarks, self.out)
         export_robot(source.of_camera(camera), weights, self.out, locations)
         print(source.frame.describe())
         print(f"{len(source.landmarks):,} landmarks, a camera of {camera.width} x {camera.height} px: {self.out}")

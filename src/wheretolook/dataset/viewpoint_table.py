@@ -6,6 +6,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from wheretolook.dataset.names import LOCALIZED as LOCALIZED
+from wheretolook.dataset.names import NO_POSE as NO_POSE
+from wheretolook.dataset.names import TOO_FEW_MATCHES as TOO_FEW_MATCHES
 from wheretolook.geometry.poses import Float
 from wheretolook.io.poses import POSE_COLUMNS, pose_values, poses_of_values
 from wheretolook.utils.errors import TableError
@@ -14,9 +17,6 @@ CAMERA_ID = "camera_id"  # optional column
 PIXELS = "matched_pixels"  # optional column
 
 UNLABELLED = "unlabelled"
-LOCALIZED = "localized"
-TOO_FEW_MATCHES = "too_few_matches"
-NO_POSE = "no_pose"
 
 
 def poses(table: pd.DataFrame) -> Float:

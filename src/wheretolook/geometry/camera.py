@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 MAX_SIDE_PX = 10**6  # of an image; COLMAP's limit is not much higher
 MAX_PX = 1e12  # of a focal length or a principal point, whose products stay finite; and no integers without end
+PINHOLES = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2}  # number of focal lengths of COLMAP's pinholes
 MAX_RAY_ERROR = 1e-4  # largest distance between a point's direction and its pixel's ray (chord, about radians)
 
 
@@ -167,6 +168,10 @@ class ColmapCamera(_Image):
     params: tuple[float, ...]  # intrinsics in COLMAP's order for the model
 
     def __post_init__(self) -> None:
+        focal_lengths = PINHOLES.get(self.model)
+        if focal_lengths and len(self.params) == focal_lengths + 2 and np.isfinite(self.params).all():
+            _check_intrinsics(self.width, self.height, self.params[:focal_lengths])
+            return  # a robot has no COLMAP
         import pycolmap
 
         names = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]

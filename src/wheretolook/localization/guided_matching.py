@@ -8,14 +8,17 @@ make it more accurate, and a wrong pose gains few.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.features.matching import Matches
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.estimation import squared_errors
 from wheretolook.localization.rig import Look
+
+if TYPE_CHECKING:
+    from wheretolook.features.matching import Matches
 
 MAX_NEAREST_RATIO = 1.15
 """Maximum ratio of the descriptor distances to a candidate and to the nearest landmark of the map."""

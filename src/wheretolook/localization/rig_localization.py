@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES
+from wheretolook.dataset.names import LOCALIZED, NO_POSE, TOO_FEW_MATCHES
 from wheretolook.geometry.local_origin import poses_from
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.estimation import PoseEstimator

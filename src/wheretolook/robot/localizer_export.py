@@ -1,0 +1,64 @@
+"""Export what a robot needs to localize: descriptors, and copies of the modules that do it without PyTorch."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+import wheretolook
+from wheretolook.features.sift import SIFT
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.utils.errors import MapError
+from wheretolook.utils.files import atomic_write, copy_file, write_text
+
+PACKAGE = "wheretolook_localization"  # of the copies, so that an installed wheretolook does not replace them
+FIRST = "wheretolook.robot.localizer"
+ROOT = Path(wheretolook.__file__).parent
+
+
+def export_localizer(landmarks: Landmarks, out: Path) -> None:
+    """Write descriptors.npy and the package `PACKAGE` into a robot's folder. Raises MapError without SIFT descriptors."""
+    if landmarks.descriptors is None or landmarks.features != SIFT.name:
+        fix = "Give --database with SIFT descriptors, or leave --localize out."
+        raise MapError("a robot localizes by SIFT descriptors", value=landmarks.features or "none", fix=fix)
+    with atomic_write(out / "descriptors.npy") as partial, partial.open("wb") as file:
+        np.save(file, landmarks.descriptors)
+    folder = out / PACKAGE
+    for name in _modules():
+        path = _path(name)
+        assert path is not None
+        text = path.read_text(encoding="utf-8").replace("from wheretolook.", f"from {PACKAGE}.")
+        write_text(folder / path.relative_to(ROOT), text)
+    write_text(folder / "__init__.py", f"from {PACKAGE}.robot.localizer import RobotLocalizer\n")
+    copy_file(ROOT / "localization" / "confidence.json", folder / "localization" / "confidence.json")
+
+
+def _path(module: str) -> Path | None:
+    """Return the file of a module of this package, None for other names."""
+    path = ROOT.joinpath(*module.split(".")[1:]).with_suffix(".py")
+    return path if path.is_file() else None
+
+
+def _modules() -> set[str]:
+    """Return the names of the modules that localizing imports."""
+    found: set[str] = set()
+    left = [FIRST]
+    while left:
+        name = left.pop()
+        path = _path(name)
+        if name not in found and path is not None:
+            found.add(name)
+            left.extend(_imports(ast.parse(path.read_text(encoding="utf-8"))))
+    return found
+
+
+def _imports(node: ast.AST) -> Iterator[str]:
+    """Yield the modules that code imports, apart from those for types only."""
+    if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("wheretolook."):
+        yield str(node.module)
+    if not (isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"):
+        for child in ast.iter_child_nodes(node):
+            yield from _imports(child)

@@ -60,7 +60,7 @@ def view_of(landmarks: Landmarks, pose: Float) -> tuple[np.ndarray, np.ndarray]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("robot")
-    export_localizer(described(), out)
+    export_localizer(described(), described().ids, out)
     return export_robot(LocalizationMap(described(), CAMERA), BUNDLED, out)
 
 
@@ -100,7 +100,7 @@ def test_the_folder_runs_by_itself(folder: Path) -> None:
 def test_poses_are_in_the_frame_of_the_map(tmp_path: Path) -> None:
     landmarks = described()
     frame = Similarity(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2.0, 3.0]))
-    export_localizer(landmarks, tmp_path)
+    export_localizer(landmarks, landmarks.ids, tmp_path)
     there = replace(LocalizationMap(landmarks, CAMERA).frame, world_from_map=frame)
     assert isinstance(there, MapFrame)
     export_robot(LocalizationMap(landmarks, CAMERA, frame=there), BUNDLED, tmp_path)
@@ -117,4 +117,4 @@ def test_invalid_input_is_rejected(folder: Path, tmp_path: Path) -> None:
         with pytest.raises(ValueError):
             robot.localize(views, turns)
     with pytest.raises(MapError):
-        export_localizer(replace(described(), descriptors=None), tmp_path)
+        export_localizer(replace(described(), descriptors=None), described().ids, tmp_path)

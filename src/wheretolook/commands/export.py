@@ -80,8 +80,10 @@ class Export(CameraOptions, FrameOptions):
         assert weights is not None
         if self.localize:
             from wheretolook.robot.localizer_export import export_localizer
+            from wheretolook.select.image_localizer import ImageLocalizer
 
-            export_localizer(source.landmarks, self.out)
+            described = ImageLocalizer.open(self.map, self.database, self.frame_options()).landmarks
+            export_localizer(described, source.landmarks.ids, self.out)
         export_robot(source.of_camera(camera), weights, self.out, locations)
         print(source.frame.describe())
         print(f"{len(source.landmarks):,} landmarks, a camera of {camera.width} x {camera.height} px: {self.out}")

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 import wheretolook
 from wheretolook.features.sift import SIFT
@@ -19,13 +20,21 @@ FIRST = "wheretolook.robot.localizer"
 ROOT = Path(wheretolook.__file__).parent
 
 
-def export_localizer(landmarks: Landmarks, out: Path) -> None:
-    """Write descriptors.npy and the package `PACKAGE` into a robot's folder. Raises MapError without SIFT descriptors."""
+def export_localizer(landmarks: Landmarks, ids: NDArray[np.int64], out: Path) -> None:
+    """Write descriptors.npy, of the landmarks with ids (N,), and the package `PACKAGE` into a robot's folder.
+
+    Raises MapError unless these landmarks have SIFT descriptors.
+    """
     if landmarks.descriptors is None or landmarks.features != SIFT.name:
         fix = "Give --database with SIFT descriptors, or leave --localize out."
         raise MapError("a robot localizes by SIFT descriptors", value=landmarks.features or "none", fix=fix)
+    known = np.isin(landmarks.ids, ids)
+    if known.sum() != len(ids):
+        raise MapError(
+            "the descriptors are of other landmarks", value=f"{known.sum()} of {len(ids)}", fix="Give --database."
+        )
     with atomic_write(out / "descriptors.npy") as partial, partial.open("wb") as file:
-        np.save(file, landmarks.descriptors)
+        np.save(file, landmarks.descriptors[known])
     folder = out / PACKAGE
     for name in _modules():
         path = _path(name)

@@ -12,6 +12,7 @@ from wheretolook.geometry.poses import Float
 from wheretolook.scorers.base import Scorer
 
 DRAWS = 32  # of the true pose, the same at each waypoint
+ALTERNATIVES = 60  # directions with the best scores, which are compared
 
 
 @dataclass(frozen=True)
@@ -41,18 +42,18 @@ class PosePrior:
         chosen: tuple[NDArray[np.int64], Float],
         progress: bool = False,
     ) -> tuple[Float, Float]:
-        """Compute mean scores over draws of the true pose, while the robot turns by its estimate.
+        """Compute mean scores over draws of the true pose outside geometry, while the robot turns by its estimate.
 
         Args:
             scorer: scores views.
             points: (W, 3) m, estimated locations in the world.
             axes: (D, 3) directions scored at each.
-            allowed: (W, D) those that may be chosen.
+            allowed: (W, D) those that are compared.
             chosen: rows of points (V,), and optical axes (V, 3), of the selected views.
             progress: show a bar.
 
         Returns:
-            (V,) of each selected view, and (V,) the highest of all allowed directions at its location.
+            (V,) of each selected view, and (V,) the highest of all compared directions at its location.
         """
         of_view, view_axes = chosen
         expected, best = np.empty(len(of_view)), np.empty(len(of_view))
@@ -60,7 +61,10 @@ class PosePrior:
         for row in tqdm(range(len(points)), desc="prior", unit="waypoint", disable=not progress):
             views = np.flatnonzero(of_view == row)
             directions = np.concatenate([view_axes[views], axes[allowed[row]]])
-            pairs = zip(points[row] + offsets, rotations, strict=True)
+            at = points[row] + offsets
+            free = ~scorer.localization_map.occlusion.inside_geometry(at)
+            free |= ~free.any()
+            pairs = zip(at[free], rotations[free], strict=True)
             scores = [scorer.score_directions(point[None], directions @ turn.T)[0] for point, turn in pairs]
             mean = np.mean(scores, axis=0)
             expected[views], best[views] = mean[: len(views)], mean.max()

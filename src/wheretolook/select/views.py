@@ -49,7 +49,7 @@ class SelectedViews:
     n_too_far: NDArray[np.int64] | None = None
     n_too_oblique: NDArray[np.int64] | None = None
     n_repeated: Float | None = None
-    # (V,) mean score over draws of an uncertain pose, if asked for, and the highest such mean of any allowed direction
+    # (V,) mean score over draws of an uncertain pose, if asked for, and the highest such mean of the best directions
     expected_score: Float | None = None
     best_expected_score: Float | None = None
 

@@ -26,7 +26,7 @@ from wheretolook.planning.config import StopConfig
 from wheretolook.planning.routes import PlannedPath
 from wheretolook.planning.stops import stops_along
 from wheretolook.planning.view_sequence import TurnLimit, best_sequence
-from wheretolook.select.pose_prior import PosePrior
+from wheretolook.select.pose_prior import ALTERNATIVES, PosePrior
 from wheretolook.select.request import SelectionRequest
 from wheretolook.select.views import SelectedViews, joined
 from wheretolook.select.waypoints import Waypoints, grid_waypoints, usable_waypoints
@@ -260,6 +260,7 @@ class WhereToLook:
         if request.sigma_m or request.yaw_sigma_deg:
             prior = PosePrior(request.sigma_m or 0.0, request.yaw_sigma_deg or 0.0)
             chosen = views.waypoint, views.axes @ self.frame.world_from_map.rotation.T
+            allowed &= scores >= -np.sort(-scores, axis=1)[:, :ALTERNATIVES][:, -1:]
             expected, best = prior.expected_scores(self.scorer, waypoints.points, axes, allowed, chosen, progress)
             views = replace(views, expected_score=expected, best_expected_score=best)
         return replace(self._explained(views), waypoint=rows[views.waypoint])

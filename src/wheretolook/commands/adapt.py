@@ -126,19 +126,21 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
     def _adapt_map(self, model: Path, log: Log, progress: Progress) -> Path | None:
         """Adapt to a COLMAP map by its photographs only."""
         from wheretolook.holdout.photo_map import folder_of_check
-        from wheretolook.mapping.colmap_model import read_model
+        from wheretolook.mapping.colmap_model import model_arrays, read_model
+        from wheretolook.mapping.map_frame import find_frame
 
         name = place_name(model)
         target = self._target(name, folder_of_check(self.data, name) / "adapted.safetensors")
         occlusion = "none" if self.occlusion.model == "none" else "hidden-points"
-        files = ColmapFiles(model, frame=self.frame_options())
-        camera_id = next(iter(read_model(model).cameras))  # landmarks and occlusion depend on none
-        environment = ColmapEnvironment(files, camera_id, occlusion, device=self.warp_device)
-        points = environment.landmarks.points
+        reconstruction = read_model(model)
+        arrays = model_arrays(reconstruction)
+        frame = find_frame(model, reconstruction, self.frame_options(), arrays=arrays)
+        log(f"{name}: {'; '.join((frame.describe(), *frame.doubts))}")
+        environment = ColmapEnvironment(ColmapFiles(model), occlusion=occlusion, device=self.warp_device)
         views = self._held_out(model, name, environment.occlusion, target.weights, log)
         _check_enough(views, model)
         with hold(target.path.with_name(f".{target.path.name}.lock"), "adapt"):
-            return self._fit(target, views, points, log, progress)
+            return self._fit(target, views, frame.of_arrays(arrays).points, log, progress)
 
     def _target(self, name: str, path: Path, dataset: Dataset | None = None) -> _Target:
         """Return what is adapted, after checks that fail before the work; `path` is the default of `adapt.out`."""

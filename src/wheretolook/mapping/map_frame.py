@@ -60,11 +60,11 @@ class MapFrame:
         return {"world_from_map": {"scale": similarity.scale, **arrays}, "gravity": self.gravity}
 
     def describe(self) -> str:
-        """State the scale and the direction up in one clause."""
+        """State a known scale and the direction up in one clause."""
         up = "z" if self.gravity == "model" else f"({_rounded(self.world_from_map.rotation[2])}), {self.gravity}"
-        unit = f"{'' if self.scale.is_metric else 'as if '}1 unit of the map = {self.world_from_map.scale:.4g} m"
+        unit = f"1 unit of the map = {self.world_from_map.scale:.4g} m ({self.scale.describe()}), "
         tilt = f", {self.tilt_deg:.0f} degrees from that of its cameras" if self.tilt_deg > NOTABLE_DEG else ""
-        return f"{unit} ({self.scale.describe()}), up: {up}{tilt}"
+        return f"{unit if self.scale.is_metric else ''}up: {up}{tilt}"
 
     def warn(self, model: Path, mapping_distance_m: ArrayLike, cam_from_world: ArrayLike) -> None:
         """Issue a `MapWarning` for each of the `messages`."""

@@ -143,3 +143,14 @@ def test_an_unknown_unit_is_reported(sparse: Path, tmp_path: Path) -> None:
     in_other_units(sparse, tmp_path, 3.0)
     with pytest.warns(MapWarning):
         WhereToLook.from_colmap(tmp_path, weights=WEIGHTS, directions=60, device="cpu")
+
+
+def test_positions_whose_z_is_not_up_are_stated(sparse: Path, tmp_path: Path) -> None:
+    model = pycolmap.Reconstruction(sparse)
+    for turn, tilt_deg in ((np.eye(3), 0), (Y_DOWN, 90)):
+        table = tmp_path / "positions.csv"
+        centers = {image.name: turn @ image.projection_center() for image in model.images.values()}
+        table.write_text("image,x,y,z\n" + "".join(f"{name},{x},{y},{z}\n" for name, (x, y, z) in centers.items()))
+        frame = frame_of(sparse, positions=table)
+        assert frame.tilt_deg == pytest.approx(tilt_deg, abs=3)
+        assert ("90 degrees" in frame.describe()) == (tilt_deg == 90)

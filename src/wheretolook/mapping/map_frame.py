@@ -120,17 +120,21 @@ def find_frame(
     scale = given_scale(model, options, photographs, model_dir)
     known = reported if reported is not None and reported.is_metric else None
     by_depth = None if depth_scale is None else MapScale("depth", depth_scale)
+    level = estimate_gravity(poses)
     if options.positions is not None:
         centers = {image.name: image.projection_center() for image in model.images.values() if image.has_pose}
         scale, similarity = scale_from_positions(centers, read_positions(options.positions))
         _check_agreement(scale, known, by_depth)
-        return MapFrame(similarity, scale, "given")
+        return MapFrame(similarity, scale, "given", _tilt_deg(similarity.rotation, level))
     _check_agreement(scale or known, known, by_depth)
     chosen = scale or known or by_depth or reported or scale_from_depths(arrays or model_arrays(model), poses)
-    level = estimate_gravity(poses)
     gravity, rotation = _upright(model_dir, poses, options, level, is_known=reported is not None)
-    tilt_deg = float(np.degrees(np.arccos(np.clip(rotation[2] @ level.up, -1, 1))))
-    return MapFrame(Similarity(chosen.factor, rotation, np.zeros(3)), chosen, gravity, tilt_deg)
+    return MapFrame(Similarity(chosen.factor, rotation, np.zeros(3)), chosen, gravity, _tilt_deg(rotation, level))
+
+
+def _tilt_deg(rotation: Float, level: Gravity) -> float:
+    """Angle between the z axis of a rotated map and up as its cameras were held."""
+    return float(np.degrees(np.arccos(np.clip(rotation[2] @ level.up, -1, 1))))
 
 
 def reported_scale(model_dir: Path) -> MapScale | None:
@@ -176,8 +180,8 @@ def _upright(
 ) -> tuple[Literal["given", "levelled", "model"], Float]:
     """Return how the direction up is known, and the rotation (3, 3) that turns it to z.
 
-    `level` is up as the cameras were held. Without options it is z if that is known, or unless the cameras, poses (M, 3, 4), are clearly not level. A user who
-    states that z is up keeps it, however the cameras were held.
+    `level` is up as the cameras were held. Without options it is z if that is known, or unless the cameras, poses
+    (M, 3, 4), are clearly not level. A user who states that z is up keeps it, however the cameras were held.
     """
     up = options.up_direction()
     if up is None:

@@ -113,6 +113,15 @@ def test_a_prior_is_a_hypothesis_and_an_array_an_image(localizer: ImageLocalizer
         localizer.localize([rgb, rgb], turns=np.ones((2, 3, 3)))
 
 
+def test_the_probability_is_that_of_the_accuracy(localizer: ImageLocalizer, photos: Path) -> None:
+    coarse, fine = (localizer.localize(photos / "a.png", accuracy=limits) for limits in ((0.5, 5.0), (0.0005, 0.005)))
+    assert coarse.probability > 0.9 and fine.probability < coarse.probability / 2
+    np.testing.assert_array_equal(coarse.cam_from_world, fine.cam_from_world)
+    for limits in ((0.0, 1.0), (0.1,), (np.nan, 1.0)):
+        with pytest.raises(ConfigError, match="accuracy"):
+            localizer.localize(photos / "a.png", accuracy=limits)
+
+
 def test_where_to_look_localizes_in_the_map_that_it_opened(room: MappedRoom, photos: Path) -> None:
     look = WhereToLook.from_colmap(room.landmarks.parent, method="visible", directions=60, device="cpu")
     rotations = POSES[:, :, :3] @ POSES[0, :, :3].T

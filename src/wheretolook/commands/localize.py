@@ -40,8 +40,7 @@ class Localize(CameraOptions, FrameOptions):
     Results (--out), in the map's own frame and unit; a row for each image:
       csv, json    x, y, z: camera centre; qw, qx, qy, qz: camera-to-world; json with all rivals
       images.txt   COLMAP's, world-to-camera, the localized images only
-    probability is that of the pose to be within 5 cm and 0.4 degrees; in a map of unknown unit, within 1 % of its median
-    depth. deviation is one standard deviation of the position. Rivals are other poses that matches support. An image
+    probability is that of the pose to be within the accuracy; in a map of unknown unit, its median depth counts as 5 m. deviation is one standard deviation of the position. Rivals are other poses that matches support. An image
     that is not localized has the reason.
 
     Examples:
@@ -56,6 +55,7 @@ class Localize(CameraOptions, FrameOptions):
         out: file of the poses: .csv, .json or images.txt.
         figure: also draw matches, pose and rivals: a file .png, .pdf or .svg; for several images a folder.
         prior: rough x,y,z of the camera in the map, and perhaps its yaw in degrees: one more hypothesis.
+        accuracy: limits of the errors in metres and degrees that the probability refers to.
         database: COLMAP's database.db or hloc's feats-*.h5.
         extractor: extractor for the images: opencv, colmap, aliked, disk or xfeat.
         extractor_weights: weights of a learned extractor; see docs/features.md.
@@ -70,6 +70,7 @@ class Localize(CameraOptions, FrameOptions):
     out: Path | None = None
     figure: Path | None = None
     prior: tuple[float, ...] | None = None
+    accuracy: tuple[float, float] = (0.05, 0.4)
     database: Path | None = None
     extractor: str | None = None
     extractor_weights: str = ""
@@ -140,10 +141,10 @@ class Localize(CameraOptions, FrameOptions):
 
         camera = localizer.images.known_camera(self.named_camera())
         if self.turns is not None or len(paths) == 1:
-            yield localizer.localize(paths, self.turns, camera, self.prior)
+            yield localizer.localize(paths, self.turns, camera, self.prior, self.accuracy)
             return
         for path in tqdm(paths, desc="localize", unit="image"):
-            yield localizer.localize_or_fail(path, camera, self.prior)
+            yield localizer.localize_or_fail(path, camera, self.prior, self.accuracy)
 
     def _draw(self, result: Localized, localizer: ImageLocalizer) -> None:
         from wheretolook.figures.style import save_figure

@@ -1,19 +1,27 @@
-"""Predicts whether a joint pose is right, from what a robot knows without ground truth.
+"""Predicts the probability that a pose is right within any accuracy, from what a robot knows without ground truth.
 
 Where a map resembles itself, a wrong pose can have a hundred inliers. But then a competing pose has nearly as many, or
 has fewer that the ambiguity does not explain; the right pose explains all views much better than any competing pose.
+
+P(error below t) = P(right place) P(error below t | right place). A logistic regression predicts the first factor. In the
+second, the log of an error is normal, with a mean linear in the log of the standard deviation that the inliers give the
+pose. Errors of position and orientation correlate at 0.84, so the smaller of their two probabilities is used.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.pose_ambiguity import log_ratio
+from wheretolook.utils.errors import WeightsError
+from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.shipped_model import LogisticRegression
 
 if TYPE_CHECKING:
@@ -23,6 +31,15 @@ FEATURE_NAMES = ("log_elsewhere", "log_share", "log_own", "log_deviation_deg")
 """log(1 + support of the best competing pose), log of the inlier ratio of the matches, log of the ratio of this pose's
 unique support to that of its strongest rival (`pose_ambiguity.log_ratio`), log of one standard deviation of the
 orientation (degrees)."""
+
+Accuracy = tuple[float, float]
+"""Limits of the position error (m) and of the orientation error (degrees)."""
+
+ACCURACY: Accuracy = (0.05, 0.4)
+RIGHT_PLACE: Accuracy = (math.inf, math.inf)
+"""Accuracy that every pose at the right place has: within `RIGHT_PLACE_LIMITS` of the true one."""
+
+RIGHT_PLACE_LIMITS: Accuracy = (0.5, 5.0)
 
 MIN_INLIERS = 10  # with fewer, the localizer itself rejects a pose
 MIN_DEVIATION_DEG = 1e-4
@@ -45,15 +62,47 @@ def confidence_features(
     return np.stack([rival, np.log(inlier_ratio), support_ratio, np.log(deviation)], axis=-1)
 
 
+@dataclass(frozen=True)
+class ErrorModel:
+    """Log-normal distribution of an error: log(error) has the mean slope * log(predicted deviation) + offset."""
+
+    slope: float
+    offset: float
+    deviation: float  # of the log
+
+    def p_below(self, limit: float, predicted: float) -> float:
+        """Probability that the error is below a limit, given its predicted standard deviation in the same unit."""
+        if math.isinf(limit):
+            return 1.0
+        if not (predicted > 0 and math.isfinite(predicted)):
+            return float(predicted == 0)
+        z = (math.log(limit) - self.slope * math.log(predicted) - self.offset) / self.deviation
+        return 0.5 * math.erfc(-z / math.sqrt(2))
+
+
+@dataclass(frozen=True)
 class ConfidenceModel(LogisticRegression):
-    """Probability that a pose is within 5 cm and 0.4 degrees; 0 with fewer inliers than `MIN_INLIERS`."""
+    """Probability that a pose is right within an accuracy; 0 with fewer inliers than `MIN_INLIERS`."""
 
     names = FEATURE_NAMES
     about = "confidence"
     file = Path(__file__).with_name("confidence.json")
 
-    def of(self, localization: JointLocalization) -> float:
-        """Confidence in a joint pose, 0 if there is none."""
+    errors: tuple[ErrorModel, ...] = ()  # of the position (m) and of the orientation (degrees)
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read the JSON file of both factors. Raises a WeightsError if it is damaged."""
+        place = super().load(path)
+        try:
+            stored = read_json_object(path)["errors"]
+            errors = tuple(ErrorModel(**stored[name]) for name in ("position", "orientation"))
+        except (OSError, KeyError, TypeError) as error:
+            raise WeightsError(f"a damaged file of {cls.about}: {error}", path=path, fix="Fit it again.") from error
+        return cls(place.weights, place.bias, errors)
+
+    def of(self, localization: JointLocalization, accuracy: Accuracy = ACCURACY) -> float:
+        """Probability that a joint pose is within an accuracy, 0 if there is no pose."""
         if localization.n_inliers < MIN_INLIERS:
             return 0.0
         features = confidence_features(
@@ -63,4 +112,12 @@ class ConfidenceModel(LogisticRegression):
             *localization.unique_support,
             localization.deviation[1],
         )
-        return float(self.predict_proba(features))
+        limits = zip(self.errors, accuracy, localization.deviation, strict=True)
+        return float(self.predict_proba(features)) * min(model.p_below(limit, own) for model, limit, own in limits)
+
+
+def probabilities(localization: JointLocalization, accuracy: Accuracy = ACCURACY) -> Float:
+    """Probabilities (1 + rivals,) that the pose and each of its rivals are within an accuracy, in sum at most 1."""
+    model = ConfidenceModel.bundled()
+    found = np.array([model.of(pose, accuracy) for pose in (localization, *localization.rivals)])
+    return found / max(1.0, float(found.sum()))

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float
-from wheretolook.localization.confidence import ConfidenceModel
+from wheretolook.localization.confidence import ACCURACY, Accuracy, probabilities
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator
 from wheretolook.localization.guided_matching import Candidates
@@ -44,7 +44,7 @@ class RobotPose:
     """A pose hypothesis: of the rig, which for a single image is the camera."""
 
     cam_from_world: Float  # (3, 4) in the map's own frame and unit
-    probability: float  # that it is within 5 cm and 0.4 degrees
+    probability: float  # that it is within the accuracy
     n_inliers: int
 
 
@@ -73,12 +73,18 @@ class RobotLocalizer:
         self._config = LocalizerConfig(method="hypotheses")
         self._localizer = JointLocalizer(PoseEstimator(points, self._config), TURN_NOISE_DEG)
 
-    def localize(self, views: Sequence[tuple[ArrayLike, ArrayLike]], turns: ArrayLike | None = None) -> list[RobotPose]:
+    def localize(
+        self,
+        views: Sequence[tuple[ArrayLike, ArrayLike]],
+        turns: ArrayLike | None = None,
+        accuracy: Accuracy = ACCURACY,
+    ) -> list[RobotPose]:
         """Localize one view or several from one location; returns the best pose and its rivals, empty if there is none.
 
         Args:
             views: pixels (K, 2) and descriptors (K, 128) uint8 of the keypoints of each.
             turns: rotations `cam_from_rig` (N, 3, 3) of several views.
+            accuracy: limits in metres and degrees that the probability refers to.
         """
         if (turns is None and len(views) != 1) or not views:
             raise ValueError("several views are localized together by their rotations: give turns")
@@ -89,10 +95,10 @@ class RobotLocalizer:
         result = self._localizer.localize([self._look(*view, pose) for view, pose in zip(views, poses, strict=True)])
         if result.rig_from_world is None:
             return []
-        model = ConfidenceModel.bundled()
+        found = zip((result, *result.rivals), probabilities(result, accuracy), strict=True)
         return [
-            RobotPose(self._in_map(pose.rig_from_world), model.of(pose), pose.n_inliers)
-            for pose in (result, *result.rivals)
+            RobotPose(self._in_map(pose.rig_from_world), float(probability), pose.n_inliers)
+            for pose, probability in found
             if pose.rig_from_world is not None
         ]
 

@@ -16,7 +16,7 @@ from wheretolook.features.matching import Matches
 from wheretolook.features.registry import kind_of, runnable_extractors
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
-from wheretolook.localization.confidence import ConfidenceModel
+from wheretolook.localization.confidence import ACCURACY, Accuracy, probabilities
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.prior import PosePrior, matches_among
@@ -107,6 +107,7 @@ class ImageLocalizer:
         turns: str | Path | ArrayLike | None = None,
         camera: Camera | int | None = None,
         prior: Sequence[float] | None = None,
+        accuracy: Accuracy = ACCURACY,
     ) -> Localized:
         """Localize an image, or several from one location of which the rotations are known.
 
@@ -118,6 +119,7 @@ class ImageLocalizer:
                 length, see `QueryImages`.
             prior: rough location x, y, z of the camera in the map, and perhaps yaw in degrees of an image: one more
                 hypothesis, which wins only if the matches support it best.
+            accuracy: limits in metres and degrees that the probability refers to.
 
         Raises:
             MapError, PoseError, ConfigError: an image cannot be read or is none, its camera is unknown or other than
@@ -136,18 +138,25 @@ class ImageLocalizer:
             raise ConfigError("several images are localized together by their rotations", value=len(given), fix=fix)
         camera = self.images.known_camera(camera)
         queries = [self.images.read(image, Path(name).name, camera) for image, name in zip(given, names, strict=True)]
-        return self._localized(queries, cam_from_rig, None if prior is None else self._prior(prior))
+        near = None if prior is None else self._prior(prior)
+        return self._localized(queries, cam_from_rig, near, checked_accuracy(accuracy))
 
     def localize_or_fail(
-        self, image: Path, camera: Camera | int | None = None, prior: Sequence[float] | None = None
+        self,
+        image: Path,
+        camera: Camera | int | None = None,
+        prior: Sequence[float] | None = None,
+        accuracy: Accuracy = ACCURACY,
     ) -> Localized:
         """Localize an image of a batch: an error becomes the reason why it is not localized."""
         try:
-            return self.localize(image, None, camera, prior)
+            return self.localize(image, None, camera, prior, accuracy)
         except WhereToLookError as error:
             return Localized((image.name,), FAILED, str(error), frame=self.frame)
 
-    def _localized(self, queries: Sequence[QueryImage], cam_from_rig: Float, prior: PosePrior | None) -> Localized:
+    def _localized(
+        self, queries: Sequence[QueryImage], cam_from_rig: Float, prior: PosePrior | None, accuracy: Accuracy
+    ) -> Localized:
         keypoints = [self._localizer.extractor.extract(query.rgb) for query in queries]
         matches = self._localizer.match(keypoints)
         rig = self._rigs if len(queries) > 1 else self._localizer.joint
@@ -161,9 +170,7 @@ class ImageLocalizer:
                 look = self._localizer.look(of_image, near, query.camera, pose)
                 poses[-1] += rig.single_view_poses(look, 1)
         joint = rig.localize(looks, poses)
-        model = ConfidenceModel.bundled()
-        probabilities = np.array([model.of(pose) for pose in (joint, *joint.rivals)])
-        return Localized.of(queries, joint, probabilities, self.frame)
+        return Localized.of(queries, joint, probabilities(joint, accuracy), self.frame)
 
     def _near(self, matches: Matches, camera: Camera, prior: PosePrior) -> Matches:
         """Return the matches with landmarks that the prior allows."""
@@ -188,6 +195,14 @@ class ImageLocalizer:
             problem = "the camera moved between the images, and the unit of the map is unknown"
             raise ConfigError(problem, value=f"{moved:.2g} m", fix="Give --scale.")
         return cam_from_rig * (1, 1, 1, 0)
+
+
+def checked_accuracy(accuracy: Sequence[float]) -> Accuracy:
+    """Return limits of the errors in metres and degrees. Raises ConfigError unless they are two positive numbers."""
+    limits = tuple(float(limit) for limit in accuracy)
+    if len(limits) != 2 or not min(limits) > 0:
+        raise ConfigError("an accuracy has two positive limits", value=accuracy, fix="Give metres,degrees: 0.05,0.4.")
+    return limits
 
 
 def _extractor_of(path: Path, landmarks: Landmarks) -> ExtractorConfig:

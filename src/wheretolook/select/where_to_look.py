@@ -19,6 +19,7 @@ from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along, rigid_poses
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.inputs.reasons import ReasonCounter
+from wheretolook.localization.confidence import ACCURACY, Accuracy
 from wheretolook.looks.selection import best_views, separated
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.map_frame import MapFrame
@@ -157,6 +158,7 @@ class WhereToLook:
         turns: str | Path | ArrayLike | None = None,
         camera: Camera | str | int | None = None,
         prior: Sequence[float] | None = None,
+        accuracy: Accuracy = ACCURACY,
     ) -> Localized:
         """Localize an image, or several from one location with `turns`, in the map; needs its descriptors.
 
@@ -166,11 +168,12 @@ class WhereToLook:
             camera: of the images, or its camera_id in the model; None for the model's, or a pinhole of the EXIF focal
                 length.
             prior: rough x, y, z of the camera, and perhaps yaw in degrees: one more hypothesis.
+            accuracy: limits in metres and degrees that the probability refers to.
 
         Raises errors as `wheretolook.select.image_localizer.ImageLocalizer.open` and `.localize`.
         """
         camera = parse_camera(camera) if isinstance(camera, str) else camera
-        return self._localizer.localize(images, turns, camera, prior)
+        return self._localizer.localize(images, turns, camera, prior, accuracy)
 
     @cached_property
     def _localizer(self) -> ImageLocalizer:

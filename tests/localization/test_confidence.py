@@ -1,0 +1,51 @@
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import lognorm
+
+from wheretolook.localization.confidence import ACCURACY, RIGHT_PLACE, ConfidenceModel, ErrorModel, probabilities
+from wheretolook.localization.rig_localization import JointLocalization
+from wheretolook.utils.errors import WeightsError
+
+
+def pose(n_inliers: int, deviation_m: float, rivals: tuple[JointLocalization, ...] = ()) -> JointLocalization:
+    """A result with inliers and a deviation, and no landmarks."""
+    covariance = np.diag([deviation_m**2, 0, 0, (deviation_m / 5) ** 2, 0, 0])
+    inliers = (np.ones(n_inliers, dtype=bool),)
+    unique = (n_inliers // 3, 2)
+    return JointLocalization(
+        "localized", (), 2 * n_inliers, np.eye(3, 4), None, inliers, float(n_inliers), 5.0, unique, covariance, rivals
+    )
+
+
+def test_the_error_is_log_normal() -> None:
+    model = ErrorModel(1.2, 0.3, 0.8)
+    expected = lognorm(s=0.8, scale=math.exp(1.2 * math.log(0.02) + 0.3)).cdf(0.05)
+    assert model.p_below(0.05, 0.02) == pytest.approx(expected)
+    assert model.p_below(math.inf, math.inf) == 1 and model.p_below(0.05, math.inf) == 0 and model.p_below(0.05, 0) == 1
+
+
+def test_a_coarser_accuracy_is_more_probable_up_to_the_right_place() -> None:
+    model = ConfidenceModel.bundled()
+    found = [model.of(pose(200, 0.02), limits) for limits in ((0.01, 0.1), ACCURACY, (0.25, 2.0), RIGHT_PLACE)]
+    assert found == sorted(found) and found[0] < 0.5 < found[1]
+    assert model.of(pose(200, 0.02), (1e6, 180.0)) == pytest.approx(found[-1], abs=1e-6)
+    assert model.of(pose(5, 0.02)) == 0
+
+
+def test_poses_that_exclude_each_other_have_probabilities_up_to_one_together() -> None:
+    strong = pose(300, 0.01)
+    found = probabilities(pose(300, 0.01, (strong, pose(30, 0.1))), RIGHT_PLACE)
+    assert found.shape == (3,) and found.sum() == pytest.approx(1) and found[0] == found[1] > found[2]
+    assert probabilities(JointLocalization("no_pose", (), 0)).tolist() == [0]
+
+
+def test_a_file_without_the_model_of_errors_is_damaged(tmp_path: Path) -> None:
+    stored = json.loads(ConfidenceModel.file.read_text())
+    del stored["errors"]["position"]["slope"]
+    (tmp_path / "confidence.json").write_text(json.dumps(stored))
+    with pytest.raises(WeightsError, match="damaged"):
+        ConfidenceModel.load(tmp_path / "confidence.json")

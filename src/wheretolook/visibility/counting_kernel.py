@@ -91,15 +91,18 @@ def classify_field_kernel(
 def runs_kernel(
     classes: wp.array2d[wp.uint8],
     size: wp.int32,
-    wanted: wp.int32,
     write: wp.bool,
     starts: wp.array[wp.int32],
     numbers: wp.array[wp.int32],
     cells: wp.array[wp.vec2i],
 ):
-    """Count the runs of cells of a class in each row of the map and, with `write`, list them from `starts` on."""
-    orientation, row = wp.tid()
-    index = orientation * size + row
+    """Count the runs of cells of each class in each row of the map and, with `write`, list them from `starts` on.
+
+    Those of class INSIDE come first, in all orientations.
+    """
+    border, orientation, row = wp.tid()
+    wanted = wp.where(border == 1, BORDER, INSIDE)
+    index = (border * classes.shape[0] + orientation) * size + row
     number = wp.int32(0)
     first = wp.int32(-1)
     for column in range(size + 1):
@@ -303,6 +306,20 @@ def count_field_kernel(
         list_unsure(location, orientation, landmarks.offsets[entry], n_unsure, unsure_pairs, unsure_offsets)
     if count > 0:
         wp.atomic_add(counts, location, orientation, count)
+
+
+@wp.kernel
+def best_kernel(counts: wp.array2d[wp.int32], best: wp.array2d[wp.int32]):
+    """List the directions with the highest counts, ties by direction; each thread finds the rank of one direction."""
+    location, direction = wp.tid()
+    count = counts[location, direction]
+    rank = wp.int32(0)
+    for other in range(counts.shape[1]):
+        difference = counts[location, other] - count
+        if difference > 0 or (difference == 0 and other < direction):
+            rank += 1
+    if rank < best.shape[1]:
+        best[location, rank] = direction
 
 
 @wp.kernel

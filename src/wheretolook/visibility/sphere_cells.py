@@ -75,18 +75,19 @@ class SphereCells:
             margin = float(ROUNDING * np.linalg.norm(sides, axis=-1).max(initial=0))
             inputs = [upload(sides, wp.vec3), upload(corners, wp.vec3), size, margin]
             wp.launch(kernels.classify_pinhole_kernel, shape, inputs, [classes], device=device)
-        return cls(size, _runs(classes, size, kernels.INSIDE), _runs(classes, size, kernels.BORDER))
+        return cls(size, *_runs(classes, size))
 
 
-def _runs(classes: Any, size: int, wanted: int) -> CellRuns:
+def _runs(classes: Any, size: int) -> tuple[CellRuns, CellRuns]:
+    """Runs of cells of the classes INSIDE and BORDER, from the classes (D, size * size) of all cells."""
     device = classes.device
-    rows = (classes.shape[0], size)
-    n_rows = rows[0] * rows[1]
-    numbers: Any = wp.zeros(n_rows + 1, dtype=wp.int32, device=device)
+    shape = (2, classes.shape[0], size)
+    n_rows = classes.shape[0] * size
+    numbers: Any = wp.zeros(2 * n_rows + 1, dtype=wp.int32, device=device)
     none: list[Any] = [wp.empty(0, dtype=dtype, device=device) for dtype in (wp.int32, wp.vec2i)]
-    wp.launch(kernels.runs_kernel, rows, [classes, size, wanted, False, none[0]], [numbers, none[1]], device=device)
-    starts: Any = wp.empty(n_rows + 1, dtype=wp.int32, device=device)
+    wp.launch(kernels.runs_kernel, shape, [classes, size, False, none[0]], [numbers, none[1]], device=device)
+    starts: Any = wp.empty_like(numbers)
     wp.utils.array_scan(numbers, starts, inclusive=False)
-    cells: Any = wp.empty(int(starts[n_rows:].numpy()[0]), dtype=wp.vec2i, device=device)
-    wp.launch(kernels.runs_kernel, rows, [classes, size, wanted, True, starts], [numbers, cells], device=device)
-    return CellRuns(starts, cells)
+    cells: Any = wp.empty(int(starts[2 * n_rows :].numpy()[0]), dtype=wp.vec2i, device=device)
+    wp.launch(kernels.runs_kernel, shape, [classes, size, True, starts], [numbers, cells], device=device)
+    return CellRuns(starts[: n_rows + 1], cells), CellRuns(starts[n_rows:], cells)

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.memory import fitting
 from wheretolook.visibility.counting import FrustumCounter
-from wheretolook.visibility.counting_kernel import pack_kernel
+from wheretolook.visibility.counting_kernel import best_kernel, pack_kernel
 from wheretolook.visibility.occlusion import DevicePoints, OcclusionModel, StoredOcclusion
 
 BYTES_TO_RANK = 4  # of every direction at every location, for those who ask which rank it has
@@ -75,7 +76,8 @@ def survey(
     on_gpu = wp.get_device(landmarks.device).is_cuda
     workers = 1 if on_gpu or occlusion.uses_all_cores else (options.threads or len(os.sched_getaffinity(0)))
     scratch = max(1, options.memory_bytes // (4 * workers))
-    counter = options.counter(camera, np.asarray(rotations), n_points, landmarks.device, scratch_bytes=scratch)
+    directions = np.asarray(rotations, dtype=np.float64).tobytes()
+    counter = _counter(options.counter, camera, directions, n_points, landmarks.device, scratch)  # type: ignore[arg-type]
     n_directions = len(counter.rotations)
     _check_counts(len(at), n_directions)
     workers, block = _workers_and_block(counter, len(at), n_points, workers, options.memory_bytes, occlusion)
@@ -89,10 +91,14 @@ def survey(
     def work(rows: slice) -> int:
         mask = occlusion.unoccluded_on_device(at[rows], landmarks)
         counted = counter.count(at[rows], landmarks.double, mask)
-        best[rows] = _best(counted, keep, on_gpu)
-        counts[rows] = counted.numpy()
-        if options.keep_occlusion:
-            packed[rows] = all_free if mask is None else _pack(mask, landmarks)
+        results: list[tuple[Any, NDArray[Any]]] = [(counted, counts), (_best(counted, keep), best)]
+        if options.keep_occlusion and mask is not None:
+            results.append((_pack(mask, landmarks), packed))
+        elif options.keep_occlusion:
+            packed[rows] = all_free
+        for values, result in results:  # all kernels are in the GPU's queue before the first copy waits for them
+            wp.copy(wp.array(result[rows], dtype=values.dtype, device="cpu", copy=False), values)
+        wp.synchronize_device(landmarks.device)
         return rows.stop - rows.start
 
     blocks = [slice(start, min(start + block, len(at))) for start in range(0, len(at), block)]
@@ -101,6 +107,16 @@ def survey(
             bar.update(done)
     stored = StoredOcclusion(at, packed, n_points, occlusion.name) if options.keep_occlusion else None
     return Survey(counts, best, stored)
+
+
+@lru_cache(maxsize=2)
+def _counter(
+    kind: Any, camera: Camera, rotations: bytes, n_points: int, device: str, scratch_bytes: int
+) -> FrustumCounter:
+    """The counter for rotations (D, 3, 3) of float64, kept for the next survey of the same directions."""
+    axes = np.frombuffer(rotations).reshape(-1, 3, 3)
+    counter: FrustumCounter = kind(camera, axes, n_points, device, scratch_bytes=scratch_bytes)
+    return counter
 
 
 def _check_counts(n_locations: int, n_directions: int) -> None:
@@ -139,19 +155,17 @@ def _each(work: Callable[[slice], int], blocks: list[slice], workers: int) -> It
         yield from pool.map(work, blocks)
 
 
-def _best(counts: Any, keep: int, on_gpu: bool) -> NDArray[np.int32]:
-    """The directions (L, K) with the highest of the counts (L, D), ties by direction."""
-    if not on_gpu:
-        return np.argsort(-counts.numpy(), axis=1, kind="stable")[:, :keep].astype(np.int32)
-    import torch
-
-    wp.synchronize_device(counts.device)  # Torch works on a stream of its own
-    order = torch.sort(wp.to_torch(counts), dim=1, descending=True, stable=True).indices
-    return np.asarray(order[:, :keep].to(torch.int32).cpu().numpy())
+def _best(counts: Any, keep: int) -> Any:
+    """The directions (L, K) with the highest of the counts (L, D), ties by direction; Warp arrays of int32."""
+    if counts.device.is_cpu:
+        return wp.array(np.argsort(-counts.numpy(), axis=1, kind="stable")[:, :keep], dtype=wp.int32, device="cpu")
+    best: Any = wp.empty((counts.shape[0], keep), dtype=wp.int32, device=counts.device)
+    wp.launch(best_kernel, counts.shape, [counts], [best], device=counts.device)
+    return best
 
 
-def _pack(mask: Any, landmarks: DevicePoints) -> NDArray[np.uint8]:
+def _pack(mask: Any, landmarks: DevicePoints) -> Any:
     """A mask (L, N) in the device's order as bits (L, ceil(N / 8)) in the map's order, as `numpy.packbits` has them."""
     packed: Any = wp.empty((mask.shape[0], (mask.shape[1] + 7) // 8), dtype=wp.uint8, device=mask.device)
     wp.launch(pack_kernel, packed.shape, [mask, landmarks.rank], [packed], device=mask.device)
-    return np.asarray(packed.numpy())
+    return packed

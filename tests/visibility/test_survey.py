@@ -60,7 +60,7 @@ def test_a_survey_is_what_its_plain_parts_say(random_views: RandomViews, threads
 def test_the_best_directions_are_those_of_a_stable_sort(directions: int, keep: int, device: str) -> None:
     counts = np.random.default_rng(0).integers(0, 9, (6, directions)).astype(np.int32)
     best = wp.empty((6, keep), dtype=wp.int32, device=start_warp(device))
-    wp.launch(best_kernel, counts.shape, [wp.array(counts, device=device)], [best], device=device)
+    wp.launch(best_kernel, counts.shape, [wp.array(counts, device=device), directions, keep], [best], device=device)
     np.testing.assert_array_equal(best.numpy(), np.argsort(-counts, axis=1, kind="stable")[:, :keep])
 
 

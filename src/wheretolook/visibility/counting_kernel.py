@@ -90,6 +90,7 @@ def classify_field_kernel(
 @wp.kernel
 def runs_kernel(
     classes: wp.array2d[wp.uint8],
+    n_orientations: wp.int32,
     size: wp.int32,
     write: wp.bool,
     starts: wp.array[wp.int32],
@@ -102,7 +103,7 @@ def runs_kernel(
     """
     border, orientation, row = wp.tid()
     wanted = wp.where(border == 1, BORDER, INSIDE)
-    index = (border * classes.shape[0] + orientation) * size + row
+    index = (border * n_orientations + orientation) * size + row
     number = wp.int32(0)
     first = wp.int32(-1)
     for column in range(size + 1):
@@ -309,16 +310,16 @@ def count_field_kernel(
 
 
 @wp.kernel
-def best_kernel(counts: wp.array2d[wp.int32], best: wp.array2d[wp.int32]):
+def best_kernel(counts: wp.array2d[wp.int32], n_directions: wp.int32, keep: wp.int32, best: wp.array2d[wp.int32]):
     """List the directions with the highest counts, ties by direction; each thread finds the rank of one direction."""
     location, direction = wp.tid()
     count = counts[location, direction]
     rank = wp.int32(0)
-    for other in range(counts.shape[1]):
+    for other in range(n_directions):
         difference = counts[location, other] - count
         if difference > 0 or (difference == 0 and other < direction):
             rank += 1
-    if rank < best.shape[1]:
+    if rank < keep:
         best[location, rank] = direction
 
 

@@ -85,9 +85,10 @@ def _runs(classes: Any, size: int) -> tuple[CellRuns, CellRuns]:
     n_rows = classes.shape[0] * size
     numbers: Any = wp.zeros(2 * n_rows + 1, dtype=wp.int32, device=device)
     none: list[Any] = [wp.empty(0, dtype=dtype, device=device) for dtype in (wp.int32, wp.vec2i)]
-    wp.launch(kernels.runs_kernel, shape, [classes, size, False, none[0]], [numbers, none[1]], device=device)
+    inputs = [classes, classes.shape[0], size]
+    wp.launch(kernels.runs_kernel, shape, [*inputs, False, none[0]], [numbers, none[1]], device=device)
     starts: Any = wp.empty_like(numbers)
     wp.utils.array_scan(numbers, starts, inclusive=False)
     cells: Any = wp.empty(int(starts[2 * n_rows :].numpy()[0]), dtype=wp.vec2i, device=device)
-    wp.launch(kernels.runs_kernel, shape, [classes, size, True, starts], [numbers, cells], device=device)
+    wp.launch(kernels.runs_kernel, shape, [*inputs, True, starts], [numbers, cells], device=device)
     return CellRuns(starts[: n_rows + 1], cells), CellRuns(starts[n_rows:], cells)

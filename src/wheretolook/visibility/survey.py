@@ -160,7 +160,7 @@ def _best(counts: Any, keep: int) -> Any:
     if counts.device.is_cpu:
         return wp.array(np.argsort(-counts.numpy(), axis=1, kind="stable")[:, :keep], dtype=wp.int32, device="cpu")
     best: Any = wp.empty((counts.shape[0], keep), dtype=wp.int32, device=counts.device)
-    wp.launch(best_kernel, counts.shape, [counts], [best], device=counts.device)
+    wp.launch(best_kernel, counts.shape, [counts, counts.shape[1], keep], [best], device=counts.device)
     return best
 
 

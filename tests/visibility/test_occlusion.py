@@ -11,7 +11,7 @@ from box_scenes import quads_mesh
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import TableError
-from wheretolook.visibility.occlusion import MeshOcclusion, StoredOcclusion, hilbert_codes
+from wheretolook.visibility.occlusion import MeshOcclusion, StoredOcclusion
 
 
 def screen() -> TexturedMesh:
@@ -56,11 +56,3 @@ def test_stored_occlusion_comes_back_by_location(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:60])
     with pytest.raises(TableError):
         StoredOcclusion.load(path)
-
-
-def test_neighbours_along_the_hilbert_curve_are_neighbours_in_space() -> None:
-    grid = np.stack(np.meshgrid(*[np.arange(16.0)] * 3), -1).reshape(-1, 3)
-    cells = np.random.default_rng(0).permutation(grid)
-    along = cells[np.argsort(hilbert_codes(cells))]
-    np.testing.assert_array_equal(np.abs(np.diff(along, axis=0)).sum(1), 1)
-    assert hilbert_codes(np.array([[-1e308, 0, 0], [np.nan, 0, 0], [1e308, 1, 1]]))[1] == 0

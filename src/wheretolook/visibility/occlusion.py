@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from wheretolook.space.free_space import FreeSpace
     from wheretolook.visibility.config import OcclusionConfig
 
-HILBERT_BITS = 10  # bits along each axis of the curve that landmarks are ordered by
+MORTON_BITS = 10  # bits along each axis of the curve that landmarks are ordered by
 MATCH_M = 1e-4  # locations closer than this are taken for the same stored location
 ON_SURFACE_M = 1e-3  # a location this close to a triangle is on it
 
 
 class DevicePoints:
-    """Landmarks (N, 3) m on a device along a Hilbert curve, so that threads side by side have landmarks side by side.
+    """Landmarks (N, 3) m on a device along a Morton curve, so that threads side by side have landmarks side by side.
 
     `positions` (N, 3) are in the map's order, `order` (N,) are rows of the map in the order of the device's arrays, and
     `double` (N,) is a Warp array of vec3d.
@@ -43,7 +43,7 @@ class DevicePoints:
     def __init__(self, positions: ArrayLike, device: str = "cpu") -> None:
         self.positions = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
         self.device = start_warp(device)
-        self.order = np.argsort(hilbert_codes(self.positions), kind="stable")
+        self.order = np.argsort(morton_codes(self.positions), kind="stable")
         self._single: dict[tuple[float, ...], Any] = {}
         self.double: Any = wp.array(self.positions[self.order], dtype=wp.vec3d, device=self.device)
 
@@ -63,32 +63,19 @@ class DevicePoints:
         return wp.array(np.argsort(self.order).astype(np.int32), dtype=wp.int32, device=self.device)
 
 
-def hilbert_codes(positions: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Place (N,) of points (N, 3) along a Hilbert curve through their bounding cube; points not finite come first.
-
-    J. Skilling, "Programming the Hilbert curve", 2004: the cell's coordinates become the transposed code.
-    """
+def morton_codes(positions: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Place (N,) of points (N, 3) along a Morton curve through their bounding box; points not finite come first."""
     finite = np.isfinite(positions).all(1)
     codes = np.zeros(len(positions), dtype=np.int64)
     if not finite.any():
         return codes
     low = positions[finite].min(0) / 2  # halves: their difference is finite
-    extent = max(float((positions[finite].max(0) / 2 - low).max()), 1e-12)
-    cells = ((positions[finite] / 2 - low) / extent * ((1 << HILBERT_BITS) - 1)).astype(np.int64).T.copy()
-    for bit in range(HILBERT_BITS - 1, 0, -1):
-        below = (1 << bit) - 1
+    high = positions[finite].max(0) / 2
+    share = (positions[finite] / 2 - low) / np.maximum(high - low, 1e-12)
+    cells = (share * ((1 << MORTON_BITS) - 1)).astype(np.int64)
+    for bit in range(MORTON_BITS):
         for axis in range(3):
-            inverted = (cells[axis] >> bit) & 1 == 1
-            swapped = np.where(inverted, 0, (cells[0] ^ cells[axis]) & below)
-            cells[0] ^= np.where(inverted, below, swapped)
-            cells[axis] ^= swapped
-    cells = np.bitwise_xor.accumulate(cells, axis=0)
-    flips = np.zeros_like(cells[0])
-    for bit in range(HILBERT_BITS - 1, 0, -1):
-        flips ^= np.where((cells[2] >> bit) & 1 == 1, (1 << bit) - 1, 0)
-    for bit in range(HILBERT_BITS):
-        for axis in range(3):
-            codes[finite] |= (((cells[axis] ^ flips) >> bit) & 1) << (3 * bit + 2 - axis)
+            codes[finite] |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
     return codes
 
 

@@ -8,6 +8,7 @@ import pytest
 from conftest import RandomViews
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import rotation_looking_along, transform
+from wheretolook.visibility import frustum
 from wheretolook.visibility.counting import FrustumCounter
 from wheretolook.visibility.frustum import (
     MIN_DEPTH_M,
@@ -70,7 +71,11 @@ def test_the_test_is_the_projection(random_views: RandomViews) -> None:
         np.testing.assert_array_equal(seen[clear], truth[clear])
 
 
-def test_collected_landmarks_are_those_of_the_plain_twin(random_views: RandomViews, device: str) -> None:
+@pytest.mark.parametrize("at_once", [frustum.CANDIDATES_AT_ONCE, 1000, 1])
+def test_collected_landmarks_are_those_of_the_plain_twin(
+    random_views: RandomViews, at_once: int, device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(frustum, "CANDIDATES_AT_ONCE", at_once)  # the views of a CPU in blocks
     v = random_views
     arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
     kernel = landmarks_in_view(arguments, device=device)

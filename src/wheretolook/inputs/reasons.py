@@ -34,17 +34,21 @@ class ReasonCounter:
     """Counts the landmarks of a map that are hard to match in views of it, by reason."""
 
     def __init__(self, localization_map: LocalizationMap) -> None:
-        self._unoccluded = replace(localization_map, occlusion=NoOcclusion())
+        hidden = not isinstance(localization_map.occlusion, NoOcclusion)
+        self._unoccluded = replace(localization_map, occlusion=NoOcclusion()) if hidden else None
         self._describer = LandmarkDescriber(localization_map, ("distance_ratio", "mapped_angle", "ambiguity"))
         self._has_descriptors = bool(np.isfinite(localization_map.landmarks.ambiguity).any())
 
     def count(self, cam_from_world: Float) -> ReasonCounts:
         """Count for poses (B, 3, 4)."""
-        starts, _ = self._unoccluded.in_view_on_device(cam_from_world)
-        n_occluded = np.diff(starts)
+        n_occluded = np.zeros(len(cam_from_world), dtype=np.int64)
+        if self._unoccluded is not None:
+            starts, _ = self._unoccluded.in_view_on_device(cam_from_world)
+            n_occluded += np.diff(starts)
         counts = np.zeros((len(cam_from_world), 3), dtype=np.int64)
         for rows, described, n_visible in self._describer.in_blocks(cam_from_world):
-            n_occluded[rows] -= n_visible.cpu().numpy()
+            if self._unoccluded is not None:
+                n_occluded[rows] -= n_visible.cpu().numpy()
             ratio, cosine, ambiguity = described.values.unbind(1)
             limits = ratio > log(TOO_FAR), cosine < cos(radians(TOO_OBLIQUE_DEG)), ambiguity > REPEATED
             hard = torch.stack(limits, 1).double()

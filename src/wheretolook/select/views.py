@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +19,6 @@ from wheretolook.io.poses import images_text, pose_texts, tum_text
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame
 from wheretolook.select.formats import MARK, check_format
 from wheretolook.utils.files import write_json, write_text
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,12 +141,10 @@ def save_views(views: SelectedViews, path: Path, format: str | None = None) -> N
         write_text(path / "points3D.txt", "# no points: poses of selected views\n")
 
 
-def _table(views: SelectedViews) -> pd.DataFrame:
-    """Return a row for each view; expected inliers are NaN where the method does not report them."""
-    import pandas as pd
-
-    columns = {
-        "waypoint": list(views.waypoint_id),
+def _columns(views: SelectedViews) -> dict[str, list[Any]]:
+    """Return columns with a value for each view; expected inliers are None where the method does not report them."""
+    columns: dict[str, Any] = {
+        "waypoint": views.waypoint_id,
         "rank": views.rank,
         **dict(zip("xyz", views.positions.T, strict=True)),
         "yaw_deg": views.yaw_deg,
@@ -159,10 +156,11 @@ def _table(views: SelectedViews) -> pd.DataFrame:
         "n_visible": views.n_visible,
         **{name: getattr(views, name) for name in REASONS},
         "in_range": views.in_range,
-        "scale": views.frame.scale.source,
+        "scale": [views.frame.scale.source] * len(views),
         **dict(zip(("qw", "qx", "qy", "qz"), views.quaternions_wxyz.T, strict=True)),
     }
-    return pd.DataFrame(columns)
+    rows = {name: np.asarray(values, dtype=object).tolist() for name, values in columns.items()}
+    return {name: [None if value != value else value for value in values] for name, values in rows.items()}
 
 
 EXPECTED = ("expected_score", "best_expected_score")
@@ -180,24 +178,28 @@ _DIGITS = {
 
 
 def _csv(views: SelectedViews) -> str:
-    table = _table(views)
-    for name in [name for name, values in table.items() if values.dtype.kind == "f"]:
-        pattern = f"{{:{_DIGITS.get(str(name), '.9f')}}}"
-        table[name] = table[name].map(pattern.format, na_action="ignore")
-    table["quaternion_xyzw"] = table[["qx", "qy", "qz", "qw"]].agg(" ".join, axis=1)
-    return str(table.to_csv(index=False, lineterminator="\n"))
+    columns = _columns(views)
+    for name, values in columns.items():
+        digits = _DIGITS.get(name, ".9f")
+        columns[name] = [format(value, digits) if isinstance(value, float) else value for value in values]
+    columns["quaternion_xyzw"] = [" ".join(row) for row in zip(*(columns[f"q{axis}"] for axis in "xyzw"), strict=True)]
+    text = StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*columns.values(), strict=True))
+    return text.getvalue()
 
 
 def _json(views: SelectedViews) -> dict[str, Any]:
     frames = "x, y, z: camera centre in the map, in its unit; qw, qx, qy, qz: camera-to-world; camera z forward"
-    table = _table(views).astype(object)
-    table = table.where(table.notna(), None)
-    table["quaternion_xyzw"] = views.quaternions_xyzw.tolist()
-    table["cam_from_world"] = views.cam_from_world.tolist()
+    columns = _columns(views)
+    columns["quaternion_xyzw"] = views.quaternions_xyzw.tolist()
+    columns["cam_from_world"] = views.cam_from_world.tolist()
+    rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     camera = views.camera.colmap.record()
     known = {"metres_per_unit": views.frame.world_from_map.scale, "up": views.frame.world_from_map.rotation[2].tolist()}
     about = {"frames": frames, "scale": views.frame.scale.source, **known, "gravity": views.frame.gravity}
-    return {**about, "method": views.method, "camera": camera, "views": table.to_dict("records")}
+    return {**about, "method": views.method, "camera": camera, "views": rows}
 
 
 def _tum(views: SelectedViews) -> str:

@@ -51,15 +51,16 @@ def classify_pinhole_kernel(
     inside = wp.bool(True)
     outside = wp.bool(False)
     for side in range(4):
-        normal = sides[orientation, side]
-        a = wp.dot(normal, corners[corner])
-        b = wp.dot(normal, corners[corner + 1])
-        c = wp.dot(normal, corners[corner + size + 1])
-        d = wp.dot(normal, corners[corner + size + 2])
-        if not (wp.min(wp.min(a, b), wp.min(c, d)) >= margin):
-            inside = False
-        if wp.max(wp.max(a, b), wp.max(c, d)) < -margin:
-            outside = True
+        if not outside:
+            normal = sides[orientation, side]
+            a = wp.dot(normal, corners[corner])
+            b = wp.dot(normal, corners[corner + 1])
+            c = wp.dot(normal, corners[corner + size + 1])
+            d = wp.dot(normal, corners[corner + size + 2])
+            if not (wp.min(wp.min(a, b), wp.min(c, d)) >= margin):
+                inside = False
+            if wp.max(wp.max(a, b), wp.max(c, d)) < -margin:
+                outside = True
     kind = wp.uint8(BORDER)
     if outside:
         kind = wp.uint8(0)

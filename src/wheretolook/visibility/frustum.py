@@ -9,7 +9,10 @@ Rounding the normals moves the border of the view by less than 1e-4 pixels.
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,10 +23,11 @@ from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.warp import start_warp
-from wheretolook.visibility.frustum_kernel import Views, collect_kernel
+from wheretolook.visibility import frustum_kernel
 
 MIN_DEPTH_M = 2.0**-10  # a pinhole sees nothing nearer to its image plane than this (about a millimetre), or behind it
 
+CANDIDATES_AT_ONCE = 1 << 20  # landmarks that a thread of a CPU tests for several views at a time
 OFFSETS_AT_ONCE = 1 << 18  # landmarks that a COLMAP camera projects at a time
 SINGLE_ROUNDING = 5e-7  # bound on the relative error of a product of two vectors of three float32: 3 * 2^-24, and room
 
@@ -44,9 +48,8 @@ class LandmarkSets:
     @classmethod
     def from_mask(cls, mask: NDArray[np.bool_]) -> LandmarkSets:
         """From a dense mask (L, N). Raises a ConfigError if there are more entries than an int32 counts."""
-        lengths = mask.sum(1)
-        columns = np.flatnonzero(mask) - np.repeat(np.arange(len(mask)) * mask.shape[1], lengths)
-        return cls(_starts(lengths), columns.astype(np.int32))
+        columns = [np.empty(0, np.int32), *(np.flatnonzero(row).astype(np.int32) for row in mask)]
+        return cls(_starts(mask.sum(1)), np.concatenate(columns))
 
 
 def _starts(lengths: NDArray[np.integer[Any]]) -> NDArray[np.int32]:
@@ -172,7 +175,7 @@ def views_on_device(views: PosedViews, rows: slice, points: Any, unoccluded: tup
     """`Views` as the kernels take them, of some of the views; points and sets are already on the device."""
     assert isinstance(views.camera, PinholeCamera)
     rotations, centers = split_poses(views.cam_from_world[rows])
-    there: Any = Views()
+    there: Any = frustum_kernel.Views()
     sides = frustum_sides(views.camera, rotations)
     there.sides = wp.array(sides, dtype=wp.vec3, device=device)
     there.rounding = sides_rounding(sides)
@@ -191,22 +194,53 @@ def in_view_on_device(posed: PosedViews, points: Any, device: str = "cpu") -> tu
     The points are those of `points_on_device`.
     """
     device = start_warp(device)
-    rows = posed.location_rows
-    unoccluded = posed.unoccluded
-    views = views_on_device(posed, slice(None), points, sets_on_device(unoccluded, device), device)
-    lengths: Any = wp.empty(len(rows), dtype=wp.int32, device=device)
+    wp.load_module(frustum_kernel, device=device)  # only one thread may do that
+    sets = sets_on_device(posed.unoccluded, device)
+    candidates = np.diff(posed.unoccluded.starts)[posed.location_rows]
+    if device == "cpu":
+        return _collected_on_cpu(posed, points, sets, candidates)
+    views = views_on_device(posed, slice(None), points, sets, device)
+    lengths: Any = wp.empty(len(candidates), dtype=wp.int32, device=device)
     # A single view is collected at once, with room for all its candidates; several are counted first.
-    once = len(rows) == 1
+    once = len(candidates) == 1
     first: Any = wp.zeros(1 if once else 0, dtype=wp.int32, device=device)
-    indices: Any = wp.empty(len(unoccluded[int(rows[0])]) if once else 0, dtype=wp.int32, device=device)
-    wp.launch(collect_kernel, len(rows), [views, once, first], [lengths, indices], device=device)
+    indices: Any = wp.empty(int(candidates[0]) if once else 0, dtype=wp.int32, device=device)
+    wp.launch(frustum_kernel.collect_kernel, len(candidates), [views, once, first], [lengths, indices], device=device)
     starts = _starts(lengths.numpy())
     if once:
         return starts, indices[: int(starts[-1])]
     indices = wp.empty(int(starts[-1]), dtype=wp.int32, device=device)
     first = wp.array(starts, dtype=wp.int32, device=device)
-    wp.launch(collect_kernel, len(rows), [views, True, first], [lengths, indices], device=device)
+    wp.launch(frustum_kernel.collect_kernel, len(candidates), [views, True, first], [lengths, indices], device=device)
     return starts, indices
+
+
+def _collected_on_cpu(
+    posed: PosedViews, points: Any, sets: tuple[Any, Any], candidates: NDArray[np.int32]
+) -> tuple[NDArray[np.int32], Any]:
+    """As `in_view_on_device`: tests each view's candidates (B,) once, in blocks of views on all cores."""
+    block = np.cumsum(candidates, dtype=np.int64) // CANDIDATES_AT_ONCE  # of each view
+    bounds = [0, *(np.flatnonzero(np.diff(block)) + 1).tolist(), len(candidates)]
+
+    def collect(rows: slice) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        first = _starts(candidates[rows])
+        views = views_on_device(posed, rows, points, sets, "cpu")
+        found: Any = wp.empty(int(first[-1]), dtype=wp.int32, device="cpu")
+        lengths: Any = wp.empty(len(first) - 1, dtype=wp.int32, device="cpu")
+        inputs = [views, True, wp.array(first, dtype=wp.int32, device="cpu")]
+        wp.launch(frustum_kernel.collect_kernel, len(lengths), inputs, [lengths, found], device="cpu")
+        numbers = lengths.numpy().copy()
+        indices = found.numpy()
+        parts = [indices[begin : begin + number] for begin, number in zip(first, numbers, strict=False)]
+        return numbers, np.concatenate([np.empty(0, np.int32), *parts])
+
+    blocks = [slice(begin, end) for begin, end in pairwise(bounds)]
+    if len(blocks) == 1:  # without the cost of threads
+        numbers, indices = collect(blocks[0])
+    else:
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+            numbers, indices = (np.concatenate(parts) for parts in zip(*pool.map(collect, blocks), strict=True))
+    return _starts(numbers), wp.array(indices, dtype=wp.int32, device="cpu")
 
 
 def landmarks_in_view_plain(views: PosedViews) -> LandmarkSets:

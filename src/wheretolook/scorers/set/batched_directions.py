@@ -98,7 +98,7 @@ class BatchedDirections:
         with warnings.catch_warnings():  # PyTorch warns once that sparse matrices are new
             warnings.simplefilter("ignore")
             torch.sparse_csr_tensor([0, 0], [], [], size=(1, 1))
-        self._listers: dict[int, FrustumLister] = {}
+        self._listers: dict[int, FrustumLister] = {}  # by the number of cells along a side
         self._lock = Lock()
 
     @staticmethod
@@ -158,19 +158,14 @@ class BatchedDirections:
         return scores.reshape(-1, n_directions)
 
     def _lister(self, level: int) -> FrustumLister:
+        """The lister for every 2^level-th landmark. Few landmarks share one: to make its cells takes 70 ms of a core."""
+        size = max(MIN_CELLS, choose_size(len(self.points) >> level))
         with self._lock:
-            if level not in self._listers:
-                n_points = len(self.points) >> level
-                size = max(MIN_CELLS, choose_size(n_points))
-                self._listers[level] = FrustumLister(
-                    self.localization_map.camera,
-                    self.rotations,
-                    n_points,
-                    self.points.device,
-                    scratch_bytes=SCRATCH_BYTES,
-                    size=size,
-                )
-            return self._listers[level]
+            if size not in self._listers:
+                camera = self.localization_map.camera
+                options = {"scratch_bytes": SCRATCH_BYTES, "size": size}
+                self._listers[size] = FrustumLister(camera, self.rotations, 0, self.points.device, **options)
+            return self._listers[size]
 
     def _of_listed(
         self, listed: ListedViews, nearby: Surroundings, stride: int, n_visible: Float, heights: Float
@@ -185,7 +180,7 @@ class BatchedDirections:
         used[entries] = True
         place = used.cumsum(0, dtype=torch.int32) - 1
         seen = used.nonzero()[:, 0]
-        base, terms = self._described(wp.to_torch(nearby.offsets)[seen], rows[seen] * stride)
+        base, terms = self._described(wp.to_torch(nearby.offsets).index_select(0, seen), rows[seen] * stride)
         sums = torch.zeros((len(n_visible), N_EXPECTED), device=self.device)
         cells = torch.zeros(len(n_visible), device=self.device)
         visible = torch.from_numpy(n_visible).to(sums)
@@ -212,14 +207,14 @@ class BatchedDirections:
 
         The landmarks are at offsets (M, 3) m from the location, and at rows (M,) of the points.
         """
-        mapped = self._mapped[rows]
+        mapped = self._mapped.index_select(0, rows)
         distance = offsets.norm(dim=1)
         log_distance = distance.log()
         bearing = offsets / distance[:, None]
         angle = (bearing * mapped[:, :3]).sum(1)
         size_ratio = log_distance + self._pixel_angle - mapped[:, 4]
         values = torch.stack([log_distance, angle, log_distance - mapped[:, 3], size_ratio], 1)
-        base = self._first[rows].addmm_((values - self._mean).nan_to_num_(nan=0.0), self._of_location)
+        base = self._first.index_select(0, rows).addmm_((values - self._mean).nan_to_num_(nan=0.0), self._of_location)
         pixels = torch.stack([torch.full_like(size_ratio, self._pixel_angle), size_ratio], 1)
         weight = bearing_precision(pixels, ("pixel_angle", "pixel_size_ratio"))
         x, y, z = bearing.unbind(1)

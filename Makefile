@@ -1,6 +1,7 @@
 # make demo   sets everything up and runs the whole line on the embedded default
 # make test   sets everything up and runs linter, type checker and the tests: nine minutes on two cores
 # make test-all   the same and the slow tests too, in half an hour
+# make bench   measures what must not become slower, in a minute, and compares with tests/benchmarks/ledger.csv
 # make ui     opens MLflow at the comparison of methods; make lab opens Jupyter on the notebooks
 # make html   runs all notebooks and writes them as pages, notebooks/html; make docs builds the documentation, site/
 # Options: TORCH=cuda for the CUDA build of PyTorch, PYTHON=python3.12, PORT=5001 for make ui. See environment.md.
@@ -15,10 +16,10 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --progre
 CONSTRAINTS := configs/constraints.txt
 READY := $(VENV)/ready-$(TORCH)
 
-.PHONY: demo test test-all setup ui lab html docs clean help
+.PHONY: demo test test-all bench setup ui lab html docs clean help
 
 help:
-	@sed -n '1,6s/^# //p' Makefile
+	@sed -n '1,7s/^# //p' Makefile
 
 demo: $(READY)
 	@$(BIN)/wheretolook demo
@@ -33,6 +34,9 @@ test test-all: $(READY)
 	  --no-loadscope-reorder $(TESTS); tests=$$?; \
 	wait $$types || { cat $(VENV)/mypy.log; test $$tests -ne 0 || tests=1; }; \
 	exit $$tests
+
+bench: $(READY)
+	@$(BIN)/python tests/benchmarks/bench_ledger.py $(BENCH)
 
 PORT ?= 5000
 ui: $(READY)

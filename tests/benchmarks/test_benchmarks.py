@@ -59,6 +59,14 @@ def test_features_and_labelling(tmp_path: Path) -> None:
     assert "ms per view" in run("labelling", str(scene), "--views", "8", "--batches", "4")
 
 
+def test_the_ledger_compares_with_the_last_entry(tmp_path: Path) -> None:
+    sizes = "--locations 2 --landmarks 300 --triangles 500 --repeats 1"
+    ledger = tmp_path / "ledger.csv"
+    assert "first entry" in run("ledger", *sizes.split(), "--ledger", str(ledger), "--record")
+    assert "first entry" not in run("ledger", *sizes.split(), "--ledger", str(ledger))
+    assert len(ledger.read_text().splitlines()) == 6
+
+
 def test_every_benchmark_is_run() -> None:
     names = {path.stem.removeprefix("bench_") for path in FOLDER.glob("bench_*.py")}
-    assert names == {*SMALL, "features", "labelling", "visibility"}
+    assert names == {*SMALL, "features", "labelling", "ledger", "visibility"}

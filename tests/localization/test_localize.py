@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -130,6 +131,15 @@ def test_where_to_look_localizes_in_the_map_that_it_opened(room: MappedRoom, pho
     assert result.table()["image"].tolist() == ["a.png", "b.png", "c.png"]
     with pytest.raises(ConfigError, match="from_colmap"):
         WhereToLook(look.scorer).localize(photos / "a.png")
+
+
+def test_the_next_view_of_a_rig(room: MappedRoom, photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = str(room.landmarks.parent)
+    given = ["--camera", "SIMPLE_PINHOLE,640,480,320,320,240"]
+    assert main(["localize", "--map", model, "--images", str(photos / "a.png"), *given, "--next"]) == 0
+    assert re.search(r"next view: turn \d+ degrees to the (left|right)", capsys.readouterr().out)
+    assert main(["localize", "--map", model, "--images", str(photos), *given, "--next"]) != 0
+    assert "--turns" in capsys.readouterr().err
 
 
 def test_an_image_of_another_camera_needs_it(localizer: ImageLocalizer, photos: Path) -> None:

@@ -242,6 +242,23 @@ def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.Cap
     assert run("compare-paths", copy, "--paths.scenes", "[nowhere]") == 2
 
 
+def test_a_camera_at_an_unknown_pose_turns_until_it_is_localized(copy: Path) -> None:
+    options = ["--places", "2", "--views", "3", "--policies", "[even,gain]"]
+    assert run("relocalize", copy, *options, "--film", str(copy / "lost.webp")) == 0
+    root = copy / "data" / "tiny" / "results"
+    summary = pd.read_csv(root / "relocalize.csv")
+    poses = pd.read_parquet(root / "relocalize" / "poses.parquet")
+    chosen = poses[poses["hypothesis"] == 0]
+    assert summary["policy"].tolist() == ["even", "gain"] and len(chosen) == 2 * 3 * summary["places"].iloc[0]
+    first = chosen[chosen["n_looks"] == 1].set_index(["scene", "location_id"])
+    pd.testing.assert_frame_equal(*(first[first["policy"] == name].drop(columns="policy") for name in ("even", "gain")))
+    assert len(list(finished_runs(TrackingConfig(str(copy / "mlruns")), "relocalize"))) == 1
+    kept = {path: path.stat().st_mtime_ns for path in (root / "relocalize").glob("*/poses.parquet")}
+    assert run("relocalize", copy, *options, "--confidence", "0.5") == 0
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    assert run("relocalize", copy, "--policies", "[forward]") == 2
+
+
 def test_views_along_paths_are_localized_together(copy: Path) -> None:
     options = ["--paths.pairs", "1", "--paths.methods", "[forward,set]", *PATHS]
     assert run("compare-paths", copy, *options) == 0

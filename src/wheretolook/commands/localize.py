@@ -46,7 +46,7 @@ class Localize(CameraOptions, FrameOptions):
     Examples:
       wheretolook localize --map sparse/0 --images query.jpg --out pose.csv --figure pose.png
       wheretolook localize --map sparse/0 --images queries --out images.txt
-      wheretolook localize --map sparse/0 --images a.jpg b.jpg --turns turns.csv --scale 1 --out pose.json
+      wheretolook localize --map sparse/0 --images a.jpg b.jpg --turns turns.csv --scale 1 --out pose.json --next
 
     Args:
         map: folder of a COLMAP model.
@@ -56,6 +56,7 @@ class Localize(CameraOptions, FrameOptions):
         figure: also draw matches, pose and rivals: a file .png, .pdf or .svg; for several images a folder.
         prior: rough x,y,z of the camera in the map, and perhaps its yaw in degrees: one more hypothesis.
         accuracy: limits of the errors in metres and degrees that the probability refers to.
+        next: also print where a camera that turns in place should look next, by the bundled weights.
         database: COLMAP's database.db or hloc's feats-*.h5.
         extractor: extractor for the images: opencv, colmap, aliked, disk or xfeat.
         extractor_weights: weights of a learned extractor; see docs/features.md.
@@ -71,6 +72,7 @@ class Localize(CameraOptions, FrameOptions):
     figure: Path | None = None
     prior: tuple[float, ...] | None = None
     accuracy: tuple[float, float] = (0.05, 0.4)
+    next: bool = False
     database: Path | None = None
     extractor: str | None = None
     extractor_weights: str = ""
@@ -100,6 +102,8 @@ class Localize(CameraOptions, FrameOptions):
         paths = self._paths()
         if self.figure is not None and self.figure.suffix and len(paths) > 1 and self.turns is None:
             raise ConfigError("several images need a folder of figures", path=self.figure, fix="Name a folder.")
+        if self.next and len(paths) > 1 and self.turns is None:
+            raise ConfigError("the next view is that of one rig", value=len(paths), fix="Give --turns, or one image.")
         from wheretolook.select.image_localizer import ImageLocalizer
 
         device = usable_device(self.device)
@@ -114,6 +118,8 @@ class Localize(CameraOptions, FrameOptions):
         if self.out is not None:
             save_localized(results, self.out)
         self._summarize(results)
+        if self.next:
+            self._print_next(result, device)
         where = "" if self.out is None else f": {self.out}"
         print(f"{len(paths)} images in {time.monotonic() - start:.1f} s{where}")
         return results
@@ -153,6 +159,18 @@ class Localize(CameraOptions, FrameOptions):
         assert self.figure is not None
         path = self.figure if self.figure.suffix else self.figure / f"{Path(result.names[0]).stem}.png"
         save_figure(figure_of(result, localizer.landmarks.points), path)
+
+    def _print_next(self, result: Localized, device: str) -> None:
+        """Print where the camera should look next."""
+        from wheretolook.select.where_to_look import WhereToLook
+
+        frame = vars(self.frame_options())
+        camera = result.cameras[0]
+        look = WhereToLook.from_colmap(self.map, camera=camera, database=self.database, device=device, **frame)
+        chosen = look.next_look(result)
+        side = "left" if chosen.pan_deg > 0 else "right"
+        turn = f"turn {abs(chosen.pan_deg):.0f} degrees to the {side}, to a pitch of {chosen.pitch_deg:.0f} degrees"
+        print(f"next view: {turn}; it localizes with an expected probability of {chosen.gain:.2f}")
 
     def _summarize(self, results: list[Localized]) -> None:
         """Print each result if they are few, and how many are localized."""

@@ -92,14 +92,14 @@ def label_sets(
                     single_view[row] = localizer.single_view_poses(look)
             result = localizer.localize(looks, [single_view[row] for row in key])
             seconds = time.perf_counter() - start
-            label = _label(result, true if rigs is None else true[:1])
+            label = set_label(result, true if rigs is None else true[:1])
             known[key] = (len(key), locations[key[0]], *label, seconds)
         rows.append(known[key])
     return pd.DataFrame(rows, columns=list(SET_COLUMNS))
 
 
-def _label(result: JointLocalization, true: Float) -> tuple[object, ...]:
-    """Return the values of `SET_COLUMNS` from a joint pose and the true poses (N, 3, 4) of its first N views."""
+def set_label(result: JointLocalization, true: Float) -> tuple[object, ...]:
+    """Return `SET_COLUMNS` from status to confidence, given the true poses (N, 3, 4) of the first N views."""
     error_m = error_deg = np.nan
     if result.cams_from_world is not None:
         error_m, error_deg = (error.max() for error in pose_error(result.cams_from_world[: len(true)], true))

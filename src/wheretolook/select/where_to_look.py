@@ -20,6 +20,7 @@ from wheretolook.geometry.poses import Float, camera_centers, poses_looking_alon
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.inputs.reasons import ReasonCounter
 from wheretolook.localization.confidence import ACCURACY, Accuracy
+from wheretolook.looks.next_look import NextLook, NextLookSelector
 from wheretolook.looks.selection import best_views, separated
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.map_frame import MapFrame
@@ -33,7 +34,7 @@ from wheretolook.select.views import SelectedViews, joined
 from wheretolook.select.waypoints import Waypoints, grid_waypoints, usable_waypoints
 from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.devices import usable_device
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.errors import ConfigError, PlanningError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -174,6 +175,31 @@ class WhereToLook:
         """
         camera = parse_camera(camera) if isinstance(camera, str) else camera
         return self._localizer.localize(images, turns, camera, prior, accuracy)
+
+    def next_look(
+        self,
+        result: Localized,
+        pitch_deg: tuple[float, float] = (-45.0, 45.0),
+        pan_deg: tuple[float, float] | None = None,
+        up: ArrayLike | None = None,
+    ) -> NextLook:
+        """Select where a camera that turns in place looks next, given the result of `localize` for all views so far.
+
+        Args:
+            result: of one image or several from one location.
+            pitch_deg: lowest and highest pitch.
+            pan_deg: lowest and highest pan, to the left from the first view; None for any.
+            up: direction up (3,) in the rig, the frame of the given turns; by default see `NextLookSelector.select`.
+
+        Raises PlanningError if the limits leave no new view, or nothing was localized.
+        """
+        if result.joint is None:
+            raise PlanningError("without matches no next view can be selected", value=result.names)
+        return self._next_look_selector.select(result.joint, up, pitch_deg, pan_deg)
+
+    @cached_property
+    def _next_look_selector(self) -> NextLookSelector:
+        return NextLookSelector(self.scorer)
 
     @cached_property
     def _localizer(self) -> ImageLocalizer:

@@ -84,10 +84,13 @@ class LookStory:
     images: Pixels  # (N, H, W, 3)
     single: tuple[Estimate, ...]
     joint: Estimate
+    steps: tuple[Result, ...] = ()  # if they are taken one after another: the result after each
 
     @property
     def results(self) -> list[Result]:
-        """The result of each view, then of all jointly."""
+        """The result of each view, then of all jointly; or after each view."""
+        if self.steps:
+            return [*self.steps]
         single = [(f"view {k + 1}", [k], estimate) for k, estimate in enumerate(self.single)]
         return [*single, ("all views", [*range(len(self.single))], self.joint)]
 
@@ -121,6 +124,16 @@ def _estimate(pose: JointLocalization, views: Sequence[Look], true: Float) -> Es
     return Estimate(pose.cams_from_world, pixels, probability, float(error_m.max()), float(error_deg.max()))
 
 
+def story_of_steps(
+    camera: Camera, cam_from_world: Float, images: Pixels, localizations: Sequence[JointLocalization]
+) -> LookStory:
+    """Build the story of N views that are added one after another: true poses (N, 3, 4), with the results of the first N."""
+    estimates = [_estimate(pose, pose.looks, cam_from_world[: len(pose.looks)]) for pose in localizations]
+    names = ["first view", *(f"{n} views" for n in range(2, len(estimates) + 1))]
+    steps = [(name, [*range(n + 1)], estimate) for n, (name, estimate) in enumerate(zip(names, estimates, strict=True))]
+    return LookStory(camera, cam_from_world, images, (), estimates[-1], tuple(steps))
+
+
 def story_figure(story: LookStory, house: Dollhouse) -> Figure:
     """Draw a column for each view, and one for all of them jointly: the estimated pose from above, and the inliers."""
     with context(RC):
@@ -149,7 +162,8 @@ def _draw_result(figure: Figure, story: LookStory, house: Dollhouse, result: Res
     name, views, estimate = result
     above = figure.add_subplot(plan)
     _draw_plan(above, story.camera, house, story.cam_from_world[views], estimate)
-    above.set_title(f"{name}: {estimate.summary}", color=estimate.color, fontsize=10)
+    sure = f", confidence {100 * estimate.probability:.0f} %" if story.steps else ""
+    above.set_title(f"{name}: {estimate.summary}{sure}", color=estimate.color, fontsize=10)
     for k, view in enumerate(views):
         _draw_image(figure.add_subplot(images[k]), story.images[view], estimate.pixels[k], estimate.color)
 

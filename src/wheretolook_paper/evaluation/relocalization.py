@@ -1,0 +1,179 @@
+"""Simulates a camera at an unknown location that turns in place until its pose is known.
+
+Views are rendered, and localized jointly with all views before. Policies for the next view are compared from the same
+first view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from tqdm.auto import tqdm
+
+from wheretolook.dataset.environment import SceneEnvironment
+from wheretolook.dataset.viewpoint_table import is_good
+from wheretolook.evaluation.bootstrap import ClusterBootstrap
+from wheretolook.features.config import ExtractorConfig
+from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.localization.config import LocalizerConfig
+from wheretolook.localization.joint_labels import SET_COLUMNS, set_label
+from wheretolook.localization.localizer import Localizer
+from wheretolook.localization.rig import Look, rig_of
+from wheretolook.localization.rig_localization import JointLocalization
+from wheretolook.looks.next_look import NextLookSelector, angles_to_views
+from wheretolook.scorers.base import Scorer
+from wheretolook.utils.markdown import markdown_table
+
+COLUMNS = ("location_id", "policy", "n_looks", "hypothesis", *SET_COLUMNS[2:-1])
+"""Columns of `simulate`: `hypothesis` is 0 for the chosen pose, and counts its rivals; others are those of
+`wheretolook.localization.joint_labels`."""
+
+
+class Place:
+    """A camera at one location of a scene, with poses (D, 3, 4) of views that it can take."""
+
+    def __init__(self, robot: SimulatedRobot, cam_from_world: Float) -> None:
+        self.robot = robot
+        self.cam_from_world = cam_from_world
+        self._looks: dict[int, Look] = {}
+        self._localizations: dict[tuple[int, ...], JointLocalization] = {}
+
+    def image(self, row: int) -> NDArray[np.uint8]:
+        """Render a view, (H, W, 3)."""
+        scene = self.robot.scene
+        return np.asarray(scene.renderer.render(scene.camera, self.cam_from_world[row : row + 1]).rgb[0])
+
+    def localize(self, rows: Sequence[int]) -> JointLocalization:
+        """Localize views jointly; the rig has the axes of the first."""
+        key = tuple(rows)
+        if key not in self._localizations:
+            for row in key:
+                if row not in self._looks:
+                    self._looks[row] = self.robot.look(self.image(row))
+            rig = rig_of(self.cam_from_world[list(key)])
+            looks = [replace(self._looks[row], cam_from_rig=pose) for row, pose in zip(key, rig, strict=True)]
+            self._localizations[key] = self.robot.localizer.joint.localize(looks)
+        return self._localizations[key]
+
+    def true_scores(self) -> Float:
+        """Scores (D,) of all views at the true location."""
+        center = camera_centers(self.cam_from_world[:1])
+        return self.robot.scorer.score_directions(center, self.cam_from_world[:, 2, :3])[0]
+
+    def values(self, policy: str, taken: Sequence[int], rng: np.random.Generator) -> Float:
+        """Rate all views (D,) by a policy, given the rows of earlier views."""
+        if policy == "random":
+            return rng.random(len(self.cam_from_world))
+        if policy == "known":
+            return self.true_scores()
+        localization = self.localize(taken)
+        axes = self.cam_from_world[:, 2, :3] @ self.cam_from_world[taken[0]][:, :3].T
+        if policy == "even":
+            return angles_to_views(localization, axes)
+        selector = self.robot.selector
+        heights = self.cam_from_world[:, 2, 2]
+        if policy == "gain":
+            return selector.gains(localization, axes, heights)
+        found, scores = selector.scores_under(localization, axes)
+        expected = found @ scores / max(float(found.sum()), 1e-9)
+        if policy == "expected":
+            return expected + 1e-9 * rng.random(len(axes))
+        confidence = found.max(initial=0)
+        return confidence * expected + (1 - confidence) * selector.scores_if_lost(localization, axes, heights)
+
+    def turn(self, policy: str, first: int, n_views: int, rng: np.random.Generator) -> list[int]:
+        """Return the rows of views that a policy selects after the first."""
+        taken = [first]
+        while len(taken) < min(n_views, len(self.cam_from_world)):
+            values = self.values(policy, taken, rng).copy()
+            values[taken] = -np.inf
+            taken.append(int(np.argmax(values)))
+        return taken
+
+
+class SimulatedRobot:
+    """A camera in a scene with a mesh, which localizes by several hypotheses and scores views by any method."""
+
+    def __init__(self, scene: SceneEnvironment, scorer: Scorer, extractor: ExtractorConfig) -> None:
+        self.scene = scene
+        self.scorer = scorer
+        self.selector = NextLookSelector(scorer)
+        config = LocalizerConfig(method="hypotheses")
+        self.localizer = Localizer(scene.landmarks, scene.camera, config, extractor, scene.device)
+
+    def look(self, rgb: NDArray[np.uint8]) -> Look:
+        """Match an image (H, W, 3) with the map."""
+        keypoints = self.localizer.extractor.extract(rgb)
+        return self.localizer.look(keypoints, self.localizer.match([keypoints])[0])
+
+    def simulate(
+        self, places: Mapping[int, Float], policies: Sequence[str], n_views: int, seed: int, title: str
+    ) -> pd.DataFrame:
+        """Turn by each policy at places, by their id, with poses (D, 3, 4); return `COLUMNS` after each view."""
+        rows: list[tuple[Any, ...]] = []
+        for number, poses in tqdm(places.items(), desc=title, unit="place"):
+            place = Place(self, poses)
+            first = int(np.random.default_rng([seed, number]).integers(len(poses)))
+            for policy in policies:
+                taken = place.turn(policy, first, n_views, np.random.default_rng([seed, number, 1]))
+                for n in range(1, len(taken) + 1):
+                    result = place.localize(taken[:n])
+                    for k, pose in enumerate((result, *result.rivals)):
+                        label = set_label(pose, poses[first : first + 1])
+                        rows.append((number, policy, n, k, *label))
+        return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+def summarize(table: pd.DataFrame, confidence: float, resamples: int = 2000) -> pd.DataFrame:
+    """Summarize `simulate` of several scenes, with a column `scene`: a row for each policy.
+
+    Returns the columns `right_N`, the share of places whose pose is right after N views; `views`, the mean number until
+    the confidence is reached or views run out, and `right`, the share right then; `confident`, the share of places that
+    reach it, and `precision`, the share of these that is right. The first have 95 % intervals by resampling places.
+    """
+    table = table[table["hypothesis"] == 0]
+    good = table.assign(good=is_good(table))
+    rows = []
+    for policy in good["policy"].unique():
+        part = good[good["policy"] == policy]
+        places = part.set_index(["scene", "location_id", "n_looks"])[["good", "confidence"]].unstack()
+        right = places["good"].to_numpy(float)
+        sure = places["confidence"].to_numpy() >= confidence
+        stop = np.argmax(np.column_stack([sure[:, :-1], np.ones(len(sure), dtype=bool)]), axis=1)
+        at_stop = right[np.arange(len(right)), stop]
+        is_sure = sure.any(axis=1)
+        scenes = np.unique(places.index.get_level_values("scene"), return_inverse=True)[1]
+        bootstrap = ClusterBootstrap(np.arange(len(right)), resamples, 0, scenes)
+        values = np.column_stack([right, stop + 1, at_stop])
+        low, high = bootstrap.ratio_interval(values, np.ones((len(right), 1)))
+        names = [*(f"right_{n}" for n in range(1, right.shape[1] + 1)), "views", "right"]
+        row: dict[str, Any] = {"policy": policy, "places": len(right)}
+        for name, value, least, most in zip(names, values.mean(0), low, high, strict=True):
+            row |= {name: value, f"{name}_low": least, f"{name}_high": most}
+        precision = at_stop[is_sure].mean() if is_sure.any() else np.nan
+        rows.append(row | {"confident": is_sure.mean(), "precision": precision})
+    return pd.DataFrame(rows)
+
+
+def summary_markdown(summary: pd.DataFrame, confidence: float) -> str:
+    """Format `summarize` as Markdown."""
+    numbers = [int(name[6:]) for name in map(str, summary) if name.startswith("right_") and name[6:].isdigit()]
+    shares = [*(f"right_{n}" for n in numbers), "right"]
+    heads = ["policy", "places", *(f"{n} views" if n > 1 else "first view" for n in numbers)]
+    heads += ["right at stop", "views until stop", "confident", "of these right"]
+    lines = []
+    for row in summary.to_dict("records"):
+        cells = [
+            f"{100 * row[name]:.1f} [{100 * row[f'{name}_low']:.1f}, {100 * row[f'{name}_high']:.1f}]"
+            for name in shares
+        ]
+        views = f"{row['views']:.2f} [{row['views_low']:.2f}, {row['views_high']:.2f}]"
+        last = [f"{100 * row[name]:.1f}" for name in ("confident", "precision")]
+        lines.append([str(row["policy"]), str(row["places"]), *cells, views, *last])
+    head = f"Share of places whose pose is right, in % [95 % interval over places]; stop at a confidence of {confidence:g}."
+    return f"{head}\n\n{markdown_table(heads, lines)}\n"

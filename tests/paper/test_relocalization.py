@@ -1,0 +1,39 @@
+"""A simulated camera that turns until it is localized: the summary of its poses."""
+
+from __future__ import annotations
+
+import pandas as pd
+import pytest
+
+from wheretolook_paper.evaluation.relocalization import summarize, summary_markdown
+
+
+def poses_of(policy: str, place: int, good: list[bool], confidence: list[float]) -> pd.DataFrame:
+    """A place's chosen poses after each view, and a rival of each."""
+    errors = [0.01 if right else 3.0 for right in good]
+    chosen = pd.DataFrame(
+        {"n_looks": range(1, len(good) + 1), "error_m": errors, "confidence": confidence, "hypothesis": 0}
+    )
+    both = pd.concat([chosen, chosen.assign(hypothesis=1, error_m=9.0, confidence=0.99)])
+    return both.assign(scene="a", location_id=place, policy=policy, status="localized", error_deg=0.1)
+
+
+def test_a_camera_stops_at_its_confidence_or_after_the_last_view() -> None:
+    table = pd.concat(
+        [
+            poses_of("gain", 0, [False, True, True], [0.1, 0.96, 0.5]),  # stops after two, right
+            poses_of("gain", 1, [False, False, True], [0.97, 0.99, 0.99]),  # stops after one, wrong
+            poses_of("gain", 2, [False, True, True], [0.0, 0.2, 0.3]),  # never confident, right in the end
+            poses_of("gain", 3, [True, True, False], [0.9, 0.9, 0.98]),  # confident at last, wrong
+            poses_of("even", 0, [True, True, True], [0.99, 0.99, 0.99]),
+        ],
+        ignore_index=True,
+    )
+    summary = summarize(table, 0.95).set_index("policy")
+    gain = summary.loc["gain"]
+    assert gain[["right_1", "right_2", "right_3"]].tolist() == [0.25, 0.75, 0.75]
+    assert gain["views"] == (2 + 1 + 3 + 3) / 4 and gain["right"] == 0.5
+    assert gain["confident"] == 0.75 and gain["precision"] == pytest.approx(1 / 3)
+    assert gain["right_2_low"] <= 0.75 <= gain["right_2_high"]
+    assert summary.loc["even", "views"] == 1 and summary.loc["even", "precision"] == 1
+    assert "| gain   | 4" in summary_markdown(summary.reset_index(), 0.95)

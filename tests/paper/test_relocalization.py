@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from wheretolook_paper.evaluation.relocalization import summarize, summary_markdown
+from wheretolook_paper.studies.fit_confidence import fit, is_within, predict
 
 
 def poses_of(policy: str, place: int, good: list[bool], confidence: list[float]) -> pd.DataFrame:
@@ -31,9 +33,28 @@ def test_a_camera_stops_at_its_confidence_or_after_the_last_view() -> None:
     )
     summary = summarize(table, 0.95).set_index("policy")
     gain = summary.loc["gain"]
-    assert gain[["right_1", "right_2", "right_3"]].tolist() == [0.25, 0.75, 0.75]
+    assert gain["right_1"] == 0.25 and gain["right_2"] == gain["right_3"] == 0.75
     assert gain["views"] == (2 + 1 + 3 + 3) / 4 and gain["right"] == 0.5
     assert gain["confident"] == 0.75 and gain["precision"] == pytest.approx(1 / 3)
     assert gain["right_2_low"] <= 0.75 <= gain["right_2_high"]
     assert summary.loc["even", "views"] == 1 and summary.loc["even", "precision"] == 1
     assert "| gain   | 4" in summary_markdown(summary.reset_index(), 0.95)
+
+
+def test_a_fit_recovers_the_distribution_of_errors() -> None:
+    rng = np.random.default_rng(0)
+    n = 4000
+    place = rng.random(n) < 0.6
+    deviation = np.exp(rng.normal(-4, 1, n))
+    error = np.where(place, np.exp(1.1 * np.log(deviation) + 0.2 + rng.normal(0, 0.7, n)), 5.0)
+    poses = pd.DataFrame({"n_inliers": 100, "n_matches": 200, "elsewhere": np.where(place, 5, 50), "own": 30})
+    poses["rival_own"] = np.where(rng.random(n) < 0.9, np.where(place, 1, 40), 15)
+    poses = poses.assign(deviation_m=deviation, deviation_deg=10 * deviation, error_m=error, error_deg=5 * error)
+    model = fit(poses)
+    near = place & (error < 0.5)
+    assert model.errors[0].slope == pytest.approx(1.1, abs=0.05) and model.errors[0].deviation == pytest.approx(
+        0.7, abs=0.05
+    )
+    found = predict(model, poses, (0.03, 0.3))
+    assert found.mean() == pytest.approx(is_within(poses, (0.03, 0.3)).mean(), abs=0.02)
+    assert predict(model, poses, (0.5, 5.0)).mean() == pytest.approx(near.mean(), abs=0.03)

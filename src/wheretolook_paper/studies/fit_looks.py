@@ -1,12 +1,11 @@
-"""Fit the bundled models of view sets: the confidence of a joint pose, and the score of a set.
+"""Fit the bundled score of a set of views.
 
     python -m wheretolook_paper.studies.fit_looks --scenes '[FOLDER, ...]' [--places 60] [--draws 4]
 
 The scenes are validation scenes with one camera whose labels store pixels (`--label.store_pixels true`). At each
 location, sets of 1, 2, 3 and 5 views are drawn with probabilities that grow with their scores, and localized jointly.
-Two logistic regressions are fitted; each is tested on scenes it was not fitted to. Prints the JSON of both models. The
-weight of the position's variance is fixed, because random sets do not show that views of the same landmarks fail
-together.
+A logistic regression is fitted, and tested on scenes that it was not fitted to. Prints its JSON. The weight of the
+position's variance is fixed, because random sets do not show that views of the same landmarks fail together.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from wheretolook.dataset.layout import SceneFolder
 from wheretolook.dataset.viewpoint_files import read_table
 from wheretolook.dataset.viewpoint_table import is_good, poses
 from wheretolook.geometry.poses import camera_centers
-from wheretolook.localization import confidence
 from wheretolook.localization.joint_labels import label_sets
 from wheretolook.looks import set_score
 from wheretolook.looks.joint_visibility import candidate_views, log_position_variance
@@ -75,7 +73,7 @@ def report(name: str, inputs: np.ndarray, sets: pd.DataFrame) -> LogisticRegress
 
 
 def main(scenes: tuple[Path, ...], places: int = 60, draws: int = 4) -> None:
-    """Draw sets, fit both models and print them.
+    """Draw sets, fit the model and print it.
 
     Args:
         scenes: scene folders.
@@ -83,11 +81,6 @@ def main(scenes: tuple[Path, ...], places: int = 60, draws: int = 4) -> None:
         draws: sets of each number of views at a location.
     """
     sets = pd.concat([drawn_sets(SceneFolder(folder, "val"), places, draws) for folder in scenes], ignore_index=True)
-    accepted = sets[sets["n_inliers"] >= 10]
-    names = ("n_inliers", "n_matches", "elsewhere", "own", "rival_own", "deviation_deg")
-    fitted = report("confidence", confidence.confidence_features(*(accepted[name] for name in names)), accepted)
-    weights = dict(zip(confidence.FEATURE_NAMES, fitted.coef_[0].round(4).tolist(), strict=True))
-    print(json.dumps({"weights": weights, "bias": round(float(fitted.intercept_[0]), 4)}, indent=2))
     probability = np.clip(1 - sets["failed"].to_numpy(), set_score.MIN_PROBABILITY, 1 - set_score.MIN_PROBABILITY)
     mixed = np.log(probability / (1 - probability)) - VARIANCE * sets["log_position_variance"].to_numpy()
     fitted = report("set score", mixed[:, None], sets)

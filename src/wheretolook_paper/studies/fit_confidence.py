@@ -1,0 +1,99 @@
+"""Fit the bundled model of the confidence in a pose.
+
+    wheretolook relocalize --config my.yaml --in-scenes '[val-0, val-1, ...]' --policies '[random]' --places 60
+    python -m wheretolook_paper.studies.fit_confidence --poses data/my/results/relocalize/poses.parquet
+
+Every pose hypothesis of the simulated views counts, also those that were not chosen. Each scene is judged by a fit on
+the others, at several accuracies. Prints the JSON of the model.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from jsonargparse import auto_cli
+from sklearn.linear_model import LogisticRegression
+from sklearn.metrics import roc_auc_score
+
+from wheretolook.evaluation.calibration import expected_calibration_error
+from wheretolook.geometry.poses import Float
+from wheretolook.localization.confidence import (
+    FEATURE_NAMES,
+    MIN_INLIERS,
+    RIGHT_PLACE_LIMITS,
+    Accuracy,
+    ConfidenceModel,
+    ErrorModel,
+    confidence_features,
+)
+
+ACCURACIES: tuple[Accuracy, ...] = ((0.01, 0.1), (0.02, 0.2), (0.05, 0.4), (0.1, 1.0), (0.25, 2.0), (0.5, 5.0))
+INPUTS = ("n_inliers", "n_matches", "elsewhere", "own", "rival_own", "deviation_deg")
+
+
+def features_of(poses: pd.DataFrame) -> Float:
+    """Return the features (B, K) of pose hypotheses."""
+    return confidence_features(*(poses[name] for name in INPUTS))
+
+
+def is_within(poses: pd.DataFrame, accuracy: Accuracy) -> np.ndarray:
+    """Return which poses (B,) are within an accuracy."""
+    return ((poses["error_m"] <= accuracy[0]) & (poses["error_deg"] <= accuracy[1])).to_numpy()
+
+
+def fit(poses: pd.DataFrame) -> ConfidenceModel:
+    """Fit both factors to pose hypotheses."""
+    place = is_within(poses, RIGHT_PLACE_LIMITS)
+    fitted = LogisticRegression(C=1e3, max_iter=1000).fit(features_of(poses), place)
+    right = poses[place & np.isfinite(poses["deviation_m"]).to_numpy()]
+    errors = []
+    for unit in ("m", "deg"):
+        predicted = np.log(right[f"deviation_{unit}"].to_numpy())
+        actual = np.log(right[f"error_{unit}"].to_numpy())
+        slope, offset = np.polyfit(predicted, actual, 1)
+        deviation = float((actual - slope * predicted - offset).std())
+        errors.append(ErrorModel(round(float(slope), 4), round(float(offset), 4), round(deviation, 4)))
+    weights = tuple(fitted.coef_[0].round(4).tolist())
+    return ConfidenceModel(weights, round(float(fitted.intercept_[0]), 4), tuple(errors))
+
+
+def predict(model: ConfidenceModel, poses: pd.DataFrame, accuracy: Accuracy) -> Float:
+    """Predict the probabilities (B,) that poses are within an accuracy."""
+    place = model.predict_proba(features_of(poses))
+    limits = zip(model.errors, accuracy, ("deviation_m", "deviation_deg"), strict=True)
+    below = [[error.p_below(limit, value) for value in poses[name]] for error, limit, name in limits]
+    return place * np.min(below, axis=0)
+
+
+def main(poses: tuple[Path, ...]) -> None:
+    """Fit the model, judge each scene by a fit on the others, and print the model.
+
+    Args:
+        poses: `results/relocalize/poses.parquet` of datasets of validation scenes.
+    """
+    table = pd.concat([pd.read_parquet(path) for path in poses], ignore_index=True)
+    table = table[table["n_inliers"] >= MIN_INLIERS].reset_index(drop=True)
+    scenes = table["scene"].unique()
+    models = {scene: fit(table[table["scene"] != scene]) for scene in scenes} if len(scenes) > 1 else {}
+    chosen = table[table["hypothesis"] == 0]
+    for accuracy in ACCURACIES if models else ():
+        found = [predict(models[scene], chosen[chosen["scene"] == scene], accuracy) for scene in scenes]
+        good = np.concatenate([is_within(chosen[chosen["scene"] == scene], accuracy) for scene in scenes])
+        probability = np.concatenate(found)
+        sure = probability >= 0.99
+        numbers = (
+            f"AUC {roc_auc_score(good, probability):.3f}, error {expected_calibration_error(probability, good):.3f}"
+        )
+        right = f"{good[sure].mean():.3f} of {sure.sum()} at 0.99" if sure.any() else "none at 0.99"
+        print(f"{accuracy[0]} m, {accuracy[1]} degrees: {good.mean():.3f} right; {numbers}; right {right}")
+    model = fit(table)
+    errors = {name: vars(error) for name, error in zip(("position", "orientation"), model.errors, strict=True)}
+    weights = dict(zip(FEATURE_NAMES, model.weights, strict=True))
+    print(json.dumps({"weights": weights, "bias": model.bias, "errors": errors}, indent=2))
+
+
+if __name__ == "__main__":
+    auto_cli(main, as_positional=False)

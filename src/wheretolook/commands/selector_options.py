@@ -120,8 +120,8 @@ def finish(command: SelectorOptions, selector: WhereToLook, views: SelectedViews
     landmarks = f"{len(localization_map.landmarks):,} landmarks ({features})"
     print(f"{landmarks}, occlusion: {localization_map.occlusion.name}, method: {views.method}")
     best = views.rank == 1
-    scores = views.score[best]
-    print(f"{locations}: {n_used}{skipped}; best scores {scores.min():.3g} to {scores.max():.3g}")
+    kind, scores = ("best scores", views.score) if views.set_score is None else ("set scores", views.set_score)
+    print(f"{locations}: {n_used}{skipped}; {kind} {scores[best].min():.3g} to {scores[best].max():.3g}")
     counts = {
         "no visible landmark": views.n_visible[best] == 0,
         "outside the training distribution (column in_range)": ~views.in_range[best],

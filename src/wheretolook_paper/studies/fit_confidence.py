@@ -41,14 +41,15 @@ def features_of(poses: pd.DataFrame) -> Float:
 
 def is_within(poses: pd.DataFrame, accuracy: Accuracy) -> np.ndarray:
     """Return which poses (B,) are within an accuracy."""
-    return ((poses["error_m"] <= accuracy[0]) & (poses["error_deg"] <= accuracy[1])).to_numpy()
+    errors = poses[["error_m", "error_deg"]].to_numpy(np.float64)
+    return np.asarray((errors <= accuracy).all(axis=1))
 
 
 def fit(poses: pd.DataFrame) -> ConfidenceModel:
     """Fit both factors to pose hypotheses."""
     place = is_within(poses, RIGHT_PLACE_LIMITS)
     fitted = LogisticRegression(C=1e3, max_iter=1000).fit(features_of(poses), place)
-    right = poses[place & np.isfinite(poses["deviation_m"]).to_numpy()]
+    right = poses[place & np.isfinite(poses["deviation_m"].to_numpy())]
     errors = []
     for unit in ("m", "deg"):
         predicted = np.log(right[f"deviation_{unit}"].to_numpy())

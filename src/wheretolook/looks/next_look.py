@@ -140,8 +140,8 @@ class NextLookSelector:
 
 def angles_to_views(localization: JointLocalization, axes: Float) -> Float:
     """Angles (D,) in degrees between axes (D, 3) in the rig and the nearest localized view."""
-    taken = np.stack([look.cam_from_rig[2, :3] for look in localization.looks])
-    return np.asarray(np.degrees(np.arccos(np.clip(axes @ taken.T, -1, 1))).min(axis=1))
+    views = np.stack([look.cam_from_rig[2, :3] for look in localization.looks])
+    return np.asarray(np.degrees(np.arccos(np.clip(axes @ views.T, -1, 1))).min(axis=1))
 
 
 def _level_from_rig(localization: JointLocalization, up: ArrayLike | None) -> Float:

@@ -65,14 +65,14 @@ class Place:
         center = camera_centers(self.cam_from_world[:1])
         return self.robot.scorer.score_directions(center, self.cam_from_world[:, 2, :3])[0]
 
-    def values(self, policy: str, taken: Sequence[int], rng: np.random.Generator) -> Float:
+    def values(self, policy: str, earlier: Sequence[int], rng: np.random.Generator) -> Float:
         """Rate all views (D,) by a policy, given the rows of earlier views."""
         if policy == "random":
             return rng.random(len(self.cam_from_world))
         if policy == "known":
             return self.true_scores()
-        localization = self.localize(taken)
-        axes = self.cam_from_world[:, 2, :3] @ self.cam_from_world[taken[0]][:, :3].T
+        localization = self.localize(earlier)
+        axes = self.cam_from_world[:, 2, :3] @ self.cam_from_world[earlier[0]][:, :3].T
         if policy == "even":
             return angles_to_views(localization, axes)
         selector = self.robot.selector
@@ -88,12 +88,12 @@ class Place:
 
     def turn(self, policy: str, first: int, n_views: int, rng: np.random.Generator) -> list[int]:
         """Return the rows of views that a policy selects after the first."""
-        taken = [first]
-        while len(taken) < min(n_views, len(self.cam_from_world)):
-            values = self.values(policy, taken, rng).copy()
-            values[taken] = -np.inf
-            taken.append(int(np.argmax(values)))
-        return taken
+        earlier = [first]
+        while len(earlier) < min(n_views, len(self.cam_from_world)):
+            values = self.values(policy, earlier, rng).copy()
+            values[earlier] = -np.inf
+            earlier.append(int(np.argmax(values)))
+        return earlier
 
 
 class SimulatedRobot:
@@ -120,9 +120,9 @@ class SimulatedRobot:
             place = Place(self, poses)
             first = int(np.random.default_rng([seed, number]).integers(len(poses)))
             for policy in policies:
-                taken = place.turn(policy, first, n_views, np.random.default_rng([seed, number, 1]))
-                for n in range(1, len(taken) + 1):
-                    result = place.localize(taken[:n])
+                earlier = place.turn(policy, first, n_views, np.random.default_rng([seed, number, 1]))
+                for n in range(1, len(earlier) + 1):
+                    result = place.localize(earlier[:n])
                     for k, pose in enumerate((result, *result.rivals)):
                         label = set_label(pose, poses[first : first + 1])
                         rows.append((number, policy, n, k, *label))
@@ -143,10 +143,10 @@ def summarize(table: pd.DataFrame, confidence: float, resamples: int = 2000) -> 
         part = good[good["policy"] == policy]
         places = part.set_index(["scene", "location_id", "n_looks"])[["good", "confidence"]].unstack()
         right = places["good"].to_numpy(float)
-        sure = places["confidence"].to_numpy() >= confidence
-        stop = np.argmax(np.column_stack([sure[:, :-1], np.ones(len(sure), dtype=bool)]), axis=1)
+        reached = places["confidence"].to_numpy() >= confidence
+        stop = np.argmax(np.column_stack([reached[:, :-1], np.ones(len(reached), dtype=bool)]), axis=1)
         at_stop = right[np.arange(len(right)), stop]
-        is_sure = sure.any(axis=1)
+        stopped = reached.any(axis=1)
         scenes = np.unique(places.index.get_level_values("scene"), return_inverse=True)[1]
         bootstrap = ClusterBootstrap(np.arange(len(right)), resamples, 0, scenes)
         values = np.column_stack([right, stop + 1, at_stop])
@@ -155,8 +155,8 @@ def summarize(table: pd.DataFrame, confidence: float, resamples: int = 2000) -> 
         row: dict[str, Any] = {"policy": policy, "places": len(right)}
         for name, value, least, most in zip(names, values.mean(0), low, high, strict=True):
             row |= {name: value, f"{name}_low": least, f"{name}_high": most}
-        precision = at_stop[is_sure].mean() if is_sure.any() else np.nan
-        rows.append(row | {"confident": is_sure.mean(), "precision": precision})
+        precision = at_stop[stopped].mean() if stopped.any() else np.nan
+        rows.append(row | {"confident": stopped.mean(), "precision": precision})
     return pd.DataFrame(rows)
 
 

@@ -50,6 +50,16 @@ def test_photographs_are_listed_by_name(tmp_path: Path) -> None:
     assert list_photographs(tmp_path) == ["a.png", "b.JPG", "hall/c.jpg"]
 
 
+def test_depth_images_are_no_photographs(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for name in ("a.color.jpg", "b.color.png"):
+        save(tmp_path / name, sized(20, 30))
+    Image.fromarray(np.full((20, 30), 90, np.uint8)).save(tmp_path / "grey.png")
+    for name in ("a.depth.png", "b.depth.png"):
+        Image.fromarray(np.full((20, 30), 1500, np.uint16)).save(tmp_path / name)
+    assert list_photographs(tmp_path) == ["a.color.jpg", "b.color.png", "grey.png"]
+    assert "2 depth images" in caplog.text
+
+
 def test_names_that_colmap_cannot_read_are_rejected(tmp_path: Path) -> None:
     for name in (b"a.png", b"caf\xe9.png", "ä.png".encode()):
         (tmp_path / os.fsdecode(name)).touch()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ from wheretolook.mapping.config import PhotographsConfig
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.images import read_image
+from wheretolook.utils.logs import LOG
 
 if TYPE_CHECKING:
     import pycolmap
@@ -22,13 +24,17 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
 
 def list_photographs(folder: Path) -> list[str]:
-    """List photographs in a folder and its subfolders by relative name.
+    """List photographs in a folder and its subfolders by relative name, without depth images (PNG, 16-bit grey).
 
     Raises MapError if there are fewer than two, or a name is not in UTF-8, which COLMAP needs.
     """
     if not folder.is_dir():
         raise MapError("there is no such folder", path=folder, fix="Give the folder of the photographs.")
-    files = (path for path in folder.rglob("*") if path.is_file() and path.suffix.lower() in SUFFIXES)
+    files = [path for path in folder.rglob("*") if path.is_file() and path.suffix.lower() in SUFFIXES]
+    n_files = len(files)
+    files = [path for path in files if not _is_depth_image(path)]
+    if len(files) < n_files:
+        LOG.warning("%s: %d depth images (PNG, 16-bit grey) are left out", folder, n_files - len(files))
     names = sorted(path.relative_to(folder).as_posix() for path in files)
     for name in names:
         if name != name.encode(errors="replace").decode():
@@ -37,6 +43,14 @@ def list_photographs(folder: Path) -> list[str]:
         fix = f"Files that end in {', '.join(SUFFIXES)} count."
         raise MapError("a map needs at least two photographs", path=folder, value=len(names), fix=fix)
     return names
+
+
+def _is_depth_image(path: Path) -> bool:
+    """Return whether a file is a PNG of one channel with 16 bits, by its header."""
+    if path.suffix.lower() != ".png" or not os.access(path, os.R_OK):
+        return False
+    with path.open("rb") as file:
+        return file.read(26)[24:] == b"\x10\x00"
 
 
 def read_photograph(path: Path, turned: bool = True) -> NDArray[np.uint8]:

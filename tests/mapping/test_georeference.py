@@ -141,3 +141,17 @@ def test_invalid_settings_are_rejected() -> None:
     ):
         with pytest.raises(ConfigError):
             MapConfig(**settings)
+
+
+def test_a_mislabelled_position_of_many_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
+    rng = np.random.default_rng(0)
+    centers = {f"{n:02}.jpg": rng.normal(0, 2, 3) for n in range(30)}
+    positions = {name: 3 * center + (1, 2, 3) for name, center in centers.items()}
+    positions["07.jpg"] = positions["07.jpg"] + (9, -7, 0)
+    scale, similarity = scale_from_positions(centers, positions)
+    assert similarity.scale == pytest.approx(3) and "07.jpg" not in scale.residuals
+    assert "m off" in scale.unused["07.jpg"] and "07.jpg" in caplog.text
+    for n in range(8, 12):  # more than one in twenty
+        positions[f"{n:02}.jpg"] = positions[f"{n:02}.jpg"] + (0, 9, 5)
+    with pytest.raises(MapError, match="do not fit"):
+        scale_from_positions(centers, positions)

@@ -19,11 +19,13 @@ from wheretolook.mapping.config import MARKER, SCALE_TOLERANCE_PERCENT, FrameOpt
 from wheretolook.mapping.markers import Marker, MarkerView, detect_markers, marker_detector, place_marker
 from wheretolook.mapping.photographs import read_photograph
 from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.logs import LOG
 from wheretolook.utils.reading import read_json_object, read_text
 
 REPORT_FILE = "report.json"
 DEPTH_M = 5.0
 """Median depth of the images that a map of unknown scale is scaled to: scorers were trained in rooms."""
+MAX_WRONG_SHARE = 0.05  # of given positions that are left out
 _FLAT = 1e-6  # points whose second largest spread is below this share of the largest are on a line
 
 
@@ -205,23 +207,30 @@ def median_depths(arrays: ModelArrays, cam_from_world: Float) -> Float:
 def scale_from_positions(centers: Mapping[str, Float], positions: Mapping[str, Float]) -> tuple[MapScale, Similarity]:
     """The scale, and the similarity from camera centres in the map to known positions in metres, by photograph.
 
-    The tolerance is a share of the diagonal of the box around the positions used. Raises MapError if fewer than three
-    photographs are in the map, all are on a line, or the error of one exceeds the tolerance.
+    The tolerance is a share of the diagonal of the box around the positions used. The worst positions beyond it are left
+    out, up to `MAX_WRONG_SHARE`, with a warning. Raises MapError if fewer than three photographs are in the map, all are
+    on a line, or the error of another exceeds the tolerance.
     """
     names = [name for name in positions if name in centers]
-    source = np.array([centers[name] for name in names]).reshape(-1, 3)
-    target = np.array([positions[name] for name in names]).reshape(-1, 3)
-    similarity = fit_similarity(source, target)
-    errors_m = np.linalg.norm(similarity.apply(source) - target, axis=1).tolist()
-    residuals = dict(zip(names, errors_m, strict=True))
-    limit_m = SCALE_TOLERANCE_PERCENT / 100 * float(np.linalg.norm(np.ptp(target, axis=0)))
-    wrong = sorted((name for name in names if residuals[name] > limit_m), key=lambda name: -residuals[name])
-    if wrong:
-        limit = f"{limit_m:.3g} m, {SCALE_TOLERANCE_PERCENT:g} % of their extent"
-        value = ", ".join(f"{name}: {residuals[name]:.3g} m" for name in wrong[:5])
-        fix = "Check the first one's position, and the units and names of all."
-        raise MapError(f"the positions do not fit the map: errors exceed {limit}", value=value, fix=fix)
     unused = {name: "not in the map" for name in positions if name not in centers}
+    for removable in range(int(MAX_WRONG_SHARE * len(names)), -1, -1):
+        source = np.array([centers[name] for name in names]).reshape(-1, 3)
+        target = np.array([positions[name] for name in names]).reshape(-1, 3)
+        similarity = fit_similarity(source, target)
+        errors_m = np.linalg.norm(similarity.apply(source) - target, axis=1).tolist()
+        residuals = dict(zip(names, errors_m, strict=True))
+        limit_m = SCALE_TOLERANCE_PERCENT / 100 * float(np.linalg.norm(np.ptp(target, axis=0)))
+        wrong = sorted((name for name in names if residuals[name] > limit_m), key=lambda name: -residuals[name])
+        if not wrong:
+            break
+        if removable == 0:
+            limit = f"{limit_m:.3g} m, {SCALE_TOLERANCE_PERCENT:g} % of their extent"
+            value = ", ".join(f"{name}: {residuals[name]:.3g} m" for name in wrong[:5])
+            fix = "Check the first one's position, and the units and names of all."
+            raise MapError(f"the positions do not fit the map: errors exceed {limit}", value=value, fix=fix)
+        names.remove(wrong[0])
+        unused[wrong[0]] = f"{residuals[wrong[0]]:.3g} m off"
+        LOG.warning("the position of %s is left out: it is %s", wrong[0], unused[wrong[0]])
     return MapScale("positions", similarity.scale, residuals, "m", unused), similarity
 
 

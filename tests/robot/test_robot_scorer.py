@@ -265,7 +265,8 @@ def content(name: str, change):
 
 
 DAMAGES = [
-    setting("camera", name, value=value) for name, value in (("fx", 0), ("fy", np.nan), ("width", -1), ("cx", "a"))
+    setting("camera", name, value=value)
+    for name, value in (("fx", 0), ("fy", np.nan), ("width", -1), ("cx", "a"), ("cx", np.nan), ("fx", 1e9))
 ]
 DAMAGES += [
     setting(key, value=None) for key in ("camera", "attributes", "most", "range", "n_landmarks", "format_version")

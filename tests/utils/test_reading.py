@@ -68,6 +68,7 @@ INVALID: list[tuple[Callable[[Path], object], Callable[[Path], object]]] = [
     (read_yaml, alias_bomb),
     (read_yaml, text("a: &a " + "x" * 50_000 + "\nb: [" + "*a, " * 10_000 + "]")),
     (read_yaml, text("a: 2001-99-99")),
+    (read_yaml, text("a: 1\nb: {c: 2, c: 3}")),
     (read_yaml, text("!!python/object/apply:os.system ['true']")),
 ]
 

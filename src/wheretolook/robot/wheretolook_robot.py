@@ -129,7 +129,7 @@ class RobotScorer:
                 raise ValueError(f"this program reads format {FORMAT_VERSION}")
             self.camera: dict[str, float] = {name: float(about["camera"][name]) for name in CAMERA}  # in pixels
             positive = min(self.camera[name] for name in CAMERA[:4])
-            if not (np.isfinite([*self.camera.values()]).all() and positive > 0):
+            if not (positive > 0 and (np.abs([*self.camera.values()]) < 1e6).all()):
                 raise ValueError(f"the camera has an impossible size or focal length: {self.camera}")
             self._names = [str(name) for name in about["attributes"]]  # inputs of the network, in its order
             self._map_names = [str(name) for name in about["map_attributes"]]  # columns of `attributes`

@@ -82,7 +82,7 @@ def read_json_object(path: Path) -> dict[str, Any]:
 def read_yaml(path: Path) -> Any:
     """Read a YAML file of plain values with a safe loader, which creates no objects of classes that a file names.
 
-    Raises ValueError if it is none, or if its aliases expand to too much.
+    Raises ValueError if it is none, if a key is given twice, or if its aliases expand to too much.
     """
     import yaml
 
@@ -94,11 +94,29 @@ def read_yaml(path: Path) -> Any:
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if depth > MAX_YAML_DEPTH:
                 raise ValueError("its values are nested too deeply")
+        _check_keys(yaml.compose(text, Loader=loader))
         content = yaml.load(text, Loader=loader)
     except (yaml.YAMLError, RecursionError, TypeError, OverflowError) as error:
         raise ValueError(" ".join(str(error).split())) from error
     _check_expanded_size(content)
     return content
+
+
+def _check_keys(root: Any) -> None:
+    """Raise ValueError if a mapping in a tree of YAML nodes has a key twice: the first value would be ignored."""
+    pending = [root]
+    known: set[int] = set()  # nodes may be shared by aliases
+    while pending:
+        node = pending.pop()
+        if isinstance(node, tuple):
+            pending += node
+        elif isinstance(getattr(node, "value", None), list) and id(node) not in known:
+            known.add(id(node))
+            pending += node.value
+            keys = [key.value for key, _ in node.value if isinstance(key.value, str)] if node.id == "mapping" else []
+            for key in keys:
+                if keys.count(key) > 1 and key != "<<":
+                    raise ValueError(f"the key {key} is given twice")
 
 
 def _check_expanded_size(content: Any) -> None:

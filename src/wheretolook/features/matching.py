@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+
+class NearestLandmarks(Protocol):
+    """Finds landmarks by their descriptors; see `DescriptorMatcher.nearest`."""
+
+    n_landmarks: int
+
+    def nearest(
+        self, descriptors: NDArray[np.uint8], count: int = 2
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]: ...
 
 
 class Matches(NamedTuple):
@@ -138,7 +148,7 @@ def _byte_products_are_fast() -> bool:
 
 
 def match(
-    matcher: DescriptorMatcher, descriptors: Sequence[NDArray[np.uint8]], max_ratio: float, count: int = 2
+    matcher: NearestLandmarks, descriptors: Sequence[NDArray[np.uint8]], max_ratio: float, count: int = 2
 ) -> list[Matches]:
     """2D-3D matches of several images, from their descriptors (K_i, 128) uint8, with each keypoint's nearest landmarks.
 

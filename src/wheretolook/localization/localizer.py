@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES
 from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.descriptor_index import DescriptorIndex, has_index
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.matching import MAX_NEAREST, DescriptorMatcher, Matches, match
@@ -81,8 +82,12 @@ class Localizer:
         if extractor is not None:
             self._check_extractor()
         self._device = device
-        matcher = DescriptorMatcher if self.kind.in_bytes else SimilarityMatcher
-        self._matcher = matcher(landmarks.descriptors, device)
+        self._matcher: DescriptorMatcher | DescriptorIndex | SimilarityMatcher
+        if self.kind.in_bytes and config.method == "hypotheses" and has_index(len(landmarks), device):
+            self._matcher = DescriptorIndex(landmarks.descriptors)
+        else:
+            matcher = DescriptorMatcher if self.kind.in_bytes else SimilarityMatcher
+            self._matcher = matcher(landmarks.descriptors, device)
         self._guided: LightGlueMatcher | None = None
         if config.lightglue:
             from wheretolook.localization.lightglue import LightGlueMatcher

@@ -155,3 +155,5 @@ def test_a_mislabelled_position_of_many_is_left_out(caplog: pytest.LogCaptureFix
         positions[f"{n:02}.jpg"] = positions[f"{n:02}.jpg"] + (0, 9, 5)
     with pytest.raises(MapError, match="do not fit"):
         scale_from_positions(centers, positions)
+    with pytest.raises(MapError, match=r"x.png; images are named like 00.jpg"):
+        scale_from_positions(centers, {"x.png": np.zeros(3)})

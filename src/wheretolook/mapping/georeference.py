@@ -213,6 +213,9 @@ def scale_from_positions(centers: Mapping[str, Float], positions: Mapping[str, F
     """
     names = [name for name in positions if name in centers]
     unused = {name: "not in the map" for name in positions if name not in centers}
+    if not names and positions and centers:
+        value = f"{next(iter(positions))}; images are named like {next(iter(centers))}"
+        raise MapError("no position is that of an image in the map", value=value, fix="Name the images as in the map.")
     for removable in range(int(MAX_WRONG_SHARE * len(names)), -1, -1):
         source = np.array([centers[name] for name in names]).reshape(-1, 3)
         target = np.array([positions[name] for name in names]).reshape(-1, 3)

@@ -1,6 +1,6 @@
 # make demo   sets everything up and runs the whole line on the embedded default
-# make test   sets everything up and runs linter, type checker and the tests: nine minutes on two cores
-# make test-all   the same and the slow tests too, in half an hour
+# make test   sets everything up and runs linter, type checker and the tests: three minutes on two cores
+# make test-all   the same and the slow tests too, in a quarter of an hour
 # make bench   measures what must not become slower, in a minute, and compares with tests/benchmarks/ledger.csv
 # make ui     opens MLflow at the comparison of methods; make lab opens Jupyter on the notebooks
 # make html   runs all notebooks and writes them as pages, notebooks/html; make docs builds the documentation, site/

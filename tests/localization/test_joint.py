@@ -134,6 +134,35 @@ def test_turns_that_are_known_to_a_degree_are_refined():
     assert np.median(np.array(ignored)[:, 0]) > 3 * np.median(np.array(errors)[:, 0])
 
 
+@pytest.mark.parametrize(("error_deg", "contradicted"), [(0.0, False), (3.0, True)])
+def test_rotations_that_the_images_contradict_are_reported_and_do_no_harm(error_deg, contradicted):
+    """The second view is turned by another angle than stated; the third as stated."""
+    points = a_room()
+    estimator = PoseEstimator(points)
+    for seed in range(5):
+        poses, looks, _ = looks_from(points, seed=seed, noise_px=1.0, outliers=0.4)
+        wrong = Rotation.from_rotvec(np.radians([0.0, error_deg, 0.0])).as_matrix() @ looks[1].cam_from_rig
+        looks[1] = Look(wrong, looks[1].pixels, looks[1].rows, CAMERA)
+        found = JointLocalizer(estimator, 0.2, check_turns=True).localize(looks)
+        assert (found.turn_error_deg > 0) == contradicted
+        assert found.turn_error_deg == pytest.approx(error_deg, abs=0.4)
+        error_m, angle = pose_error(found.cams_from_world, poses)
+        assert error_m.max() < 0.05 and angle.max() < 0.4
+        if contradicted:
+            believed = JointLocalizer(estimator, 0.2).localize(looks)
+            assert pose_error(believed.cams_from_world, poses)[1].max() > 1
+
+
+def test_wrong_poses_of_views_do_not_contradict_rotations():
+    """Matches of the second view are of landmarks at random."""
+    points = a_room()
+    _, looks, _ = looks_from(points, noise_px=1.0)
+    rng = np.random.default_rng(0)
+    looks[1] = Look(looks[1].cam_from_rig, looks[1].pixels, rng.permutation(looks[1].rows), CAMERA)
+    found = JointLocalizer(PoseEstimator(points), 0.2, check_turns=True).localize(looks)
+    assert found.turn_error_deg == 0 and found.status == "localized"
+
+
 def test_a_map_in_national_coordinates_gives_the_same():
     points = a_room()
     far = np.array([4_512_300.0, 5_402_100.0, 300.0])

@@ -131,14 +131,14 @@ class RigMatches:
             poses.append(sampled)
             left = [mask & ~inlier for mask, inlier in zip(left, sampled.inliers, strict=True)]
         for k, single in enumerate(single_view_poses):
-            poses += [self.refine(self._rig_pose(k, pose)) for pose, _ in single]
+            poses += [self.refine(self.rig_pose(k, pose)) for pose, _ in single]
         return distinct(poses)
 
     def first_poses(self, poses: SingleViewPoses) -> list[Hypothesis]:
         """Poses of the only view as its single-image localization left them, in their order."""
         hypotheses = []
         for pose, mask in poses:
-            evaluated = self._evaluate(self._rig_pose(0, pose))
+            evaluated = self._evaluate(self.rig_pose(0, pose))
             hypotheses.append(replace(evaluated, inliers=(mask,)))
         return hypotheses
 
@@ -154,7 +154,7 @@ class RigMatches:
             hypothesis = rig.refine(hypothesis.rig_from_world)
         return hypothesis
 
-    def _rig_pose(self, k: int, cam_from_world: Float) -> Float:
+    def rig_pose(self, k: int, cam_from_world: Float) -> Float:
         """rig_from_world (3, 4) from the pose of view k."""
         return compose_poses(invert_poses(self.cam_from_rig[k]), cam_from_world)
 

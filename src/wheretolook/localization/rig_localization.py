@@ -28,6 +28,7 @@ from wheretolook.localization.hypotheses import (
 )
 from wheretolook.localization.pose_ambiguity import PoseAmbiguity, most_likely, strongest_rival
 from wheretolook.localization.rig import Look
+from wheretolook.localization.turn_errors import turn_errors
 from wheretolook.utils.errors import PoseError
 from wheretolook.utils.validation import check_range
 
@@ -56,6 +57,7 @@ class JointLocalization:
         covariance: (6, 6) of position (m) and orientation (rad) in the world given the inliers; infinite where they
             do not determine the pose.
         rivals: the other hypotheses, by decreasing evidence, without rivals of their own.
+        turn_error_deg: largest error of the known rotations if the images contradict them; else 0.
     """
 
     status: str
@@ -69,6 +71,7 @@ class JointLocalization:
     unique_support: tuple[int, int] = (0, 0)
     covariance: Float = field(default_factory=lambda: np.full((6, 6), np.inf))
     rivals: tuple[JointLocalization, ...] = ()
+    turn_error_deg: float = 0.0
 
     @property
     def n_inliers(self) -> int:
@@ -92,13 +95,15 @@ class JointLocalizer:
     view's own image, not angles, with which RANSAC would be twice as lenient near the border of an image.
 
     With `LocalizerConfig.method` "first", a single view is localized exactly as by the estimator. `turn_noise_deg` is
-    one standard deviation, about each axis, of the known rotations between views.
+    one standard deviation, about each axis, of the known rotations between views. With `check_turns`, the views' own
+    poses are compared with these: if they contradict them, the noise that they imply replaces it (`turn_errors`).
     """
 
-    def __init__(self, estimator: PoseEstimator, turn_noise_deg: float = 0.0) -> None:
+    def __init__(self, estimator: PoseEstimator, turn_noise_deg: float = 0.0, check_turns: bool = False) -> None:
         check_range("the noise of rotations in degrees", turn_noise_deg, 0, 90)
         self.estimator = estimator
         self.turn_noise_deg = turn_noise_deg
+        self.check_turns = check_turns
 
     @cached_property
     def ambiguity(self) -> PoseAmbiguity:
@@ -139,7 +144,8 @@ class JointLocalizer:
         if single_view_poses is None:
             count = POSES_OF_A_VIEW if len(looks) > 1 else POSES_OF_AN_IMAGE
             single_view_poses = [self.single_view_poses(look, count) for look in looks]
-        rig = RigMatches(self.estimator, looks, self.turn_noise_deg)
+        noise_deg, error_deg = self._turn_noise(looks, single_view_poses)
+        rig = RigMatches(self.estimator, looks, noise_deg)
         first = len(looks) == 1 and self.estimator.config.method == "first"
         if first:
             hypotheses = rig.first_poses(single_view_poses[0])
@@ -148,8 +154,16 @@ class JointLocalizer:
             if all(look.candidates is not None for look in looks):
                 hypotheses = distinct([rig.guided(hypothesis) for hypothesis in hypotheses])
         if not hypotheses:
-            return JointLocalization(NO_POSE, tuple(looks), n_matches)
-        return self._ranked(hypotheses, n_matches, first)
+            return JointLocalization(NO_POSE, tuple(looks), n_matches, turn_error_deg=error_deg)
+        return replace(self._ranked(hypotheses, n_matches, first), turn_error_deg=error_deg)
+
+    def _turn_noise(self, looks: Sequence[Look], poses: Sequence[SingleViewPoses]) -> tuple[float, float]:
+        """Return the noise of the known rotations to assume, and their largest error if the images contradict them."""
+        if self.check_turns and len(looks) > 1:
+            errors = turn_errors(self.estimator, looks, poses, self.turn_noise_deg)
+            if errors is not None and errors.contradictory:
+                return max(errors.noise_deg, self.turn_noise_deg), errors.largest_deg
+        return self.turn_noise_deg, 0.0
 
     def _ranked(self, hypotheses: Sequence[Hypothesis], n_matches: int, first: bool) -> JointLocalization:
         """Compare hypotheses; return the best with the others as its rivals."""

@@ -46,6 +46,7 @@ class RobotPose:
     cam_from_world: Float  # (3, 4) in the map's own frame and unit
     probability: float  # that it is within the accuracy
     n_inliers: int
+    turn_error_deg: float = 0.0  # largest error of the given rotations if the images contradict them
 
 
 class RobotLocalizer:
@@ -71,7 +72,7 @@ class RobotLocalizer:
         self._descriptors = np.zeros((128, padded), dtype=np.float32)
         self._descriptors[:, : len(points)] = descriptors.T
         self._config = LocalizerConfig(method="hypotheses")
-        self._localizer = JointLocalizer(PoseEstimator(points, self._config), TURN_NOISE_DEG)
+        self._localizer = JointLocalizer(PoseEstimator(points, self._config), TURN_NOISE_DEG, check_turns=True)
 
     def localize(
         self,
@@ -97,7 +98,7 @@ class RobotLocalizer:
             return []
         found = zip((result, *result.rivals), probabilities(result, accuracy), strict=True)
         return [
-            RobotPose(self._in_map(pose.rig_from_world), float(probability), pose.n_inliers)
+            RobotPose(self._in_map(pose.rig_from_world), float(probability), pose.n_inliers, result.turn_error_deg)
             for pose, probability in found
             if pose.rig_from_world is not None
         ]

@@ -99,7 +99,7 @@ class ImageLocalizer:
 
     @cached_property
     def _rigs(self) -> JointLocalizer:
-        return JointLocalizer(self._localizer.estimator, TURN_NOISE_DEG)
+        return JointLocalizer(self._localizer.estimator, TURN_NOISE_DEG, check_turns=True)
 
     def localize(
         self,

@@ -34,7 +34,7 @@ class Localized:
     Attributes:
         names: N names of the images.
         status: "localized"; "too_few_matches" or "no_pose"; "error" in a batch, for an image that cannot be used.
-        reason: why it is not localized, in words.
+        reason: why it is not localized, or that the images contradict the given rotations.
         cam_from_world: (N, 3, 4), world-to-camera; camera x right, y down, z forward. None unless localized.
         probability: that the pose is right (`wheretolook.localization.confidence`).
         n_matches: matches of all images with the map.
@@ -76,6 +76,8 @@ class Localized:
             reason = found if joint.status == NO_POSE else f"{joint.n_matches} matches with the map"
             return cls(status=joint.status, reason=reason, **values)
         assert joint.cams_from_world is not None
+        if joint.turn_error_deg:
+            values["reason"] = f"the images contradict the given rotations, by up to {joint.turn_error_deg:.1f} degrees"
         rivals = [
             cls.of(images, rival, p, frame) for rival, p in zip(joint.rivals, probabilities[1:, None], strict=True)
         ]
@@ -104,7 +106,8 @@ class Localized:
         at = ", ".join(f"{value:.3f}" for value in self.positions[0])
         matches = f"{self.n_inliers} inliers, {self.n_matches} matches"
         rivals = "" if not self.rivals else f" (of rivals at most {self.rivals[0].probability:.3f})"
-        return f"({at}), probability {self.probability:.3f}{rivals}; {matches}"
+        doubt = self.reason and f"; {self.reason}"
+        return f"({at}), probability {self.probability:.3f}{rivals}; {matches}{doubt}"
 
     def without_images(self) -> Localized:
         """Return the result without the images and `joint`, which take megabytes."""

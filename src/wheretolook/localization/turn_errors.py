@@ -1,0 +1,80 @@
+"""Compares known rotations between the views of a rig with those of the views' own poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations, product
+
+import numpy as np
+
+from wheretolook.geometry.poses import pose_error
+from wheretolook.localization.estimation import PoseEstimator
+from wheretolook.localization.hypotheses import Hypothesis, RigMatches, SingleViewPoses
+from wheretolook.localization.rig import Look
+
+MAX_DEVIATIONS = 4.0
+"""Errors of so many standard deviations contradict the assumed noise: 0.1 % of those of three Gaussian angles do."""
+
+MAX_ERROR_DEG = 45.0  # of rotations that are wrong and not merely of another view
+MAX_POSITION_DEVIATION_M = 0.25  # of a view's own pose that is compared
+MOVE_M = 0.02  # of a camera that turns about its base
+
+
+@dataclass(frozen=True)
+class TurnErrors:
+    """Errors of the rotations between views, where two views have own poses at the same location.
+
+    Attributes:
+        noise_deg: standard deviation, about each axis, of each rotation that explains the errors.
+        largest_deg: largest error of the rotation between two views.
+        contradictory: whether an error exceeds `MAX_DEVIATIONS` of the assumed noise and of the poses' own deviations.
+    """
+
+    noise_deg: float
+    largest_deg: float
+    contradictory: bool
+
+
+def turn_errors(
+    estimator: PoseEstimator, looks: Sequence[Look], poses: Sequence[SingleViewPoses], noise_deg: float
+) -> TurnErrors | None:
+    """Estimate the errors of known rotations from each view's poses as a single image, given their assumed noise.
+
+    Wrong poses of two views hardly ever agree in their location, so those that do are compared in their orientation.
+    Returns None if no two views agree in their location.
+    """
+    own = [
+        [_own_pose(estimator, look, k, of_view) for k in range(len(of_view))]
+        for look, of_view in zip(looks, poses, strict=True)
+    ]
+    pairs = [_smallest_error(first, second) for first, second in combinations(own, 2)]
+    compared = np.array([pair for pair in pairs if pair is not None])
+    if len(compared) == 0:
+        return None
+    error, variance = compared.T
+    noise = np.sqrt(np.maximum(error**2 / 3 - variance, 0).mean() / 2)
+    limit = MAX_DEVIATIONS * np.sqrt(2 * noise_deg**2 + variance)
+    return TurnErrors(float(noise), float(error.max()), bool((error > limit).any()))
+
+
+def _own_pose(estimator: PoseEstimator, look: Look, k: int, poses: SingleViewPoses) -> Hypothesis:
+    """Return the k-th pose of a view as that of the rig, refined on the view's inliers alone."""
+    rig = RigMatches(estimator, [look], 0.0)
+    return rig.refine(rig.rig_pose(0, poses[k][0]))
+
+
+def _smallest_error(first: Sequence[Hypothesis], second: Sequence[Hypothesis]) -> tuple[float, float] | None:
+    """Return the angle (deg) between two views' poses of the rig, and its variance about each axis (deg^2).
+
+    Of all pairs of poses at the same location the one with the smallest angle; None if there is none.
+    """
+    errors = []
+    for pose, other in product(first, second):
+        covariance = pose.covariance + other.covariance
+        deviation_m = np.sqrt(np.trace(covariance[:3, :3]))
+        error_m, error_deg = pose_error(pose.rig_from_world, other.rig_from_world)
+        near = error_m < MAX_DEVIATIONS * deviation_m + MOVE_M and deviation_m < MAX_POSITION_DEVIATION_M
+        if near and error_deg < MAX_ERROR_DEG:
+            errors.append((float(error_deg), float(np.degrees(1) ** 2 * np.trace(covariance[3:, 3:]) / 3)))
+    return min(errors, default=None)

@@ -22,6 +22,7 @@ from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import load_colmap_landmarks
+from wheretolook.utils.errors import MapError
 
 KIND = all_kinds()["aliked"]
 
@@ -85,3 +86,24 @@ def test_held_out_photographs_of_a_map_of_learned_features_are_localized(corrido
     (found,) = hold_out_blocks(source, tmp_path, [block])
     assert found.landmarks.features == "aliked"
     assert found.views["good"].mean() > 0.5 and (found.views["n_matches"] > 20).any()
+
+
+def test_the_features_of_mapping_images_may_be_in_another_file(corridor, tmp_path):
+    """hloc keeps them in HDF5; a missing file is an error that names it."""
+    weights = nearest_neighbour_weights(tmp_path / "aliked_lightglue.pth")
+    landmarks = load_colmap_landmarks(corridor, corridor / "database.db")
+    camera = cameras_by_id(read_model(corridor).cameras, corridor)[1]
+    _, ((pixels, descriptors),) = read_features(corridor / "database.db", ["010.jpg"])
+    query = Keypoints(pixels, KIND.restore(descriptors))
+    config = LocalizerConfig(lightglue=str(weights), lightglue_images=2)
+    other = tmp_path / "features.db"
+    shutil.copy(corridor / "database.db", other)
+    by_database, by_file = (
+        Localizer(landmarks, camera, config, map_dir=corridor, features=features).match([query])[0]
+        for features in (None, other)
+    )
+    np.testing.assert_array_equal(by_file.landmarks, by_database.landmarks)
+    among = Localizer(landmarks, camera, config, map_dir=corridor).match_among(query, np.arange(len(landmarks)))
+    np.testing.assert_array_equal(among.landmarks, by_database.landmarks)
+    with pytest.raises(MapError, match=r"missing\.h5"):
+        Localizer(landmarks, camera, config, map_dir=corridor, features=tmp_path / "missing.h5")

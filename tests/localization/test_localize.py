@@ -69,6 +69,39 @@ def test_a_batch_is_localized_and_an_unreadable_image_is_a_row_with_its_reason(
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {"a.png", "b.png", "c.png"}
 
 
+def test_images_are_matched_with_the_landmarks_of_their_pairs_alone(
+    room: MappedRoom, photos: Path, localizer: ImageLocalizer, tmp_path: Path
+) -> None:
+    """Of all mapping images: the same result. Of those that observe another wall: few matches, and no confident pose."""
+    folder = room.landmarks.parent
+    model = read_model(folder)
+    axes = {image.name: image.cam_from_world().rotation.matrix()[2] for image in model.images.values()}
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("".join(f"photos/a.png {name}\n" for name in axes))
+    paired = ImageLocalizer.open(folder, pairs=pairs)
+    result, expected = (one.localize(photos / "a.png") for one in (paired, localizer))
+    observed = {p.point3D_id for image in model.images.values() for p in image.points2D if p.has_point3D()}
+    assert len(paired.pairs.landmarks("a.png")) == np.isin(localizer.landmarks.ids, [*observed]).sum()
+    assert_near(result.cam_from_world, POSES[:1])
+    assert result.n_matches == expected.n_matches
+    opposite = [name for name, axis in axes.items() if axis @ AXES[0] < -0.9]
+    pairs.write_text("".join(f"a.png {name}\n" for name in opposite))
+    away = ImageLocalizer.open(folder, pairs=pairs).localize(photos / "a.png")
+    assert away.n_matches < 0.3 * expected.n_matches and away.probability < 0.05
+    with pytest.raises(TableError, match=r"b\.png.*do not name this image|do not name this image.*b\.png"):
+        ImageLocalizer.open(folder, pairs=pairs).localize(photos / "b.png")
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [("a.png one two\n", "line 1"), ("a.png nowhere.png\n", "no mapping image"), ("\x00\xff", "line 1|cannot be read")],
+)
+def test_damaged_pairs(room: MappedRoom, tmp_path: Path, text: str, problem: str) -> None:
+    (tmp_path / "pairs.txt").write_bytes(text.encode("latin-1"))
+    with pytest.raises(TableError, match=problem):
+        ImageLocalizer.open(room.landmarks.parent, pairs=tmp_path / "pairs.txt")
+
+
 def test_a_rig_by_yaw_and_pitch_has_the_pose_of_each_image(room: MappedRoom, photos: Path, tmp_path: Path) -> None:
     yaw = np.degrees(np.arctan2(AXES[:, 1], AXES[:, 0]))
     pitch = np.degrees(np.arcsin(AXES[:, 2] / np.linalg.norm(AXES, axis=1)))

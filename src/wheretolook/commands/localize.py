@@ -60,6 +60,10 @@ class Localize(CameraOptions, FrameOptions):
         database: COLMAP's database.db or hloc's feats-*.h5.
         extractor: extractor for the images: opencv, colmap, aliked, disk or xfeat.
         extractor_weights: weights of a learned extractor; see docs/features.md.
+        pairs: hloc's file of the mapping images that retrieval found for each image, in lines "image mapping_image".
+            Images are matched with the landmarks of these alone.
+        lightglue: weights of LightGlue for learned features, or kornia for its copy. Images are then matched with the five
+            mapping images that observe most of the landmarks that they matched.
         device: where to compute: auto, cpu, cuda, or cuda:<index>.
     """
 
@@ -76,6 +80,8 @@ class Localize(CameraOptions, FrameOptions):
     database: Path | None = None
     extractor: str | None = None
     extractor_weights: str = ""
+    pairs: Path | None = None
+    lightglue: str = ""
     device: str = "auto"
 
     def __post_init__(self) -> None:
@@ -107,7 +113,9 @@ class Localize(CameraOptions, FrameOptions):
         from wheretolook.select.image_localizer import ImageLocalizer
 
         device = usable_device(self.device)
-        localizer = ImageLocalizer.open(self.map, self.database, self.frame_options(), self._extractor, device)
+        localizer = ImageLocalizer.open(
+            self.map, self.database, self.frame_options(), self._extractor, device, self.pairs, self.lightglue
+        )
         landmarks = f"{len(localizer.landmarks):,} landmarks ({localizer.landmarks.features})"
         print(f"{localizer.frame.describe()}; {landmarks}")
         results = []

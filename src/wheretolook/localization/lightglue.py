@@ -38,22 +38,32 @@ class _MappingImages:
 class LightGlueMatcher:
     """Matches queries with the mapping images that observe most of the landmarks that the query matched.
 
-    Raises ConfigError if LightGlue does not support the map's features or kornia is missing, MapError if the map's
-    folder has no model or database, WeightsError if the weights cannot be used.
+    `features` is the file of the mapping images' features, by default database.db in the map's folder. Raises
+    ConfigError if LightGlue does not support the map's features or kornia is missing, MapError if the map's folder has no
+    model or features, WeightsError if the weights cannot be used.
     """
 
-    def __init__(self, landmarks: Landmarks, map_dir: Path | None, weights: str, device: str = "cpu") -> None:
+    def __init__(
+        self,
+        landmarks: Landmarks,
+        map_dir: Path | None,
+        weights: str,
+        device: str = "cpu",
+        features: Path | None = None,
+    ) -> None:
         supported = {
             record.descriptors.name: record.lightglue for record in all_extractors().values() if record.lightglue
         }
         if landmarks.features not in supported:
-            fix = f"Leave label.localizer.lightglue out, or map with one of {', '.join(supported)}."
+            fix = f"Leave LightGlue out, or map with one of {', '.join(supported)}."
             raise ConfigError("LightGlue does not support these features", value=landmarks.features, fix=fix)
-        if map_dir is None or not (map_dir / _DATABASE).is_file():
-            fix = "Map again with --mapping.keep_database true."
-            raise MapError("LightGlue needs the database of the mapping images", path=map_dir, fix=fix)
+        features = features or (None if map_dir is None else map_dir / _DATABASE)
+        if map_dir is None or features is None or not features.is_file():
+            fix = "Name it by --database, or map again with --mapping.keep_database true."
+            raise MapError("LightGlue needs the features of the mapping images", path=features or map_dir, fix=fix)
         self.landmarks = landmarks
         self.map_dir = map_dir
+        self.features = features
         self.device = torch.device(device)
         self.kind = all_kinds()[landmarks.features]
         self._network = _network(supported[landmarks.features], weights).to(self.device)
@@ -104,10 +114,10 @@ class LightGlueMatcher:
     def _images(self) -> _MappingImages:
         model = read_model(self.map_dir)
         arrays = model_arrays(model)
-        kind, stored = read_features(self.map_dir / _DATABASE, arrays.image_names)
+        kind, stored = read_features(self.features, arrays.image_names)
         if kind is not self.kind:
             problem = f"the database holds {kind.name}, the landmarks are of {self.kind.name}"
-            raise MapError(problem, path=self.map_dir / _DATABASE, fix="Map again.")
+            raise MapError(problem, path=self.features, fix="Map again.")
         point = np.repeat(arrays.point_ids, np.diff(arrays.observation_start))
         row = np.minimum(np.searchsorted(self.landmarks.ids, point), len(self.landmarks) - 1)
         known = self.landmarks.ids[row] == point

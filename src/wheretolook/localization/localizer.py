@@ -60,8 +60,8 @@ class Localizer:
 
     Keypoints are matched to the landmarks' mean descriptors, SIFT with Lowe's ratio test, learned ones as mutual nearest
     neighbours; the pose is estimated by `PoseEstimator`. The extractor must be that of the map, and may be omitted if
-    nothing is extracted. The device is "cpu" or a CUDA device. `map_dir` is the folder of the map, which LightGlue needs
-    (`LocalizerConfig.lightglue`). Raises MapError if the landmarks have no descriptors, or not the extractor's.
+    nothing is extracted. The device is "cpu" or a CUDA device. LightGlue (`LocalizerConfig.lightglue`) needs the folder
+    of the map, `map_dir`, and the features of its images, by default its database. Raises MapError if the landmarks have no descriptors, or not the extractor's.
     """
 
     def __init__(
@@ -72,6 +72,7 @@ class Localizer:
         extractor: ExtractorConfig | None = None,
         device: str = "cpu",
         map_dir: Path | None = None,
+        features: Path | None = None,
     ) -> None:
         if landmarks.descriptors is None:
             raise MapError("landmarks without descriptors cannot be matched", fix="Build the map with its database.")
@@ -92,7 +93,7 @@ class Localizer:
         if config.lightglue:
             from wheretolook.localization.lightglue import LightGlueMatcher
 
-            self._guided = LightGlueMatcher(landmarks, map_dir, config.lightglue, device)
+            self._guided = LightGlueMatcher(landmarks, map_dir, config.lightglue, device, features)
         self._camera = camera
         self.estimator = PoseEstimator(landmarks.points, config)
 
@@ -115,14 +116,35 @@ class Localizer:
 
     def match(self, keypoints: Sequence[Keypoints], camera: Camera | None = None) -> list[Matches]:
         """Match keypoints of several images with landmarks. The result for an image does not depend on the others."""
+        return self._by_lightglue(keypoints, self._match(keypoints, self._matcher), camera)
+
+    def match_among(self, keypoints: Keypoints, rows: NDArray[np.int64], camera: Camera | None = None) -> Matches:
+        """Match keypoints of an image with the landmarks in rows (R,) alone."""
+        if len(rows) == 0:
+            return Matches.none(len(keypoints))
+        descriptors = self.landmarks.descriptors
+        assert descriptors is not None
+        matcher = DescriptorMatcher if self.kind.in_bytes else SimilarityMatcher
+        (found,) = self._match([keypoints], matcher(descriptors[rows], self._device))
+        near = rows[np.minimum(found.near, len(rows) - 1)]  # with few landmarks, missing ones have large distances
+        found = found._replace(landmarks=rows[found.landmarks], near=near)
+        return self._by_lightglue([keypoints], [found], camera)[0]
+
+    def _match(
+        self, keypoints: Sequence[Keypoints], matcher: DescriptorMatcher | DescriptorIndex | SimilarityMatcher
+    ) -> list[Matches]:
         descriptors = [self.kind.store(of_image.descriptors) for of_image in keypoints]
         several = self.config.method == "hypotheses"
-        if isinstance(self._matcher, SimilarityMatcher):
+        if isinstance(matcher, SimilarityMatcher):
             limit = self.config.min_similarity
             limit = self.kind.min_similarity if limit is None else limit
-            matches = self._matcher.match(descriptors, limit, MAX_NEAREST if several else 1)
-        else:
-            matches = match(self._matcher, descriptors, self.config.max_ratio, MAX_NEAREST if several else 2)
+            return matcher.match(descriptors, limit, MAX_NEAREST if several else 1)
+        return match(matcher, descriptors, self.config.max_ratio, MAX_NEAREST if several else 2)
+
+    def _by_lightglue(
+        self, keypoints: Sequence[Keypoints], matches: list[Matches], camera: Camera | None
+    ) -> list[Matches]:
+        """Replace matches by those of LightGlue, if it is configured, with the mapping images that they lead to."""
         if self._guided is None:
             return matches
         camera = camera or self._camera

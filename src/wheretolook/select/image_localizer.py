@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.matching import Matches
 from wheretolook.features.registry import kind_of, runnable_extractors
 from wheretolook.geometry.camera import Camera
@@ -25,6 +26,7 @@ from wheretolook.localization.turns import checked_turns, read_turns
 from wheretolook.mapping.colmap_model import model_arrays, read_model
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.georeference import REPORT_FILE
+from wheretolook.mapping.image_pairs import ImagePairs
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.map_folder import LANDMARKS_FILE
 from wheretolook.mapping.map_frame import MapFrame, find_frame
@@ -53,6 +55,9 @@ class ImageLocalizer:
     images: QueryImages
     extractor: ExtractorConfig
     device: str = "cpu"
+    pairs: ImagePairs | None = None
+    lightglue: str = ""  # as in `LocalizerConfig`
+    features: Path | None = None  # of the mapping images, which LightGlue matches
 
     @classmethod
     def open(
@@ -62,10 +67,13 @@ class ImageLocalizer:
         frame: FrameOptions = FrameOptions(),
         extractor: ExtractorConfig | None = None,
         device: str = "cpu",
+        pairs: Path | None = None,
+        lightglue: str = "",
     ) -> ImageLocalizer:
         """Open a COLMAP model with its descriptors: a database or HDF5 file, by default the one near the model.
 
-        A map of this project has them in its file of landmarks. Raises MapError if the model cannot be read, or there
+        A map of this project has them in its file of landmarks. `pairs` is hloc's file of each image's mapping images,
+        `lightglue` as in `LocalizerConfig`. Raises MapError if the model cannot be read, or there
         are no descriptors, or none of the extractor's kind; ConfigError if an option is invalid.
         """
         model = read_model(path)
@@ -88,14 +96,19 @@ class ImageLocalizer:
             fix = "Give --database: the model's database.db, or hloc's feats-*.h5."
             raise MapError("the landmarks have no descriptors, so nothing can be localized", path=path, fix=fix)
         extractor = extractor or _extractor_of(path, landmarks)
-        result = cls(landmarks, own, QueryImages(model, path), extractor, device)
+        if lightglue and features is None:
+            features = find_features(path, model)
+        of_images = None if pairs is None else ImagePairs.read(pairs, arrays, landmarks.ids)
+        result = cls(landmarks, own, QueryImages(model, path), extractor, device, of_images, lightglue, features)
         _ = result._localizer.extractor  # so that another extractor and missing weights are reported once
         return result
 
     @cached_property
     def _localizer(self) -> Localizer:
-        config = LocalizerConfig(method="hypotheses")
-        return Localizer(self.landmarks, next(iter(self.images.cameras.values())), config, self.extractor, self.device)
+        config = LocalizerConfig(method="hypotheses", lightglue=self.lightglue)
+        camera = next(iter(self.images.cameras.values()))
+        map_dir = self.images.folder
+        return Localizer(self.landmarks, camera, config, self.extractor, self.device, map_dir, self.features)
 
     @cached_property
     def _rigs(self) -> JointLocalizer:
@@ -139,7 +152,10 @@ class ImageLocalizer:
         camera = self.images.known_camera(camera)
         queries = [self.images.read(image, Path(name).name, camera) for image, name in zip(given, names, strict=True)]
         near = None if prior is None else self._prior(prior)
-        return self._localized(queries, cam_from_rig, near, checked_accuracy(accuracy))
+        limits = checked_accuracy(accuracy)
+        keypoints = [self._localizer.extractor.extract(query.rgb) for query in queries]
+        matches = [self._match(*of_image) for of_image in zip(names, keypoints, queries, strict=True)]
+        return self._localized(queries, keypoints, matches, cam_from_rig, near, limits)
 
     def localize_or_fail(
         self,
@@ -155,10 +171,14 @@ class ImageLocalizer:
             return Localized((image.name,), FAILED, str(error), frame=self.frame)
 
     def _localized(
-        self, queries: Sequence[QueryImage], cam_from_rig: Float, prior: PosePrior | None, accuracy: Accuracy
+        self,
+        queries: Sequence[QueryImage],
+        keypoints: Sequence[Keypoints],
+        matches: Sequence[Matches],
+        cam_from_rig: Float,
+        prior: PosePrior | None,
+        accuracy: Accuracy,
     ) -> Localized:
-        keypoints = [self._localizer.extractor.extract(query.rgb) for query in queries]
-        matches = self._localizer.match(keypoints)
         rig = self._rigs if len(queries) > 1 else self._localizer.joint
         looks = []
         poses = []
@@ -171,6 +191,12 @@ class ImageLocalizer:
                 poses[-1] += rig.single_view_poses(look, 1)
         joint = rig.localize(looks, poses)
         return Localized.of(queries, joint, probabilities(joint, accuracy), self.frame)
+
+    def _match(self, name: str, keypoints: Keypoints, query: QueryImage) -> Matches:
+        """Match an image with all landmarks, or with those of its pairs."""
+        if self.pairs is None:
+            return self._localizer.match([keypoints], query.camera)[0]
+        return self._localizer.match_among(keypoints, self.pairs.landmarks(name), query.camera)
 
     def _near(self, matches: Matches, camera: Camera, prior: PosePrior) -> Matches:
         """Return the matches with landmarks that the prior allows."""

@@ -1,0 +1,67 @@
+"""Reads hloc's files of image pairs: the mapping images that retrieval found for each query."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.mapping.colmap_model import ModelArrays, observation_matrix
+from wheretolook.utils.errors import TableError
+from wheretolook.utils.reading import read_text
+
+MAX_BYTES = 2**28
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePairs:
+    """Landmarks that the mapping images paired with each query observe."""
+
+    path: Path
+    rows: dict[str, NDArray[np.int64]]  # of landmarks, by the query's name in the file
+
+    @classmethod
+    def read(cls, path: Path, model: ModelArrays, landmark_ids: NDArray[np.int64]) -> ImagePairs:
+        """Read a file with lines "query mapping_image", given a model and the ids (N,) of its landmarks, ascending.
+
+        Raises TableError if a line is not two names, or no image of the model is named.
+        """
+        images: dict[str, list[str]] = defaultdict(list)
+        try:
+            lines = read_text(path, MAX_BYTES).splitlines()
+        except (OSError, ValueError) as error:
+            raise TableError(f"the pairs of images cannot be read: {error}", path=path) from error
+        for number, line in enumerate(lines, 1):
+            names = line.split()
+            if len(names) not in (0, 2):
+                fix = "Give hloc's file of pairs: a query and a mapping image in each line."
+                raise TableError(f"line {number} is not a pair of images", path=path, value=line[:80], fix=fix)
+            if names:
+                images[names[0]].append(names[1])
+        row_of = {name: row for row, name in enumerate(model.image_names)}
+        if not any(name in row_of for of_query in images.values() for name in of_query):
+            fix = f"Its images have names such as {model.image_names[0]}." if model.image_names else ""
+            raise TableError("no mapping image of the pairs is in the model", path=path, fix=fix)
+        observed = observation_matrix(model)
+        rows = {}
+        for query, of_query in images.items():
+            known = [row_of[name] for name in of_query if name in row_of]
+            points = model.point_ids[np.unique(observed[known].indices)]
+            rows[query] = np.flatnonzero(np.isin(landmark_ids, points))
+        return cls(path, rows)
+
+    def landmarks(self, query: str) -> NDArray[np.int64]:
+        """Return the rows of the landmarks of a query, by its path or the end of it. Raises TableError if it has none."""
+        parts = PurePath(query).parts
+        names = ("/".join(parts[start:]) for start in range(len(parts)))
+        found = next((self.rows[name] for name in names if name in self.rows), None)
+        if found is None:
+            ends = [rows for name, rows in self.rows.items() if PurePath(name).name == parts[-1]]
+            if len(ends) != 1:
+                fix = "Name it in the first column."
+                raise TableError("the pairs do not name this image", path=self.path, value=query, fix=fix)
+            found = ends[0]
+        return found

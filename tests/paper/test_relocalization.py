@@ -36,6 +36,7 @@ def test_a_camera_stops_at_its_confidence_or_after_the_last_view() -> None:
     assert gain["right_1"] == 0.25 and gain["right_2"] == gain["right_3"] == 0.75
     assert gain["views"] == (2 + 1 + 3 + 3) / 4 and gain["right"] == 0.5
     assert gain["confident"] == 0.75 and gain["precision"] == pytest.approx(1 / 3)
+    assert gain["precision_area"] == pytest.approx((1 + 1 / 2 + 2 / 3 + 3 / 4) / 4)  # right, wrong, right, right
     assert gain["right_2_low"] <= 0.75 <= gain["right_2_high"]
     assert summary.loc["even", "views"] == 1 and summary.loc["even", "precision"] == 1
     assert "| gain   | 4" in summary_markdown(summary.reset_index(), 0.95)

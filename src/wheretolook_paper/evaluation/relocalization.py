@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.environment import SceneEnvironment
-from wheretolook.dataset.viewpoint_table import is_good
+from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good
 from wheretolook.evaluation.bootstrap import ClusterBootstrap
+from wheretolook.evaluation.calibration import precision_area
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.localization.config import LocalizerConfig
@@ -134,7 +135,8 @@ def summarize(table: pd.DataFrame, confidence: float, resamples: int = 2000) -> 
 
     Returns the columns `right_N`, the share of places whose pose is right after N views; `views`, the mean number until
     the confidence is reached or views run out, and `right`, the share right then; `confident`, the share of places that
-    reach it, and `precision`, the share of these that is right. The first have 95 % intervals by resampling places.
+    reach it, and `precision`, the share of these that is right; and `precision_area`, the area under precision over
+    coverage of the poses after the last view. The first have 95 % intervals by resampling places.
     """
     table = table[table["hypothesis"] == 0]
     good = table.assign(good=is_good(table))
@@ -156,7 +158,10 @@ def summarize(table: pd.DataFrame, confidence: float, resamples: int = 2000) -> 
         for name, value, least, most in zip(names, values.mean(0), low, high, strict=True):
             row |= {name: value, f"{name}_low": least, f"{name}_high": most}
         precision = at_stop[stopped].mean() if stopped.any() else np.nan
-        rows.append(row | {"confident": stopped.mean(), "precision": precision})
+        row |= {"confident": stopped.mean(), "precision": precision}
+        final = part[part["n_looks"] == part["n_looks"].max()]
+        of_poses = final["confidence"].where(final["status"] == LOCALIZED).to_numpy(float)
+        rows.append(row | {"precision_area": precision_area(of_poses, final["good"].to_numpy())})
     return pd.DataFrame(rows)
 
 
@@ -165,7 +170,7 @@ def summary_markdown(summary: pd.DataFrame, confidence: float) -> str:
     numbers = [int(name[6:]) for name in map(str, summary) if name.startswith("right_") and name[6:].isdigit()]
     shares = [*(f"right_{n}" for n in numbers), "right"]
     heads = ["policy", "places", *(f"{n} views" if n > 1 else "first view" for n in numbers)]
-    heads += ["right at stop", "views until stop", "confident", "of these right"]
+    heads += ["right at stop", "views until stop", "confident", "of these right", "area under precision over coverage"]
     lines = []
     for row in summary.to_dict("records"):
         cells = [
@@ -174,6 +179,6 @@ def summary_markdown(summary: pd.DataFrame, confidence: float) -> str:
         ]
         views = f"{row['views']:.2f} [{row['views_low']:.2f}, {row['views_high']:.2f}]"
         last = [f"{100 * row[name]:.1f}" for name in ("confident", "precision")]
-        lines.append([str(row["policy"]), str(row["places"]), *cells, views, *last])
+        lines.append([str(row["policy"]), str(row["places"]), *cells, views, *last, f"{row['precision_area']:.3f}"])
     head = f"Share of places whose pose is right, in % [95 % interval over places]; stop at a confidence of {confidence:g}."
     return f"{head}\n\n{markdown_table(heads, lines)}\n"

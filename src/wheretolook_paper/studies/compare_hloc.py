@@ -1,0 +1,250 @@
+"""Compare localization with hloc (Sarlin et al., CVPR 2019) on the same features, maps and queries.
+
+    python -m wheretolook_paper.studies.compare_hloc --sets work/kitchen work/fox --features aliked \\
+        --weights aliked-n16rot.pth --lightglue aliked_lightglue.pth --out hloc.csv
+
+Needs hloc (https://github.com/cvg/Hierarchical-Localization) and h5py. A set is a folder with images/, cameras.txt of one
+camera and images.txt with all poses (COLMAP's text), and queries.txt: lines "image fold". The queries of a fold are
+localized in a map of all images but those of the fold, which hloc triangulates at the known poses from exhaustive
+matches. hloc then matches each query with the `retrieved` mapping images that observe most of the landmarks that the
+query matches, since weights of global descriptors are not assumed; its confidence is the number of inliers.
+
+Methods: `hloc`; `first` (the paper's: landmarks, one RANSAC), `hypotheses` (landmarks, several hypotheses), `lightglue`
+(the same after LightGlue with five mapping images). Times are those of matching and pose estimation, without features.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pycolmap
+from jsonargparse import auto_cli
+from tqdm.auto import tqdm
+
+from wheretolook.evaluation.calibration import precision_area
+from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extraction import KeypointExtractor
+from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.registry import all_kinds, kind_of
+from wheretolook.geometry.camera import Camera, camera_of
+from wheretolook.geometry.poses import Float, pose_error
+from wheretolook.io.poses import images_text
+from wheretolook.localization.confidence import Accuracy, probabilities
+from wheretolook.localization.config import LocalizerConfig
+from wheretolook.localization.localizer import Localizer
+from wheretolook.mapping.colmap_model import colmap_poses, read_model, registered_names
+from wheretolook.mapping.feature_files import read_features
+from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
+from wheretolook.mapping.photographs import read_photograph
+from wheretolook.utils.files import atomic_write, write_text
+
+MATCHERS = {"aliked": "aliked+lightglue", "disk": "disk+lightglue", "opencv": "NN-ratio"}  # of hloc, by extractor
+ACCURACIES: Mapping[str, Accuracy] = {"5 cm, 0.4 deg": (0.05, 0.4), "25 cm, 2 deg": (0.25, 2.0)}
+MIN_TIMED = 10  # queries of a fold of which hloc's time is stated
+HLOC_ERROR_PX = 12.0  # hloc's default limit of an inlier
+
+
+@dataclass(frozen=True, eq=False)
+class Fold:
+    """A map of one fold, hloc's files, and the queries with their true poses (3, 4)."""
+
+    folder: Path
+    model: Path
+    features: Path
+    landmarks: Landmarks
+    camera: Camera
+    queries: Mapping[str, Float]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """An estimated pose (3, 4), None without one; confidences, by accuracy; seconds that it took."""
+
+    cam_from_world: Float | None
+    confidence: Mapping[str, float]
+    seconds: float
+
+
+def main(
+    sets: list[Path],
+    out: Path,
+    features: str = "aliked",
+    weights: str = "",
+    lightglue: str = "",
+    retrieved: int = 10,
+    work: Path = Path("hloc-work"),
+    device: str = "cpu",
+) -> pd.DataFrame:
+    """Localize the queries of all sets by all methods, write every pose's errors to `out`, and print a summary."""
+    rows = []
+    for folder in sets:
+        extractor = KeypointExtractor(ExtractorConfig(features, weights=weights), device)
+        for fold in _folds(folder, extractor, work / folder.name / features):
+            for method, poses in _methods(fold, features, lightglue, retrieved, device).items():
+                for name, pose in poses.items():
+                    estimated = np.full((3, 4), np.nan) if pose.cam_from_world is None else pose.cam_from_world
+                    error_m, error_deg = pose_error(estimated, fold.queries[name])
+                    row = {"set": folder.name, "features": features, "method": method, "query": name}
+                    confidences = {f"confidence at {at}": value for at, value in pose.confidence.items()}
+                    errors = {"error_m": float(error_m), "error_deg": float(error_deg)}
+                    rows.append({**row, **errors, **confidences, "seconds": pose.seconds})
+    table = pd.DataFrame(rows)
+    write_text(out, table.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
+    print(summarize(table).to_string(index=False))
+    return table
+
+
+def summarize(table: pd.DataFrame) -> pd.DataFrame:
+    """Summarize poses by set, features, method and accuracy: recall, precision area, confident poses, median time."""
+    rows = []
+    for (name, features, method), part in table.groupby(["set", "features", "method"], sort=False):
+        for at, (limit_m, limit_deg) in ACCURACIES.items():
+            right = ((part["error_m"] <= limit_m) & (part["error_deg"] <= limit_deg)).to_numpy()
+            confidence = part[f"confidence at {at}"].to_numpy(float)
+            row = {"set": name, "features": features, "method": method, "accuracy": at, "queries": len(part)}
+            row |= {"recall": right.mean(), "precision_area": precision_area(confidence, right)}
+            sure = confidence >= 0.99
+            if method != "hloc":
+                row |= {"confident": sure.mean(), "right_of_confident": right[sure].mean() if sure.any() else np.nan}
+            rows.append(row | {"seconds": part["seconds"].median()})
+    return pd.DataFrame(rows)
+
+
+def _store_features(images: Mapping[str, Path], extractor: KeypointExtractor, path: Path) -> None:
+    """Write the features of images, by name, as hloc does; nothing if the file exists."""
+    import h5py
+
+    if path.is_file():
+        return
+    with atomic_write(path) as partial, h5py.File(partial, "w") as file:
+        for name, image in tqdm(images.items(), desc="features"):
+            rgb = read_photograph(image)
+            keypoints = extractor.extract(rgb)
+            group = file.create_group(name)
+            group["keypoints"] = keypoints.pixels - 0.5  # hloc counts from the centre of the top-left pixel
+            group["descriptors"] = keypoints.descriptors.T
+            group["image_size"] = np.array(rgb.shape[1::-1])
+
+
+def _folds(folder: Path, extractor: KeypointExtractor, work: Path) -> Iterator[Fold]:
+    """Map the images outside each fold by hloc, and yield the map with the fold's queries."""
+    from hloc import match_features, triangulation
+
+    reference = read_model(folder)
+    names = [*registered_names(reference).values()]
+    true = dict(zip(names, colmap_poses(folder, reference), strict=True))
+    (camera,) = reference.cameras.values()
+    fold_of = dict(line.split() for line in (folder / "queries.txt").read_text(encoding="utf-8").splitlines())
+    method = extractor.config.method
+    stored = work / f"feats-{kind_of(method).name}.h5"
+    _store_features({name: folder / "images" / name for name in names}, extractor, stored)
+    matcher = match_features.confs[MATCHERS[method]]
+    for fold in dict.fromkeys(fold_of.values()):
+        out = work / f"fold-{fold}"
+        mapping = [name for name in names if fold_of.get(name) != fold]
+        write_text(out / "reference" / "cameras.txt", (folder / "cameras.txt").read_text(encoding="utf-8"))
+        write_text(out / "reference" / "images.txt", images_text(mapping, [true[name] for name in mapping]))
+        write_text(out / "reference" / "points3D.txt", "")
+        pairs = ((a, b) for n, a in enumerate(mapping) for b in mapping[n + 1 :])
+        pairs_file = out / "pairs.txt"
+        write_text(pairs_file, "\n".join(f"{a} {b}" for a, b in pairs))
+        matches = work / "mapping-matches.h5"  # shared by all folds
+        match_features.main(matcher, pairs_file, stored, matches=matches)
+        model = out / "model"
+        if not model.is_dir():
+            reference_dir = out / "reference"
+            # pycolmap 4 ignores the pairs that hloc verifies by the known poses, since it leaves their configuration open
+            triangulation.main(
+                model, reference_dir, folder / "images", pairs_file, stored, matches, estimate_two_view_geometries=True
+            )
+        landmarks = load_colmap_landmarks(model, stored, ambiguity=False)
+        queries = {name: true[name] for name in names if fold_of.get(name) == fold}
+        own = camera_of(camera.model_name, camera.width, camera.height, camera.params)
+        yield Fold(out, model, stored, landmarks, own, queries)
+
+
+def _methods(fold: Fold, features: str, lightglue: str, retrieved: int, device: str) -> dict[str, dict[str, Pose]]:
+    """Localize the queries of a fold by every method."""
+    kind, stored = read_features(fold.features, [*fold.queries])
+    assert kind == all_kinds()[fold.landmarks.features]
+    queries = {
+        name: Keypoints(pixels, kind.restore(descriptors))
+        for name, (pixels, descriptors) in zip(fold.queries, stored, strict=True)
+    }
+    configs = {"first": LocalizerConfig(), "hypotheses": LocalizerConfig(method="hypotheses")}
+    if lightglue:
+        configs["lightglue"] = LocalizerConfig(method="hypotheses", lightglue=lightglue)
+    results = {}
+    for method, config in configs.items():
+        localizer = Localizer(fold.landmarks, fold.camera, config, None, device, fold.model, fold.features)
+        localizer.match([next(iter(queries.values()))])  # what is read or compiled once is not timed
+        results[method] = {name: _localize(localizer, query) for name, query in tqdm(queries.items(), desc=method)}
+    results["hloc"] = _by_hloc(fold, features, _retrieve(fold, queries, retrieved, device))
+    return results
+
+
+def _localize(localizer: Localizer, query: Keypoints) -> Pose:
+    start = time.perf_counter()
+    (matches,) = localizer.match([query])
+    joint = localizer.joint.localize([localizer.look(query, matches)])
+    seconds = time.perf_counter() - start
+    if joint.status != "localized":
+        return Pose(None, dict.fromkeys(ACCURACIES, np.nan), seconds)
+    confidence = {at: float(probabilities(joint, limits)[0]) for at, limits in ACCURACIES.items()}
+    return Pose(joint.rig_from_world, confidence, seconds)
+
+
+def _retrieve(fold: Fold, queries: Mapping[str, Keypoints], count: int, device: str) -> dict[str, list[str]]:
+    """Return the mapping images that observe most of the landmarks that each query matches."""
+    localizer = Localizer(fold.landmarks, fold.camera, device=device)
+    model = read_model(fold.model)
+    row_of = {int(number): row for row, number in enumerate(fold.landmarks.ids)}
+    observed = {
+        image.name: np.array([row_of[p.point3D_id] for p in image.points2D if p.point3D_id in row_of], dtype=int)
+        for image in model.images.values()
+    }
+    found = {}
+    for name, query in queries.items():
+        is_matched = np.isin(np.arange(len(fold.landmarks)), localizer.match([query])[0].landmarks)
+        votes = {image: int(is_matched[rows].sum()) for image, rows in observed.items()}
+        found[name] = sorted(votes, key=lambda image: -votes[image])[:count]
+    return found
+
+
+def _by_hloc(fold: Fold, features: str, retrieved: Mapping[str, Sequence[str]]) -> dict[str, Pose]:
+    """Match by hloc's matcher with the retrieved images, and localize by its `pose_from_cluster`."""
+    from hloc import localize_sfm, match_features
+
+    model = pycolmap.Reconstruction(fold.model)
+    number_of = {image.name: number for number, image in model.images.items()}
+    localizer = localize_sfm.QueryLocalizer(model, {"estimation": {"ransac": {"max_error": HLOC_ERROR_PX}}})
+    camera = pycolmap.Camera(**fold.camera.colmap.record())
+    matches = fold.folder / "query-matches.h5"
+    pairs = fold.folder / "query-pairs.txt"
+    write_text(pairs, "\n".join(f"{query} {image}" for query, images in retrieved.items() for image in images))
+    matches.unlink(missing_ok=True)
+    start = time.perf_counter()
+    match_features.main(match_features.confs[MATCHERS[features]], pairs, fold.features, matches=matches)
+    # of few queries most of the time is that of loading the matcher
+    matching = (time.perf_counter() - start) / len(retrieved) if len(retrieved) >= MIN_TIMED else np.nan
+    poses = {}
+    for query, images in tqdm(retrieved.items(), desc="hloc"):
+        start = time.perf_counter()
+        numbers = [number_of[image] for image in images]
+        found, _ = localize_sfm.pose_from_cluster(localizer, query, camera, numbers, fold.features, matches)
+        seconds = matching + time.perf_counter() - start
+        if found is None:
+            poses[query] = Pose(None, dict.fromkeys(ACCURACIES, np.nan), seconds)
+            continue
+        confidence = dict.fromkeys(ACCURACIES, float(found["num_inliers"]))
+        poses[query] = Pose(found["cam_from_world"].matrix(), confidence, seconds)
+    return poses
+
+
+if __name__ == "__main__":
+    auto_cli(main, as_positional=False)

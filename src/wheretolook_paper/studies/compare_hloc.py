@@ -5,8 +5,8 @@
 
 Needs hloc (https://github.com/cvg/Hierarchical-Localization) and h5py. A set is a folder with images/, cameras.txt of one
 camera and images.txt with all poses (COLMAP's text), and queries.txt: lines "image fold". The queries of a fold are
-localized in a map of all images but those of the fold, which hloc triangulates at the known poses from exhaustive
-matches. hloc then matches each query with the `retrieved` mapping images that observe most of the landmarks that the
+localized in a map of all images but those of the fold, which hloc triangulates at the known poses. Each of these is
+matched with the `partners` nearest ones. hloc then matches each query with the `retrieved` mapping images that observe most of the landmarks that the
 query matches, since weights of global descriptors are not assumed; its confidence is the number of inliers.
 
 Methods: `hloc`; `first` (the paper's: landmarks, one RANSAC), `hypotheses` (landmarks, several hypotheses), `lightglue`
@@ -32,7 +32,7 @@ from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.registry import all_kinds, kind_of
 from wheretolook.geometry.camera import Camera, camera_of
-from wheretolook.geometry.poses import Float, pose_error
+from wheretolook.geometry.poses import Float, camera_centers, pose_error
 from wheretolook.io.poses import images_text
 from wheretolook.localization.confidence import Accuracy, probabilities
 from wheretolook.localization.config import LocalizerConfig
@@ -45,6 +45,7 @@ from wheretolook.utils.files import atomic_write, write_text
 
 MATCHERS = {"aliked": "aliked+lightglue", "disk": "disk+lightglue", "opencv": "NN-ratio"}  # of hloc, by extractor
 ACCURACIES: Mapping[str, Accuracy] = {"5 cm, 0.4 deg": (0.05, 0.4), "25 cm, 2 deg": (0.25, 2.0)}
+AHEAD_M = 3.0  # of a camera, of the point that decides which images are matched
 MIN_TIMED = 10  # queries of a fold of which hloc's time is stated
 HLOC_ERROR_PX = 12.0  # hloc's default limit of an inlier
 
@@ -77,6 +78,7 @@ def main(
     weights: str = "",
     lightglue: str = "",
     retrieved: int = 10,
+    partners: int = 20,
     work: Path = Path("hloc-work"),
     device: str = "cpu",
 ) -> pd.DataFrame:
@@ -84,7 +86,7 @@ def main(
     rows = []
     for folder in sets:
         extractor = KeypointExtractor(ExtractorConfig(features, weights=weights), device)
-        for fold in _folds(folder, extractor, work / folder.name / features):
+        for fold in _folds(folder, extractor, partners, work / folder.name / features):
             for method, poses in _methods(fold, features, lightglue, retrieved, device).items():
                 for name, pose in poses.items():
                     estimated = np.full((3, 4), np.nan) if pose.cam_from_world is None else pose.cam_from_world
@@ -131,7 +133,16 @@ def _store_features(images: Mapping[str, Path], extractor: KeypointExtractor, pa
             group["image_size"] = np.array(rgb.shape[1::-1])
 
 
-def _folds(folder: Path, extractor: KeypointExtractor, work: Path) -> Iterator[Fold]:
+def _nearest(cam_from_world: Sequence[Float], count: int) -> list[tuple[int, int]]:
+    """Return pairs of images: each with those whose point `AHEAD_M` ahead of the camera is nearest to its own."""
+    poses = np.stack(cam_from_world)
+    ahead = camera_centers(poses) + AHEAD_M * poses[:, 2, :3]
+    distance = np.linalg.norm(ahead[:, None] - ahead, axis=2)
+    order = np.argsort(distance, axis=1, kind="stable")[:, 1 : count + 1]
+    return sorted({(min(a, int(b)), max(a, int(b))) for a, row in enumerate(order) for b in row})
+
+
+def _folds(folder: Path, extractor: KeypointExtractor, partners: int, work: Path) -> Iterator[Fold]:
     """Map the images outside each fold by hloc, and yield the map with the fold's queries."""
     from hloc import match_features, triangulation
 
@@ -150,9 +161,9 @@ def _folds(folder: Path, extractor: KeypointExtractor, work: Path) -> Iterator[F
         write_text(out / "reference" / "cameras.txt", (folder / "cameras.txt").read_text(encoding="utf-8"))
         write_text(out / "reference" / "images.txt", images_text(mapping, [true[name] for name in mapping]))
         write_text(out / "reference" / "points3D.txt", "")
-        pairs = ((a, b) for n, a in enumerate(mapping) for b in mapping[n + 1 :])
         pairs_file = out / "pairs.txt"
-        write_text(pairs_file, "\n".join(f"{a} {b}" for a, b in pairs))
+        pairs = _nearest([true[name] for name in mapping], partners)
+        write_text(pairs_file, "\n".join(f"{mapping[a]} {mapping[b]}" for a, b in pairs))
         matches = work / "mapping-matches.h5"  # shared by all folds
         match_features.main(matcher, pairs_file, stored, matches=matches)
         model = out / "model"

@@ -52,7 +52,10 @@ class DescriptorKind:
 
 def quantize_descriptors(descriptors: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
     """Unit descriptors (N, D) as COLMAP stores them, (N, D) uint8: 512 times the value, rounded, at most 255."""
-    return np.clip(np.rint(512 * descriptors), 0, 255).astype(np.uint8)
+    values = 512 * descriptors
+    np.rint(values, out=values)
+    np.clip(values, 0, 255, out=values)  # in place: new arrays of this size take longer than the computation
+    return values.astype(np.uint8)
 
 
 def unit_descriptors(descriptors: NDArray[Any]) -> NDArray[np.float32]:

@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import torch
 import warp as wp
 from numpy.typing import NDArray
 
@@ -15,7 +16,7 @@ from wheretolook.features import warp_sift_kernels as scale_kernels
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.warp_sift_kernels import BORDER, KEYS_OF_IMAGE, LAYERS, LEVELS, MAX_SIDE
-from wheretolook.utils.warp import start_warp
+from wheretolook.utils.warp import Staging, start_warp
 
 _ASSUMED_SIGMA = 0.5  # blur of an input image, in its pixels
 
@@ -42,6 +43,7 @@ class WarpSift:
         self._limits = limits
         self._space: ScaleSpace | None = None
         self._buffers: dict[str, Any] = {}
+        self._staging = Staging()
 
     def extract_many(self, grey: NDArray[np.uint8]) -> list[Keypoints]:
         """At most `max_keypoints` keypoints of each grey image (B, H, W) uint8, those of most contrast first.
@@ -68,14 +70,14 @@ class WarpSift:
     def _extract_block(self, space: ScaleSpace, grey: NDArray[np.uint8]) -> list[Keypoints]:
         n_images = grey.shape[0]
         space.fill(grey)
-        keys = np.unique(space.find())
+        keys = space.find()
         if len(keys) == 0:
             return [Keypoints.none() for _ in range(n_images)]
         table, place, angle, places = self._orientations(space, keys)
         if len(place) == 0:
             return [Keypoints.none() for _ in range(n_images)]
         image = (keys // KEYS_OF_IMAGE)[place]
-        order = _by_response(image, table[place], angle)
+        order = _by_response(image, table[place], angle, self.device)
         ends = np.searchsorted(image, np.arange(n_images + 1))  # `image` is sorted to begin with
         order = order[np.arange(len(order)) - ends[image] < self.config.max_keypoints]
         ends = np.searchsorted(image[order], np.arange(n_images + 1))
@@ -125,8 +127,7 @@ class WarpSift:
         descriptors = self._buffer("descriptors", n, wp.float32, size)
         self._launch(kernels.describe_kernel, (n, cells), [space.pyramid, places, chosen, turned], [histograms])
         self._launch(kernels.finish_kernel, n, [histograms], [descriptors])
-        result: NDArray[np.float32] = descriptors[:n].numpy()
-        return result.copy() if self.device == "cpu" else result  # on the CPU it shares the buffer's memory
+        return self._staging.download(descriptors[:n]).copy()
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
         # small thread blocks, so that a few thousand keypoints occupy all of a GPU
@@ -145,11 +146,13 @@ class WarpSift:
         return buffer
 
 
-def _by_response(image: NDArray[np.int64], table: NDArray[np.float32], angle: NDArray[np.float32]) -> NDArray[np.intp]:
+def _by_response(
+    image: NDArray[np.int64], table: NDArray[np.float32], angle: NDArray[np.float32], device: str
+) -> NDArray[np.intp]:
     """Order by image, -response, y, x, scale, angle. `table` is x, y, scale, response, which is positive."""
     # Positive floats have the same order as their bits.
     key = (image << 32) - np.ascontiguousarray(table[:, 3]).view(np.int32)
-    order = np.argsort(key)
+    order = torch.from_numpy(key).to(device).argsort().cpu().numpy()
     equal = np.diff(key[order]) == 0
     tied = np.flatnonzero(np.append(equal, False) | np.insert(equal, 0, False))
     rows = order[tied]
@@ -204,7 +207,7 @@ class ScaleSpace:
             command.launch()
 
     def find(self) -> NDArray[np.int64]:
-        """Keys (K,) int64 of the extrema that pass the limits, in any order and with repetitions (see `key_of`)."""
+        """Keys (K,) int64 of the extrema that pass the limits, ascending (see `key_of`)."""
         while True:
             self.number.zero_()
             for octave in range(1 + self.first_octave, len(self.sizes)):
@@ -215,7 +218,7 @@ class ScaleSpace:
                 wp.launch(scale_kernels.extrema_kernel, shape, inputs, outputs, device=self.device)
             number = int(self.number.numpy()[0])
             if number <= len(self.keys):
-                return self.keys[:number].numpy()
+                return np.asarray(torch.unique(wp.to_torch(self.keys[:number])).cpu().numpy())
             self.keys = wp.empty(roomy(number), dtype=wp.int64, device=self.device)
 
     def _record(self) -> list[tuple[Any, tuple[int, int]]]:
@@ -238,10 +241,17 @@ class ScaleSpace:
 
         def smooth(octave: int, source: int, target: int) -> None:
             """From level to level of an octave, with the filter of the latter."""
-            filter_of_target = [self.weights, self.first_weights[target], self.radii[target]]
+            along_rows, along_columns = kernels_of[self.radii[target]]
             half = level_of(octave, 0, half_smooth=True)
-            add(scale_kernels.smooth_kernel, octave, level_of(octave, source), half, True, *filter_of_target)
-            add(scale_kernels.smooth_kernel, octave, half, level_of(octave, target), False, *filter_of_target)
+            weights = self.weights, self.first_weights[target]
+            add(along_rows, octave, level_of(octave, source), half, *weights)
+            add(along_columns, octave, half, level_of(octave, target), *weights)
+
+        # all before the first launch, so that their module is compiled once
+        kernels_of = {
+            radius: [scale_kernels.smooth_kernel(radius, along_rows) for along_rows in (True, False)]
+            for radius in sorted({*self.radii})
+        }
 
         add(scale_kernels.double_kernel, 0, self.grey, level_of(0, 0))
         smooth(0, 0, 0)

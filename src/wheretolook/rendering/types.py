@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -12,12 +13,24 @@ from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.poses import Float
 
 
-@dataclass(frozen=True, eq=False)
 class Rendering:
-    """Images of a batch of B poses."""
+    """Images of a batch of B poses.
 
-    rgb: NDArray[np.uint8]  # (B, H, W, 3) sRGB; black where the ray through the pixel's centre meets nothing
-    depth_m: NDArray[np.float32]  # (B, H, W) z-depth along the optical axis in metres; 0 where the ray meets nothing
+    Attributes:
+        rgb: (B, H, W, 3) uint8 sRGB; black where the ray through the pixel's centre meets nothing.
+        depth_m: (B, H, W) float32 z-depth along the optical axis in metres; 0 where the ray meets nothing. May be given
+            as a function, which copies it from a GPU when it is first used.
+    """
+
+    def __init__(
+        self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32] | Callable[[], NDArray[np.float32]]
+    ) -> None:
+        self.rgb = rgb
+        self._depth_m = depth_m
+
+    @cached_property
+    def depth_m(self) -> NDArray[np.float32]:
+        return self._depth_m() if callable(self._depth_m) else self._depth_m
 
 
 class Renderer(Protocol):

@@ -19,7 +19,7 @@ from wheretolook.rendering.textures import build_pyramids, texel_gradients
 from wheretolook.rendering.trace_kernel import TILE, Appearance, trace_kernel
 from wheretolook.rendering.types import Rendering, camera_rays
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.utils.warp import start_warp, vec3_array
+from wheretolook.utils.warp import Staging, start_warp, vec3_array
 
 Method = Literal["rays", "raster"]
 
@@ -57,6 +57,7 @@ class WarpRenderer:
         else:
             self._mesh = warp_mesh(mesh, self.device)
         self._appearance = self._upload(mesh)
+        self._staging = Staging()
         self._origin = mesh.origin
 
     def _array(self, values: NDArray[Any], dtype: Any) -> Any:
@@ -85,7 +86,7 @@ class WarpRenderer:
         height = camera.height
         width = camera.width
         rgb = np.empty((len(poses), height, width, 3), dtype=np.uint8)
-        depth_m = np.empty((len(poses), height, width), dtype=np.float32)
+        depths = []
         bytes_per_pose = height * width * 7
         if self.method == "raster":
             bytes_per_pose += height * width * 8 + self._vertices.shape[0] * 24
@@ -98,7 +99,13 @@ class WarpRenderer:
             centers, ray_from_pixel = camera_rays(camera, poses[rows])
             rays = (vec3_array(centers, self.device), self._array(ray_from_pixel.astype(np.float32), wp.mat33))
             draw(camera.matrix @ poses[rows], rays, images)
-            rgb[rows], depth_m[rows] = (image.numpy() for image in images)
+            rgb[rows] = self._staging.download(images[0])
+            depths.append(images[1])
+
+        def depth_m() -> NDArray[np.float32]:
+            parts = [depth.numpy() for depth in depths]
+            return np.concatenate([np.zeros((0, height, width), dtype=np.float32), *parts])
+
         return Rendering(rgb, depth_m)
 
     # Both draw images (rgb, depth) of B poses, given (B, 3, 4) pixel_from_world and rays: centres and ray_from_pixel.

@@ -8,10 +8,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from ctypes.util import find_library
 from functools import cache
+from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.utils.errors import ConfigError
 
@@ -62,3 +63,25 @@ def _without_driver_warning() -> Iterator[None]:
 def vec3_array(points: ArrayLike, device: str) -> wp.array:
     """Copy points (N, 3) to a float32 array of vectors on a device."""
     return wp.array(np.ascontiguousarray(points, dtype=np.float32).reshape(-1, 3), dtype=wp.vec3, device=device)
+
+
+class Staging:
+    """Page-locked memory through which arrays are copied from a GPU, about ten times as fast as without.
+
+    For one thread; the memory is kept from call to call.
+    """
+
+    def __init__(self) -> None:
+        self._memory: Any = None
+
+    def download(self, array: Any) -> NDArray[Any]:
+        """Return the content of a Warp array; it is overwritten by the next call."""
+        if array.device.is_cpu:
+            return np.asarray(array.numpy())
+        n_bytes = array.size * wp.types.type_size_in_bytes(array.dtype)
+        if self._memory is None or self._memory.size < n_bytes:
+            self._memory = wp.empty(n_bytes, dtype=wp.uint8, device="cpu", pinned=True)
+        target: Any = wp.array(ptr=self._memory.ptr, dtype=array.dtype, shape=array.shape, device="cpu")
+        wp.copy(target, array)
+        wp.synchronize_stream(wp.get_stream(array.device))
+        return np.asarray(target.numpy())

@@ -9,7 +9,7 @@ import pytest
 
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.ranking import CandidateViews, choose_at_random, choose_best, choose_oracle, rank_views
-from wheretolook.evaluation.scores import reference_method, score_table
+from wheretolook.evaluation.scores import reference_method, score_table, threshold_keys
 from wheretolook.utils.errors import ConfigError
 
 HAND = CandidateViews(
@@ -102,6 +102,17 @@ def test_table_by_hand() -> None:
     assert top1["roc_auc"] == pytest.approx(np.mean(pairs))
     # precision and gain in recall at the scores 0.5, 0.4 and 0.2
     assert top1["average_precision"] == pytest.approx((1 / 4 + 2 / 5 + 3 / 7) / 3)
+
+
+def test_shares_by_both_localizers_by_hand() -> None:
+    """The two columns are one threshold by several hypotheses, and by the first RANSAC result."""
+    config = EvaluateConfig(methods=("bins",), top_n=(1, 3), thresholds=((5.0, 10.0),), resamples=20)
+    table = score_table(HAND, {"bins": HAND_SCORES}, ["a", "b"], config)
+    pooled = table[table["scene"] == "all"].set_index(["method", "top_n"])
+    names = ["raw_5m_10deg", "first_raw_5m_10deg"]
+    assert pooled.loc[("bins", 3), names].tolist() == pytest.approx([2 / 7, 4 / 7])
+    assert pooled.loc[("oracle", 3), names].tolist() == pytest.approx([3 / 7, 5 / 7])
+    assert threshold_keys(table) == ["5m_10deg"]
 
 
 def test_regret_and_difference_by_hand() -> None:

@@ -11,12 +11,13 @@ import pytest
 
 from localization.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, map_room
 from one_scene import label_viewpoints
-from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good, poses
+from wheretolook.dataset.viewpoint_files import FIRST_FIELDS, SCHEMA, read_table, write_table
+from wheretolook.dataset.viewpoint_table import LOCALIZED, by_first, is_good, poses
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.matching import Matches
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import pose_error, transform
-from wheretolook.localization.config import LabelConfig
+from wheretolook.localization.config import LabelConfig, LocalizerConfig
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.shard import label_rows
 from wheretolook.mapping.landmarks import Landmarks
@@ -49,6 +50,25 @@ def test_a_repeated_texture_localizes_at_the_wrong_copy_and_is_labelled_so(tmp_p
     assert 0 < wrong.sum() < 12
     np.testing.assert_allclose(labelled["error_m"][wrong], 2.5, atol=0.02)
     assert labelled["n_inliers"][wrong].min() > 50 and not is_good(labelled)[wrong].any()
+
+
+def test_several_hypotheses_also_label_by_the_first_ransac_result(
+    room: MappedRoom, views: pd.DataFrame, tmp_path: Path
+) -> None:
+    """The same renderings, localized by each method alone; of a plain wall there are too few matches, or a wrong pose."""
+    renderer = WarpRenderer(load_mesh(room.mesh))
+    landmarks = Landmarks.load(room.landmarks)
+    first, both = (
+        label_rows(views, renderer, Localizer(landmarks, CAMERA, LocalizerConfig(method)), CAMERA)
+        for method in ("first", "hypotheses")
+    )
+    pd.testing.assert_frame_equal(by_first(both)[[*first]], first)
+    assert first["status"].nunique() > 1 and not both["n_inliers"].equals(first["n_inliers"])
+    write_table(both, tmp_path / "both.parquet")
+    stored = read_table(tmp_path / "both.parquet")
+    assert [*stored] == [*SCHEMA.names, *FIRST_FIELDS.names]
+    pd.testing.assert_frame_equal(by_first(stored)[["status", "error_m"]], first[["status", "error_m"]])
+    assert [*label_rows(stored, renderer, Localizer(landmarks, CAMERA), CAMERA)] == SCHEMA.names
 
 
 def test_errors_are_measured_against_the_true_pose(room: MappedRoom) -> None:

@@ -16,7 +16,7 @@ from wheretolook.dataset.thresholds import ALL
 from wheretolook.dataset.viewpoint_files import read_table, write_table
 from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, UNLABELLED, pose_columns
 from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.localization.report import POSITIVE, label_summary
+from wheretolook.localization.report import POSITIVE, label_markdown, label_summary
 from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import artifact, newest_run
 from wheretolook.utils.errors import TableError
@@ -73,6 +73,23 @@ def test_shares_by_hand(summary) -> None:  # type: ignore[no-untyped-def]
     assert everything[POSITIVE[0]] == 2 / 10
     assert everything["locations_positive"] == 2 / 5
     pd.testing.assert_series_equal(shares.loc[ALL, "test"], shares.loc["shed", "test"], check_names=False)
+
+
+def test_shares_of_both_localizers_by_hand() -> None:
+    """By the first RANSAC result one view less is right in the shed, by 3 m, and none of the hall changes."""
+    names = ("status", "error_m", "error_deg")
+    hall, shed = (scene.assign(**{f"first_{name}": scene[name] for name in names}) for scene in (HALL, SHED))
+    shed.loc[0, "first_error_m"] = 3.0
+    splits = {"hall": "train", "shed": "test"}
+    summary = label_summary({"hall": hall, "shed": shed}, splits)  # type: ignore[arg-type]
+    everything = summary.overall
+    assert (everything[POSITIVE[0]], everything[f"first_{POSITIVE[0]}"]) == (2 / 10, 1 / 10)
+    assert (everything[POSITIVE[-1]], everything[f"first_{POSITIVE[-1]}"]) == (5 / 10, 5 / 10)
+    cells = " ".join(label_markdown(summary).split("## By the first RANSAC result")[1].split())
+    assert "| shed | test | 0.0 | 0.0 | 0.0 | 50.0 |" in cells
+    mixed = label_summary({"hall": hall, "shed": SHED}, splits)  # type: ignore[arg-type]
+    alone = label_summary({"hall": HALL, "shed": SHED}, splits)  # type: ignore[arg-type]
+    assert label_markdown(mixed) == label_markdown(alone)
 
 
 def test_bands_by_hand(summary) -> None:  # type: ignore[no-untyped-def]

@@ -17,7 +17,7 @@ from wheretolook.commands.evaluate import evaluate_methods as evaluate
 from wheretolook.commands.train import train_methods as train
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_files import write_table
-from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses
+from wheretolook.dataset.viewpoint_table import LABELS, NO_POSE, UNLABELLED, is_good, poses
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.results import latest_scores
 from wheretolook.tracking.config import TrackingConfig
@@ -87,6 +87,42 @@ def test_evaluation_writes_prints_and_logs(
         mlflow.log_text(later, "here", "note.txt")
     assert artifact(moved, later, "note.txt").read_text() == "here" and not (tmp_path / "mlruns").exists()
     assert [run.info.run_id for run in finished_runs(moved, "evaluate")] == [later, parent_id]
+
+
+def test_both_localizers_are_reported(tmp_path: Path) -> None:
+    """By the first RANSAC result the same views localize, but none at a location with an odd number."""
+    tracking = TrackingConfig(str(tmp_path / "mlruns"), "both")
+    dataset = make_dataset(tmp_path / "both", ("test", "test"), n_locations=10, n_directions=12)
+    report = dataset.root / "results" / "scores.md"
+    tables = [scene.read_table() for scene in dataset.scenes]
+    compared = []
+    for table, scene in zip([None, *tables], [None, *dataset.scenes], strict=True):
+        if table is not None and scene is not None:
+            first = {f"first_{name}": table[name] for name in LABELS}
+            first["first_status"] = table["status"].where(table["location_id"] % 2 == 0, NO_POSE)
+            write_table(table.assign(**first), scene.table)
+        compared.append((evaluate(dataset, RULES, tracking, progress=False), report.read_text()))
+    (before, text), (half, text_of_half), (after, text_after) = compared
+    pd.testing.assert_frame_equal(half, before)  # one scene of two has no labels by the first result
+    assert text == text_of_half and "Both localizers" not in text
+    pd.testing.assert_frame_equal(after[[*before]], before)
+
+    found = [table.assign(good=is_good(table)).groupby("location_id")["good"].any() for table in tables]
+    share, first_share = (np.mean([one.to_numpy()[::step].sum() / len(one) for one in found]) for step in (1, 2))
+    (row,) = after.query("method == 'bins' and top_n == 1 and scene == 'all'").to_dict("records")
+    assert (row["raw_0.05m_0.4deg"], row["first_raw_0.05m_0.4deg"]) == pytest.approx((share, first_share))
+    assert 0 < first_share < share and row["first_normalized_0.05m_0.4deg"] == 1
+    section = text_after.split("## Both localizers")[1].split("##")[0]
+    (line,) = (line for line in section.splitlines() if line.startswith("| reprojections with bins |"))
+    for cell, value in zip(line.split("|")[2:4], (share, first_share), strict=True):
+        assert cell.split()[0] == f"{100 * value:.1f}"
+    parent = newest_run(tracking, "evaluate", {"dataset": "both"})
+    assert parent is not None
+    runs = client(tracking).search_runs(
+        [parent.info.experiment_id], f"tags.mlflow.parentRunId = '{parent.info.run_id}'"
+    )
+    (bins,) = (run for run in runs if run.data.params["method"] == "bins")
+    assert bins.data.metrics["top-1/first_raw_0.05m_0.4deg"] == pytest.approx(first_share)
 
 
 def test_learned_methods_are_calibrated_on_the_val_scenes(dataset: Dataset, tmp_path: Path) -> None:

@@ -17,11 +17,12 @@ from wheretolook.cli import main, parse_command
 from wheretolook.commands.preconditions import open_scene
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_files import read_table
-from wheretolook.dataset.viewpoint_table import is_good, poses
+from wheretolook.dataset.viewpoint_table import by_first, is_good, poses
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.localization.shard import LabelledShard, SceneJob, ShardWorker
 from wheretolook.scorers.registry import scorers
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.space.free_space import FreeSpace
@@ -152,6 +153,39 @@ def test_matches_are_stored_on_request_and_removed_with_their_labels(copy: Path)
     for scene in scenes:
         with pytest.raises(TableError):
             read_table(scene.table, matches=True)
+
+
+@pytest.mark.usefixtures("in_this_process", "no_pictures_here")
+def test_labels_by_another_localizer_replace_the_old_ones_when_they_are_finished(
+    copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenes = Dataset.load(copy / "data" / "tiny").scenes
+    before = {scene: scene.table.read_bytes() for scene in scenes}
+    hypotheses = ("label", copy, "--label.localizer.method", "hypotheses")
+    labelled = ShardWorker.label
+    done: list[pd.DataFrame] = []
+
+    def interrupted(worker: ShardWorker, job: SceneJob, rows: pd.DataFrame) -> LabelledShard:
+        if len(done) == 1:
+            raise KeyboardInterrupt
+        done.append(rows)
+        return labelled(worker, job, rows)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ShardWorker, "label", interrupted)
+        assert run(*hypotheses) != 0
+    assert {scene: scene.table.read_bytes() for scene in scenes} == before and run("label", copy) == 0
+    assert {scene: scene.table.read_bytes() for scene in scenes} == before  # still current
+    assert run(*hypotheses) == 0
+    for scene, table in before.items():
+        (copy / "before.parquet").write_bytes(table)
+        by_one = read_table(copy / "before.parquet")
+        pd.testing.assert_frame_equal(by_first(scene.read_table())[[*by_one]], by_one)
+        assert not (scene.folder / "shards").exists()
+    times = {scene: scene.table.stat().st_mtime_ns for scene in scenes}
+    assert run(*hypotheses) == 0 and {scene: scene.table.stat().st_mtime_ns for scene in scenes} == times
+    assert run("label", copy) == 0
+    assert {scene: scene.table.read_bytes() for scene in scenes} == before
 
 
 def test_three_lines_score_viewpoints_of_a_colmap_model(demo: Path) -> None:

@@ -130,10 +130,16 @@ def _shards(files: SceneFolder) -> Path:
 
 
 def _report(files: SceneFolder, table: pd.DataFrame, log: Log) -> None:
-    from wheretolook.dataset.viewpoint_table import is_good
+    from wheretolook.dataset.viewpoint_table import by_first, has_first, is_good
+    from wheretolook.localization.confidence import RIGHT_PLACE_LIMITS
 
-    good = f"{is_good(table).mean():.0%} of {len(table):,} viewpoints localize within 5 cm and 0.4 degrees"
-    log(f"{files.name}: {good} -> {files.table}")
+    text = f"{is_good(table).mean():.0%} of {len(table):,} viewpoints localize within 5 cm and 0.4 degrees"
+    if has_first(table):
+        first = by_first(table)
+        places = [is_good(labels, *RIGHT_PLACE_LIMITS).mean() for labels in (table, first)]
+        text += f" ({is_good(first).mean():.0%} by the first RANSAC result), "
+        text += "{:.0%} ({:.0%}) at the right place".format(*places)
+    log(f"{files.name}: {text} -> {files.table}")
 
 
 def log_labels(

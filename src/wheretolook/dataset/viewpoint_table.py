@@ -18,6 +18,12 @@ PIXELS = "matched_pixels"  # optional column
 
 UNLABELLED = "unlabelled"
 
+LABELS = ("status", "error_m", "error_deg", "n_inliers")
+"""Columns that labelling fills in."""
+
+FIRST = "first_"
+"""Prefix of optional columns with the labels by the first RANSAC result, where the others are by several hypotheses."""
+
 
 def poses(table: pd.DataFrame) -> Float:
     """cam_from_world poses (B, 3, 4) of a table's rows."""
@@ -36,6 +42,16 @@ def is_good(table: pd.DataFrame, max_error_m: float = 0.05, max_error_deg: float
         raise TableError("viewpoints without labels", value=unlabelled, fix="Run the label stage (it resumes).")
     good = (table["status"] == LOCALIZED) & (table["error_m"] < max_error_m) & (table["error_deg"] < max_error_deg)
     return good.to_numpy()
+
+
+def has_first(table: pd.DataFrame) -> bool:
+    """Whether a table also has the labels by the first RANSAC result."""
+    return f"{FIRST}{LABELS[0]}" in table
+
+
+def by_first(table: pd.DataFrame) -> pd.DataFrame:
+    """Replace columns of a table by those of the same name with the prefix `FIRST`."""
+    return table.assign(**{name.removeprefix(FIRST): table[name] for name in table if str(name).startswith(FIRST)})
 
 
 def shares_good(table: pd.DataFrame) -> tuple[NDArray[np.int64], Float]:

@@ -22,7 +22,7 @@ class CandidateViews:
     Attributes:
         location: (B,) number of each view's location, 0 .. L-1 over all scenes.
         viewpoint_id: (B,) unique within a location.
-        good: (B, T) whether the view localizes within each of T thresholds.
+        good: (B, T) whether the view localizes within each of T thresholds; (B, 2 T) by both localizers.
         location_scene: (L,) number of each location's scene.
         location_block: (L,) block of neighbouring locations that are resampled together
             (`wheretolook.evaluation.bootstrap.ClusterBootstrap`).

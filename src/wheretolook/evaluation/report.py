@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from wheretolook.dataset.thresholds import ALL, threshold_label
+from wheretolook.dataset.viewpoint_table import FIRST, by_first
 from wheretolook.evaluation.scores import PHOTOGRAPHS, is_random, main_rows, methods_of, reference_of, threshold_keys
 from wheretolook.scorers.styles import ORACLE, method_group, method_style
 from wheretolook.utils.markdown import markdown_table
@@ -25,8 +26,8 @@ SCENES_ABREAST = 8  # scenes in one table; more make another below
 def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> str:
     """Format a score table (`wheretolook.evaluation.scores.score_table`) as Markdown.
 
-    The rows are of the first occlusion model and set of candidates: the first N with all columns; other N; the share of
-    locations with a good view; by scene; held-out photographs; calibration; probes.
+    The rows are of the first occlusion model and set of candidates: the first N with all columns; other N; both
+    localizers; the share of locations with a good view; by scene; held-out photographs; calibration; probes.
     """
     main = main_rows(scores)
     is_probe = main["method"].map(method_group) == "probes"
@@ -41,6 +42,7 @@ def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> s
         columns = _all_columns(first, keys) if n == counts[0] else _score_columns(keys, 1)
         header = f"## {best_views(n)} of each location ({rows['n_views'].iloc[0]:,} in all)"
         parts += [header, method_table(rows, columns)]
+    parts += _first_table(pooled, keys[0], counts)
     parts += _any_table(pooled, keys[0], counts)
     parts += _scene_tables(methods, keys[0], counts[0])
     photographs = scores[(scores["candidates"] == PHOTOGRAPHS) & (main["candidates"].iloc[0] != PHOTOGRAPHS)]
@@ -177,6 +179,21 @@ def cross_table(
         cells = [by_key.get((method, value)) for value in values]
         lines.append([method_style(method).label, *("–" if cell is None else text(cell) for cell in cells)])
     return markdown_table(["method", *(header.format(value) for value in values)], lines)
+
+
+def _first_table(pooled: pd.DataFrame, key: str, counts: Sequence[int]) -> list[str]:
+    """Shares of the chosen views by both localizers, if their labels are known."""
+    if f"{FIRST}raw_{key}" not in pooled or pooled[f"{FIRST}raw_{key}"].isna().all():
+        return []
+    names = {n: f"best {n}" for n in counts}
+    rows = pooled.assign(by=pooled["top_n"].map(names))
+    rows = pd.concat([rows, by_first(rows.assign(by=rows["by"] + ", first"))])
+    columns = [f"{name}{suffix}" for name in names.values() for suffix in ("", ", first")]
+    about = (
+        f"Share in % of the chosen viewpoints that localize within {threshold_label(key)} by the best of several "
+        "hypotheses, as in all other tables, and by the first RANSAC result."
+    )
+    return ["## Both localizers", about, cross_table(rows, "by", columns, partial(share_text, name="raw", key=key))]
 
 
 def _any_table(pooled: pd.DataFrame, key: str, counts: Sequence[int]) -> list[str]:

@@ -12,6 +12,7 @@ import pandas as pd
 
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.thresholds import ALL, threshold_key
+from wheretolook.dataset.viewpoint_table import FIRST
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.ranking import CandidateViews
 from wheretolook.evaluation.scores import Choices, is_random, main_rows, methods_of, read_scores, threshold_keys
@@ -105,11 +106,12 @@ def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[Nes
     """Yield a nested run for each method, occlusion model and candidate set of joined score tables.
 
     Metrics are those of `first_metrics`, those of all views by their columns, and the others by N, the scene unless it
-    is all of them, and the column, such as `top-5/any_5m_10deg` and `top-1/apartment-210/regret_0.05m_0.4deg`.
+    is all of them, and the column, such as `top-5/any_5m_10deg`, `top-1/first_raw_0.05m_0.4deg` (by the first RANSAC result) and `top-1/apartment-210/regret_0.05m_0.4deg`.
     """
     keys = threshold_keys(table)
     of_pooled = [f"{name}_{key}" for key in keys for name in _OF_EACH_THRESHOLD]
     of_pooled += [f"{name}_{keys[0]}" for name in _OF_FIRST_THRESHOLD]
+    of_pooled += [FIRST + name for name in of_pooled if FIRST + name in table]
     for key, rows in table.groupby(list(_RUN_KEY), sort=False):
         own = dict(zip(_RUN_KEY, map(str, key), strict=True))
         pooled = rows[rows["scene"] == ALL]

@@ -13,6 +13,8 @@ threshold, such as "0.05m_0.4deg":
 - low_* and high_* of raw_, normalized_, any_, regret_ and difference_, such as raw_low_*: bootstrap interval over blocks
   of locations, paired where two methods are compared (`ClusterBootstrap.ratio_interval`).
 
+If views are labelled by both localizers, the same columns by the first RANSAC result have the prefix "first_".
+
 Then reference ("" for none); average_precision and roc_auc of the scores against the first threshold, NaN where all views
 are of one class; and for methods that give probabilities ece (expected calibration error), ece_scaled (with logits
 divided by the temperature) and temperature, NaN where unknown. A scene without candidates has rows with 0 locations and
@@ -29,6 +31,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from wheretolook.dataset.thresholds import ALL, threshold_key
+from wheretolook.dataset.viewpoint_table import FIRST
 from wheretolook.evaluation.bootstrap import ClusterBootstrap, divide
 from wheretolook.evaluation.calibration import expected_calibration_error, scale_probability
 from wheretolook.evaluation.config import EvaluateConfig
@@ -197,10 +200,14 @@ def _share_columns(
         columns["p"] = bootstrap.paired_p(difference)
         expected = [is_random(reference) or is_random(method) for method in tops]
         columns["p"][expected] = np.nan  # the test does not apply to expectations
-    keys = list(enumerate(map(threshold_key, config.thresholds)))
+    keys = [(prefix, threshold_key(limits)) for prefix in ("", FIRST) for limits in config.thresholds]
     return {
         method: {"n_locations": len(good), "n_views": int(chosen.sum())}
-        | {f"{name}_{key}": float(values[row, index]) for index, key in keys for name, values in columns.items()}
+        | {
+            f"{prefix}{name}_{key}": float(values[row, index])
+            for index, (prefix, key) in enumerate(keys[: good.shape[2]])
+            for name, values in columns.items()
+        }
         for row, method in enumerate(tops)
     }
 

@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from wheretolook.dataset.layout import SceneFolder
-from wheretolook.dataset.viewpoint_table import is_good, poses
+from wheretolook.dataset.viewpoint_table import by_first, has_first, is_good, poses
 from wheretolook.evaluation.config import EvaluateConfig, candidates_label
 from wheretolook.evaluation.ranking import CandidateViews, Ids, SceneViews, join_scenes
 from wheretolook.geometry.poses import camera_centers
@@ -40,16 +40,18 @@ def views_of(
 ) -> tuple[CandidateViews, Ids]:
     """Return all labelled views of scenes in the order of their tables, and the location_id (L,) of each location.
 
-    Raises a TableError if a table is empty, or a viewpoint has no label.
+    If all tables have labels by the first RANSAC result, too, these give a second half of the columns of `good`. Raises a TableError if a table is empty, or a viewpoint has no label.
     """
-    return join_scenes([_scene_views(scene, table, config) for scene, table in zip(scenes, tables, strict=True)])
+    both = all(map(has_first, tables))
+    return join_scenes([_scene_views(scene, table, config, both) for scene, table in zip(scenes, tables, strict=True)])
 
 
-def _scene_views(scene: SceneFolder, table: pd.DataFrame, config: EvaluateConfig) -> SceneViews:
+def _scene_views(scene: SceneFolder, table: pd.DataFrame, config: EvaluateConfig, both: bool) -> SceneViews:
     if table.empty:
         raise TableError("the table has no viewpoints", path=scene.table, fix="Run the sample stage again.")
     try:
-        good = np.stack([is_good(table, *limits) for limits in config.thresholds], axis=-1)
+        labels = [table, *([by_first(table)] if both else [])]
+        good = np.stack([is_good(one, *limits) for one in labels for limits in config.thresholds], axis=-1)
     except TableError as error:
         raise TableError(error.problem, path=scene.table, value=error.value, fix=error.fix) from None
     ids, first, rows = np.unique(table["location_id"].to_numpy(np.int64), return_index=True, return_inverse=True)

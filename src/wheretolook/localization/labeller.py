@@ -16,7 +16,7 @@ import pandas as pd
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.viewpoint_files import SCHEMA, read_table, write_table
-from wheretolook.dataset.viewpoint_table import CAMERA_ID
+from wheretolook.dataset.viewpoint_table import CAMERA_ID, LABELS
 from wheretolook.localization.config import LabelConfig
 from wheretolook.localization.shard import LabelledShard, SceneJob, Shard, run_local
 from wheretolook.localization.versions import versions
@@ -28,9 +28,6 @@ MANIFEST = "manifest.json"
 
 MIN_VIEWS_PER_CAMERA = 16
 """Minimum mean number of views of each of several cameras in a shard on a GPU: a batch is of one camera."""
-
-LABELS = ("status", "error_m", "error_deg", "n_inliers")
-"""Columns that labelling fills in."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +46,8 @@ class LabelledScene:
 
     Attributes:
         task: the scene.
-        table: the viewpoints with status, error_m, error_deg and n_inliers, and with `viewpoint_files.MATCH_FIELDS` and
-            `PIXEL_FIELD` if the job stores them; the paper's label y is `viewpoint_table.is_good`.
+        table: the viewpoints with the columns that `shard.label_rows` adds; the paper's label y is
+            `viewpoint_table.is_good`.
         manifest: versions, settings and fingerprints of the inputs, and each shard's name and SHA-256.
         seconds: the workers' time in each step, for shards labelled in this run.
     """
@@ -122,6 +119,8 @@ class _SceneInProgress:
             "mesh": fingerprint(job.mesh),
             "landmarks": fingerprint(job.landmarks),
         }
+        if job.localizer.method == "hypotheses":
+            settings["first"] = True  # shards of before lack these labels
         if job.cameras:
             settings["cameras"] = {number: camera.record() for number, camera in job.cameras}
         # only options that are set: the record decides the names of shards

@@ -20,12 +20,13 @@ from wheretolook.features.matching import MAX_NEAREST, DescriptorMatcher, Matche
 from wheretolook.features.registry import all_kinds, kind_of
 from wheretolook.features.similarity import SimilarityMatcher
 from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.local_origin import poses_from
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator
 from wheretolook.localization.guided_matching import Candidates
 from wheretolook.localization.rig import Look
-from wheretolook.localization.rig_localization import JointLocalizer
+from wheretolook.localization.rig_localization import POSES_OF_AN_IMAGE, JointLocalizer
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import MapError
 
@@ -46,6 +47,7 @@ class Localization:
         inlier_rows: (I,) rows of the landmarks that agree with the pose; also of those matched only under its guidance.
         matched_rows: (M,) rows of all landmarks matched with the whole map.
         matched_pixels: (M, 2) float32, their pixels in the image.
+        first: the result of method "first", where several hypotheses were found.
     """
 
     status: str
@@ -53,6 +55,7 @@ class Localization:
     inlier_rows: NDArray[np.int64]
     matched_rows: NDArray[np.int64]
     matched_pixels: NDArray[np.float32]
+    first: Localization | None = None
 
 
 class Localizer:
@@ -178,13 +181,22 @@ class Localizer:
         if len(rows) < self.config.min_matches:
             return Localization(TOO_FEW_MATCHES, None, rows[:0], rows, pixels)
         if self.config.method == "hypotheses":
-            best = self.joint.localize([self.look(keypoints, matches, camera)])
+            look = self.look(keypoints, matches, camera)
+            found = self.joint.single_view_poses(look, POSES_OF_AN_IMAGE)
+            best = self.joint.localize([look], [found])
             inlier_rows = best.looks[0].rows[best.inliers[0]] if best.inliers else rows[:0]
-            return Localization(best.status, best.rig_from_world, inlier_rows, rows, pixels)
-        result = self.estimator.estimate(pixels, rows, camera or self._camera)
-        if result is None:
+            in_map = [(poses_from(pose, -self.estimator.origin), inliers) for pose, inliers in found[:1]]
+            first = self._first(in_map[0] if in_map else None, pixels, rows)
+            return Localization(best.status, best.rig_from_world, inlier_rows, rows, pixels, first)
+        return self._first(self.estimator.estimate(pixels, rows, camera or self._camera), pixels, rows)
+
+    def _first(
+        self, estimated: tuple[Float, NDArray[np.bool_]] | None, pixels: NDArray[np.float32], rows: NDArray[np.int64]
+    ) -> Localization:
+        """Return the result for a pose (3, 4), if RANSAC found one, and its inliers among matches (M,)."""
+        if estimated is None:
             return Localization(NO_POSE, None, rows[:0], rows, pixels)
-        pose, inliers = result
+        pose, inliers = estimated
         status = LOCALIZED if inliers.sum() >= self.config.min_inliers else NO_POSE
         return Localization(status, pose, rows[inliers], rows, pixels)
 

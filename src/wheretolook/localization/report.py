@@ -13,7 +13,16 @@ from numpy.typing import NDArray
 
 from wheretolook.dataset.sampling_config import Split
 from wheretolook.dataset.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
-from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, is_good, poses
+from wheretolook.dataset.viewpoint_table import (
+    FIRST,
+    LOCALIZED,
+    NO_POSE,
+    TOO_FEW_MATCHES,
+    by_first,
+    has_first,
+    is_good,
+    poses,
+)
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.utils.markdown import markdown_table
 
@@ -58,7 +67,8 @@ class LabelSummary:
             `same_label_share`, the share of viewpoints whose labels are all equal; `spearman`, the rank correlation of
             the finest and the coarsest label; median errors of the poses found for the coarsest's positives
             (`median_within_m`, `median_within_deg`) and for the others (`median_beyond_m`, `median_beyond_deg`). NaN
-            where there is nothing to count.
+            where there is nothing to count. If all tables have labels by the first RANSAC result, also the shares of
+            their positives, with the prefix `FIRST`.
         by_height: one row for each band of the camera's height above its scene's lowest location: `low`, `high` in
             metres, `n_views`, shares of positives. Bands within the range may be empty.
         by_visible: the same by the number of landmarks in view; `high` is exclusive, infinite in the last.
@@ -84,7 +94,8 @@ def label_summary(tables: Mapping[str, pd.DataFrame], splits: Mapping[str, Split
 
     Raises TableError if some viewpoint has no label yet.
     """
-    views = pd.concat([_views(name, table, splits[name]) for name, table in tables.items()], ignore_index=True)
+    both = all(map(has_first, tables.values()))
+    views = pd.concat([_views(name, table, splits[name], both) for name, table in tables.items()], ignore_index=True)
     groups = [(name, splits[name], views[views["scene"] == name]) for name in tables]
     groups += [(ALL, split, views[views["split"] == split]) for split in dict.fromkeys(splits[name] for name in tables)]
     shares = [{"scene": scene, "split": split, **_shares(part)} for scene, split, part in [*groups, (ALL, ALL, views)]]
@@ -100,11 +111,14 @@ def label_summary(tables: Mapping[str, pd.DataFrame], splits: Mapping[str, Split
     )
 
 
-def _views(scene: str, table: pd.DataFrame, split: str) -> pd.DataFrame:
+def _views(scene: str, table: pd.DataFrame, split: str, both: bool) -> pd.DataFrame:
     """The columns that the summary needs, with heights and the label at each threshold."""
     height = camera_centers(poses(table))[:, 2]
     height = np.round(height - height.min(), 6)  # so that all views of a location fall into one band
     labels = {name: is_good(table, *limits) for name, limits in zip(POSITIVE, THRESHOLDS, strict=True)}
+    if both:
+        first = by_first(table)
+        labels |= {f"{FIRST}{name}": is_good(first, *limits) for name, limits in zip(POSITIVE, THRESHOLDS, strict=True)}
     columns = table[["location_id", "n_visible", "status", "error_m", "error_deg"]]
     return columns.assign(scene=scene, split=split, height_m=height, **labels)
 
@@ -127,6 +141,7 @@ def _shares(views: pd.DataFrame) -> dict[str, Any]:
         "same_label_share": (positives == positives[:, :1]).all(axis=1).mean(),
         "spearman": _correlation(finest, coarsest),
         **medians,
+        **{name: views[name].mean() for name in views if str(name).startswith(FIRST)},
     }
 
 
@@ -198,6 +213,7 @@ def label_markdown(summary: LabelSummary, title: str = "Labels") -> str:
         "threshold's positives are positive at the first. Same label: equal at all thresholds. Spearman: the rank "
         "correlation of the first and the last label.",
         _table(shares, columns),
+        *_first_table(summary),
         "## By height of the camera above its scene's lowest location",
         _table(summary.by_height.assign(band=heights), {"height (m)": "band", **bands}),
         "## By number of visible landmarks",
@@ -209,6 +225,16 @@ def label_markdown(summary: LabelSummary, title: str = "Labels") -> str:
         _error_table("rotation error (°)", summary.errors_deg, row["n_views"]),
     ]
     return "\n\n".join(sections) + "\n"
+
+
+def _first_table(summary: LabelSummary) -> list[str]:
+    """Section on the labels by the first RANSAC result, if there are any."""
+    if f"{FIRST}{POSITIVE[0]}" not in summary.shares:
+        return []
+    columns = {label: f"{FIRST}{name}" for label, name in zip(LABELS, POSITIVE, strict=True)}
+    about = "Shares in %, where those above are by the best of several hypotheses."
+    table = _table(summary.shares, {"scene": "scene", "split": "split", **columns})
+    return ["## By the first RANSAC result", about, table]
 
 
 def _visible_label(low: float, high: float) -> str:

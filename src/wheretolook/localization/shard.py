@@ -11,10 +11,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.dataset.viewpoint_files import MATCH_FIELDS
-from wheretolook.dataset.viewpoint_table import CAMERA_ID, PIXELS, poses
+from wheretolook.dataset.viewpoint_files import FIRST_FIELDS, MATCH_FIELDS
+from wheretolook.dataset.viewpoint_table import CAMERA_ID, FIRST, PIXELS, poses
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import Camera, PinholeCamera
+from wheretolook.geometry.poses import Float
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.pipeline import Step, run_pipeline
 from wheretolook.utils.errors import WhereToLookError, WorkerError
@@ -148,11 +149,10 @@ def label_rows(
     """Render viewpoints, localize the images and measure the errors, in batched steps that overlap.
 
     With several cameras, `camera_id` selects that of a viewpoint. The seconds spent in each step (render, extract,
-    match, pose) are added to `seconds`. Returns the table with new status, error_m, error_deg and n_inliers,
-    `viewpoint_files.MATCH_FIELDS` if `store_matches`, and also `PIXEL_FIELD` if `store_pixels`.
+    match, pose) are added to `seconds`. Returns the table with new status, error_m, error_deg and n_inliers, with
+    `viewpoint_files.FIRST_FIELDS` by several hypotheses, `MATCH_FIELDS` if `store_matches`, and also `PIXEL_FIELD` if
+    `store_pixels`.
     """
-    from wheretolook.localization.localizer import localization_errors
-
     true_poses = poses(table)
     if isinstance(cameras, Mapping):
         numbers = table[CAMERA_ID].to_numpy()
@@ -175,16 +175,26 @@ def label_rows(
     localizations = [result for batch in run_pipeline(batches, steps, seconds) for result in batch]
     order = np.argsort(np.concatenate([rows for _, rows in groups]))
     results = [localizations[row] for row in order]
-    error_m, error_deg = localization_errors(results, true_poses)
-    columns: dict[str, Any] = {
-        "status": [result.status for result in results],
-        "error_m": error_m.astype(np.float32),
-        "error_deg": error_deg.astype(np.float32),
-        "n_inliers": np.array([len(result.inlier_rows) for result in results], dtype=np.int32),
-    }
+    columns = _labels(results, true_poses)
+    if localizer.config.method == "hypotheses":
+        columns |= _labels([result.first or result for result in results], true_poses, FIRST)
     if store_matches or store_pixels:
         columns |= _matches(results, store_pixels)
-    return table.drop(columns=[*MATCH_FIELDS.names, PIXELS], errors="ignore").assign(**columns)
+    old = [*FIRST_FIELDS.names, *MATCH_FIELDS.names, PIXELS]
+    return table.drop(columns=old, errors="ignore").assign(**columns)
+
+
+def _labels(results: Sequence[Localization], true_poses: Float, prefix: str = "") -> dict[str, Any]:
+    """Columns of status, errors and inliers, by their names with a prefix."""
+    from wheretolook.localization.localizer import localization_errors
+
+    error_m, error_deg = localization_errors(results, true_poses)
+    return {
+        f"{prefix}status": [result.status for result in results],
+        f"{prefix}error_m": error_m.astype(np.float32),
+        f"{prefix}error_deg": error_deg.astype(np.float32),
+        f"{prefix}n_inliers": np.array([len(result.inlier_rows) for result in results], dtype=np.int32),
+    }
 
 
 def _batches(camera: Camera, rows: NDArray[np.int64], batch_size: int) -> list[NDArray[np.int64]]:

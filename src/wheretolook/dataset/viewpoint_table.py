@@ -51,7 +51,7 @@ def has_first(table: pd.DataFrame) -> bool:
 
 def by_first(table: pd.DataFrame) -> pd.DataFrame:
     """Replace columns of a table by those of the same name with the prefix `FIRST`."""
-    return table.assign(**{name.removeprefix(FIRST): table[name] for name in table if str(name).startswith(FIRST)})
+    return table.assign(**{str(name).removeprefix(FIRST): table[name] for name in table if str(name).startswith(FIRST)})
 
 
 def shares_good(table: pd.DataFrame) -> tuple[NDArray[np.int64], Float]:

@@ -141,7 +141,7 @@ def _shares(views: pd.DataFrame) -> dict[str, Any]:
         "same_label_share": (positives == positives[:, :1]).all(axis=1).mean(),
         "spearman": _correlation(finest, coarsest),
         **medians,
-        **{name: views[name].mean() for name in views if str(name).startswith(FIRST)},
+        **{str(name): views[name].mean() for name in views if str(name).startswith(FIRST)},
     }
 
 

@@ -46,6 +46,8 @@ def test_a_correct_pose_finds_landmarks_that_have_twins_and_a_wrong_one_does_not
     points, descriptors = twin_rooms()
     pose, wrong = poses_looking_along([(0.4, -0.7, 0.1)] * 2, [(1, 0.2, 0), (-0.2, 1, 0)])
     look, rows = view_of(points, descriptors, pose)
+    assert look.candidates is not None
+    points = points[look.candidates.landmarks]
     found = match_under(look, points, pose, 4.0)
     assert len(found.rows) > 0.98 * len(rows) and np.isin(found.rows, rows).mean() > 0.99
     assert len(match_under(look, points, wrong, 4.0).rows) < 0.02 * len(rows)
@@ -59,9 +61,9 @@ def test_matches_are_those_of_a_search_over_all_pairs():
     squared = rng.uniform(1, 1.5, (300, 400))
     near = np.argsort(squared, axis=1)
     matches = Matches.none(300)._replace(near=near, squared=np.take_along_axis(squared, near, 1))
-    found = match_under(
-        Look(np.eye(3, 4), pixels[:0], near[0, :0], CAMERA, Candidates.of(pixels, matches)), points, pose, 30.0
-    )
+    candidates = Candidates.of(pixels, matches)
+    look = Look(np.eye(3, 4), pixels[:0], near[0, :0], CAMERA, candidates)
+    found = match_under(look, points[candidates.landmarks], pose, 30.0)
     in_camera = transform(pose, points)
     near_px = np.linalg.norm(CAMERA.project(in_camera) - pixels[:, None], axis=2) < 30
     allowed = near_px & (in_camera[:, 2] > 0) & (squared <= MAX_NEAREST_RATIO**2 * squared.min(1)[:, None])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.local_origin import local_origin, poses_from
-from wheretolook.geometry.poses import Float, transform
+from wheretolook.geometry.poses import Float
 from wheretolook.localization.config import LocalizerConfig
 
 REFINEMENT = {"loss_type": "CAUCHY", "loss_scale": 1.0}
@@ -61,12 +61,15 @@ class PoseEstimator:
 
 def squared_errors(camera: Camera, pixels: Float, points: Float, cam_from_world: Float) -> Float:
     """Squared reprojection errors (M,) of points (M, 3) at pixels (M, 2) of a pose's image; infinite behind it."""
-    in_camera = transform(cam_from_world, points)
+    in_camera = cam_from_world[:, :3] @ points.T  # (3, M): coordinates are contiguous
+    in_camera += cam_from_world[:, 3:]
     fisheye = camera.colmap.model.endswith("FISHEYE")
-    ahead = np.ones(len(in_camera), dtype=bool) if fisheye else in_camera[:, 2] > 1e-6
-    projected = camera.project(np.where(ahead[:, None], in_camera, (0.0, 0.0, 1.0)))
-    squared = ((projected - pixels) ** 2).sum(1)
-    return np.where(ahead & np.isfinite(squared), squared, np.inf)
+    ahead = np.arange(len(points)) if fisheye else np.flatnonzero(in_camera[2] > 1e-6)
+    x, y = (camera.project(in_camera.take(ahead, axis=1).T) - pixels.take(ahead, axis=0)).T
+    squared = x**2 + y**2
+    result = np.full(len(points), np.inf)
+    result[ahead] = np.where(np.isnan(squared), np.inf, squared)
+    return result
 
 
 POSELIB_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")

@@ -26,39 +26,40 @@ MAX_NEAREST_RATIO = 1.15
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Landmarks whose descriptors are about as near to a keypoint's as the nearest of the map, by increasing distance.
+    """Landmarks whose descriptors are about as near to a keypoint's as the nearest of the map.
 
     Attributes:
-        pixels: (K, 2) of all keypoints of an image.
-        keypoints: (M,) rows of keypoints.
+        keypoints: (M,) rows of an image's keypoints.
+        pixels: (M, 2) their pixels.
         landmarks: (M,) rows of their candidates.
+        squared: (M,) squared distances of the descriptors.
     """
 
-    pixels: Float
     keypoints: NDArray[np.int64]
+    pixels: Float
     landmarks: NDArray[np.int64]
+    squared: NDArray[np.float32]
 
     @classmethod
     def of(cls, pixels: Float, matches: Matches) -> Candidates:
         """Select from the nearest landmarks of keypoints at pixels (K, 2)."""
         near = matches.squared <= MAX_NEAREST_RATIO**2 * matches.squared[:, :1]
-        keypoints, column = np.nonzero(near)
-        order = np.argsort(matches.squared[keypoints, column], kind="stable")
-        keypoints = keypoints[order]
-        return cls(np.asarray(pixels, dtype=np.float64), keypoints, matches.near[keypoints, column[order]])
+        keypoints = np.repeat(np.arange(len(near)), near.sum(1))
+        of_keypoints = np.asarray(pixels, dtype=np.float64)[keypoints]
+        return cls(keypoints, of_keypoints, matches.near[near], matches.squared[near])
 
 
 def match_under(look: Look, points: Float, cam_from_world: Float, radius_px: float) -> Look:
     """Return a view with the matches of all its keypoints that agree with a pose up to a radius in pixels.
 
     A keypoint matches the nearest of its candidates that the pose projects within the radius; a landmark keeps its
-    nearest keypoint. `points` (N, 3) m are those of the map.
+    nearest keypoint. `points` (M, 3) m are those of the candidates.
     """
     candidates = look.candidates
     assert candidates is not None
-    pixels = candidates.pixels[candidates.keypoints]
-    squared = squared_errors(look.camera, pixels, points[candidates.landmarks], cam_from_world)
+    squared = squared_errors(look.camera, candidates.pixels, points, cam_from_world)
     order = np.flatnonzero(squared < radius_px**2)
+    order = order[np.argsort(candidates.squared[order], kind="stable")]
     for values in (candidates.keypoints, candidates.landmarks):  # each keypoint once, then each landmark once
         order = order[np.sort(np.unique(values[order], return_index=True)[1])]
-    return replace(look, pixels=pixels[order], rows=candidates.landmarks[order])
+    return replace(look, pixels=candidates.pixels[order], rows=candidates.landmarks[order])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -146,13 +147,18 @@ class RigMatches:
         """Match all keypoints again under a hypothesis and refine it, with a radius that decreases."""
         for radius_px in GUIDED_RADII_PX:
             cams = hypothesis.cams_from_world
-            pairs = zip(self.looks, cams, strict=True)
-            looks = [match_under(look, self.estimator.points, pose, radius_px) for look, pose in pairs]
+            views = zip(self.looks, self._candidates, cams, strict=True)
+            looks = [match_under(look, points, pose, radius_px) for look, points, pose in views]
             rig = RigMatches(self.estimator, looks, self.turn_noise_deg)
             if sum(len(look.rows) for look in looks) < MIN_MATCHES:
                 return hypothesis
             hypothesis = rig.refine(hypothesis.rig_from_world)
         return hypothesis
+
+    @cached_property
+    def _candidates(self) -> list[Float]:
+        """Points (M, 3) m of each view's candidates."""
+        return [self.estimator.points[look.candidates.landmarks] for look in self.looks if look.candidates]
 
     def rig_pose(self, k: int, cam_from_world: Float) -> Float:
         """rig_from_world (3, 4) from the pose of view k."""

@@ -166,7 +166,7 @@ class Localizer:
     ) -> Look:
         """Return a view of a rig, for `JointLocalizer`, from an image's keypoints and their matches."""
         candidates = Candidates.of(keypoints.pixels, matches)
-        pixels = candidates.pixels[matches.keypoints]
+        pixels = keypoints.pixels[matches.keypoints].astype(np.float64)
         return Look(cam_from_rig, pixels, matches.landmarks, camera or self._camera, candidates)
 
     @cached_property

@@ -32,6 +32,9 @@ MIN_SUPPORT_RATIO = 0.1
 """Minimum support of a candidate, relative to the best supported pose."""
 
 
+_CELL_STRIDES = np.array([1, 2**21, 2**42])  # for 260 km in each direction
+
+
 class PoseAmbiguity:
     """Compares pose hypotheses in a map with landmarks (N, 3) m, by the inliers that only one of them explains."""
 
@@ -50,7 +53,8 @@ class PoseAmbiguity:
 
     def count_voxels(self, rows: NDArray[np.int64]) -> int:
         """Count voxels (cubes of `VOXEL_SIZE_M`) with landmarks, rows (M,)."""
-        return len(np.unique(np.floor(self.points[rows] / VOXEL_SIZE_M), axis=0))
+        cells = np.floor(self.points[rows] / VOXEL_SIZE_M).astype(np.int64)
+        return len(np.unique(cells @ _CELL_STRIDES))  # of one number each: unique rows take ten times as long
 
 
 def log_ratio(unique: ArrayLike, rival_unique: ArrayLike) -> Float:

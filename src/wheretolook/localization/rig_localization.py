@@ -130,7 +130,9 @@ class JointLocalizer:
             if estimated is None:
                 break
             pose, inliers = estimated
-            poses.append((pose, np.isin(np.arange(len(points)), left[inliers])))
+            mask = np.zeros(len(points), dtype=bool)
+            mask[left[inliers]] = True
+            poses.append((pose, mask))
             left = left[~inliers]
         return tuple(poses)
 

@@ -127,7 +127,7 @@ class RobotLocalizer:
             raise ValueError(f"pixels (K, 2) and descriptors (K, 128) uint8, not {at.shape} and {described.shape}")
         none: NDArray[Any] = np.zeros(0, dtype=np.int64)
         if len(at) == 0 or self._n_landmarks < 2:
-            return Look(cam_from_rig, at[:0], none, self.camera, Candidates(at, none, none))
+            return Look(cam_from_rig, at[:0], none, self.camera, Candidates(none, at[:0], none, none))
         near, squared = self.nearest(described)
         keypoints = np.flatnonzero(squared[:, 0] < self._config.max_ratio**2 * squared[:, 1])
         landmarks = near[keypoints, 0]

@@ -60,11 +60,11 @@ class Stopwatch:
         return time.perf_counter()
 
 
-def time_steps(folder: SceneFolder, views: np.ndarray, batch: int, device: str) -> None:
+def time_steps(folder: SceneFolder, views: np.ndarray, batch: int, device: str, config: LocalizerConfig) -> None:
     """Label views (B, 3, 4) in one process, step by step, and print milliseconds per view."""
     camera = next(iter(folder.cameras().values()))
     renderer = WarpRenderer(load_mesh(folder.mesh), device)
-    localizer = Localizer(Landmarks.load(folder.landmarks), camera, LocalizerConfig(), extractor_of(folder), device)
+    localizer = Localizer(Landmarks.load(folder.landmarks), camera, config, extractor_of(folder), device)
     network = getattr(localizer.extractor._extraction, "_network", None)
     for warm_up in (True, False):
         watch = Stopwatch(device)
@@ -84,7 +84,7 @@ def time_steps(folder: SceneFolder, views: np.ndarray, batch: int, device: str) 
                     localizer.estimate(of_image, matched)
     steps = ", ".join(f"{step} {1000 * seconds / len(views):.2f}" for step, seconds in watch.seconds.items())
     peak = f"; peak {torch.cuda.max_memory_allocated() / 1e9:.2f} GB of PyTorch" if device != "cpu" else ""
-    print(f"batches of {batch}, ms per view: {steps}{peak}", flush=True)
+    print(f"{config.method}, batches of {batch}, ms per view: {steps}{peak}", flush=True)
 
 
 def main() -> None:
@@ -94,6 +94,7 @@ def main() -> None:
     add("scene", type=Path, metavar="SCENE")
     add("--views", type=int, default=256, help="number of viewpoints (default: %(default)s)")
     add("--batches", nargs="*", type=int, default=[8], help="batch sizes (default: 8)")
+    add("--methods", nargs="*", default=["first"], help="of the localizer: first, hypotheses (default: first)")
     add("--device", default="cpu")
     args = parser.parse_args()
     use_one_thread()
@@ -106,8 +107,9 @@ def main() -> None:
         locations = free_points(scene.free_space, scene.mesh.bounds, args.views, rng)
         views = poses_looking_along(locations, rng.normal(size=locations.shape))
     views = views[rng.permutation(len(views))][: args.views]
-    for batch in args.batches:
-        time_steps(folder, views, batch, args.device)
+    for method in args.methods:
+        for batch in args.batches:
+            time_steps(folder, views, batch, args.device, LocalizerConfig(method))
 
 
 if __name__ == "__main__":

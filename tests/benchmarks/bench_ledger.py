@@ -4,7 +4,9 @@
     make bench BENCH='--device cuda --record'                   # on a GPU; appends the times to ledger.csv
 
 Run it before finishing a change to a kernel or to its caller. Sizes are the paper's (`bench_visibility.py`), on a CPU with
-every twentieth location, and 25,000 landmarks for `select`, whose process is timed from start to end.
+every twentieth location, and 25,000 landmarks for `select`, whose process is timed from start to end. Localizing is of one
+image by several hypotheses on one core (matching on the device): a tenth of its keypoints show landmarks, half of which
+have a twin elsewhere.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from datetime import date
 from functools import partial
 from pathlib import Path
@@ -23,15 +26,20 @@ from typing import Any
 import numpy as np
 import warp as wp
 from bench_visibility import CAMERA, COUNTS, EVERYTHING, Setup, machine, seconds_of
-from common import SIDE_M, write_model
+from common import SIDE_M, room_map, use_one_thread, write_model
 
+from wheretolook.features.descriptors import quantize_descriptors
+from wheretolook.features.keypoints import Keypoints
 from wheretolook.geometry.lattices import fibonacci_sphere
-from wheretolook.geometry.poses import rotation_looking_along
+from wheretolook.geometry.poses import poses_looking_along, rotation_looking_along, transform
+from wheretolook.localization.config import LocalizerConfig
+from wheretolook.localization.localizer import Localizer
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.occlusion import DevicePoints, NoOcclusion
 from wheretolook.visibility.survey import SurveyOptions, survey
 
 LEDGER = Path(__file__).with_name("ledger.csv")
+KEYPOINTS = 2000
 COLUMNS = ("when", "commit", "device", "what", "median_s", "min_s", "max_s")
 
 
@@ -68,6 +76,30 @@ def select(args: argparse.Namespace, device: str, folder: Path) -> Iterator[tupl
         command += ["--out", "views.csv", "--occlusion", "none", "--device", device]
         work = partial(subprocess.run, command, cwd=folder, check=True, capture_output=True)
         yield f"select, {number} waypoints x 500 x {args.landmarks:,}, process", work
+
+
+def localization(args: argparse.Namespace, device: str) -> Iterator[tuple[str, Callable[[], object]]]:
+    """Yield names and work of matching an image's keypoints with landmarks, and of estimating its pose from these."""
+    rng = np.random.default_rng(0)
+    room = room_map(args.landmarks, np.zeros((1, 3)), "cpu").landmarks
+    described = rng.gamma(0.3, size=(args.landmarks + KEYPOINTS, 128))
+    described[1 : args.landmarks : 2] = described[: args.landmarks - 1 : 2] * rng.uniform(0.6, 1.6, 128)  # twins
+    described /= np.linalg.norm(described, axis=1, keepdims=True)
+    landmarks = replace(room, descriptors=quantize_descriptors(described[: args.landmarks]))
+    pose = poses_looking_along([(0.0, 0.0, 1.2)], [(1.0, 0.2, 0.0)])[0]
+    in_camera = transform(pose, room.points)
+    shown = np.flatnonzero((in_camera[:, 2] > 0.1) & CAMERA.in_image(CAMERA.project(in_camera)))[: KEYPOINTS // 10]
+    pixels = rng.uniform(0, (CAMERA.width, CAMERA.height), (KEYPOINTS, 2))
+    pixels[: len(shown)] = CAMERA.project(in_camera[shown]) + rng.normal(0, 0.5, (len(shown), 2))
+    seen = described[args.landmarks :].astype(np.float32)
+    seen[: len(shown)] = described[shown]
+    keypoints = replace(Keypoints.none(), pixels=pixels.astype(np.float32), descriptors=seen)
+    localizer = Localizer(landmarks, CAMERA, LocalizerConfig("hypotheses"), device=device)
+    use_one_thread()
+    matches = localizer.match([keypoints])[0]
+    about = f"an image, {KEYPOINTS:,} x {args.landmarks:,}"
+    yield f"match {about}", partial(localizer.match, [keypoints])
+    yield f"pose of {about}", partial(localizer.estimate, keypoints, matches)
 
 
 def commit() -> str:
@@ -111,6 +143,8 @@ def main() -> None:
 
     print(f"{name}, {commit()}")
     for what, work in visibility(args, device):
+        add(what, work, args.repeats)
+    for what, work in localization(args, device):
         add(what, work, args.repeats)
     with tempfile.TemporaryDirectory() as folder:
         for what, work in select(args, args.device, Path(folder)):

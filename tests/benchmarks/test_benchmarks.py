@@ -21,6 +21,7 @@ SMALL = {
     "fisher": "--landmarks 300 --voxels 2 --directions 20 --repeats 1 --samples 10",
     "looks": f"{ROOT}/data/release/apartment-209 --directions 30 --places 2",
     "robot": f"--weights {WEIGHTS} --landmarks 500 --directions 20 --repeats 2",
+    "scale": "--landmarks 500 5000 --locations 1 2 --repeats 1 --out /dev/null",
     "scorers": f"--weights {WEIGHTS} --landmarks 500 --locations 2 --directions 20 --repeats 1 --poses 2",
     "select": "--landmarks 400 --waypoints 2 --repeats 1",
     "view": "--landmarks 400 --turns 2 --clients 1 --seconds 4",

@@ -1,13 +1,15 @@
 """Compare localization with hloc (Sarlin et al., CVPR 2019) on the same features, maps and queries.
 
-    python -m wheretolook_paper.studies.compare_hloc --sets work/kitchen work/fox --features aliked \\
+    python -m wheretolook_paper.studies.compare_hloc compare --sets work/kitchen work/fox --features aliked \\
         --weights aliked-n16rot.pth --lightglue aliked_lightglue.pth --out hloc.csv
+    python -m wheretolook_paper.studies.compare_hloc draw --tables hloc.csv --figure hloc.png
 
 Needs hloc (https://github.com/cvg/Hierarchical-Localization) and h5py. A set is a folder with images/, cameras.txt of one
 camera and images.txt with all poses (COLMAP's text), and queries.txt: lines "image fold". The queries of a fold are
 localized in a map of all images but those of the fold, which hloc triangulates at the known poses. Each of these is
-matched with the `partners` nearest ones. hloc then matches each query with the `retrieved` mapping images that observe most of the landmarks that the
-query matches, since weights of global descriptors are not assumed; its confidence is the number of inliers.
+matched with the `partners` nearest ones. hloc then matches each query with the `retrieved` mapping images that observe
+most of the landmarks that the query matches, since weights of global descriptors are not assumed; its confidence is the
+number of inliers.
 
 Methods: `hloc`; `first` (the paper's: landmarks, one RANSAC), `hypotheses` (landmarks, several hypotheses), `lightglue`
 (the same after LightGlue with five mapping images). Times are those of matching and pose estimation, without features.
@@ -26,7 +28,7 @@ import pycolmap
 from jsonargparse import auto_cli
 from tqdm.auto import tqdm
 
-from wheretolook.evaluation.calibration import precision_area
+from wheretolook.evaluation.calibration import precision_area, precision_over_coverage
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import Keypoints
@@ -44,6 +46,8 @@ from wheretolook.mapping.photographs import read_photograph
 from wheretolook.utils.files import atomic_write, write_text
 
 MATCHERS = {"aliked": "aliked+lightglue", "disk": "disk+lightglue", "opencv": "NN-ratio"}  # of hloc, by extractor
+LABELS = {"aliked": "ALIKED", "disk": "DISK", "opencv": "SIFT"}
+COLORS = {"hloc": "#c44e52", "first": "#8c8c8c", "hypotheses": "#4c72b0", "lightglue": "#55a868"}
 ACCURACIES: Mapping[str, Accuracy] = {"5 cm, 0.4 deg": (0.05, 0.4), "25 cm, 2 deg": (0.25, 2.0)}
 AHEAD_M = 3.0  # of a camera, of the point that decides which images are matched
 MIN_TIMED = 10  # queries of a fold of which hloc's time is stated
@@ -115,6 +119,30 @@ def summarize(table: pd.DataFrame) -> pd.DataFrame:
                 row |= {"confident": sure.mean(), "right_of_confident": right[sure].mean() if sure.any() else np.nan}
             rows.append(row | {"seconds": part["seconds"].median()})
     return pd.DataFrame(rows)
+
+
+def draw(tables: list[Path], figure: Path, accuracy: str = "5 cm, 0.4 deg") -> None:
+    """Draw precision over coverage of the poses in tables of `main`: a panel for each set and features."""
+    import matplotlib.pyplot as plt
+
+    from wheretolook.figures.style import save_figure
+
+    table = pd.concat([pd.read_csv(path) for path in tables], ignore_index=True)
+    limit_m, limit_deg = ACCURACIES[accuracy]
+    table["right"] = (table["error_m"] <= limit_m) & (table["error_deg"] <= limit_deg)
+    panels = list(table.groupby(["set", "features"], sort=False))
+    canvas, axes = plt.subplots(1, len(panels), figsize=(2.6 * len(panels), 2.6), layout="constrained", squeeze=False)
+    for axis, ((name, features), panel) in zip(axes[0], panels, strict=True):
+        for method, part in panel.groupby("method", sort=False):
+            confidence = part[f"confidence at {accuracy}"].to_numpy(float)
+            coverage, precision = precision_over_coverage(confidence, part["right"].to_numpy())
+            axis.plot(coverage, precision, color=COLORS[str(method)], label=method)
+        axis.set(title=f"{name}, {LABELS[features]}", xlabel="coverage", ylim=(0.55, 1.01), xlim=(0, 1))
+        axis.grid(alpha=0.3)
+    axes[0, 0].set_ylabel("precision")
+    handles = {text: line for axis in axes[0] for line, text in zip(*axis.get_legend_handles_labels(), strict=True)}
+    canvas.legend(handles.values(), handles, frameon=False, loc="outside right center")
+    save_figure(canvas, figure)
 
 
 def _store_features(images: Mapping[str, Path], extractor: KeypointExtractor, path: Path) -> None:
@@ -258,4 +286,4 @@ def _by_hloc(fold: Fold, features: str, retrieved: Mapping[str, Sequence[str]]) 
 
 
 if __name__ == "__main__":
-    auto_cli(main, as_positional=False)
+    auto_cli({"compare": main, "draw": draw}, as_positional=False)

@@ -147,7 +147,7 @@ def draw(table: pd.DataFrame, path: Path) -> None:
             axis.plot(part["size"], part["median_s"], "o-", label=name)
         axis.set(xscale="log", yscale="log", xlabel=label, ylabel="CPU seconds, one core")
         axis.grid(alpha=0.3)
-        axis.legend(frameon=False, loc="lower right")
+        axis.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2)
     by_index = table[(table["what"] == MATCHED) & (table["about"] == "index")]
     if len(by_index):
         first = by_index.iloc[0]

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from localization.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, map_room
+from localization.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, file_bytes, map_room
 from one_scene import label_viewpoints
 from wheretolook.dataset.viewpoint_files import FIRST_FIELDS, SCHEMA, read_table, write_table
 from wheretolook.dataset.viewpoint_table import LOCALIZED, by_first, is_good, poses
@@ -37,6 +37,39 @@ def test_a_plain_wall_never_localizes_and_a_poster_wall_always_does(room: Mapped
             assert labelled["error_m"].isna().all() and (labelled["n_inliers"] == 0).all()
         else:
             assert (labelled["n_inliers"] >= 10).all() and labelled["error_m"].max() < 0.05
+
+
+def test_batches_that_exceed_the_memory_are_halved(
+    room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A renderer and an extractor that fail, as on a full GPU, for more than three views give the same labels."""
+
+    class SmallRenderer(WarpRenderer):
+        def render(self, camera, cam_from_world):  # type: ignore[no-untyped-def]
+            if len(cam_from_world) > 3:
+                raise RuntimeError("Failed to allocate 1000 bytes on device 'cuda:0'")
+            return super().render(camera, cam_from_world)
+
+    localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
+    whole = localizer.extractor.extract_batch
+
+    def extract_batch(images):  # type: ignore[no-untyped-def]
+        if len(images) > 3:
+            raise RuntimeError("CUDA out of memory. Tried to allocate 1000 MiB")
+        return whole(images)
+
+    localizer.extractor.extract_batch = extract_batch  # type: ignore[method-assign]
+    with caplog.at_level("WARNING"):
+        labelled = label_rows(views, SmallRenderer(load_mesh(room.mesh)), localizer, CAMERA)
+    assert file_bytes(labelled, tmp_path / "halved") == expected
+    assert "GPU memory does not suffice" in caplog.text
+
+    def broken(images):  # type: ignore[no-untyped-def]
+        raise RuntimeError("another error")
+
+    localizer.extractor.extract_batch = broken  # type: ignore[method-assign]
+    with pytest.raises(RuntimeError, match="another error"):
+        label_rows(views, WarpRenderer(load_mesh(room.mesh)), localizer, CAMERA)
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from wheretolook.geometry.poses import Float
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.pipeline import Step, run_pipeline
 from wheretolook.utils.errors import WhereToLookError, WorkerError
+from wheretolook.utils.memory import halving
 from wheretolook.utils.processes import WorkerPool, use_one_core, worker_number
 
 if TYPE_CHECKING:
@@ -149,7 +150,7 @@ def label_rows(
     """Render viewpoints, localize the images and measure the errors, in batched steps that overlap.
 
     With several cameras, `camera_id` selects that of a viewpoint. The seconds spent in each step (render, extract,
-    match, pose) are added to `seconds`. Returns the table with new status, error_m, error_deg and n_inliers, with
+    match, pose) are added to `seconds`. A batch that exceeds a GPU's memory is halved. Returns the table with new status, error_m, error_deg and n_inliers, with
     `viewpoint_files.FIRST_FIELDS` by several hypotheses, `MATCH_FIELDS` if `store_matches`, and also `PIXEL_FIELD` if
     `store_pixels`.
     """
@@ -162,14 +163,23 @@ def label_rows(
     batch_size = max(BATCH, localizer.extractor.batch_of(640, 480))
     batches = [(camera, rows) for camera, group in groups for rows in _batches(camera, group, batch_size)]
 
+    def render(batch: tuple[Camera, NDArray[np.int64]]) -> tuple[Camera, Sequence[NDArray[np.uint8]]]:
+        camera, rows = batch
+        return camera, halving(lambda some: renderer.render(camera, true_poses[some]).rgb)(rows)
+
+    def match(batch: tuple[Camera, list[Keypoints]]) -> tuple[Camera, list[tuple[Keypoints, Matches]]]:
+        camera, keypoints = batch
+        matches = halving(lambda some: localizer.match(some, camera))(keypoints)
+        return camera, list(zip(keypoints, matches, strict=True))
+
     def estimate(batch: tuple[Camera, list[tuple[Keypoints, Matches]]]) -> list[Localization]:
         camera, matched = batch
         return [localizer.estimate(keypoints, matches, camera) for keypoints, matches in matched]
 
     steps = [  # the camera of a batch goes with it from step to step
-        Step("render", lambda batch: (batch[0], renderer.render(batch[0], true_poses[batch[1]]).rgb)),
-        Step("extract", lambda batch: (batch[0], localizer.extractor.extract_batch(batch[1]))),
-        Step("match", lambda batch: (batch[0], list(zip(batch[1], localizer.match(batch[1], batch[0]), strict=True)))),
+        Step("render", render),
+        Step("extract", lambda batch: (batch[0], halving(localizer.extractor.extract_batch)(batch[1]))),
+        Step("match", match),
         Step("pose", estimate),
     ]
     localizations = [result for batch in run_pipeline(batches, steps, seconds) for result in batch]

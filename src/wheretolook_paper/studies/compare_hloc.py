@@ -137,7 +137,7 @@ def draw(tables: list[Path], figure: Path, accuracy: str = "5 cm, 0.4 deg") -> N
             confidence = part[f"confidence at {accuracy}"].to_numpy(float)
             coverage, precision = precision_over_coverage(confidence, part["right"].to_numpy())
             axis.plot(coverage, precision, color=COLORS[str(method)], label=method)
-        axis.set(title=f"{name}, {LABELS[features]}", xlabel="coverage", ylim=(0.55, 1.01), xlim=(0, 1))
+        axis.set(title=f"{name}, {LABELS[str(features)]}", xlabel="coverage", ylim=(0.55, 1.01), xlim=(0, 1))
         axis.grid(alpha=0.3)
     axes[0, 0].set_ylabel("precision")
     handles = {text: line for axis in axes[0] for line, text in zip(*axis.get_legend_handles_labels(), strict=True)}

@@ -14,12 +14,14 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.stats import rankdata
+from scipy.stats import t as student
 
 from wheretolook.evaluation.bootstrap import ClusterBootstrap, divide
 from wheretolook.evaluation.calibration import BINS, bins_of
 from wheretolook.geometry.poses import Float
 
 RESAMPLES = 2000
+BLOCKS = 11  # of a check of many photographs, at least
 
 
 def resampled_auc(bootstrap: ClusterBootstrap, good: NDArray[np.bool_], score: Float, within: bool = False) -> Float:
@@ -111,9 +113,9 @@ def measure(
         has_choice[rows] = 1
         of_methods[method] = {
             "auc": record(areas[method]),
-            "auc_above_visible": record(areas[method] - baseline_auc),
+            "auc_above_visible": record(areas[method] - baseline_auc, -1),
             "auc_within_blocks": record(resampled_auc(bootstrap, good, score, within=True)),
-            "regret": record(bootstrap.ratios(100 * missed, has_choice)),
+            "regret": record(bootstrap.ratios(100 * missed, has_choice), most=100),
             "rank_correlation_with_inliers": _correlation(score, n_inliers),
         }
     sizes = np.bincount(place)
@@ -123,8 +125,8 @@ def measure(
     ratios = None
     if np.isfinite(expected).all():
         ratios = {
-            "localized": record(bootstrap.ratios(n_inliers * good, expected * good)),
-            "all": record(bootstrap.ratios(n_inliers * good, expected)),
+            "localized": record(bootstrap.ratios(n_inliers * good, expected * good), most=np.inf),
+            "all": record(bootstrap.ratios(n_inliers * good, expected), most=np.inf),
         }
     return {
         "n_views": len(views),
@@ -141,10 +143,19 @@ def measure(
     }
 
 
-def _record(bootstrap: ClusterBootstrap, statistics: Float) -> dict[str, float | None]:
-    """Return value and 95 % interval of statistics (1 + R,) of the views and of each resample; None where unknown."""
-    low, high = bootstrap.interval(statistics)
-    named = {"value": statistics[0], "low": low, "high": high}
+def _record(
+    bootstrap: ClusterBootstrap, statistics: Float, least: float = 0, most: float = 1
+) -> dict[str, float | None]:
+    """Return value and 95 % interval of statistics (1 + R,) of the views and of each resample; None where unknown.
+
+    Resampling few blocks makes intervals too narrow: they are widened as Student's quantile exceeds that of `BLOCKS`
+    blocks, within `least` and `most`.
+    """
+    quantiles = student.ppf(0.975, np.array([max(2, bootstrap.n_clusters), BLOCKS]) - 1)
+    wider = max(1.0, quantiles[0] / quantiles[1])
+    value = statistics[0]
+    low, high = (np.clip(value + wider * (end - value), least, most) for end in bootstrap.interval(statistics))
+    named = {"value": value, "low": low, "high": high}
     return {name: float(value) if np.isfinite(value) else None for name, value in named.items()}
 
 

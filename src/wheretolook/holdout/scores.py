@@ -17,6 +17,7 @@ from wheretolook.geometry.poses import Float
 from wheretolook.holdout.holdout import HoldoutResult
 from wheretolook.holdout.photo_map import PhotographedMap
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.localization.confidence import Accuracy
 from wheretolook.mapping.colmap_model import compact_poses
 from wheretolook.mapping.landmarks import load_colmap_landmarks
 from wheretolook.scorers.base import Scorer
@@ -39,12 +40,14 @@ class Scoring:
         weights: file or folder; None for the bundled ones.
         also: further methods, with bundled weights.
         anywhere: whether weights adapted to another scene are allowed.
+        accuracy: up to which a photograph counts as localized; None for that of the weights.
     """
 
     method: str = ""
     weights: Path | None = None
     also: tuple[str, ...] = ()
     anywhere: bool = False
+    accuracy: Accuracy | None = None
 
     def check(self) -> None:
         """Raise a WeightsError if weights of any of the methods are missing or unreadable."""
@@ -62,8 +65,10 @@ class Scoring:
         chosen = resolve_weights(self.method, self.weights, localization_map.landmarks.features)
         anywhere = anywhere or self.anywhere
         if self.method:
-            return make_scorer(self.method, localization_map, weights=chosen, anywhere=anywhere)
-        return load_scorer(chosen, localization_map, anywhere=anywhere)
+            scorer = make_scorer(self.method, localization_map, weights=chosen, anywhere=anywhere)
+        else:
+            scorer = load_scorer(chosen, localization_map, anywhere=anywhere)
+        return scorer if self.accuracy is None else scorer.at_accuracy(self.accuracy)
 
 
 def check_place(source: PhotographedMap, scoring: Scoring, device: str) -> None:

@@ -11,6 +11,7 @@ pose. Errors of position and orientation correlate at 0.84, so the smaller of th
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -20,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.pose_ambiguity import log_ratio
-from wheretolook.utils.errors import WeightsError
+from wheretolook.utils.errors import ConfigError, WeightsError
 from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.shipped_model import LogisticRegression
 
@@ -60,6 +61,14 @@ def confidence_features(
     support_ratio = log_ratio(unique_support, rival_unique_support)
     rival = np.log1p(np.asarray(rival_support, dtype=np.float64))
     return np.stack([rival, np.log(inlier_ratio), support_ratio, np.log(deviation)], axis=-1)
+
+
+def checked_accuracy(accuracy: Sequence[float]) -> Accuracy:
+    """Return limits of the errors in metres and degrees. Raises ConfigError unless they are two positive numbers."""
+    limits = tuple(float(limit) for limit in accuracy)
+    if len(limits) != 2 or not min(limits) > 0:
+        raise ConfigError("an accuracy has two positive limits", value=accuracy, fix="Give metres,degrees: 0.05,0.4.")
+    return limits
 
 
 @dataclass(frozen=True)

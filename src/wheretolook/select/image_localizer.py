@@ -16,7 +16,7 @@ from wheretolook.features.matching import Matches
 from wheretolook.features.registry import kind_of, runnable_extractors
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
-from wheretolook.localization.confidence import ACCURACY, Accuracy, probabilities
+from wheretolook.localization.confidence import ACCURACY, Accuracy, checked_accuracy, probabilities
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.prior import PosePrior, matches_among
@@ -195,14 +195,6 @@ class ImageLocalizer:
             problem = "the camera moved between the images, and the unit of the map is unknown"
             raise ConfigError(problem, value=f"{moved:.2g} m", fix="Give --scale.")
         return cam_from_rig * (1, 1, 1, 0)
-
-
-def checked_accuracy(accuracy: Sequence[float]) -> Accuracy:
-    """Return limits of the errors in metres and degrees. Raises ConfigError unless they are two positive numbers."""
-    limits = tuple(float(limit) for limit in accuracy)
-    if len(limits) != 2 or not min(limits) > 0:
-        raise ConfigError("an accuracy has two positive limits", value=accuracy, fix="Give metres,degrees: 0.05,0.4.")
-    return limits
 
 
 def _extractor_of(path: Path, landmarks: Landmarks) -> ExtractorConfig:

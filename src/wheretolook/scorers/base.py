@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from wheretolook.geometry.camera import Camera, ColmapCamera, describe_camera
 from wheretolook.geometry.poses import Float, check_poses, poses_looking_along
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
-from wheretolook.localization.confidence import Accuracy, checked_accuracy
 from wheretolook.utils.errors import CameraError, ConfigError
 
 if TYPE_CHECKING:
     from wheretolook.inputs.bins import BinnedViews
     from wheretolook.inputs.localization_map import LocalizationMap
+    from wheretolook.localization.confidence import Accuracy
     from wheretolook.visibility.frustum import LandmarkSets
 
 BLOCK = 4096  # views scored at a time: about 80 MB of bins
@@ -68,9 +68,9 @@ class Scorer(ABC):
     def at_accuracy(self, accuracy: Accuracy) -> Scorer:
         """Return a scorer whose scores are probabilities that errors are within limits in metres and degrees.
 
-        In a map of unknown unit, metres are those of a median depth of 5 m. Raises a ConfigError unless the limits are positive and the method predicts this.
+        In a map of unknown unit, metres are those of a median depth of 5 m. Raises a ConfigError unless the limits are
+        positive and the method predicts this.
         """
-        checked_accuracy(accuracy)
         fix = "Use the method set and its weights, or leave the accuracy out."
         raise ConfigError("the scores of this method are not for any accuracy", value=self.name, fix=fix)
 

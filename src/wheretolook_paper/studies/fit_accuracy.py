@@ -1,18 +1,21 @@
-"""Fit the bundled model of the accuracy of views to labelled datasets, and compare it with the scorer's own probability.
+"""Fit the bundled model of the accuracy of views to labelled datasets, and compare it with the network's own scores.
 
-    python -m wheretolook_paper.studies.fit_accuracy --datasets '[data/release]'
-    python -m wheretolook_paper.studies.fit_accuracy --datasets '[data/release]' --others '[data/cameras]'
+    wheretolook scenes --config kinds.yaml          (then map, sample, label)
+    python -m wheretolook_paper.studies.fit_accuracy --datasets '[data/release, data/kinds]'
 
-Scenes of the splits train and val are each judged by a fit on the others, and test scenes by the fit on all of these;
-none of them trained the bundled network. `--others` are judged by that fit, too. Prints, for each accuracy, the share
-of views within it, and AUC and calibration error of the model and of the network's own probability; then the JSON of
-the model.
+kinds.yaml has scenes and cameras unlike those of the release, of seeds that the bundled network has not seen:
+
+    {name: kinds, scenes: {train: 8, test: 0, seed: 700, kinds: [court, building, hall, office], apartment: {vary: true}},
+     mapping: {draw_camera: true}, sample: {grid: [14, 14, 8], keep: 0, cameras: 20, max_locations: 60, max_directions: 10}}
+
+Apartments of the splits train and val are each judged by a fit on all other scenes, scenes of other kinds by a fit on
+those of other kinds than theirs, and test scenes by the fit on all of these. Prints, for each accuracy, the share of
+views within it, and AUC and calibration error of the model and of the network's own probability; then the model.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -27,16 +30,19 @@ from wheretolook.dataset.viewpoint_table import CAMERA_ID, LOCALIZED, poses
 from wheretolook.evaluation.calibration import expected_calibration_error
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.confidence import ACCURACY, RIGHT_PLACE_LIMITS, Accuracy
-from wheretolook.scorers.set.accuracy import VARIANCE, AccuracyModel, LogError, probabilities, statistics_of
+from wheretolook.scorers.set.accuracy import MARGIN, STATISTICS, AccuracyModel, LogError, probabilities, statistics_of
 from wheretolook.scorers.set.network import ALL_STATISTICS
 from wheretolook.scorers.set.score import SetScorer
+from wheretolook.utils.probability import finite_log_odds
 from wheretolook_paper.studies.fit_confidence import ACCURACIES, is_within
 
 LEAST = (1e-5, 1e-4)  # error in metres and degrees: labels are rounded
+SPLITS = ("train", "val", "test")
+APARTMENT = "apartment"  # the kind of the release
 VIEWS = 6000  # of a scene, drawn at random
 
 
-def read_views(dataset: Dataset, scene: SceneFolder, weights: Path) -> pd.DataFrame:
+def read_views(scene: SceneFolder, weights: Path) -> pd.DataFrame:
     """Return errors (infinite without a pose), the network's probability `own` and `ALL_STATISTICS` of a scene's views."""
     table = scene.read_table()
     table = table.sample(min(VIEWS, len(table)), random_state=0).reset_index(drop=True)
@@ -44,7 +50,7 @@ def read_views(dataset: Dataset, scene: SceneFolder, weights: Path) -> pd.DataFr
     parts = []
     for number, camera in scene.cameras().items():
         part = table[numbers == number]
-        scorer = load_scorer(weights, scene.localization_map(dataset.camera).of_camera(camera))
+        scorer = load_scorer(weights, scene.localization_map(camera))
         assert isinstance(scorer, SetScorer)
         views = poses(part)
         for rows, described, n_visible in scorer.describer.in_blocks(views, scorer.max_landmarks):
@@ -59,17 +65,21 @@ def read_views(dataset: Dataset, scene: SceneFolder, weights: Path) -> pd.DataFr
 
 
 def fit(views: pd.DataFrame) -> AccuracyModel:
-    """Fit both factors: the place to all views, the errors to those at the right place."""
+    """Fit both factors, with the same weight for every scene: the place to all views, the errors at the right place."""
+    weight = (1 / views.groupby("scene")["own"].transform("size")).to_numpy()
+    weight = weight / weight.mean()
     place = is_within(views, RIGHT_PLACE_LIMITS)
-    features = views[list(AccuracyModel.names)].to_numpy()
-    logistic = LogisticRegression(C=1e3, max_iter=2000).fit(features, place)
+    variance = views["log_orientation_variance"].to_numpy()
+    features = np.stack([finite_log_odds(views["own"].to_numpy(), MARGIN), variance], axis=-1)
+    logistic = LogisticRegression(C=1e3, max_iter=2000).fit(features, place, weight)
     right = views[place]
-    deviation = right[ALL_STATISTICS[VARIANCE]].to_numpy() / 2
+    features = right[list(STATISTICS)].to_numpy()
+    deviation = right["log_position_variance"].to_numpy() / 2
     errors = []
     for unit, least, known in zip(("m", "deg"), LEAST, (deviation, 0 * deviation), strict=True):
         target = np.log(np.maximum(right[f"error_{unit}"].to_numpy(np.float64), least)) - known
-        line = LinearRegression().fit(features[place], target)
-        spread = float((target - line.predict(features[place])).std())
+        line = LinearRegression().fit(features, target, weight[place])
+        spread = float(np.sqrt(np.average((target - line.predict(features)) ** 2, weights=weight[place])))
         errors.append(LogError(tuple(line.coef_.round(4).tolist()), round(float(line.intercept_), 4), round(spread, 4)))
     bias = round(float(logistic.intercept_[0]), 4)
     return AccuracyModel(tuple(logistic.coef_[0].round(4).tolist()), bias, tuple(errors))
@@ -80,9 +90,8 @@ def predict(model: AccuracyModel, views: pd.DataFrame, accuracy: Accuracy) -> Fl
     return model.at(accuracy, ACCURACY, views["own"].to_numpy(), views[list(ALL_STATISTICS)].to_numpy())
 
 
-def compare(title: str, parts: Iterable[tuple[AccuracyModel, pd.DataFrame]]) -> None:
+def compare(title: str, parts: list[tuple[AccuracyModel, pd.DataFrame]]) -> None:
     """Print AUC and calibration error of views by models, and of the network's own probability, at each accuracy."""
-    parts = list(parts)
     print(f"{title}: {sum(len(views) for _, views in parts)} views of {len(parts)} scenes")
     for accuracy in ACCURACIES:
         good = np.concatenate([is_within(views, accuracy) for _, views in parts])
@@ -95,40 +104,36 @@ def compare(title: str, parts: Iterable[tuple[AccuracyModel, pd.DataFrame]]) -> 
         print(f"  {accuracy[0]} m, {accuracy[1]} degrees: {good.mean():.3f} within; {numbers}")
 
 
-def main(
-    datasets: tuple[Path, ...], others: tuple[Path, ...] = (), weights: Path = Path("data/release/weights")
-) -> None:
+def main(datasets: tuple[Path, ...], weights: Path = Path("data/release/weights")) -> None:
     """Fit the model, compare, and print the model.
 
     Args:
-        datasets: labelled datasets to fit to.
-        others: labelled datasets to judge only.
+        datasets: labelled datasets; their test scenes are only judged.
         weights: of the set network.
     """
-    views: dict[str, list[pd.DataFrame]] = {"train": [], "val": [], "test": [], "others": []}
-    for root in (*datasets, *others):
-        dataset = Dataset.load(root)
-        for split in ("train", "val", "test"):
-            part = views["others" if root in others else split]
-            part.extend(read_views(dataset, scene, weights) for scene in dataset.split(split))
-    known = views["train"] + views["val"]
-    held_out = [(fit(pd.concat(known[:row] + known[row + 1 :])), scene) for row, scene in enumerate(known)]
-    compare("each scene by a fit on the others", held_out)
-    model = fit(pd.concat(known))
-    for title in ("test", "others"):
-        if views[title]:
-            compare(title, [(model, scene) for scene in views[title]])
+    scenes = [(split, scene) for root in datasets for split in SPLITS for scene in Dataset.load(root).split(split)]
+    views = {scene.name: (split, read_views(scene, weights)) for split, scene in scenes}
+    known = {name: part for name, (split, part) in views.items() if split != "test"}
+    groups: dict[str, list[tuple[AccuracyModel, pd.DataFrame]]] = {}
+    for name, part in known.items():
+        kind = name.rsplit("-", 1)[0]
+        alike = name if kind == APARTMENT else kind
+        rest = fit(pd.concat([other for key, other in known.items() if not key.startswith(alike)]))
+        groups.setdefault("apartments" if kind == APARTMENT else "other kinds", []).append((rest, part))
+    model = fit(pd.concat([*known.values()]))
+    groups["test"] = [(model, part) for split, part in views.values() if split == "test"]
+    for title, parts in groups.items():
+        compare(title, parts)
     kinds = zip(("position", "orientation"), model.errors, strict=True)
-    names = AccuracyModel.names
     errors = {
         kind: {
-            "weights": dict(zip(names, error.weights, strict=True)),
+            "weights": dict(zip(STATISTICS, error.weights, strict=True)),
             "bias": error.bias,
             "deviation": error.deviation,
         }
         for kind, error in kinds
     }
-    place = dict(zip(names, model.weights, strict=True))
+    place = dict(zip(AccuracyModel.names, model.weights, strict=True))
     print(json.dumps({"weights": place, "bias": model.bias, "errors": errors}, indent=2))
 
 

@@ -1,9 +1,10 @@
 """Predicts the probability that a view localizes within any accuracy, and the error of its pose.
 
 P(error within a) = P(right place) F(a), with F(a) = P(error within a | right place). A logistic regression predicts the
-first factor from statistics that the network computes anyway. In the second, the logs of both errors are normal: their
-means follow from the expected covariance of the pose and from the same statistics. The errors of position and
-orientation correlate at 0.92, so F is the smaller of their two probabilities.
+first factor from the network's own probability and the expected variance of the orientation. In the second, the logs of
+both errors are normal: their means follow from the expected covariance of the pose and from other statistics that the
+network computes anyway. The errors of position and orientation correlate at 0.92, so F is the smaller of their two
+probabilities.
 
 The network predicts the probability p at one accuracy b, that of its labels. The family
 
@@ -29,6 +30,7 @@ from wheretolook.localization.confidence import Accuracy
 from wheretolook.scorers.set.network import ALL_STATISTICS, SetNetwork
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import WeightsError
+from wheretolook.utils.probability import finite_log_odds
 from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.shipped_model import LogisticRegression
 
@@ -48,11 +50,18 @@ class LogError:
         return np.asarray(features @ np.asarray(self.weights) + self.bias)
 
 
+STATISTICS = ("log_visible", "log_orientation_variance", "log_expected_cells")
+"""Features of the errors. None depends on the unit of length: errors scale with the deviation of the position."""
+
+FEATURES = [ALL_STATISTICS.index(name) for name in STATISTICS]
+MARGIN = 1e-5  # of probabilities from 0 and 1, so that their log-odds are finite
+
+
 @dataclass(frozen=True)
 class AccuracyModel(LogisticRegression):
-    """Both factors. No feature but the position's deviation depends on the unit of length, so the errors scale with it."""
+    """Both factors."""
 
-    names = ("log_expected_inliers", "log_visible", "log_orientation_variance", "log_expected_cells")
+    names = ("log_odds", "log_orientation_variance")
     about = "the accuracy of views"
     file = Path(__file__).with_name("accuracy.json")
 
@@ -65,20 +74,21 @@ class AccuracyModel(LogisticRegression):
         try:
             stored: Any = read_json_object(path)["errors"]
             errors = tuple(
-                LogError(tuple(float(one["weights"][name]) for name in cls.names), one["bias"], one["deviation"])
+                LogError(tuple(float(one["weights"][name]) for name in STATISTICS), one["bias"], one["deviation"])
                 for one in (stored["position"], stored["orientation"])
             )
         except (OSError, KeyError, TypeError, ValueError) as error:
             raise WeightsError(f"a damaged file of {cls.about}: {error}", path=path, fix="Fit it again.") from error
         return cls(place.weights, place.bias, errors)
 
-    def features(self, statistics: Float) -> Float:
-        """Return the features (B, K) among `ALL_STATISTICS` (B, S)."""
-        return statistics[:, [ALL_STATISTICS.index(name) for name in self.names]]
+    def p_right_place(self, own: Float, statistics: Float) -> Float:
+        """Return P(right place) (B,) of views with the network's probabilities (B,) and `ALL_STATISTICS` (B, S)."""
+        variance = statistics[:, ALL_STATISTICS.index("log_orientation_variance")]
+        return self.predict_proba(np.stack([finite_log_odds(own, MARGIN), variance], axis=-1))
 
     def log_errors(self, statistics: Float) -> Float:
         """Return the means (B, 2) of the logs of the errors (m, degrees) at the right place."""
-        features = self.features(statistics)
+        features = statistics[:, FEATURES]
         position, orientation = (error.mean(features) for error in self.errors)
         return np.stack([position + statistics[:, VARIANCE] / 2, orientation], axis=-1)
 
@@ -95,7 +105,7 @@ class AccuracyModel(LogisticRegression):
     def at(self, accuracy: Accuracy, own: Accuracy, probability: Float, statistics: Float) -> Float:
         """Return probabilities (B,) at an accuracy from those (B,) at a network's own accuracy, and `ALL_STATISTICS`."""
         asked, known = (self.log_p_within(statistics, limits) for limits in (accuracy, own))
-        place = np.maximum(probability, self.predict_proba(self.features(statistics)))
+        place = np.maximum(probability, self.p_right_place(probability, statistics))
         missed = np.expm1(np.minimum(known, -np.finfo(float).tiny))
         share = 1 - np.expm1(np.maximum(asked, known)) / missed
         return np.where(

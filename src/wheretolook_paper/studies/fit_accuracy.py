@@ -121,7 +121,8 @@ def main(datasets: tuple[Path, ...], weights: Path = Path("data/release/weights"
         rest = fit(pd.concat([other for key, other in known.items() if not key.startswith(alike)]))
         groups.setdefault("apartments" if kind == APARTMENT else "other kinds", []).append((rest, part))
     model = fit(pd.concat([*known.values()]))
-    groups["test"] = [(model, part) for split, part in views.values() if split == "test"]
+    if tested := [(model, part) for split, part in views.values() if split == "test"]:
+        groups["test"] = tested
     for title, parts in groups.items():
         compare(title, parts)
     kinds = zip(("position", "orientation"), model.errors, strict=True)

@@ -34,20 +34,14 @@ from wheretolook.utils.probability import finite_log_odds
 from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.shipped_model import LogisticRegression
 
-VARIANCE = ALL_STATISTICS.index("log_position_variance")
-
 
 @dataclass(frozen=True)
 class LogError:
-    """Normal distribution of the log of an error, given features of the view."""
+    """Normal distribution of the log of an error: its mean is linear in `STATISTICS`."""
 
     weights: tuple[float, ...]
     bias: float
     deviation: float
-
-    def mean(self, features: Float) -> Float:
-        """Return the means (B,) for features (B, K)."""
-        return np.asarray(features @ np.asarray(self.weights) + self.bias)
 
 
 STATISTICS = ("log_visible", "log_orientation_variance", "log_expected_cells")
@@ -74,12 +68,20 @@ class AccuracyModel(LogisticRegression):
         try:
             stored: Any = read_json_object(path)["errors"]
             errors = tuple(
-                LogError(tuple(float(one["weights"][name]) for name in STATISTICS), one["bias"], one["deviation"])
+                LogError(
+                    tuple(float(one["weights"][name]) for name in STATISTICS),
+                    float(one["bias"]),
+                    float(one["deviation"]),
+                )
                 for one in (stored["position"], stored["orientation"])
             )
         except (OSError, KeyError, TypeError, ValueError) as error:
             raise WeightsError(f"a damaged file of {cls.about}: {error}", path=path, fix="Fit it again.") from error
         return cls(place.weights, place.bias, errors)
+
+    @property
+    def _deviations(self) -> Float:
+        return np.array([error.deviation for error in self.errors])
 
     def p_right_place(self, own: Float, statistics: Float) -> Float:
         """Return P(right place) (B,) of views with the network's probabilities (B,) and `ALL_STATISTICS` (B, S)."""
@@ -88,19 +90,18 @@ class AccuracyModel(LogisticRegression):
 
     def log_errors(self, statistics: Float) -> Float:
         """Return the means (B, 2) of the logs of the errors (m, degrees) at the right place."""
-        features = statistics[:, FEATURES]
-        position, orientation = (error.mean(features) for error in self.errors)
-        return np.stack([position + statistics[:, VARIANCE] / 2, orientation], axis=-1)
+        weights = np.array([error.weights for error in self.errors])
+        means = statistics[:, FEATURES] @ weights.T + [error.bias for error in self.errors]
+        means[:, 0] += statistics[:, ALL_STATISTICS.index("log_position_variance")] / 2
+        return np.asarray(means)
 
     def expected_errors(self, statistics: Float) -> Float:
         """Return the expected errors (B, 2) at the right place, in metres and degrees."""
-        deviations = np.array([error.deviation for error in self.errors])
-        return np.asarray(np.exp(self.log_errors(statistics) + deviations**2 / 2))
+        return np.asarray(np.exp(self.log_errors(statistics) + self._deviations**2 / 2))
 
     def log_p_within(self, statistics: Float, accuracy: Accuracy) -> Float:
         """Return the log (B,) of F at an accuracy."""
-        deviations = np.array([error.deviation for error in self.errors])
-        return np.asarray(log_ndtr((np.log(accuracy) - self.log_errors(statistics)) / deviations).min(axis=-1))
+        return np.asarray(log_ndtr((np.log(accuracy) - self.log_errors(statistics)) / self._deviations).min(axis=-1))
 
     def at(self, accuracy: Accuracy, own: Accuracy, probability: Float, statistics: Float) -> Float:
         """Return probabilities (B,) at an accuracy from those (B,) at a network's own accuracy, and `ALL_STATISTICS`."""

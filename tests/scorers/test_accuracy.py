@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.typing import NDArray
 from scipy.stats import lognorm
 
 from synthetic_dataset import CAMERA, make_landmarks
@@ -171,14 +173,16 @@ def test_views_have_an_accuracy_and_expected_errors(scorer: SetScorer) -> None:
 
 
 def test_landmarks_mapped_from_one_place_are_out_of_range(poses: Float) -> None:
-    landmarks = make_landmarks(np.random.default_rng(0), 400)
-    landmarks.triangulation_angle_deg[:] = 8
-    landmarks.reprojection_error_px[:] = 0.1
-    landmarks.mapping_distance_spread[:] = 0.1
-    camera = PinholeCamera(400, 300, 200.0)
-    usual = load_scorer(LocalizationMap(landmarks, camera)).in_range(poses)
-    landmarks.triangulation_angle_deg[:] = 2
-    landmarks.reprojection_error_px[:] = 0.3
-    landmarks.mapping_distance_spread[:] = 0.01
-    assert usual.sum() > 30
-    assert not load_scorer(LocalizationMap(landmarks, camera)).in_range(poses)[usual].any()
+    def seen_and_in_range(angle_deg: float, error_px: float, spread: float) -> NDArray[np.bool_]:
+        of_map = {
+            "triangulation_angle_deg": np.full(400, angle_deg, np.float32),
+            "reprojection_error_px": np.full(400, error_px, np.float32),
+            "mapping_distance_spread": np.full(400, spread, np.float32),
+        }
+        landmarks = replace(make_landmarks(np.random.default_rng(0), 400), **of_map)
+        report = load_scorer(LocalizationMap(landmarks, PinholeCamera(400, 300, 200.0))).report(poses)
+        return report.in_range & (report.n_visible > 0)
+
+    assert seen_and_in_range(8.0, 0.1, 0.1).sum() > 10
+    assert not seen_and_in_range(2.0, 0.3, 0.01).any()
+    assert seen_and_in_range(8.0, 1.0, 0.1).sum() > 10  # photographs, mapped from several places

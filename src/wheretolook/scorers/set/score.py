@@ -27,12 +27,13 @@ MAX_LANDMARKS = 1024
 by 0.05 where a view sees thousands."""
 
 
-UNCERTAIN = {"reprojection_error": 1.0, "triangulation_angle": -1.0, "distance_spread": -1.0}
-"""Sum of standardized attributes that is large where landmarks were mapped from one place or imprecisely."""
-MAX_UNCERTAIN = 2.3
-"""Mean over a view's landmarks, exceeded by 0.1 % of the views of 18 rendered scenes, and by most views of maps by a
-camera that turns in place, where 4 to 17 times the expected inliers are found: in training, small triangulation angles
-occur at landmarks that are hard to match, with narrow baselines at all of them."""
+NARROW = {"reprojection_error": 1.0, "triangulation_angle": -1.0, "distance_spread": -1.0}
+"""Signs of the deviations of these attributes where landmarks were mapped from nearly one place."""
+MAX_DEVIATION = 1.5  # that counts, in standard deviations, so that one attribute alone decides nothing
+MAX_NARROW = 2.3
+"""Sum of the deviations of a view's mean attributes, exceeded by 0.1 % of the views of 18 rendered scenes, and by most
+views of maps by a camera that turns in place. There, 4 to 17 times the expected inliers are found: in training, small
+triangulation angles occur at landmarks that are hard to match, with narrow baselines at all of them."""
 
 
 class SetScorer(LandmarkScorer):
@@ -47,7 +48,7 @@ class SetScorer(LandmarkScorer):
         self.trained = trained
         self.network = trained.network.to(localization_map.device)
         self.accuracy = trained.accuracy
-        signs = [UNCERTAIN.get(name, 0.0) for name in self.network.attributes]
+        signs = [NARROW.get(name, 0.0) for name in self.network.attributes]
         self._signs = torch.tensor(signs, device=localization_map.device)
         self._batched: BatchedDirections | None = None
 
@@ -90,9 +91,10 @@ class SetScorer(LandmarkScorer):
         return report
 
     def _in_range(self, described: ViewLandmarks, n_visible: Tensor) -> NDArray[np.bool_]:
-        uncertain = self.network.matchability.input(described.values) @ self._signs
-        mean = torch.segment_reduce(uncertain, "mean", lengths=described.counts).cpu().numpy()
-        return super()._in_range(described, n_visible) & ~(mean > MAX_UNCERTAIN)  # NaN without landmarks
+        deviations = self.network.matchability.input(described.values) * self._signs
+        means = torch.segment_reduce(deviations, "mean", lengths=described.counts)
+        narrow = means.clamp(max=MAX_DEVIATION).sum(1).cpu().numpy()
+        return super()._in_range(described, n_visible) & ~(narrow > MAX_NARROW)  # NaN without landmarks
 
     def log_odds_of_detection(self, values: Tensor) -> Tensor:
         """Return the log-odds (E,) that landmarks (E, A) are detected, by the network's part for single landmarks."""

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from scipy.stats import lognorm
 
 from synthetic_dataset import CAMERA, make_landmarks
+from wheretolook.dataset.thresholds import ACCURACY
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.localization.confidence import ACCURACY
 from wheretolook.scorers.registry import find, make_scorer
 from wheretolook.scorers.set.accuracy import STATISTICS, AccuracyModel, LogError
 from wheretolook.scorers.set.network import ALL_STATISTICS

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 from wheretolook.commands.options import OcclusionOptions, ScorerOptions
 from wheretolook.dataset.names import LOCK
+from wheretolook.dataset.thresholds import checked_accuracy
 from wheretolook.features.config import ExtractorConfig
-from wheretolook.localization.confidence import checked_accuracy
 from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.locks import hold

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.commands.options import CameraOptions, OcclusionOptions, ScorerOptions
+from wheretolook.dataset.thresholds import checked_accuracy
 from wheretolook.figures import KINDS
-from wheretolook.localization.confidence import checked_accuracy
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.validation import check_choice

@@ -15,11 +15,11 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from wheretolook.dataset.thresholds import Accuracy
 from wheretolook.dataset.viewpoint_table import LOCALIZED
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.holdout.holdout_blocks import Block, choose_blocks
 from wheretolook.holdout.photo_map import MAX_ERROR_DEG, MAX_ERROR_M, PhotographedMap
-from wheretolook.localization.confidence import Accuracy
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer, localization_errors
 from wheretolook.localization.versions import versions

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from wheretolook.dataset.thresholds import ACCURACY, Accuracy
 from wheretolook.holdout.holdout import HoldoutResult, hold_out_blocks, judged
 from wheretolook.holdout.holdout_blocks import VIEWS, choose_blocks
 from wheretolook.holdout.metrics import measure
 from wheretolook.holdout.photo_map import PhotographedMap
 from wheretolook.holdout.scores import VISIBLE, Scoring, check_place, score_views
 from wheretolook.holdout.weak_regions import WeakPart, weak_parts
-from wheretolook.localization.confidence import ACCURACY, Accuracy
 from wheretolook.mapping.georeference import DEPTH_M
 from wheretolook.scorers.registry import is_probability
 from wheretolook.utils.files import write_json, write_text

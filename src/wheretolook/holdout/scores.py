@@ -12,12 +12,12 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from wheretolook.dataset.thresholds import Accuracy
 from wheretolook.evaluation.scoring import score_scale
 from wheretolook.geometry.poses import Float
 from wheretolook.holdout.holdout import HoldoutResult
 from wheretolook.holdout.photo_map import PhotographedMap
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.localization.confidence import Accuracy
 from wheretolook.mapping.colmap_model import compact_poses
 from wheretolook.mapping.landmarks import load_colmap_landmarks
 from wheretolook.scorers.base import Scorer

@@ -11,7 +11,6 @@ pose. Errors of position and orientation correlate at 0.84, so the smaller of th
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -19,9 +18,11 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from wheretolook.dataset.thresholds import ACCURACY as ACCURACY
+from wheretolook.dataset.thresholds import Accuracy as Accuracy
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.pose_ambiguity import log_ratio
-from wheretolook.utils.errors import ConfigError, WeightsError
+from wheretolook.utils.errors import WeightsError
 from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.shipped_model import LogisticRegression
 
@@ -33,10 +34,6 @@ FEATURE_NAMES = ("log_elsewhere", "log_share", "log_own", "log_deviation_deg")
 unique support to that of its strongest rival (`pose_ambiguity.log_ratio`), log of one standard deviation of the
 orientation (degrees)."""
 
-Accuracy = tuple[float, float]
-"""Limits of the position error (m) and of the orientation error (degrees)."""
-
-ACCURACY: Accuracy = (0.05, 0.4)
 RIGHT_PLACE: Accuracy = (math.inf, math.inf)
 """Accuracy that every pose at the right place has: within `RIGHT_PLACE_LIMITS` of the true one."""
 
@@ -61,14 +58,6 @@ def confidence_features(
     support_ratio = log_ratio(unique_support, rival_unique_support)
     rival = np.log1p(np.asarray(rival_support, dtype=np.float64))
     return np.stack([rival, np.log(inlier_ratio), support_ratio, np.log(deviation)], axis=-1)
-
-
-def checked_accuracy(accuracy: Sequence[float]) -> Accuracy:
-    """Return limits of the errors in metres and degrees. Raises ConfigError unless they are two positive numbers."""
-    limits = tuple(float(limit) for limit in accuracy)
-    if len(limits) != 2 or not min(limits) > 0:
-        raise ConfigError("an accuracy has two positive limits", value=accuracy, fix="Give metres,degrees: 0.05,0.4.")
-    return limits
 
 
 @dataclass(frozen=True)

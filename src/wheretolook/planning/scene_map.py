@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from wheretolook.dataset.environment import SceneEnvironment
+from wheretolook.dataset.thresholds import Accuracy
 from wheretolook.geometry.lattices import ViewLattice
-from wheretolook.localization.confidence import Accuracy
 from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.rrt import Space
 from wheretolook.planning.viewpoint_map import ViewpointMap

@@ -15,9 +15,9 @@ from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
 from wheretolook.utils.errors import CameraError, ConfigError
 
 if TYPE_CHECKING:
+    from wheretolook.dataset.thresholds import Accuracy
     from wheretolook.inputs.bins import BinnedViews
     from wheretolook.inputs.localization_map import LocalizationMap
-    from wheretolook.localization.confidence import Accuracy
     from wheretolook.visibility.frustum import LandmarkSets
 
 BLOCK = 4096  # views scored at a time: about 80 MB of bins

@@ -14,13 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, EnvironmentConfig
+from wheretolook.dataset.thresholds import ACCURACY, Accuracy
 from wheretolook.geometry.camera import Camera, PinholeCamera, parse_camera
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along, rigid_poses
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.inputs.reasons import ReasonCounter
-from wheretolook.localization.confidence import ACCURACY, Accuracy
 from wheretolook.looks.next_look import NextLook, NextLookSelector
 from wheretolook.looks.selection import best_views, separated
 from wheretolook.mapping.config import FrameOptions

@@ -12,8 +12,8 @@ from typing import Any, Generic, Self, TypeVar
 import torch
 from torch import Tensor, nn
 
+from wheretolook.dataset.thresholds import ACCURACY, Accuracy, checked_accuracy
 from wheretolook.geometry.camera import Camera, camera_of_record
-from wheretolook.localization.confidence import ACCURACY, Accuracy, checked_accuracy
 from wheretolook.training.training_range import TrainingRange
 from wheretolook.training.weights import check_method_of_weights, read_weights, write_weights
 from wheretolook.utils.errors import ConfigError, WeightsError

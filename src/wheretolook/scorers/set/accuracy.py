@@ -25,8 +25,8 @@ import torch
 from scipy.special import log_ndtr
 from torch import Tensor
 
+from wheretolook.dataset.thresholds import Accuracy
 from wheretolook.geometry.poses import Float
-from wheretolook.localization.confidence import Accuracy
 from wheretolook.scorers.set.network import ALL_STATISTICS, SetNetwork
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import WeightsError

@@ -18,10 +18,10 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from wheretolook.dataset.thresholds import Accuracy
 from wheretolook.geometry.poses import Float, check_locations, rotation_looking_along
 from wheretolook.inputs.landmark_features import ragged_blocks
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.localization.confidence import Accuracy
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.scorers.matchability.network import N_EXPECTED, bearing_precision
 from wheretolook.scorers.set.accuracy import probabilities

@@ -10,11 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wheretolook.dataset.thresholds import threshold_key
+from wheretolook.dataset.thresholds import Accuracy, checked_accuracy, threshold_key
 from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.inputs.landmark_features import ViewLandmarks
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.localization.confidence import Accuracy, checked_accuracy
 from wheretolook.scorers.base import ViewReport
 from wheretolook.scorers.landmark_scorer import LandmarkScorer
 from wheretolook.scorers.set.accuracy import AccuracyModel, probabilities, statistics_of

@@ -26,6 +26,7 @@ from sklearn.metrics import roc_auc_score
 
 from wheretolook import load_scorer
 from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.dataset.sampling_config import Split
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, LOCALIZED, poses
 from wheretolook.evaluation.calibration import expected_calibration_error
 from wheretolook.geometry.poses import Float
@@ -37,7 +38,7 @@ from wheretolook.utils.probability import finite_log_odds
 from wheretolook_paper.studies.fit_confidence import ACCURACIES, is_within
 
 LEAST = (1e-5, 1e-4)  # error in metres and degrees: labels are rounded
-SPLITS = ("train", "val", "test")
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
 APARTMENT = "apartment"  # the kind of the release
 VIEWS = 6000  # of a scene, drawn at random
 

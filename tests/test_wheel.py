@@ -96,7 +96,8 @@ def test_it_carries_all_modules_and_what_they_need(wheel: Path) -> None:
         for name in ("set", "matchability", "mlp-2d+z", "aliked/set", "aliked/matchability")
         for suffix in ("json", "safetensors")
     }
-    numbers = {"wheretolook/localization/confidence.json", "wheretolook/looks/set_score.json"}
+    fitted = ("localization/confidence", "looks/set_score", "scorers/set/accuracy")
+    numbers = {f"wheretolook/{name}.json" for name in fitted}
     assert files == {*modules, *configs, *weights, *numbers, "wheretolook/py.typed"}
     assert metadata["License-Expression"] == "Apache-2.0" and "wheretolook = wheretolook.cli:main" in points
 

@@ -188,6 +188,26 @@ def test_finished_blocks_are_reused(checked: Path, corridor: tuple[Path, Path], 
     assert (work / "01" / "views.json").stat().st_mtime_ns == cached
 
 
+def test_another_accuracy_judges_the_same_poses(checked: Path, corridor: tuple[Path, Path], tmp_path: Path) -> None:
+    shutil.copytree(checked, tmp_path / "out")
+    (work,) = (tmp_path / "out" / "work").glob("blocks-*")
+    before = [path.stat().st_mtime_ns for path in sorted(work.glob("*/views.json"))]
+    run(_arguments(*corridor, tmp_path / "out", "--scale", "1", "--accuracy", "0.002,0.1"))
+    assert [path.stat().st_mtime_ns for path in sorted(work.glob("*/views.json"))] == before
+    own, fine = (pd.read_csv(folder / "views.csv") for folder in (checked, tmp_path / "out"))
+    within = (own["status"] == "localized") & (own["error_m"] < 0.002) & (own["error_deg"] < 0.1)
+    assert fine["good"].tolist() == within.tolist() and 0 < within.sum() < own["good"].sum()
+    assert (fine["score"] <= own["score"]).all() and (fine["limit_m"] == 0.002).all()
+    numbers = json.loads((tmp_path / "out" / "check.json").read_text())
+    assert numbers["limits"] == "0.2 cm and 0.1 degrees" and numbers["ece"] is not None
+
+
+def test_eight_photographs_are_enough(tmp_path: Path) -> None:
+    run(_arguments(*write_corridor(tmp_path / "few", photographs=8), tmp_path / "out", "--scale", "1"))
+    numbers = json.loads((tmp_path / "out" / "check.json").read_text())
+    assert numbers["n_photographs"] == 8 and numbers["n_blocks"] >= 2 and numbers["ece"]["low"] >= 0
+
+
 # --- invalid input
 
 
@@ -197,6 +217,7 @@ def test_finished_blocks_are_reused(checked: Path, corridor: tuple[Path, Path], 
     [
         ([], ConfigError),
         (["--map", "{sparse}", "--scale", "0"], ConfigError),
+        (["--map", "{sparse}", "--database", "{database}", "--accuracy", "0,1"], ConfigError),
         (["--map", "{folder}/alone"], MapError),  # no database
         (["--map", "{folder}/nowhere"], MapError),
         (["--map", "{folder}/few/sparse", "--database", "{folder}/few/features.db"], MapError),
@@ -207,7 +228,7 @@ def test_finished_blocks_are_reused(checked: Path, corridor: tuple[Path, Path], 
 def test_invalid_input(options: list[str], error: type[Exception], corridor: tuple[Path, Path], tmp_path: Path) -> None:
     sparse, database = corridor
     shutil.copytree(sparse, tmp_path / "alone")
-    write_corridor(tmp_path / "few", photographs=19)
+    write_corridor(tmp_path / "few", photographs=7)
     write_corridor(tmp_path / "other", noise_px=2.0)
     named = [option.format(sparse=sparse, database=database, folder=tmp_path) for option in options]
     with pytest.raises(error):

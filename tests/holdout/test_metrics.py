@@ -9,7 +9,14 @@ from sklearn.metrics import roc_auc_score
 
 from wheretolook.evaluation.bootstrap import ClusterBootstrap
 from wheretolook.evaluation.calibration import expected_calibration_error
-from wheretolook.holdout.metrics import measure, places_of, regret_of_places, resampled_auc, resampled_calibration_error
+from wheretolook.holdout.metrics import (
+    RESAMPLES,
+    measure,
+    places_of,
+    regret_of_places,
+    resampled_auc,
+    resampled_calibration_error,
+)
 
 
 @pytest.fixture(scope="module")
@@ -87,3 +94,19 @@ def test_where_all_localize_there_is_no_auc(views: pd.DataFrame) -> None:
     found = measure(views.assign(good=True), {"set": "score", "visible": "visible"}, np.zeros((300, 3)), 0.5, True)
     assert found["methods"]["set"]["auc"] == {"value": None, "low": None, "high": None}
     assert found["methods"]["set"]["regret"]["value"] == 0
+
+
+def test_few_blocks_have_wide_intervals(views: pd.DataFrame) -> None:
+    def error_of(blocks: int) -> tuple[float, float, float]:
+        part = views.assign(block=views["block"] % blocks)
+        found = measure(part, {"set": "score", "visible": "visible"}, np.zeros((300, 3)), 0.5, True)["ece"]
+        bootstrap = ClusterBootstrap(part["block"].to_numpy(), RESAMPLES, seed=0)
+        errors = resampled_calibration_error(bootstrap, part["score"].to_numpy(), part["good"].to_numpy())
+        return found["value"] - found["low"], found["high"] - found["value"], bootstrap.interval(errors)[1] - errors[0]
+
+    below, above, resampled = error_of(3)
+    # Student's 97.5 % quantiles of 2 and of 10 degrees of freedom
+    assert above == pytest.approx(resampled * 4.3027 / 2.2281, rel=1e-3) and below >= 0
+    one_bad = views.assign(good=np.arange(300) > 0, score=np.arange(300) / 300)
+    found = measure(one_bad, {"set": "score", "visible": "visible"}, np.zeros((300, 3)), 0.5, True)
+    assert found["methods"]["set"]["auc"] == {"value": 1.0, "low": 0.0, "high": 1.0}

@@ -128,7 +128,9 @@ def test_a_sample_of_all_landmarks_scores_as_all_of_them(pooled: int) -> None:
     for view in range(3):
         padded[view, : counts[view]] = values[starts[view] : starts[view + 1]]
     height = torch.tensor([0.1, -0.2, 0.3])
-    whole = network.score(ViewLandmarks(starts, torch.zeros(48, dtype=torch.int64), values), counts, height)
+    described = ViewLandmarks(starts, torch.zeros(48, dtype=torch.int64), values)
+    sums, cells = network.sums_of(described, counts)
+    whole = network.logits(sums, counts, height, cells)
     torch.testing.assert_close(network(padded, counts, counts, height), whole, rtol=1e-4, atol=1e-5)
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from wheretolook.commands.options import OcclusionOptions, ScorerOptions
 from wheretolook.dataset.names import LOCK
+from wheretolook.dataset.thresholds import checked_accuracy
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.utils.errors import MapError
@@ -35,8 +36,8 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
     --images instead, keypoints are extracted again (SIFT, or by --extractor), and the landmarks triangulated again at
     the model's poses.
 
-    Metres: a photograph counts as localized within 5 cm and 0.4 degrees. Where metres are not known, it is 1 % of the
-    median depth of the photograph instead of 5 cm, and the map is scored as if its median depth were 5 m. A map of this
+    Metres: a photograph counts as localized within 5 cm and 0.4 degrees, or --accuracy. Where metres are not known, it
+    is 1 % of the median depth of the photograph instead of 5 cm, and the map is scored as if its median depth were 5 m. A map of this
     project knows whether it is in metres; for another, give --scale (1 for metres), --distance or --positions. A map
     whose cameras are clearly not level is turned upright first, unless --up states what is up.
 
@@ -91,6 +92,8 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
         )
         self._extractor()
         self.frame_options()
+        if self.accuracy is not None:
+            checked_accuracy(self.accuracy)
 
     def _extractor(self) -> ExtractorConfig:
         return ExtractorConfig(self.extractor or "opencv", weights=self.extractor_weights)
@@ -119,7 +122,7 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
 
         device = usable_device(self.device)
         workers = self.workers or len(os.sched_getaffinity(0))
-        scoring = Scoring(self.method, self.weights, self.also, self.anywhere)
+        scoring = Scoring(self.method, self.weights, self.also, self.anywhere, self.accuracy)
         scoring.check()
         out = self.out or folder_of_check(self.data, name)
         with ExitStack() as locks:

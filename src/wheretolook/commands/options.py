@@ -248,9 +248,12 @@ class ScorerOptions(Command):
     Args:
         weights: file or folder of weights; by default the bundled ones.
         method: a name of `wheretolook evaluate --list-methods`; by default that of the weights.
+        accuracy: limits of the errors in metres and degrees that scores refer to; by default those of the weights,
+            0.05,0.4. In a map of unknown unit, metres are those of a median depth of 5 m.
         anywhere: allow weights adapted to another scene.
     """
 
     weights: Path | None = None
     method: str = ""
+    accuracy: tuple[float, float] | None = None
     anywhere: bool = False

@@ -48,7 +48,7 @@ class Plan(SceneOrMapOptions):
     """
 
     SHORT: ClassVar = {
-        **{name: f"plan.{name}" for name in ("scene", "start", "goal", "method", "weights", "out", "film")},
+        **{name: f"plan.{name}" for name in ("scene", "start", "goal", "method", "weights", "accuracy", "out", "film")},
         "stops": "plan.stops.looks",
     }
 

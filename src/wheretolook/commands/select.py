@@ -80,6 +80,8 @@ class Select(SelectionRequest, SelectorOptions):
         SelectionRequest.__post_init__(self)
         SelectorOptions.__post_init__(self)
         check_format(self.out, self.format, max(self.n, self.looks or 1))
+        if self.looks is not None and self.accuracy is not None:
+            raise ConfigError("looks are for the accuracy of the weights: leave --accuracy out", value=self.accuracy)
         if bool(self.at) == (self.grid is not None):
             raise ConfigError("waypoints are given by either --at or --grid")
 

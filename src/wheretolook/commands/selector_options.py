@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.commands.options import CameraOptions, OcclusionOptions, ScorerOptions
+from wheretolook.dataset.thresholds import checked_accuracy
 from wheretolook.figures import KINDS
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.utils.errors import ConfigError
@@ -52,6 +53,8 @@ class SelectorOptions(CameraOptions, OcclusionOptions, ScorerOptions, FrameOptio
 
     def __post_init__(self) -> None:
         self.frame_options()
+        if self.accuracy is not None:
+            checked_accuracy(self.accuracy)
         self.named_camera()
         if self.floor_plan is not None:
             check_choice("format of figures", self.floor_plan.suffix[1:].lower(), KINDS)
@@ -99,7 +102,7 @@ class SelectorOptions(CameraOptions, OcclusionOptions, ScorerOptions, FrameOptio
                 **directions,
             )
             compiled.result()
-        return selector
+        return selector if self.accuracy is None else selector.at_accuracy(self.accuracy)
 
 
 def finish(command: SelectorOptions, selector: WhereToLook, views: SelectedViews, given: int, locations: str) -> None:

@@ -36,7 +36,7 @@ class BuildViewpointMap(SceneOrMapOptions):
         viewpoint_map: which views, and how they are scored.
     """
 
-    SHORT: ClassVar = {name: f"viewpoint_map.{name}" for name in ("scene", "method", "weights", "out")}
+    SHORT: ClassVar = {name: f"viewpoint_map.{name}" for name in ("scene", "method", "weights", "accuracy", "out")}
 
     WRITES: ClassVar = "viewpoint_map.json"
 
@@ -69,7 +69,7 @@ class BuildViewpointMap(SceneOrMapOptions):
         for files in scenes:
             scene = open_scene(self, files)
             with naming_file(scene.source):
-                scorer = scene_scorer(scene, config.method, config.weights, config.anywhere)
+                scorer = scene_scorer(scene, config.method, config.weights, config.anywhere, config.accuracy)
                 viewpoint_map = scene_viewpoint_map(scene, config, scorer)
             folder = config.out or files.folder / "viewpoint-map"
             viewpoint_map.save(folder)

@@ -2,8 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from wheretolook.utils.errors import ConfigError
+
+Accuracy = tuple[float, float]
+"""Limits of the position error (m) and of the orientation error (degrees)."""
+
 THRESHOLDS = ((0.05, 0.4), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 """Error limits in metres and degrees: the Long-Term Visual Localization benchmark's and the paper's finer one."""
+
+
+ACCURACY: Accuracy = THRESHOLDS[0]
+
+
+def checked_accuracy(accuracy: Sequence[float]) -> Accuracy:
+    """Return limits of the errors in metres and degrees. Raises ConfigError unless they are two positive numbers."""
+    limits = tuple(float(limit) for limit in accuracy)
+    if len(limits) != 2 or not min(limits) > 0:
+        raise ConfigError("an accuracy has two positive limits", value=accuracy, fix="Give metres,degrees: 0.05,0.4.")
+    return limits
 
 
 def threshold_key(threshold: tuple[float, float]) -> str:

@@ -15,10 +15,11 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from wheretolook.dataset.thresholds import Accuracy
 from wheretolook.dataset.viewpoint_table import LOCALIZED
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.holdout.holdout_blocks import Block, choose_blocks
-from wheretolook.holdout.photo_map import MAX_ERROR_DEG, PhotographedMap
+from wheretolook.holdout.photo_map import MAX_ERROR_DEG, MAX_ERROR_M, PhotographedMap
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer, localization_errors
 from wheretolook.localization.versions import versions
@@ -101,6 +102,14 @@ def hold_out_blocks(
             bar.update(len(job.block.tested))
     shutil.rmtree(model, ignore_errors=True)
     return [result for result in results.values() if result is not None]
+
+
+def judged(result: HoldoutResult, accuracy: Accuracy) -> HoldoutResult:
+    """Return a result whose views are good within another accuracy; where metres are unknown, limits stay shares of depth."""
+    views = result.views
+    limit_m = views["limit_m"] * (accuracy[0] / MAX_ERROR_M)
+    good = (views["status"] == LOCALIZED) & (views["error_m"] < limit_m) & (views["error_deg"] < accuracy[1])
+    return replace(result, views=views.assign(good=good, limit_m=limit_m))
 
 
 def without(model: Any, image_ids: Sequence[int]) -> Any:

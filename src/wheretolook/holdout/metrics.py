@@ -14,12 +14,14 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.stats import rankdata
+from scipy.stats import t as student
 
 from wheretolook.evaluation.bootstrap import ClusterBootstrap, divide
 from wheretolook.evaluation.calibration import BINS, bins_of
 from wheretolook.geometry.poses import Float
 
 RESAMPLES = 2000
+BLOCKS = 11  # of a check of many photographs, at least
 
 
 def resampled_auc(bootstrap: ClusterBootstrap, good: NDArray[np.bool_], score: Float, within: bool = False) -> Float:
@@ -102,6 +104,8 @@ def measure(
     scores = {method: views[column].to_numpy(np.float64) for method, column in columns.items()}
     areas = {method: resampled_auc(bootstrap, good, score) for method, score in scores.items()}
     baseline_auc = areas[[*areas][-1]]
+    rarer = good if good.sum() < len(good) / 2 else ~good
+    decide = partial(record, blocks=len(np.unique(blocks[rarer])))
     of_methods: dict[str, object] = {}
     for method, score in scores.items():
         rows, possible, chosen = regret_of_places(place, good, score)
@@ -110,10 +114,10 @@ def measure(
         missed[rows] = possible & ~chosen
         has_choice[rows] = 1
         of_methods[method] = {
-            "auc": record(areas[method]),
-            "auc_above_visible": record(areas[method] - baseline_auc),
-            "auc_within_blocks": record(resampled_auc(bootstrap, good, score, within=True)),
-            "regret": record(bootstrap.ratios(100 * missed, has_choice)),
+            "auc": decide(areas[method]),
+            "auc_above_visible": decide(areas[method] - baseline_auc, -1),
+            "auc_within_blocks": decide(resampled_auc(bootstrap, good, score, within=True)),
+            "regret": record(bootstrap.ratios(100 * missed, has_choice), most=100),
             "rank_correlation_with_inliers": _correlation(score, n_inliers),
         }
     sizes = np.bincount(place)
@@ -123,8 +127,8 @@ def measure(
     ratios = None
     if np.isfinite(expected).all():
         ratios = {
-            "localized": record(bootstrap.ratios(n_inliers * good, expected * good)),
-            "all": record(bootstrap.ratios(n_inliers * good, expected)),
+            "localized": record(bootstrap.ratios(n_inliers * good, expected * good), most=np.inf),
+            "all": record(bootstrap.ratios(n_inliers * good, expected), most=np.inf),
         }
     return {
         "n_views": len(views),
@@ -141,10 +145,24 @@ def measure(
     }
 
 
-def _record(bootstrap: ClusterBootstrap, statistics: Float) -> dict[str, float | None]:
-    """Return value and 95 % interval of statistics (1 + R,) of the views and of each resample; None where unknown."""
+def _record(
+    bootstrap: ClusterBootstrap, statistics: Float, least: float = 0, most: float = 1, blocks: int | None = None
+) -> dict[str, float | None]:
+    """Return value and 95 % interval of statistics (1 + R,) of the views and of each resample; None where unknown.
+
+    Resampling few blocks makes intervals too narrow: they are widened as Student's quantile exceeds that of `BLOCKS`
+    blocks, within `least` and `most`. `blocks` are those that decide the statistic, by default all; one decides nothing.
+    """
+    count = bootstrap.n_clusters if blocks is None else blocks
+    value = statistics[0]
     low, high = bootstrap.interval(statistics)
-    named = {"value": statistics[0], "low": low, "high": high}
+    if count < 2:
+        low, high = (np.where(np.isfinite(value), end, np.nan) for end in (least, most))
+    else:
+        quantiles = student.ppf(0.975, np.array([count, BLOCKS]) - 1)
+        wider = max(1.0, quantiles[0] / quantiles[1])
+        low, high = (np.clip(value + wider * (end - value), least, most) for end in (low, high))
+    named = {"value": value, "low": low, "high": high}
     return {name: float(value) if np.isfinite(value) else None for name, value in named.items()}
 
 

@@ -30,13 +30,13 @@ from wheretolook.utils.files import fingerprint, size_and_time
 from wheretolook.utils.logs import LOG
 
 MAX_ERROR_M, MAX_ERROR_DEG = THRESHOLDS[0]  # below both, a photograph counts as localized
-MAX_ERROR_OF_DEPTH = 0.01  # instead of MAX_ERROR_M where metres are unknown: of the photograph's median depth
+MAX_ERROR_OF_DEPTH = MAX_ERROR_M / DEPTH_M  # instead, where metres are unknown: of the photograph's median depth
 PLACE_OF_DEPTH = 0.1
 """Views whose cameras are within this share of the map's median depth (0.5 m in a room of 5 m) share a place: what can
 be seen hardly changes within it, so that mostly the direction decides."""
 CHECKS = "checks"  # folder of the folders of checks, next to the datasets
 WORK = "work"  # folder of cached work, in that of a check
-MIN_PHOTOGRAPHS = 20  # with fewer, blocks are too small
+MIN_PHOTOGRAPHS = 8  # with fewer, blocks are too small
 MIN_OBSERVED = 10  # landmarks that the median photograph observes
 
 

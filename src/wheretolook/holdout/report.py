@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from wheretolook.holdout.holdout import HoldoutResult, hold_out_blocks
+from wheretolook.dataset.thresholds import ACCURACY, Accuracy
+from wheretolook.holdout.holdout import HoldoutResult, hold_out_blocks, judged
 from wheretolook.holdout.holdout_blocks import VIEWS, choose_blocks
 from wheretolook.holdout.metrics import measure
-from wheretolook.holdout.photo_map import MAX_ERROR_DEG, MAX_ERROR_M, MAX_ERROR_OF_DEPTH, PhotographedMap
+from wheretolook.holdout.photo_map import PhotographedMap
 from wheretolook.holdout.scores import VISIBLE, Scoring, check_place, score_views
 from wheretolook.holdout.weak_regions import WeakPart, weak_parts
+from wheretolook.mapping.georeference import DEPTH_M
 from wheretolook.scorers.registry import is_probability
 from wheretolook.utils.files import write_json, write_text
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
@@ -36,6 +38,7 @@ class CheckReport:
         blocks: a row for each block; `blocks.csv`.
         numbers: see `metrics.measure`.
         parts: parts of the map that relocalize badly.
+        accuracy: up to which a photograph counts as localized.
     """
 
     source: PhotographedMap
@@ -45,6 +48,7 @@ class CheckReport:
     blocks: pd.DataFrame
     numbers: dict[str, Any]
     parts: list[WeakPart]
+    accuracy: Accuracy = ACCURACY
 
     def save(self, folder: Path) -> None:
         """Write check.csv, blocks.csv, views.csv and check.json into a folder."""
@@ -66,9 +70,10 @@ class CheckReport:
 
     def limits(self) -> str:
         """Name the errors up to which a photograph counts as localized."""
+        metres, degrees = self.accuracy
         if self.source.is_metric:
-            return f"{100 * MAX_ERROR_M:g} cm and {MAX_ERROR_DEG:g} degrees"
-        return f"{100 * MAX_ERROR_OF_DEPTH:g} % of the median depth and {MAX_ERROR_DEG:g} degrees"
+            return f"{100 * metres:g} cm and {degrees:g} degrees"
+        return f"{100 * metres / DEPTH_M:g} % of the median depth and {degrees:g} degrees"
 
     def sentence(self) -> str:
         """State how often the better of two views is picked, or why that is unknown."""
@@ -143,7 +148,9 @@ def check_map(
     block are localized. Raises MapError if blocks leave no map; WeightsError if weights cannot be used.
     """
     check_place(source, scoring, device)
+    accuracy = scoring.accuracy or ACCURACY
     results = hold_out_blocks(source, work, choose_blocks(source, views), workers, device)
+    results = [judged(result, accuracy) for result in results]
     method, scored = score_views(source, results, scoring, occlusion or HiddenPointRemoval(), device)
     columns = {method: "score", **{name: name for name in (*scoring.also, VISIBLE) if name != method}}
     columns[VISIBLE] = columns.pop(VISIBLE)  # the baseline comes last
@@ -151,7 +158,8 @@ def check_map(
     numbers = measure(scored, columns, centers, source.place_radius, is_probability(method))
     parts = weak_parts(source, results, scored)
     photographs = _photographs(source, scored, parts)
-    return CheckReport(source, method, scored, photographs, _blocks(source, results, scored), numbers, parts)
+    blocks = _blocks(source, results, scored)
+    return CheckReport(source, method, scored, photographs, blocks, numbers, parts, accuracy)
 
 
 def _photographs(source: PhotographedMap, views: pd.DataFrame, parts: Sequence[WeakPart]) -> pd.DataFrame:
@@ -181,7 +189,7 @@ def _photographs(source: PhotographedMap, views: pd.DataFrame, parts: Sequence[W
             "in_range": counts["in_range"],
             "error": once["error_m"] / source.from_model.scale,
             "error_deg": once["error_deg"],
-            "limit": source.limit_m / source.from_model.scale,
+            "limit": once["limit_m"] / source.from_model.scale,
             **counts[["n_visible", "n_matches", "n_inliers", "n_observed", "n_kept"]],
             "expected_inliers": once["expected_inliers"],
             "part": part_of,

@@ -12,6 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from wheretolook.dataset.thresholds import Accuracy
 from wheretolook.evaluation.scoring import score_scale
 from wheretolook.geometry.poses import Float
 from wheretolook.holdout.holdout import HoldoutResult
@@ -39,12 +40,14 @@ class Scoring:
         weights: file or folder; None for the bundled ones.
         also: further methods, with bundled weights.
         anywhere: whether weights adapted to another scene are allowed.
+        accuracy: up to which a photograph counts as localized; None for that of the weights.
     """
 
     method: str = ""
     weights: Path | None = None
     also: tuple[str, ...] = ()
     anywhere: bool = False
+    accuracy: Accuracy | None = None
 
     def check(self) -> None:
         """Raise a WeightsError if weights of any of the methods are missing or unreadable."""
@@ -62,8 +65,10 @@ class Scoring:
         chosen = resolve_weights(self.method, self.weights, localization_map.landmarks.features)
         anywhere = anywhere or self.anywhere
         if self.method:
-            return make_scorer(self.method, localization_map, weights=chosen, anywhere=anywhere)
-        return load_scorer(chosen, localization_map, anywhere=anywhere)
+            scorer = make_scorer(self.method, localization_map, weights=chosen, anywhere=anywhere)
+        else:
+            scorer = load_scorer(chosen, localization_map, anywhere=anywhere)
+        return scorer if self.accuracy is None else scorer.at_accuracy(self.accuracy)
 
 
 def check_place(source: PhotographedMap, scoring: Scoring, device: str) -> None:

@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from wheretolook.dataset.thresholds import ACCURACY as ACCURACY
+from wheretolook.dataset.thresholds import Accuracy as Accuracy
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.pose_ambiguity import log_ratio
 from wheretolook.utils.errors import WeightsError
@@ -32,10 +34,6 @@ FEATURE_NAMES = ("log_elsewhere", "log_share", "log_own", "log_deviation_deg")
 unique support to that of its strongest rival (`pose_ambiguity.log_ratio`), log of one standard deviation of the
 orientation (degrees)."""
 
-Accuracy = tuple[float, float]
-"""Limits of the position error (m) and of the orientation error (degrees)."""
-
-ACCURACY: Accuracy = (0.05, 0.4)
 RIGHT_PLACE: Accuracy = (math.inf, math.inf)
 """Accuracy that every pose at the right place has: within `RIGHT_PLACE_LIMITS` of the true one."""
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.pose_information import N_NUMBERS, PRIOR, bearing_numbers, information_matrices
 from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.utils.errors import ConfigError
 
 if TYPE_CHECKING:
     from wheretolook.scorers.base import Scorer
@@ -93,6 +94,9 @@ def candidate_views(
             precision[column] = known.precision  # the same from every view: it depends on the distance
             terms[:, 1:] *= precision[:, None]
         method = find(scorer.name)
+        if method is not None and method.name != scorer.name:
+            fix = "Leave the accuracy out for several views of a location."
+            raise ConfigError("joint scores have the accuracy of the weights", value=scorer.name, fix=fix)
         if scores is not None and method is not None and method.probability:
             p_single = np.clip(np.asarray(scores, dtype=np.float64), 0, 1)
     return CandidateViews(p_detect, terms * stride, n_visible, p_single)

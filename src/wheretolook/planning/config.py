@@ -37,6 +37,8 @@ class ViewpointMapConfig(MappedLattice):
         scene: name of the scene; empty for all scenes of the dataset.
         method: method that scores the views. See `wheretolook evaluate --list-methods`; empty for the one that the
             weights are of, or bins if there are none.
+        accuracy: limits of the errors in metres and degrees that the scores refer to, for the method set; by default
+            those of the weights, 0.05,0.4.
         weights: file of weights that the train stage wrote, for a learned method. Unless a method is named,
             the best of the dataset, or else of those that ship, for cameras with their field of view.
         out: folder to write; empty for `<data>/<name>/<scene>/viewpoint-map`. Of one scene only.
@@ -45,6 +47,7 @@ class ViewpointMapConfig(MappedLattice):
 
     scene: str = ""
     method: str = ""
+    accuracy: tuple[float, float] | None = None
     weights: Path | None = None
     out: Path | None = None
     anywhere: bool = False
@@ -113,6 +116,7 @@ class PlanConfig(MappedLattice):
         out: folder to write; empty for `<data>/<name>/<scene>/path`.
         method: method that scores the views; forward for the shortest path, looking ahead. Empty as for the viewpoint
             map.
+        accuracy: as for the viewpoint map, of `method`; excludes stops.
         weights: file of weights, for a learned method; by default the best there are.
         against: further methods to plan by, drawn for comparison. Such as forward and fisher-trace-gp; in `methods.png`.
         film: kind of film to make: gif, mp4 or none.
@@ -127,6 +131,7 @@ class PlanConfig(MappedLattice):
     goal: tuple[float, float, float] | None = None
     out: Path | None = None
     method: str = ""
+    accuracy: tuple[float, float] | None = None
     weights: Path | None = None
     against: tuple[str, ...] = ()
     film: Literal["gif", "mp4", "none"] = "gif"
@@ -137,6 +142,8 @@ class PlanConfig(MappedLattice):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.accuracy is not None and self.stops.looks > 1:
+            raise ConfigError("plan.accuracy excludes stops", value=self.accuracy)
         check_choice("plan.film", self.film, ("gif", "mp4", "none"))
         for name in ("start", "goal"):
             point = getattr(self, name)

@@ -59,7 +59,8 @@ def plan_by_methods(
             path = plan_path(start, goal, space, space.bounds, None, config.planner)
         else:
             weights = resolve_weights(method, config.weights, dataset=dataset)
-            scorer = scene_scorer(scene, method, weights, config.anywhere)
+            accuracy = config.accuracy if number == len(methods) else None
+            scorer = scene_scorer(scene, method, weights, config.anywhere, accuracy)
             views = planner_map(scene, config, scorer)
             name = method or scorer.name
             path = plan_path(start, goal, space, space.bounds, views, config.planner)

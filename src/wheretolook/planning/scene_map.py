@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from wheretolook.dataset.environment import SceneEnvironment
+from wheretolook.dataset.thresholds import Accuracy
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.planning.map_building import build_viewpoint_map
 from wheretolook.planning.rrt import Space
@@ -24,19 +25,25 @@ INSIDE = np.stack(np.meshgrid(*[(-1 / 3, 0.0, 1 / 3)] * 3, indexing="ij"), -1).r
 
 
 def scene_scorer(
-    scene: SceneEnvironment, method: str = "", weights: Path | None = None, anywhere: bool = False
+    scene: SceneEnvironment,
+    method: str = "",
+    weights: Path | None = None,
+    anywhere: bool = False,
+    accuracy: Accuracy | None = None,
 ) -> Scorer:
     """Build the scorer of a scene by a method; an empty one stands for that of the weights, or bins.
 
-    With `anywhere`, weights adapted to another scene are allowed.
+    With `anywhere`, weights adapted to another scene are allowed. An `accuracy` is that of its scores.
 
     Raises:
-        ConfigError: no such method, or it needs weights. WeightsError: the weights cannot be used.
+        ConfigError: no such method, or it needs weights, or has no such accuracy. WeightsError: the weights cannot be used.
         MapError: the map lacks what the method needs.
     """
     if weights is not None and not method:
-        return load_scorer(weights, scene.localization_map, anywhere=anywhere)
-    return make_scorer(method or FALLBACK, scene.localization_map, weights=weights, anywhere=anywhere)
+        scorer = load_scorer(weights, scene.localization_map, anywhere=anywhere)
+    else:
+        scorer = make_scorer(method or FALLBACK, scene.localization_map, weights=weights, anywhere=anywhere)
+    return scorer if accuracy is None else scorer.at_accuracy(accuracy)
 
 
 def scene_viewpoint_map(scene: SceneEnvironment, views: ViewLattice, scorer: Scorer) -> ViewpointMap:

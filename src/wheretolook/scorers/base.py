@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from wheretolook.geometry.camera import Camera, ColmapCamera, describe_camera
 from wheretolook.geometry.poses import Float, check_poses, poses_looking_along
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
-from wheretolook.utils.errors import CameraError
+from wheretolook.utils.errors import CameraError, ConfigError
 
 if TYPE_CHECKING:
+    from wheretolook.dataset.thresholds import Accuracy
     from wheretolook.inputs.bins import BinnedViews
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.visibility.frustum import LandmarkSets
@@ -31,6 +32,7 @@ class ViewReport:
     expected_inliers: Float  # (B,) landmarks expected to be detected; NaN where it is unknown
     n_visible: NDArray[np.int64]  # (B,) visible landmarks
     in_range: NDArray[np.bool_]  # (B,) whether the view is in the range of the training views
+    expected_errors: Float | None = None  # (B, 2) of the pose at the right place, in metres and degrees
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +64,15 @@ class Scorer(ABC):
     @abstractmethod
     def score(self, cam_from_world: Float) -> Float:
         """Score poses (B, 3, 4). Returns (B,) float64, finite. Raises PoseError if a pose is not finite."""
+
+    def at_accuracy(self, accuracy: Accuracy) -> Scorer:
+        """Return a scorer whose scores are probabilities that errors are within limits in metres and degrees.
+
+        In a map of unknown unit, metres are those of a median depth of 5 m. Raises a ConfigError unless the limits are
+        positive and the method predicts this.
+        """
+        fix = "Use the method set and its weights, or leave the accuracy out."
+        raise ConfigError("the scores of this method are not for any accuracy", value=self.name, fix=fix)
 
     def in_range(self, cam_from_world: Float) -> NDArray[np.bool_]:
         """Return which poses (B, 3, 4) have views in the range of the training views, (B,) bool; all if there is none."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wheretolook.dataset.thresholds import checked_accuracy
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.matching import Matches
@@ -221,14 +222,6 @@ class ImageLocalizer:
             problem = "the camera moved between the images, and the unit of the map is unknown"
             raise ConfigError(problem, value=f"{moved:.2g} m", fix="Give --scale.")
         return cam_from_rig * (1, 1, 1, 0)
-
-
-def checked_accuracy(accuracy: Sequence[float]) -> Accuracy:
-    """Return limits of the errors in metres and degrees. Raises ConfigError unless they are two positive numbers."""
-    limits = tuple(float(limit) for limit in accuracy)
-    if len(limits) != 2 or not min(limits) > 0:
-        raise ConfigError("an accuracy has two positive limits", value=accuracy, fix="Give metres,degrees: 0.05,0.4.")
-    return limits
 
 
 def _extractor_of(path: Path, landmarks: Landmarks) -> ExtractorConfig:

@@ -51,6 +51,9 @@ class SelectedViews:
     # (V,) mean score over draws of an uncertain pose, if asked for, and the highest such mean of the best directions
     expected_score: Float | None = None
     best_expected_score: Float | None = None
+    # (V,) mean errors of a pose at the right place, where the method predicts them
+    expected_error_m: Float | None = None
+    expected_error_deg: Float | None = None
 
     def __len__(self) -> int:
         return len(self.score)
@@ -163,7 +166,7 @@ def _columns(views: SelectedViews) -> dict[str, list[Any]]:
     return {name: [None if value != value else value for value in values] for name, values in rows.items()}
 
 
-EXPECTED = ("expected_score", "best_expected_score")
+EXPECTED = ("expected_score", "best_expected_score", "expected_error_m", "expected_error_deg")
 REASONS = ("n_occluded", "n_too_far", "n_too_oblique", "n_repeated")
 _DIGITS = {
     "yaw_deg": ".3f",
@@ -172,6 +175,8 @@ _DIGITS = {
     "set_score": ".9g",
     "expected_score": ".9g",
     "best_expected_score": ".9g",
+    "expected_error_m": ".4g",
+    "expected_error_deg": ".4g",
     "expected_inliers": ".2f",
     "n_repeated": ".0f",
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -13,13 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, EnvironmentConfig
+from wheretolook.dataset.thresholds import ACCURACY, Accuracy
 from wheretolook.geometry.camera import Camera, PinholeCamera, parse_camera
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along, rigid_poses
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.inputs.reasons import ReasonCounter
-from wheretolook.localization.confidence import ACCURACY, Accuracy
 from wheretolook.looks.next_look import NextLook, NextLookSelector
 from wheretolook.looks.selection import best_views, separated
 from wheretolook.mapping.config import FrameOptions
@@ -224,6 +225,15 @@ class WhereToLook:
         grid = grid_waypoints(self.localization_map, self.space, spacing_m)
         return replace(grid, points=self.frame.world_from_map.inverse.apply(grid.points))
 
+    def at_accuracy(self, accuracy: Accuracy) -> WhereToLook:
+        """Return the same whose scores are probabilities of errors within limits in metres and degrees: (0.25, 2).
+
+        Raises a ConfigError as `wheretolook.scorers.base.Scorer.at_accuracy`.
+        """
+        look = copy(self)
+        look.scorer = self.scorer.at_accuracy(accuracy)
+        return look
+
     def score(self, cam_from_world: ArrayLike) -> Float:
         """Score poses (B, 3, 4) or (B, 4, 4), or one of them, world-to-camera, (B,).
 
@@ -251,6 +261,7 @@ class WhereToLook:
         ids: Sequence[str] = (),
         heading_deg: ArrayLike | None = None,
         progress: bool = False,
+        accuracy: Accuracy | None = None,
         **options: Any,
     ) -> SelectedViews:
         """Select the best view, the n best, or the best set of views, at each of points (W, 3) of the map.
@@ -261,6 +272,7 @@ class WhereToLook:
             ids: names of the points; counts from 0 unless given.
             heading_deg: yaws (W,) of the robot at the points, for a limit on pan.
             progress: show a progress bar.
+            accuracy: limits of the errors that the scores refer to, see `at_accuracy`.
             options: further fields of `wheretolook.select.request.SelectionRequest`. With `looks`, the rank is the
                 order to look in, and `set_score` the probability that the set localizes; with `least_score`, the view
                 of the sequence has rank 1.
@@ -271,6 +283,9 @@ class WhereToLook:
                 of scores that are no probabilities.
             PlanningError: no sequence, or no set of looks, keeps the limit on turns.
         """
+        if accuracy is not None:
+            look = self.at_accuracy(accuracy)
+            return look.best(points, n, ids=ids, heading_deg=heading_deg, progress=progress, **options)
         request = SelectionRequest(n=n, **options)
         axes = self._allowed(request)
         waypoints = Waypoints.of(points, ids, heading_deg)
@@ -357,6 +372,7 @@ class WhereToLook:
     ) -> SelectedViews:
         """Return the views with poses (V, 3, 4) at the waypoints of rows (V,), with their scores."""
         report = self.scorer.report(poses)
+        errors = None if report.expected_errors is None else report.expected_errors.T
         return SelectedViews(
             waypoint=rows,
             waypoint_id=tuple(waypoints.ids[row] for row in rows),
@@ -370,6 +386,8 @@ class WhereToLook:
             method=self.scorer.name,
             set_score=set_score,
             frame=self.frame,
+            expected_error_m=None if errors is None else errors[0],
+            expected_error_deg=None if errors is None else errors[1],
         )
 
     def floor_plan(self, views: SelectedViews) -> Figure:

@@ -12,6 +12,7 @@ from typing import Any, Generic, Self, TypeVar
 import torch
 from torch import Tensor, nn
 
+from wheretolook.dataset.thresholds import ACCURACY, Accuracy, checked_accuracy
 from wheretolook.geometry.camera import Camera, camera_of_record
 from wheretolook.training.training_range import TrainingRange
 from wheretolook.training.weights import check_method_of_weights, read_weights, write_weights
@@ -49,6 +50,7 @@ class TrainedNetwork(Generic[NetworkT]):
     scale: float = 1.0
     offset: float = 0.0
     training_range: TrainingRange | None = None  # of its training views; None if the weights do not store it
+    accuracy: Accuracy = ACCURACY  # limits of its training views' errors, in metres and degrees
 
     def __post_init__(self) -> None:
         self.network.eval()
@@ -88,12 +90,16 @@ class TrainedNetwork(Generic[NetworkT]):
                 raise ValueError(f"the scale of the logits is {scale:g}")
             offset = finite(header.get("offset", 0.0))
             training_range = TrainingRange.of_record(header["range"]) if "range" in header else None
+            options = header.get("training", {}).get("config", {})
+            names = ("max_error_m", "max_error_deg")
+            limits = [finite(options.get(name, limit)) for name, limit in zip(names, ACCURACY, strict=True)]
+            accuracy = checked_accuracy(limits)
         except (KeyError, TypeError, ValueError, IndexError, AttributeError, RuntimeError, ConfigError) as error:
             problem = f"the header does not describe these weights: {error}"
             fix = "Use the version that wrote them, or train again."
             raise WeightsError(problem, path=path, fix=fix) from error
         network.to(device).requires_grad_(False)
-        return TrainedNetwork(header["method"], network, camera, scale, offset, training_range)
+        return TrainedNetwork(header["method"], network, camera, scale, offset, training_range, accuracy)
 
 
 def finite(value: Any) -> float:

@@ -18,11 +18,13 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from wheretolook.dataset.thresholds import Accuracy
 from wheretolook.geometry.poses import Float, check_locations, rotation_looking_along
 from wheretolook.inputs.landmark_features import ragged_blocks
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.scorers.matchability.network import N_EXPECTED, bearing_precision
+from wheretolook.scorers.set.accuracy import probabilities
 from wheretolook.scorers.set.network import SetNetwork, expected_cells
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.visibility.listing import FrustumLister, ListedViews, Surroundings
@@ -61,12 +63,18 @@ class BatchedDirections:
     """
 
     def __init__(
-        self, localization_map: LocalizationMap, trained: TrainedNetwork[SetNetwork], directions: Float, limit: int
+        self,
+        localization_map: LocalizationMap,
+        trained: TrainedNetwork[SetNetwork],
+        directions: Float,
+        limit: int,
+        accuracy: Accuracy,
     ) -> None:
         self.localization_map = localization_map
         self.trained = trained
         self.directions = directions
         self.limit = limit
+        self.accuracy = accuracy
         self.rotations = rotation_looking_along(directions)
         landmarks = localization_map.landmarks
         matchability = trained.network.matchability
@@ -171,7 +179,6 @@ class BatchedDirections:
         self, listed: ListedViews, nearby: Surroundings, stride: int, n_visible: Float, heights: Float
     ) -> Float:
         """Return scores (V,) of listed views of `n_visible` (V,) landmarks in all, whose axes have z `heights` (V,)."""
-        network = self.trained.network
         starts = listed.starts
         entries = wp.to_torch(listed.entries)
         image = wp.to_torch(listed.image)
@@ -195,12 +202,10 @@ class BatchedDirections:
             ends = torch.from_numpy((part - part[0]).astype(np.int32)).to(self.device)
             p_detect = torch.sparse_csr_tensor(ends, here, log_odds.sigmoid(), size=(len(part) - 1, len(terms)))
             sums[views, :16] = p_detect @ terms
-            if network.needs_cells:
-                of_view = torch.arange(len(part) - 1, device=self.device).repeat_interleave(ends.diff())
-                cells[views] = expected_cells(image[span], log_odds, of_view, each[views], IMAGE)
+            of_view = torch.arange(len(part) - 1, device=self.device).repeat_interleave(ends.diff())
+            cells[views] = expected_cells(image[span], log_odds, of_view, each[views], IMAGE)
         height = torch.from_numpy(heights).to(sums)
-        logits = network.logits(sums * each[:, None], visible, height, cells if network.needs_cells else None).double()
-        return np.asarray(self.trained.calibrated(logits).sigmoid().cpu().numpy())
+        return probabilities(self.trained, self.accuracy, sums * each[:, None], visible, height, cells)
 
     def _described(self, offsets: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Return the first layer (M, W) of landmarks without their position in the image, and their terms of sums (M, 16).

@@ -148,16 +148,15 @@ class SetNetwork(LandmarkNetwork):
             cells = expected_cells(values[valid], log_odds[valid], views, each, self.attributes)
         return self.logits(sums * each[:, None], n_visible, axis_height, cells)
 
-    def score(self, landmarks: ViewLandmarks, n_visible: Tensor, axis_height: Tensor) -> Tensor:
-        """Return logits (B,) from described landmarks, possibly a sample of those visible; see `forward`."""
+    def sums_of(self, landmarks: ViewLandmarks, n_visible: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the sums (B, D) and `expected_cells` (B,) of described landmarks, possibly a sample of the visible."""
         values = landmarks.values
         log_odds = self.matchability(values)
         # summed in double precision: in single, the sums of two machines may differ by more than scores should
         parts = self.parts(values, log_odds).double()
         sums = torch.segment_reduce(parts, "sum", lengths=landmarks.counts, initial=0.0)
         each = n_visible / landmarks.counts.clamp(min=1)
-        cells = expected_cells(values, log_odds, landmarks.views, each, self.attributes) if self.needs_cells else None
-        return self.logits(sums * each[:, None], n_visible, axis_height, cells)
+        return sums * each[:, None], expected_cells(values, log_odds, landmarks.views, each, self.attributes)
 
     def parts(self, values: Tensor, log_odds: Tensor) -> Tensor:
         """Return what landmarks (..., A) with log-odds of detection (...) add to their view's sums, (..., D)."""
@@ -170,11 +169,7 @@ class SetNetwork(LandmarkNetwork):
 
     def logits(self, sums: Tensor, n_visible: Tensor, axis_height: Tensor, cells: Tensor | None = None) -> Tensor:
         """Return logits (B,) from sums (B, D) over each view's landmarks, and `expected_cells` (B,) if they are an input."""
-        statistics = expected_statistics(sums[:, :N_EXPECTED], n_visible, self.pose_variances)
-        known = [statistics, axis_height[:, None]]
-        if cells is not None:
-            known.append(cells.log1p()[:, None])
-        features = [torch.cat(known, 1)[:, self._inputs]]
+        features = [self.statistics_of(sums, n_visible, axis_height, cells)[:, self._inputs]]
         if self.attention is not None:
             features.append(sums[:, N_EXPECTED + 1 :] / (sums[:, N_EXPECTED : N_EXPECTED + 1] + 1e-6))
         joined = torch.cat(features, 1).float()
@@ -184,6 +179,15 @@ class SetNetwork(LandmarkNetwork):
         else:
             joined = self.standard(joined)
         return (self.linear(joined) + self.decide(joined)).squeeze(-1)
+
+    def statistics_of(
+        self, sums: Tensor, n_visible: Tensor, axis_height: Tensor, cells: Tensor | None = None
+    ) -> Tensor:
+        """Return `ALL_STATISTICS` (B, S) from what `logits` takes, without the last if `cells` are not given."""
+        known = [expected_statistics(sums[:, :N_EXPECTED], n_visible, self.pose_variances), axis_height[:, None]]
+        if cells is not None:
+            known.append(cells.log1p()[:, None])
+        return torch.cat(known, 1)
 
 
 def expected_cells(

@@ -1,0 +1,188 @@
+"""Scores of the set network at any accuracy, against closed forms."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import lognorm
+
+from synthetic_dataset import CAMERA, make_landmarks
+from wheretolook.dataset.thresholds import ACCURACY
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.lattices import direction_lattice
+from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.scorers.registry import find, make_scorer
+from wheretolook.scorers.set.accuracy import STATISTICS, AccuracyModel, LogError
+from wheretolook.scorers.set.network import ALL_STATISTICS
+from wheretolook.scorers.set.score import SetScorer
+from wheretolook.select.where_to_look import WhereToLook
+from wheretolook.utils.errors import ConfigError, WeightsError
+from wheretolook.weights.resolve import load_scorer
+from wheretolook_paper.studies import fit_accuracy
+
+ACCURACIES = ((1e-9, 1e-9), (0.01, 0.1), ACCURACY, (0.1, 1.0), (0.25, 2.0), (math.inf, math.inf))
+MODEL = AccuracyModel((1.0, 0.5), 0.2, (LogError((0.1, 0.2, -0.3), -4.0, 0.9), LogError((0.0, 0.4, -0.1), -2.0, 0.8)))
+
+
+def views(n: int = 200) -> Float:
+    """Statistics as of views with few to many landmarks."""
+    rng = np.random.default_rng(0)
+    statistics = np.zeros((n, len(ALL_STATISTICS)))
+    for name, low, high in (
+        ("log_visible", 0, 7),
+        ("log_position_variance", -8, 8),
+        ("log_orientation_variance", -8, 8),
+        ("log_expected_cells", 0, 5),
+    ):
+        statistics[:, ALL_STATISTICS.index(name)] = rng.uniform(low, high, n)
+    return statistics
+
+
+def p_within(statistics: Float, accuracy: tuple[float, float]) -> Float:
+    """F of `MODEL` by SciPy's log-normal distribution."""
+    visible, position, orientation, cells = (
+        statistics[:, ALL_STATISTICS.index(name)]
+        for name in ("log_visible", "log_position_variance", "log_orientation_variance", "log_expected_cells")
+    )
+    median_m = np.exp(position / 2 + 0.1 * visible + 0.2 * orientation - 0.3 * cells - 4)
+    median_deg = np.exp(0.4 * orientation - 0.1 * cells - 2)
+    within = lognorm(0.9, scale=median_m).cdf(accuracy[0]), lognorm(0.8, scale=median_deg).cdf(accuracy[1])
+    return np.minimum(*within)
+
+
+def test_it_is_the_product_of_both_factors_where_the_network_is() -> None:
+    statistics = views()
+    place = np.random.default_rng(1).uniform(0.1, 0.9, len(statistics))
+    own = place * p_within(statistics, ACCURACY)
+    rows = np.flatnonzero(own > 1e-4)
+    assert len(rows) > 20
+    for row in rows:  # each by a model whose first factor is this view's, whatever the network's probability
+        constant = AccuracyModel((0.0, 0.0), math.log(place[row] / (1 - place[row])), MODEL.errors)
+        for accuracy in ((0.01, 0.1), (0.02, 3.0), (0.25, 2.0), (1.0, 10.0)):
+            found = constant.at(accuracy, ACCURACY, own[row : row + 1], statistics[row : row + 1])
+            assert found == pytest.approx(place[row] * p_within(statistics[row : row + 1], accuracy), abs=1e-9)
+
+
+def test_it_rises_from_0_through_the_networks_own_probability_to_the_right_place() -> None:
+    statistics = views()
+    own = np.random.default_rng(2).uniform(0, 1, len(statistics))
+    own[:2] = 0, 1
+    found = np.stack([MODEL.at(accuracy, ACCURACY, own, statistics) for accuracy in ACCURACIES])
+    assert (np.diff(found, axis=0) >= -1e-12).all() and (found >= 0).all() and (found <= 1).all()
+    assert found[0] == pytest.approx(0, abs=1e-9)
+    assert found[2] == pytest.approx(own, abs=1e-12)
+    unsure = p_within(statistics, ACCURACY) < 1 - 1e-9
+    place = np.maximum(own, MODEL.p_right_place(own, statistics))
+    assert found[-1][unsure] == pytest.approx(place[unsure], abs=1e-9)
+
+
+def test_errors_and_limits_scale_with_the_unit() -> None:
+    statistics = views()
+    larger = statistics.copy()
+    larger[:, ALL_STATISTICS.index("log_position_variance")] += 2 * math.log(10)
+    assert MODEL.log_p_within(larger, (0.5, 0.4)) == pytest.approx(MODEL.log_p_within(statistics, ACCURACY))
+    assert MODEL.expected_errors(larger) == pytest.approx(MODEL.expected_errors(statistics) * (10, 1))
+    median_m = np.exp(MODEL.log_errors(statistics)[:, 0])
+    assert MODEL.expected_errors(statistics)[:, 0] == pytest.approx(lognorm(0.9, scale=median_m).mean())
+
+
+def test_the_fit_finds_the_model_that_errors_are_drawn_from(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(3)
+    statistics = views(20_000)
+    own = rng.uniform(0.01, 0.99, len(statistics))
+    place = rng.uniform(size=len(own)) < MODEL.p_right_place(own, statistics)
+    noise = rng.normal(size=(len(own), 1)) * [error.deviation for error in MODEL.errors]
+    # shrunk, so that no error at the right place exceeds its limits
+    errors = np.exp(MODEL.log_errors(statistics) + noise - 12)
+    errors[~place] = np.inf
+    table = pd.DataFrame(statistics, columns=ALL_STATISTICS).assign(
+        own=own, scene="one", error_m=errors[:, 0], error_deg=errors[:, 1]
+    )
+    monkeypatch.setattr(fit_accuracy, "LEAST", (0.0, 0.0))
+    found = fit_accuracy.fit(table)
+    assert [*found.weights, found.bias] == pytest.approx([*MODEL.weights, MODEL.bias], abs=0.1)
+    for error, known in zip(found.errors, MODEL.errors, strict=True):
+        assert error.weights == pytest.approx(known.weights, abs=0.03)
+        assert (error.bias + 12, error.deviation) == pytest.approx((known.bias, known.deviation), abs=0.1)
+
+
+def test_the_bundled_file_is_the_model_and_damage_is_found(tmp_path: Path) -> None:
+    stored = json.loads(AccuracyModel.file.read_text())
+    model = AccuracyModel.bundled()
+    assert dict(zip(AccuracyModel.names, model.weights, strict=True)) == stored["weights"]
+    for error, name in zip(model.errors, ("position", "orientation"), strict=True):
+        record = {"weights": dict(zip(STATISTICS, error.weights, strict=True)), **vars(error)}
+        assert record | {"weights": stored["errors"][name]["weights"]} == stored["errors"][name]
+    del stored["errors"]["position"]["bias"]
+    (tmp_path / "accuracy.json").write_text(json.dumps(stored))
+    with pytest.raises(WeightsError, match="damaged"):
+        AccuracyModel.load(tmp_path / "accuracy.json")
+
+
+@pytest.fixture(scope="module")
+def scorer() -> SetScorer:
+    scorer = load_scorer(LocalizationMap(make_landmarks(np.random.default_rng(0), 400), CAMERA))
+    assert isinstance(scorer, SetScorer)
+    return scorer
+
+
+@pytest.fixture(scope="module")
+def poses() -> Float:
+    return poses_looking_along(np.tile([0.0, 0.0, 1.5], (60, 1)), direction_lattice(60))
+
+
+@pytest.mark.filterwarnings("ignore::wheretolook.utils.errors.OutOfRangeWarning")
+def test_scores_rise_with_the_limits_and_are_unchanged_at_the_weights_own(scorer: SetScorer, poses: Float) -> None:
+    own = scorer.score(poses)
+    found = [scorer.at_accuracy(accuracy).score(poses) for accuracy in ACCURACIES]
+    assert np.array_equal(found[2], own) and scorer.at_accuracy(ACCURACY).name == "set"
+    assert (np.diff(found, axis=0) >= 0).all() and found[4].mean() > own.mean() > found[1].mean()
+    coarse = scorer.at_accuracy((0.25, 2.0))
+    assert coarse.name == "set 0.25m_2deg" and find(coarse.name) is find("set")
+    assert np.array_equal(coarse.at_accuracy(ACCURACY).score(poses), own)
+    assert np.array_equal(coarse.report(poses).score, found[4])
+    grid = coarse.score_directions(np.array([[0.0, 0.0, 1.5]]), direction_lattice(60))
+    assert grid[0] == pytest.approx(found[4], abs=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore::wheretolook.utils.errors.OutOfRangeWarning")
+def test_views_have_an_accuracy_and_expected_errors(scorer: SetScorer) -> None:
+    look = WhereToLook(scorer, direction_lattice(60))
+    place = [(0.0, 0.0, 1.5)]
+    own, coarse = look.best(place), look.best(place, accuracy=(0.25, 2))
+    assert coarse.score[0] >= own.score[0] and coarse.method == "set 0.25m_2deg"
+    assert coarse.expected_error_m is not None and coarse.expected_error_deg is not None
+    assert np.array_equal(look.at_accuracy((0.25, 2)).score(coarse.cam_from_world), coarse.score)
+    with pytest.raises(ConfigError, match="joint scores"):
+        look.best(place, accuracy=(0.25, 2), looks=2)
+    for limits in ((0, 1), (0.1, -1), (math.nan, 1), (1,)):
+        with pytest.raises(ConfigError, match="accuracy"):
+            look.best(place, accuracy=limits)
+    visible = WhereToLook(make_scorer("visible", look.localization_map), direction_lattice(60))
+    assert visible.best(place).expected_error_m is None
+    with pytest.raises(ConfigError, match="visible"):
+        visible.best(place, accuracy=(0.25, 2))
+
+
+def test_landmarks_mapped_from_one_place_are_out_of_range(poses: Float) -> None:
+    def seen_and_in_range(angle_deg: float, error_px: float, spread: float) -> NDArray[np.bool_]:
+        of_map = {
+            "triangulation_angle_deg": np.full(400, angle_deg, np.float32),
+            "reprojection_error_px": np.full(400, error_px, np.float32),
+            "mapping_distance_spread": np.full(400, spread, np.float32),
+        }
+        landmarks = replace(make_landmarks(np.random.default_rng(0), 400), **of_map)
+        report = load_scorer(LocalizationMap(landmarks, PinholeCamera(400, 300, 200.0))).report(poses)
+        return report.in_range & (report.n_visible > 0)
+
+    assert seen_and_in_range(8.0, 0.1, 0.1).sum() > 10
+    assert not seen_and_in_range(2.0, 0.3, 0.01).any()
+    assert seen_and_in_range(8.0, 1.0, 0.1).sum() > 10  # photographs, mapped from several places

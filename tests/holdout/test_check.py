@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,6 +22,7 @@ from wheretolook.geometry.poses import camera_centers
 from wheretolook.holdout.holdout import without
 from wheretolook.holdout.holdout_blocks import KEPT, MIN_REST, choose_blocks, landmarks_kept
 from wheretolook.holdout.photo_map import open_map
+from wheretolook.holdout.report import CheckReport
 from wheretolook.mapping.colmap_model import model_arrays, observation_matrix, read_model
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.scorers.adapted.network import AdaptedNetwork
@@ -200,6 +202,40 @@ def test_another_accuracy_judges_the_same_poses(checked: Path, corridor: tuple[P
     assert (fine["score"] <= own["score"]).all() and (fine["limit_m"] == 0.002).all()
     numbers = json.loads((tmp_path / "out" / "check.json").read_text())
     assert numbers["limits"] == "0.2 cm and 0.1 degrees" and numbers["ece"] is not None
+
+
+@pytest.mark.parametrize(
+    ("auc", "ece", "in_range", "expected"),
+    [
+        (0.95, 0.03, 1.0, "trust the scores"),
+        (0.95, 0.15, 1.0, "trust the order"),
+        (0.95, None, 1.0, "trust the order"),  # of a rule that predicts no probabilities
+        (0.60, 0.03, 1.0, "do not use"),
+        (0.95, 0.03, 0.3, "do not use"),
+        (None, None, 1.0, "unknown"),
+    ],
+)
+def test_the_advice_follows_from_order_values_and_range(
+    auc: float | None, ece: float | None, in_range: float, expected: str
+) -> None:
+    numbers = {
+        "methods": {"set": {"auc": {"value": auc}}},
+        "ece": None if ece is None else {"value": ece},
+        "share_in_range": in_range,
+    }
+    none: Any = None
+    advice = CheckReport(none, "set", none, none, none, numbers, []).advice()
+    assert advice.startswith(expected) or advice.endswith(expected)
+
+
+def test_other_methods_are_printed(
+    corridor: tuple[Path, Path], checked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(checked, tmp_path / "out")
+    run(_arguments(*corridor, tmp_path / "out", "--scale", "1", "--also", "bins"))
+    printed = capsys.readouterr().out
+    auc = json.loads((checked / "check.json").read_text())["methods"]["bins"]["auc"]["value"]
+    assert f"bins picks the better one {100 * auc:.0f} times in 100" in printed
 
 
 def test_eight_photographs_are_enough(tmp_path: Path) -> None:

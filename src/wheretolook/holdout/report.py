@@ -24,6 +24,9 @@ from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import OcclusionModel
 
 MAX_PRINTED = 5  # all are in the files
+MIN_IN_RANGE = 0.5  # share of the views
+MIN_AUC = 0.7
+MAX_ECE = 0.08  # calibration error; of rendered scenes about 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +65,7 @@ class CheckReport:
             "turned_upright": self.source.is_turned,
             "limits": self.limits(),
             "says": self.sentence(),
+            "advice": self.advice(),
             "n_photographs": len(self.source.poses),
             **self.numbers,
             "weak_parts": [part.record(self.source.names) for part in self.parts],
@@ -87,6 +91,20 @@ class CheckReport:
             f"{self._auc(self.method)}, counting visible landmarks {self._auc(VISIBLE)}"
         )
 
+    def advice(self) -> str:
+        """State whether to trust the scores on this map, to adapt them, or not to use them."""
+        numbers = self.numbers
+        auc = numbers["methods"][self.method]["auc"]
+        if numbers["share_in_range"] < MIN_IN_RANGE:
+            return "do not use these scores: most views are outside the range of the training views"
+        if auc["value"] is None:
+            return "whether to trust the order of the scores is unknown"
+        if auc["value"] < MIN_AUC:
+            return "do not use these scores: they hardly order the views of this map"
+        if numbers["ece"] and numbers["ece"]["value"] > MAX_ECE:
+            return "trust the order of the scores, not their values: `wheretolook adapt` corrects these on this map"
+        return "trust the scores" if numbers["ece"] else "trust the order of the scores"
+
     def _auc(self, method: str, name: str = "auc") -> str:
         auc = self.numbers["methods"][method][name]
         value, *interval = _with_interval(auc, 0, 100).split(" ", 1)
@@ -99,9 +117,11 @@ class CheckReport:
         mine, visible = (numbers["methods"][name] for name in (self.method, VISIBLE))
         lines = [
             self.sentence(),
+            self.advice(),
             f"{numbers['n_localized']} of {numbers['n_views']} views in {numbers['n_blocks']} blocks localize within "
             f"{self.limits()}; {len(source.poses)} photographs",
         ]
+        lines += [f"{name} picks the better one {self._auc(name)}" for name in numbers["methods"]][1:-1]
         if mine["auc_within_blocks"]["value"] is not None:
             auc, baseline = (self._auc(name, "auc_within_blocks") for name in (self.method, VISIBLE))
             lines.append(f"of two views of the same block: {auc}, counting visible landmarks {baseline}")

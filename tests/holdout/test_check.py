@@ -238,6 +238,20 @@ def test_other_methods_are_printed(
     assert f"bins picks the better one {100 * auc:.0f} times in 100" in printed
 
 
+def test_narrower_views_of_photographs(corridor: tuple[Path, Path], checked: Path, tmp_path: Path) -> None:
+    """Three views of each photograph, fewer of which localize; the table of photographs has the middle ones."""
+    run(_arguments(*corridor, tmp_path / "out", "--scale", "1", "--fov", "25"))
+    whole, narrow = (pd.read_csv(folder / "views.csv") for folder in (checked, tmp_path / "out"))
+    assert len(narrow) == 3 * len(whole) and set(narrow["crop"]) == {0, 1, 2}
+    assert narrow["good"].mean() < whole["good"].mean() and narrow["good"].any()
+    each = narrow.groupby(["block", "row"])["n_observed"].max().to_numpy()
+    assert (each <= whole.sort_values(["block", "row"])["n_observed"]).all()
+    assert len(pd.read_csv(tmp_path / "out" / "check.csv")) == N
+    wide = _arguments(*corridor, tmp_path / "wide", "--scale", "1", "--fov", "150")
+    with pytest.raises(ConfigError, match="do not show more"):
+        run(wide)
+
+
 def test_eight_photographs_are_enough(tmp_path: Path) -> None:
     run(_arguments(*write_corridor(tmp_path / "few", photographs=8), tmp_path / "out", "--scale", "1"))
     numbers = json.loads((tmp_path / "out" / "check.json").read_text())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -62,6 +62,8 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
         extractor_weights: weights of a learned extractor; see docs/features.md.
         out: folder of the results; by default data/checks/<name>.
         also: further methods to check, with the bundled weights.
+        fov: horizontal field of view in degrees of narrower views, three of which are simulated from the keypoints of each
+            photograph: where all photographs localize, some of these do not.
         views: largest number of photographs of a block that are localized.
         workers: worker processes; 0 for one on each core.
         device: where to compute: auto, cpu, cuda, or cuda:<index>.
@@ -77,6 +79,7 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
     extractor_weights: str = ""
     out: Path | None = None
     also: tuple[str, ...] = ()
+    fov: float | None = None
     views: int = 60
     workers: int = 0
     device: str = "auto"
@@ -84,6 +87,8 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
     def __post_init__(self) -> None:
         check_range("views", self.views, 1)
         check_range("workers", self.workers, 0)
+        if self.fov is not None:
+            check_range("fov", self.fov, 1, 179)
         extracting = self.extractor is not None or bool(self.extractor_weights)
         reject(
             ((self.map is None) == (self.scene is None), "what is checked is given by either --map or --scene", None),
@@ -163,7 +168,7 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
         given = (self.images, self.database)
         folder, features = features_of(model, *given, work, workers, device, self._extractor())
         name = self.scene or place_name(model)
-        photographs = open_map(folder, features, name, frame, model)
+        photographs = replace(open_map(folder, features, name, frame, model), fov_deg=self.fov)
         files = ColmapFiles(model, mesh=mesh, frame=frame)
         camera_id = next(iter(photographs.model.cameras))  # occlusion depends on none
         environment = ColmapEnvironment(files, camera_id, self.occlusion or "", device=device)

@@ -18,6 +18,7 @@ from tqdm.auto import tqdm
 from wheretolook.dataset.thresholds import Accuracy
 from wheretolook.dataset.viewpoint_table import LOCALIZED
 from wheretolook.features.keypoints import Keypoints
+from wheretolook.holdout.crops import crop_keypoints, crop_pixels
 from wheretolook.holdout.holdout_blocks import Block, choose_blocks
 from wheretolook.holdout.photo_map import MAX_ERROR_DEG, MAX_ERROR_M, PhotographedMap
 from wheretolook.localization.config import LocalizerConfig
@@ -31,7 +32,7 @@ from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.processes import WorkerPool
 
 MIN_ANGLE_DEG = 1.5  # COLMAP's own minimum angle between the rays of a landmark
-_FORMAT = 3  # version of what is cached of a block
+_FORMAT = 4  # version of what is cached of a block
 _LANDMARKS = "landmarks.npz"
 _VIEWS = "views.json"
 
@@ -40,7 +41,8 @@ _VIEWS = "views.json"
 class HoldoutResult:
     """A block that was held out, the landmarks (without descriptors) of the remaining map, and its localized views.
 
-    `views` has a row for each tested photograph: row (of the photograph in the map), image (its name), status (of the
+    `views` has a row for each view of a tested photograph: row (of the photograph in the map), crop (of it, 0 is the
+    middle one or itself), image (its name), status (of the
     localizer), good (whether it localized within the limits), error_m and error_deg (NaN without a pose), limit_m (of
     error_m), n_matches, n_inliers, n_observed (landmarks of the whole map that it observes), n_kept (those of them that
     the remaining map still has), and n_landmarks (of the remaining map).
@@ -73,7 +75,7 @@ def hold_out_blocks(
     `choose_blocks`.
     """
     blocks = choose_blocks(source) if blocks is None else blocks
-    limits = [source.limit_m.tolist(), MAX_ERROR_DEG, MIN_ANGLE_DEG, asdict(LocalizerConfig())]
+    limits = [source.limit_m.tolist(), MAX_ERROR_DEG, MIN_ANGLE_DEG, asdict(LocalizerConfig()), source.fov_deg]
     key = cache_key(_FORMAT, versions(), source.key, limits)
     folder = work / f"blocks-{key}"
     for old in work.glob("blocks-*"):
@@ -162,7 +164,11 @@ def _run(job: _Job) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MapWarning)
         landmarks = load_colmap_landmarks(job.model, job.source.features, None, job.device, rest, progress=False)
-    observed = [_observed(whole.images[int(number)]) for number in image_ids[job.block.tested]]
+    observed = [
+        _observed(whole.images[int(image_ids[row])], job.source, row, crop)
+        for row in job.block.tested.tolist()
+        for crop in range(job.source.n_crops)
+    ]
     views = _localize(job, landmarks).assign(
         n_observed=[len(ids) for ids in observed],
         n_kept=[int(np.isin(ids, landmarks.ids).sum()) for ids in observed],
@@ -174,30 +180,41 @@ def _run(job: _Job) -> None:
     job.cache.store({_VIEWS: views.to_dict("list")})
 
 
-def _observed(image: Any) -> NDArray[np.int64]:
-    """Return the ids of the landmarks that an image of a model observes."""
-    return np.unique([point.point3D_id for point in image.points2D if point.has_point3D()]).astype(np.int64)
+def _observed(image: Any, source: PhotographedMap, row: int, crop: int) -> NDArray[np.int64]:
+    """Return the ids of the landmarks that an image of a model observes in a view of it."""
+    points = [point for point in image.points2D if point.has_point3D()]
+    ids = np.array([point.point3D_id for point in points], dtype=np.int64)
+    if source.fov_deg is not None and points:
+        ids = ids[crop_pixels(source.cameras[row], np.array([point.xy for point in points]), source.fov_deg, crop)[1]]
+    return np.unique(ids)
 
 
 def _localize(job: _Job, landmarks: Landmarks) -> pd.DataFrame:
     """Localize the tested photographs of a block against the remaining landmarks."""
     source = job.source
-    rows = job.block.tested
-    names = [source.names[row] for row in rows]
-    cameras = [source.cameras[row] for row in rows]
-    localizer = Localizer(landmarks, cameras[0], device=job.device)
-    kind, stored = read_features(source.features, names)
+    tested = job.block.tested.tolist()
+    localizer = Localizer(landmarks, source.cameras[tested[0]], device=job.device)
+    kind, stored = read_features(source.features, [source.names[row] for row in tested])
     estimates = []
-    for camera, (pixels, descriptors) in zip(cameras, stored, strict=True):
-        keypoints = Keypoints(pixels, kind.restore(descriptors))
-        estimates.append(localizer.estimate(keypoints, localizer.match([keypoints])[0], camera))
-    error_m, error_deg = localization_errors(estimates, source.poses[rows])
+    poses = []
+    for row, (pixels, descriptors) in zip(tested, stored, strict=True):
+        whole = Keypoints(pixels, kind.restore(descriptors))
+        for crop in range(source.n_crops):
+            camera, pose = source.view(row, crop)
+            shown = whole
+            if source.fov_deg is not None:
+                shown = crop_keypoints(source.cameras[row], whole, source.fov_deg, crop)
+            estimates.append(localizer.estimate(shown, localizer.match([shown])[0], camera))
+            poses.append(pose)
+    rows = np.repeat(job.block.tested, source.n_crops)
+    error_m, error_deg = localization_errors(estimates, np.stack(poses))
     status = np.array([one.status for one in estimates])
     limit_m = source.limit_m[rows]
     return pd.DataFrame(
         {
             "row": rows,
-            "image": names,
+            "crop": np.tile(np.arange(source.n_crops), len(tested)),
+            "image": [source.names[row] for row in rows],
             "status": status,
             "good": (status == LOCALIZED) & (error_m < limit_m) & (error_deg < MAX_ERROR_DEG),
             "error_m": error_m,

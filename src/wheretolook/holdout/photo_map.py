@@ -16,6 +16,7 @@ from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import Camera, cameras_by_id
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.geometry.similarity import Similarity
+from wheretolook.holdout.crops import PANS, crops_of
 from wheretolook.localization.versions import versions
 from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_arrays, read_model, registered_names
 from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, PhotographsConfig, place_name
@@ -60,6 +61,7 @@ class PhotographedMap:
         own_centers: (I, 3) camera centres in the model's own frame and unit.
         depth_m: (I,) median depth of the landmarks that each observes, NaN where it observes none.
         key: changes with the model and the features.
+        fov_deg: horizontal field of view of narrower views that are simulated from each photograph; None for itself.
     """
 
     name: str
@@ -74,6 +76,19 @@ class PhotographedMap:
     own_centers: Float
     depth_m: Float
     key: str
+    fov_deg: float | None = None
+
+    @property
+    def n_crops(self) -> int:
+        """Views of each photograph."""
+        return 1 if self.fov_deg is None else len(PANS)
+
+    def view(self, row: int, crop: int) -> tuple[Camera, Float]:
+        """Return camera and pose (3, 4) of a view of a photograph."""
+        if self.fov_deg is None:
+            return self.cameras[row], self.poses[row]
+        pinhole, rotations = crops_of(self.cameras[row], self.fov_deg)
+        return pinhole, rotations[crop] @ self.poses[row]
 
     @property
     def is_metric(self) -> bool:

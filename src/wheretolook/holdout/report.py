@@ -64,6 +64,7 @@ class CheckReport:
             "in_metres": self.source.is_metric,
             "turned_upright": self.source.is_turned,
             "limits": self.limits(),
+            "fov_deg": self.source.fov_deg,
             "says": self.sentence(),
             "advice": self.advice(),
             "n_photographs": len(self.source.poses),
@@ -138,6 +139,8 @@ class CheckReport:
         if ratios := numbers["inliers_found_over_expected"]:
             good, every = (_with_interval(ratios[name], 2) for name in ("localized", "all"))
             lines.append(f"inliers over expected: {good} of views that localize, {every} of all")
+        if source.fov_deg is not None:
+            lines.append(f"views of {source.fov_deg:g} degrees, {source.n_crops} of each photograph")
         if numbers["share_in_range"] < 1:
             lines.append(f"{100 * (1 - numbers['share_in_range']):.0f} % of the views are outside the training range")
         if source.is_turned:
@@ -176,8 +179,9 @@ def check_map(
     columns[VISIBLE] = columns.pop(VISIBLE)  # the baseline comes last
     centers = (source.own_centers * source.from_model.scale)[scored["row"].to_numpy()]
     numbers = measure(scored, columns, centers, source.place_radius, is_probability(method))
-    parts = weak_parts(source, results, scored)
-    photographs = _photographs(source, scored, parts)
+    middle = scored[scored["crop"] == 0]
+    parts = weak_parts(source, results, middle)
+    photographs = _photographs(source, middle, parts)
     blocks = _blocks(source, results, scored)
     return CheckReport(source, method, scored, photographs, blocks, numbers, parts, accuracy)
 

@@ -14,6 +14,7 @@ from tqdm.auto import tqdm
 
 from wheretolook.dataset.thresholds import Accuracy
 from wheretolook.evaluation.scoring import score_scale
+from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
 from wheretolook.holdout.holdout import HoldoutResult
 from wheretolook.holdout.photo_map import PhotographedMap
@@ -100,7 +101,8 @@ def score_views(
         for one in results:
             columns: dict[str, NDArray[np.generic]] = {}
             for rows, remaining in maps_without(source, one, occlusion, device):
-                name, scores = _score(remaining, source.poses[one.views["row"].to_numpy()[rows]], scoring)
+                poses = np.stack([pose for _, pose in _views(source, one.views.iloc[rows])])
+                name, scores = _score(remaining, poses, scoring)
                 for column, values in scores.items():
                     columns.setdefault(column, np.empty(len(one.views), values.dtype))[rows] = values
                 bar.update(len(rows))
@@ -114,12 +116,17 @@ def maps_without(
     """Yield, for each camera, the rows of a block's views, and the map without the block for that camera."""
     remaining = np.setdiff1d(np.arange(len(source.poses)), result.block.held_out)
     cached = occlusion if occlusion.name == "none" else CachedOcclusion(occlusion)
-    cameras = [source.cameras[row] for row in result.views["row"]]
+    cameras = [camera for camera, _ in _views(source, result.views)]
     poses = compact_poses(source.poses[remaining])
     localization_map = LocalizationMap(result.landmarks, cameras[0], cached, device, poses)
     for camera in dict.fromkeys(cameras):
         rows = np.array([row for row, other in enumerate(cameras) if other == camera])
         yield rows, localization_map.of_camera(camera)
+
+
+def _views(source: PhotographedMap, views: pd.DataFrame) -> list[tuple[Camera, Float]]:
+    """Return camera and pose (3, 4) of each view."""
+    return [source.view(row, crop) for row, crop in views[["row", "crop"]].to_numpy().tolist()]
 
 
 def _score(

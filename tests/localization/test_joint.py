@@ -8,9 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import camera_centers, pose_error, poses_looking_along
+from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.estimation import PoseEstimator
 from wheretolook.localization.rig import Look, rig_of, turned_looks
 from wheretolook.localization.rig_localization import JointLocalizer
+from wheretolook.localization.turn_errors import turn_errors
 from wheretolook.utils.errors import PoseError
 
 CAMERA = PinholeCamera()
@@ -151,6 +153,38 @@ def test_rotations_that_the_images_contradict_are_reported_and_do_no_harm(error_
         if contradicted:
             believed = JointLocalizer(estimator, 0.2).localize(looks)
             assert pose_error(believed.cams_from_world, poses)[1].max() > 1
+
+
+def test_rotations_of_the_wrong_sign_are_reported_and_the_pose_is_uncertain():
+    """Yaw to the right instead of to the left: the second view is 180 degrees off, the third 327 of 360."""
+    points = a_room()
+    _, looks, _ = looks_from(points, noise_px=1.0, outliers=0.4)
+    mirrored = [
+        Look(np.diag([-1.0, 1, 1]) @ one.cam_from_rig @ np.diag([-1.0, 1, 1, 1]), one.pixels, one.rows, CAMERA)
+        for one in looks
+    ]
+    found = JointLocalizer(PoseEstimator(points), 0.2, check_turns=True).localize(mirrored)
+    assert found.turn_error_deg > 90
+    assert probabilities(found)[0] < 0.9
+
+
+def test_views_of_a_small_part_of_the_image_do_not_contradict_rotations():
+    """Their own poses are uncertain, about one axis more than about others, and biased by outliers."""
+    points = a_room()
+    axes = np.array([(1, 0, 0), (0.5, 0.9, 0.1), (-0.5, 0.9, -0.1), (-1, 0, 0.1)])
+    localizer = JointLocalizer(PoseEstimator(points))
+    contradicted = []
+    for seed in range(12):
+        _, looks, right = looks_from(points, axes=axes, seed=seed, n=400, noise_px=2.0, outliers=0.3)
+        small = []
+        for look, is_right in zip(looks, right, strict=True):
+            distance = np.linalg.norm(look.pixels - (320, 240), axis=1)
+            kept = np.r_[np.flatnonzero(is_right)[np.argsort(distance[is_right])[:30]], np.flatnonzero(~is_right)[:60]]
+            small.append(Look(look.cam_from_rig, look.pixels[kept], look.rows[kept], CAMERA))
+        poses = [localizer.single_view_poses(look) for look in small]
+        errors = turn_errors(localizer.estimator, small, poses, noise_deg=0.2)
+        contradicted.append(errors is not None and errors.contradictory)
+    assert sum(contradicted) == 0
 
 
 def test_wrong_poses_of_views_do_not_contradict_rotations():

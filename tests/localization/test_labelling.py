@@ -97,10 +97,11 @@ def test_several_hypotheses_also_label_by_the_first_ransac_result(
     )
     pd.testing.assert_frame_equal(by_first(both)[[*first]], first)
     assert first["status"].nunique() > 1 and not both["n_inliers"].equals(first["n_inliers"])
-    write_table(both, tmp_path / "both.parquet")
-    stored = read_table(tmp_path / "both.parquet")
-    assert [*stored] == [*SCHEMA.names, *FIRST_FIELDS.names]
-    pd.testing.assert_frame_equal(by_first(stored)[["status", "error_m"]], first[["status", "error_m"]])
+    for compact in (False, True):
+        write_table(both, tmp_path / "both.parquet", compact)
+        stored = read_table(tmp_path / "both.parquet")
+        assert [*stored] == [*SCHEMA.names, *FIRST_FIELDS.names]
+        pd.testing.assert_frame_equal(by_first(stored)[["status", "error_m"]], first[["status", "error_m"]])
     assert [*label_rows(stored, renderer, Localizer(landmarks, CAMERA), CAMERA)] == SCHEMA.names
 
 

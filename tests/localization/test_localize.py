@@ -5,17 +5,20 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.spatial.transform import Rotation
 
 from localization.rooms import CAMERA, MappedRoom
 from wheretolook.cli import main
 from wheretolook.geometry.poses import Float, pose_error, poses_looking_along
 from wheretolook.geometry.similarity import Similarity
-from wheretolook.localization.turns import read_turns
+from wheretolook.io.poses import read_poses
+from wheretolook.localization.turns import checked_turns, read_turns
 from wheretolook.mapping.colmap_model import read_model
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.landmarks import Landmarks
@@ -23,7 +26,7 @@ from wheretolook.mapping.photographs import read_photograph
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.select.image_localizer import ImageLocalizer
-from wheretolook.select.localized import figure_of
+from wheretolook.select.localized import Localized, figure_of
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import ConfigError, MapError, PoseError, TableError
 
@@ -69,6 +72,61 @@ def test_a_batch_is_localized_and_an_unreadable_image_is_a_row_with_its_reason(
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {"a.png", "b.png", "c.png"}
 
 
+def test_images_of_the_same_name_in_two_folders_are_distinct(room: MappedRoom, photos: Path, tmp_path: Path) -> None:
+    for folder, name in (("left", "a"), ("right", "b")):
+        (tmp_path / "rig" / folder).mkdir(parents=True)
+        (tmp_path / "rig" / folder / "1.png").write_bytes((photos / f"{name}.png").read_bytes())
+    command = ["localize", str(tmp_path / "rig"), "--map", str(room.landmarks.parent)]
+    assert main([*command, "--out", str(tmp_path / "images.txt"), "--figure", str(tmp_path / "figures")]) == 0
+    found = read_poses(tmp_path / "images.txt")
+    assert found.names == ("left/1.png", "right/1.png")
+    assert_near(found.cam_from_world, POSES[:2])
+    assert all((tmp_path / "figures" / name).is_file() for name in found.names)
+    turns = tmp_path / "turns.csv"
+    yaw = np.degrees(np.arctan2(AXES[:, 1], AXES[:, 0]))
+    turns.write_text(f"image,yaw,pitch\nright/1.png,{yaw[1]},5.47\nleft/1.png,{yaw[0]},0\n")
+    assert main([*command, "--turns", str(turns), "--out", str(tmp_path / "images.txt")]) == 0
+    found = read_poses(tmp_path / "images.txt")
+    assert found.names == ("left/1.png", "right/1.png")
+    assert_near(found.cam_from_world, POSES[:2])
+
+
+def test_figures_do_not_replace_the_images(
+    room: MappedRoom, photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image = tmp_path / "a.png"
+    image.write_bytes((photos / "a.png").read_bytes())
+    command = ["localize", str(image), "--map", str(room.landmarks.parent), "--figure", str(tmp_path)]
+    assert main(command) == 2
+    assert "would replace" in capsys.readouterr().err
+    assert image.read_bytes() == (photos / "a.png").read_bytes()
+
+
+@pytest.mark.parametrize("option", ["--accuracy=0,1", "--prior=1,2"])
+def test_an_invalid_option_is_an_error_of_the_batch_not_of_each_image(
+    room: MappedRoom, photos: Path, tmp_path: Path, option: str
+) -> None:
+    out = tmp_path / "poses.csv"
+    assert main(["localize", str(photos), "--map", str(room.landmarks.parent), option, "--out", str(out)]) == 2
+    assert not out.exists()
+
+
+def test_an_interrupted_batch_keeps_its_results(
+    room: MappedRoom, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    localize = ImageLocalizer.localize_or_fail
+
+    def interrupted(self: ImageLocalizer, image: Path, *options: Any) -> Localized:
+        if image.name == "c.png":
+            raise KeyboardInterrupt
+        return localize(self, image, *options)
+
+    monkeypatch.setattr(ImageLocalizer, "localize_or_fail", interrupted)
+    out = tmp_path / "poses.csv"
+    assert main(["localize", str(photos), "--map", str(room.landmarks.parent), "--out", str(out)]) == 130
+    assert pd.read_csv(out)["image"].tolist() == ["a.png", "b.png"]
+
+
 def test_images_are_matched_with_the_landmarks_of_their_pairs_alone(
     room: MappedRoom, photos: Path, localizer: ImageLocalizer, tmp_path: Path
 ) -> None:
@@ -85,9 +143,10 @@ def test_images_are_matched_with_the_landmarks_of_their_pairs_alone(
     assert_near(result.cam_from_world, POSES[:1])
     assert result.n_matches == expected.n_matches
     opposite = [name for name, axis in axes.items() if axis @ AXES[0] < -0.9]
-    pairs.write_text("".join(f"a.png {name}\n" for name in opposite))
+    pairs.write_text("".join(f"a.png {name}\n" for name in opposite) + "c.png nowhere.png\n")
     away = ImageLocalizer.open(folder, pairs=pairs).localize(photos / "a.png")
     assert away.n_matches < 0.3 * expected.n_matches and away.probability < 0.05
+    assert ImageLocalizer.open(folder, pairs=pairs).localize(photos / "c.png").n_matches == 0
     with pytest.raises(TableError, match=r"b\.png.*do not name this image|do not name this image.*b\.png"):
         ImageLocalizer.open(folder, pairs=pairs).localize(photos / "b.png")
 
@@ -151,7 +210,7 @@ def test_the_probability_is_that_of_the_accuracy(localizer: ImageLocalizer, phot
     coarse, fine = (localizer.localize(photos / "a.png", accuracy=limits) for limits in ((0.5, 5.0), (0.0005, 0.005)))
     assert coarse.probability > 0.9 and fine.probability < coarse.probability / 2
     np.testing.assert_array_equal(coarse.cam_from_world, fine.cam_from_world)
-    for limits in ((0.0, 1.0), (0.1,), (np.nan, 1.0)):
+    for limits in ((0.0, 1.0), (0.1,), (np.nan, 1.0), (1.0, np.nan)):
         with pytest.raises(ConfigError, match="accuracy"):
             localizer.localize(photos / "a.png", accuracy=limits)
 
@@ -210,8 +269,21 @@ def test_turns_of_odometry_and_tables(tmp_path: Path) -> None:
     turned, level = read_turns(table, ["x/a.png", "x/b.png"])
     np.testing.assert_allclose(turned[:, :3], [(0, 0, -1), (0, 1, 0), (1, 0, 0)], atol=1e-9)  # x down, y to the left
     np.testing.assert_allclose(level[2, :3], (0, np.sqrt(0.75), 0.5), atol=1e-9)
+    for images in (["a.png", "c.png"], ["c.png", "d.png"]):  # if no image is named, not in the order of the rows
+        with pytest.raises(TableError, match="no rotation of this image"):
+            read_turns(table, images)
+    table.write_text("id,yaw,pitch\n0,0,0\n1,90,0\n")
+    np.testing.assert_allclose(read_turns(table, ["a.png", "b.png"])[1, 2, :3], (0, 1, 0), atol=1e-9)
+    table.write_text("image,yaw,pitch\na.png,0,0\na.png,90,0\n")
     with pytest.raises(TableError, match="no rotation of this image"):
-        read_turns(table, ["a.png", "c.png"])
+        read_turns(table, ["a.png", "b.png"])
     table.write_text("image,qw,qx,qy,qz\na.png,2,0,0,0\n")
     with pytest.raises(TableError, match="length 1"):
         read_turns(table, ["a.png"])
+
+
+def test_rounded_rotations_are_made_orthonormal() -> None:
+    exact = Rotation.from_euler("yx", [33.7, 10], degrees=True).as_matrix()
+    poses = checked_turns(np.round([np.eye(3), exact], 4), 2)
+    np.testing.assert_allclose(poses[:, :, :3] @ poses[:, :, :3].swapaxes(1, 2), [np.eye(3)] * 2, atol=1e-12)
+    np.testing.assert_allclose(poses[1, :, :3], exact, atol=1e-4)

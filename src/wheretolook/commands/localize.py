@@ -100,6 +100,7 @@ class Localize(CameraOptions, FrameOptions):
     def run(self) -> list[Localized]:
         """Localize the images, write `out` and `figure`, and print a summary."""
         from wheretolook.select.localized import check_localized_format, save_localized
+        from wheretolook.select.query_images import distinct_names
         from wheretolook.utils.devices import usable_device
 
         start = time.monotonic()
@@ -110,21 +111,28 @@ class Localize(CameraOptions, FrameOptions):
             raise ConfigError("several images need a folder of figures", path=self.figure, fix="Name a folder.")
         if self.next and len(paths) > 1 and self.turns is None:
             raise ConfigError("the next view is that of one rig", value=len(paths), fix="Give --turns, or one image.")
+        names = distinct_names(paths)
+        if self.figure is not None:
+            replaced = {self._figure_of(name).resolve() for name in names} & {path.resolve() for path in paths}
+            if replaced:
+                raise ConfigError("a figure would replace an image", path=replaced.pop(), fix="Name another folder.")
         from wheretolook.select.image_localizer import ImageLocalizer
 
         device = usable_device(self.device)
         localizer = ImageLocalizer.open(
             self.map, self.database, self.frame_options(), self._extractor, device, self.pairs, self.lightglue
         )
-        landmarks = f"{len(localizer.landmarks):,} landmarks ({localizer.landmarks.features})"
-        print(f"{localizer.frame.describe()}; {landmarks}")
+        landmarks = localizer.landmarks
+        print(f"{localizer.frame.describe()}; {len(landmarks):,} landmarks ({landmarks.features})")
         results = []
-        for result in self._results(localizer, paths):
-            if self.figure is not None and result.images:
-                self._draw(result, localizer)
-            results.append(result.without_images())
-        if self.out is not None:
-            save_localized(results, self.out)
+        try:
+            for result in self._results(localizer, paths, names):
+                if self.figure is not None and result.images:
+                    self._draw(result, localizer)
+                results.append(result.without_images())
+        finally:  # an interruption keeps those that are finished
+            if self.out is not None and results:
+                save_localized(results, self.out)
         self._summarize(results)
         if self.next:
             self._print_next(result, device)
@@ -138,18 +146,15 @@ class Localize(CameraOptions, FrameOptions):
 
         paths: list[Path] = []
         for path in self.images:
-            if not path.is_dir():
-                if not path.is_file():
-                    raise MapError("there is no such image", path=path, fix="Give images, or folders of them.")
-                paths.append(path)
-                continue
-            found = sorted(file for file in path.rglob("*") if file.is_file() and file.suffix.lower() in SUFFIXES)
+            in_folder = (file for file in path.rglob("*") if file.suffix.lower() in SUFFIXES)
+            found = [path] if path.is_file() else sorted(file for file in in_folder if file.is_file())
             if not found:
-                raise MapError("this folder has no images", path=path, fix=f"They end in {', '.join(SUFFIXES)}.")
+                fix = f"Give images, or folders of images that end in {', '.join(SUFFIXES)}."
+                raise MapError("there is no image here", path=path, fix=fix)
             paths += found
         return paths
 
-    def _results(self, localizer: ImageLocalizer, paths: list[Path]) -> Iterable[Localized]:
+    def _results(self, localizer: ImageLocalizer, paths: list[Path], names: list[str]) -> Iterable[Localized]:
         """Yield the result of the rig, or of each image, with a progress bar."""
         from tqdm.auto import tqdm
 
@@ -157,16 +162,19 @@ class Localize(CameraOptions, FrameOptions):
         if self.turns is not None or len(paths) == 1:
             yield localizer.localize(paths, self.turns, camera, self.prior, self.accuracy)
             return
-        for path in tqdm(paths, desc="localize", unit="image"):
-            yield localizer.localize_or_fail(path, camera, self.prior, self.accuracy)
+        for path, name in zip(tqdm(paths, desc="localize", unit="image"), names, strict=True):
+            yield localizer.localize_or_fail(path, name, camera, self.prior, self.accuracy)
 
     def _draw(self, result: Localized, localizer: ImageLocalizer) -> None:
         from wheretolook.figures.style import save_figure
         from wheretolook.select.localized import figure_of
 
+        save_figure(figure_of(result, localizer.landmarks.points), self._figure_of(result.names[0]))
+
+    def _figure_of(self, name: str) -> Path:
+        """Return the file of the figure of an image, or of the rig whose first image it is."""
         assert self.figure is not None
-        path = self.figure if self.figure.suffix else self.figure / f"{Path(result.names[0]).stem}.png"
-        save_figure(figure_of(result, localizer.landmarks.points), path)
+        return self.figure if self.figure.suffix else (self.figure / name).with_suffix(".png")
 
     def _print_next(self, result: Localized, device: str) -> None:
         """Print where the camera should look next."""

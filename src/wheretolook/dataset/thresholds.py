@@ -19,7 +19,7 @@ ACCURACY: Accuracy = THRESHOLDS[0]
 def checked_accuracy(accuracy: Sequence[float]) -> Accuracy:
     """Return limits of the errors in metres and degrees. Raises ConfigError unless they are two positive numbers."""
     limits = tuple(float(limit) for limit in accuracy)
-    if len(limits) != 2 or not min(limits) > 0:
+    if len(limits) != 2 or not all(limit > 0 for limit in limits):
         raise ConfigError("an accuracy has two positive limits", value=accuracy, fix="Give metres,degrees: 0.05,0.4.")
     return limits
 

@@ -149,4 +149,6 @@ def _network(features: str, weights: str) -> Any:
         return {key: value for key, value in renamed.items() if key in network.state_dict()}
 
     file = "" if weights == KORNIA_WEIGHTS else weights
-    return load_state(network, file, name, [url], prepare, "--label.localizer.lightglue").eval()
+    return load_state(
+        network, file, name, [url], prepare, "--label.localizer.lightglue (of localize --lightglue)"
+    ).eval()

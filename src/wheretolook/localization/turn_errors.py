@@ -14,10 +14,10 @@ from wheretolook.localization.hypotheses import Hypothesis, RigMatches, SingleVi
 from wheretolook.localization.rig import Look
 
 MAX_DEVIATIONS = 4.0
-"""Errors of so many standard deviations contradict the assumed noise: 0.1 % of those of three Gaussian angles do."""
+"""Errors of so many standard deviations contradict the assumed noise: at most 0.1 % of those of three Gaussian angles do."""
 
-MAX_ERROR_DEG = 45.0  # of rotations that are wrong and not merely of another view
-MAX_POSITION_DEVIATION_M = 0.25  # of a view's own pose that is compared
+MAX_POSITION_DEVIATION_M = 0.25  # between two views' own poses that are compared
+MAX_DEVIATION_DEG = 1.0  # with larger ones, poses from a small part of the image have errors beyond their covariance
 MOVE_M = 0.02  # of a camera that turns about its base
 
 
@@ -44,10 +44,7 @@ def turn_errors(
     Wrong poses of two views hardly ever agree in their location, so those that do are compared in their orientation.
     Returns None if no two views agree in their location.
     """
-    own = [
-        [_own_pose(estimator, look, k, of_view) for k in range(len(of_view))]
-        for look, of_view in zip(looks, poses, strict=True)
-    ]
+    own = [_own_poses(estimator, look, of_view) for look, of_view in zip(looks, poses, strict=True)]
     pairs = [_smallest_error(first, second) for first, second in combinations(own, 2)]
     compared = np.array([pair for pair in pairs if pair is not None])
     if len(compared) == 0:
@@ -58,14 +55,15 @@ def turn_errors(
     return TurnErrors(float(noise), float(error.max()), bool((error > limit).any()))
 
 
-def _own_pose(estimator: PoseEstimator, look: Look, k: int, poses: SingleViewPoses) -> Hypothesis:
-    """Return the k-th pose of a view as that of the rig, refined on the view's inliers alone."""
+def _own_poses(estimator: PoseEstimator, look: Look, poses: SingleViewPoses) -> list[Hypothesis]:
+    """Return a view's poses with enough inliers as those of the rig, refined on the view's inliers alone."""
     rig = RigMatches(estimator, [look], 0.0)
-    return rig.refine(rig.rig_pose(0, poses[k][0]))
+    refined = [rig.refine(rig.rig_pose(0, pose)) for pose, _ in poses]
+    return [pose for pose in refined if pose.n_inliers >= estimator.config.min_inliers]
 
 
 def _smallest_error(first: Sequence[Hypothesis], second: Sequence[Hypothesis]) -> tuple[float, float] | None:
-    """Return the angle (deg) between two views' poses of the rig, and its variance about each axis (deg^2).
+    """Return the angle (deg) between two views' poses of the rig, and its variance about the least certain axis (deg^2).
 
     Of all pairs of poses at the same location the one with the smallest angle; None if there is none.
     """
@@ -75,6 +73,8 @@ def _smallest_error(first: Sequence[Hypothesis], second: Sequence[Hypothesis]) -
         deviation_m = np.sqrt(np.trace(covariance[:3, :3]))
         error_m, error_deg = pose_error(pose.rig_from_world, other.rig_from_world)
         near = error_m < MAX_DEVIATIONS * deviation_m + MOVE_M and deviation_m < MAX_POSITION_DEVIATION_M
-        if near and error_deg < MAX_ERROR_DEG:
-            errors.append((float(error_deg), float(np.degrees(1) ** 2 * np.trace(covariance[3:, 3:]) / 3)))
+        if near:
+            variance = np.degrees(1) ** 2 * np.linalg.eigvalsh(covariance[3:, 3:])[-1]
+            if variance < MAX_DEVIATION_DEG**2:
+                errors.append((float(error_deg), float(variance)))
     return min(errors, default=None)

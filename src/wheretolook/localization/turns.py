@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from wheretolook.geometry.poses import Float, camera_centers, rigid_poses
 from wheretolook.io.poses import NAME_COLUMNS, QUATERNION_COLUMNS, NamedRows, poses_of_rows, read_named_rows
 from wheretolook.utils.errors import TableError
+from wheretolook.utils.files import path_ends
 
 MAX_STAMP_DIFFERENCE_S = 0.02  # between an image named by its time and its row of the odometry
 BODY_UPRIGHT = 0.7  # z of a robot's own z axis in odometry, from which on it is no camera
@@ -25,9 +26,9 @@ def read_turns(path: Path, images: Sequence[str]) -> Float:
     qx, qy, qz (camera-to-rig), and perhaps positions in metres; or is a TUM trajectory of the camera (z forward) or of
     a robot (x forward, z up) whose camera looks along x. Rows belong to the images of the same name, in the column
     image, or of the nearest time stamp, if images are named by their time. Otherwise they are in the order of the
-    images.
+    images, unless there is a column image.
 
-    Raises TableError if the file cannot be read, an image has no row, or a row is no rotation.
+    Raises TableError if the file cannot be read, an image has no row or several, or a row is no rotation.
     """
     table = read_named_rows(path)
     poses = _poses(table)
@@ -46,6 +47,7 @@ def checked_turns(turns: ArrayLike, n_images: int) -> Float:
     if poses.shape[1:] == (3, 3):
         poses = np.pad(poses, ((0, 0), (0, 0), (0, 1)))
     poses = rigid_poses(poses)
+    poses[:, :, :3] = Rotation.from_matrix(poses[:, :, :3]).as_matrix()  # of rounded numbers
     if len(poses) != n_images:
         raise TableError("each image needs a rotation", value=f"{len(poses)} rotations of {n_images} images")
     return poses
@@ -74,14 +76,16 @@ def _rows_of(table: NamedRows, images: Sequence[PurePath]) -> list[int]:
     """Return the row of each image: by name, by time, or in order."""
     is_named = any(name in table.columns for name in NAME_COLUMNS) and len({*table.names}) == len(table.names)
     rows = {name: row for row, name in enumerate(table.names)} if is_named else {}
-    found = [next((rows[text] for text in (str(path), path.name, path.stem) if text in rows), None) for path in images]
+    ends = [[*path_ends(path), path.stem] for path in images]
+    found = [next((rows[name] for name in names if name in rows), None) for names in ends]
     if None in found and is_named:
         found = _rows_by_time(table, images) or found
-    if not any(row is not None for row in found) and len(table.names) == len(images):
+    in_order = "image" not in table.columns and len(table.names) == len(images)
+    if in_order and not any(row is not None for row in found):
         found = [*range(len(images))]
     for path, row in zip(images, found, strict=True):
         if row is None:
-            fix = f"Name it in the column image, or give {len(images)} rows in the order of the images."
+            fix = f"Name it once in the column image, or give {len(images)} rows in the order of the images."
             raise TableError("there is no rotation of this image", path=table.path, value=str(path), fix=fix)
     return [row for row in found if row is not None]
 

@@ -8,9 +8,11 @@ from pathlib import Path, PurePath
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from wheretolook.mapping.colmap_model import ModelArrays, observation_matrix
 from wheretolook.utils.errors import TableError
+from wheretolook.utils.files import path_ends
 from wheretolook.utils.reading import read_text
 
 MAX_BYTES = 2**28
@@ -18,10 +20,11 @@ MAX_BYTES = 2**28
 
 @dataclass(frozen=True, eq=False)
 class ImagePairs:
-    """Landmarks that the mapping images paired with each query observe."""
+    """The mapping images paired with each query, and the landmarks that they observe."""
 
     path: Path
-    rows: dict[str, NDArray[np.int64]]  # of landmarks, by the query's name in the file
+    images: dict[str, list[int]]  # rows of mapping images in the model, by the query's name in the file
+    observed: csr_array  # (I, N) which landmarks they observe
 
     @classmethod
     def read(cls, path: Path, model: ModelArrays, landmark_ids: NDArray[np.int64]) -> ImagePairs:
@@ -29,7 +32,8 @@ class ImagePairs:
 
         Raises TableError if a line is not two names, or no image of the model is named.
         """
-        images: dict[str, list[str]] = defaultdict(list)
+        images: dict[str, list[int]] = defaultdict(list)
+        row_of = {name: row for row, name in enumerate(model.image_names)}
         try:
             lines = read_text(path, MAX_BYTES).splitlines()
         except (OSError, ValueError) as error:
@@ -40,28 +44,21 @@ class ImagePairs:
                 fix = "Give hloc's file of pairs: a query and a mapping image in each line."
                 raise TableError(f"line {number} is not a pair of images", path=path, value=line[:80], fix=fix)
             if names:
-                images[names[0]].append(names[1])
-        row_of = {name: row for row, name in enumerate(model.image_names)}
-        if not any(name in row_of for of_query in images.values() for name in of_query):
+                images[names[0]] += [row_of[name] for name in names[1:] if name in row_of]
+        if not any(images.values()):
             fix = f"Its images have names such as {model.image_names[0]}." if model.image_names else ""
             raise TableError("no mapping image of the pairs is in the model", path=path, fix=fix)
-        observed = observation_matrix(model)
-        rows = {}
-        for query, of_query in images.items():
-            known = [row_of[name] for name in of_query if name in row_of]
-            points = model.point_ids[np.unique(observed[known].indices)]
-            rows[query] = np.flatnonzero(np.isin(landmark_ids, points))
-        return cls(path, rows)
+        points = np.intersect1d(model.point_ids, landmark_ids, return_indices=True)[1]
+        return cls(path, images, observation_matrix(model)[:, points])
 
     def landmarks(self, query: str) -> NDArray[np.int64]:
         """Return the rows of the landmarks of a query, by its path or the end of it. Raises TableError if it has none."""
-        parts = PurePath(query).parts
-        names = ("/".join(parts[start:]) for start in range(len(parts)))
-        found = next((self.rows[name] for name in names if name in self.rows), None)
+        names = path_ends(PurePath(query))
+        found = next((self.images[name] for name in names if name in self.images), None)
         if found is None:
-            ends = [rows for name, rows in self.rows.items() if PurePath(name).name == parts[-1]]
+            ends = [rows for name, rows in self.images.items() if PurePath(name).name == names[-1]]
             if len(ends) != 1:
                 fix = "Name it in the first column."
                 raise TableError("the pairs do not name this image", path=self.path, value=query, fix=fix)
             found = ends[0]
-        return found
+        return np.unique(self.observed[found].indices).astype(np.int64)

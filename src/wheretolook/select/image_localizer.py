@@ -33,7 +33,7 @@ from wheretolook.mapping.map_folder import LANDMARKS_FILE
 from wheretolook.mapping.map_frame import MapFrame, find_frame
 from wheretolook.mapping.sources import find_features
 from wheretolook.select.localized import FAILED, Localized
-from wheretolook.select.query_images import QueryImage, QueryImages
+from wheretolook.select.query_images import QueryImage, QueryImages, distinct_names
 from wheretolook.utils.errors import ConfigError, MapError, WhereToLookError
 from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.records import from_record
@@ -122,6 +122,7 @@ class ImageLocalizer:
         camera: Camera | int | None = None,
         prior: Sequence[float] | None = None,
         accuracy: Accuracy = ACCURACY,
+        names: Sequence[str] | None = None,
     ) -> Localized:
         """Localize an image, or several from one location of which the rotations are known.
 
@@ -134,6 +135,7 @@ class ImageLocalizer:
             prior: rough location x, y, z of the camera in the map, and perhaps yaw in degrees of an image: one more
                 hypothesis, which wins only if the matches support it best.
             accuracy: limits in metres and degrees that the probability refers to.
+            names: of the images in the result; by default `distinct_names` of the files.
 
         Raises:
             MapError, PoseError, ConfigError: an image cannot be read or is none, its camera is unknown or other than
@@ -141,35 +143,43 @@ class ImageLocalizer:
             TableError, PoseError: the file of turns, or a rotation, is not valid.
         """
         given = [images] if isinstance(images, (str, Path, np.ndarray)) else list(images)
-        names = [str(n) if isinstance(image, np.ndarray) else str(image) for n, image in enumerate(given)]
+        paths = [str(n) if isinstance(image, np.ndarray) else str(image) for n, image in enumerate(given)]
         cam_from_rig: Float = np.eye(3, 4)[None]
         if isinstance(turns, (str, Path)):
-            cam_from_rig = self._usable(read_turns(Path(turns), names))
+            cam_from_rig = self._usable(read_turns(Path(turns), paths))
         elif turns is not None:
             cam_from_rig = self._usable(checked_turns(turns, len(given)))
         elif len(given) != 1:
             fix = "Give turns, or localize one image after another."
             raise ConfigError("several images are localized together by their rotations", value=len(given), fix=fix)
         camera = self.images.known_camera(camera)
-        queries = [self.images.read(image, Path(name).name, camera) for image, name in zip(given, names, strict=True)]
+        names = names or distinct_names([Path(path) for path in paths])
+        queries = [self.images.read(image, name, camera) for image, name in zip(given, names, strict=True)]
         near = None if prior is None else self._prior(prior)
         limits = checked_accuracy(accuracy)
         keypoints = [self._localizer.extractor.extract(query.rgb) for query in queries]
-        matches = [self._match(*of_image) for of_image in zip(names, keypoints, queries, strict=True)]
+        matches = [self._match(*of_image) for of_image in zip(paths, keypoints, queries, strict=True)]
         return self._localized(queries, keypoints, matches, cam_from_rig, near, limits)
 
     def localize_or_fail(
         self,
         image: Path,
+        name: str,
         camera: Camera | int | None = None,
         prior: Sequence[float] | None = None,
         accuracy: Accuracy = ACCURACY,
     ) -> Localized:
-        """Localize an image of a batch: an error becomes the reason why it is not localized."""
+        """Localize an image of a batch, and name it: an error becomes the reason why it is not localized.
+
+        Raises ConfigError if the prior or the accuracy is invalid, as they are those of all images.
+        """
+        if prior is not None:
+            self._prior(prior)
+        checked_accuracy(accuracy)
         try:
-            return self.localize(image, None, camera, prior, accuracy)
+            return self.localize(image, None, camera, prior, accuracy, [name])
         except WhereToLookError as error:
-            return Localized((image.name,), FAILED, str(error), frame=self.frame)
+            return Localized((name,), FAILED, str(error), frame=self.frame)
 
     def _localized(
         self,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ from wheretolook.mapping.colmap_model import camera_of_model, registered_names
 from wheretolook.mapping.photographs import read_photograph, reduce_photograph
 from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import ConfigError, PoseError
+from wheretolook.utils.files import path_ends
 
 MAX_SIDE_PX = 1600  # larger images are reduced
 MAX_SIDE_RATIO = 1.01  # of the proportions of an image and of its camera
@@ -68,9 +71,7 @@ class QueryImages:
 
     def _named(self, path: Path) -> Camera | None:
         """Return the camera of the mapping image of the same name: of the longest end of the path, at least the file name."""
-        parts = path.absolute().parts
-        ends = ("/".join(parts[start:]) for start in range(1, len(parts)))
-        return next((self.by_name[end] for end in ends if end in self.by_name), None)
+        return next((self.by_name[end] for end in path_ends(path.absolute()) if end in self.by_name), None)
 
     def _camera(self, path: Path | None, rgb: NDArray[np.uint8], given: Camera | None) -> Camera:
         height, width = rgb.shape[:2]
@@ -96,6 +97,15 @@ class QueryImages:
         problem = f"the camera of this image of {size} is unknown: it has no EXIF focal length"
         problem += f", and the map has {len(alike)} cameras of its proportions that differ" if alike else ""
         raise ConfigError(problem, path=path, fix="Give --camera MODEL,width,height,parameters, in Python camera.")
+
+
+def distinct_names(paths: Sequence[Path]) -> list[str]:
+    """Return the names of files, or where some are equal, the paths from the folder that has all."""
+    names = [path.name for path in paths]
+    if len({*names}) == len(names):
+        return names
+    folder = os.path.commonpath([path.absolute().parent for path in paths])
+    return [os.path.relpath(path, folder) for path in paths]
 
 
 def _has_proportions(camera: Camera, rgb: NDArray[np.uint8]) -> bool:

@@ -8,7 +8,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -33,6 +33,11 @@ def write_bytes(path: Path, content: bytes) -> None:
     """Write bytes with `atomic_write`."""
     with atomic_write(path) as partial:
         partial.write_bytes(content)
+
+
+def path_ends(path: PurePath) -> list[str]:
+    """Return the names by which a table may call a file: its path and each end of it, the file's name last."""
+    return [path.as_posix(), *("/".join(path.parts[start:]) for start in range(1, len(path.parts)))]
 
 
 def copy_file(source: Path, target: Path) -> None:

@@ -86,14 +86,23 @@ class RobotLocalization:
 
 
 class RobotLocalizer:
-    """Localizes views in the map of an exported folder. Raises OSError or ValueError if a file cannot be used."""
+    """Localizes views in the map of an exported folder.
 
-    def __init__(self, folder: str | Path, turn_noise_deg: float = TURN_NOISE_DEG) -> None:
+    Args:
+        folder: as `wheretolook export --localize` wrote it.
+        turn_noise_deg: one standard deviation, about each axis, of the rotations between views.
+        in_world: poses and priors are in the world, metres with z up, instead of the map's own frame.
+
+    Raises OSError or ValueError if a file cannot be used.
+    """
+
+    def __init__(self, folder: str | Path, turn_noise_deg: float = TURN_NOISE_DEG, in_world: bool = False) -> None:
         folder = Path(folder)
         about = json.loads((folder / "robot.json").read_text(encoding="utf-8"))
         if about.get("format_version") != FORMAT_VERSION:
             raise ValueError(f"{folder}: this program reads format {FORMAT_VERSION}. Export again.")
-        frame = about["world_from_map"]
+        same = {"scale": 1, "rotation": np.eye(3), "translation": np.zeros(3)}
+        frame = same if in_world else about["world_from_map"]
         camera = about["camera"]
         self._scale = float(frame["scale"])  # metres in a unit of the map
         self._rotation = np.array(frame["rotation"], dtype=np.float64).reshape(3, 3)

@@ -17,7 +17,7 @@ from wheretolook.utils.errors import MapError
 from wheretolook.utils.files import atomic_write, copy_file, write_text
 
 PACKAGE = "wheretolook_localization"  # of the copies, so that an installed wheretolook does not replace them
-FIRST = "wheretolook.robot.image_sequence"
+FIRST = "wheretolook.robot.image_sequence", "wheretolook.planning.view_sequence"
 ROOT = Path(wheretolook.__file__).parent
 
 
@@ -57,9 +57,9 @@ def _path(module: str) -> Path | None:
 
 
 def _modules() -> set[str]:
-    """Return the names of the modules that localizing imports."""
+    """Return the names of the modules to copy: `FIRST`, and what they import."""
     found: set[str] = set()
-    left = [FIRST]
+    left = [*FIRST]
     while left:
         name = left.pop()
         path = _path(name)

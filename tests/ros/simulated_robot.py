@@ -3,7 +3,7 @@
     python simulated_robot.py --ros-args -p mesh:=scene.glb -p pan_joint:=pan -p tilt_joint:=tilt
 
 It takes `place` (PoseStamped: where the base is), `joint_trajectory` and `plan` (which it drives along), and publishes
-`image`, `camera_info`, `odom`, `joint_states`, and `ground_truth`, the true pose of the base for each image.
+`image`, `camera_info`, `odom`, `joint_states`, and `ground_truth`, the true pose of the camera for each image.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ class SimulatedRobot(RobotNode):
         info.d = [0.0] * 5
         image = Image(height=rgb.shape[0], width=rgb.shape[1], encoding="rgb8", step=3 * rgb.shape[1])
         image.data = np.ascontiguousarray(rgb, dtype=np.uint8).tobytes()
-        truth = PoseStamped(pose=pose_message(self._base))
+        truth = PoseStamped(pose=pose_message(map_from_camera))
         for message, frame in ((info, "camera"), (truth, self.settings["map_frame"]), (image, "camera")):
             message.header.stamp = now
             message.header.frame_id = frame

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -79,7 +80,7 @@ def test_frame_stamp_and_covariance(robot: Robot) -> None:
         joints = (0.4, -0.2)
         status = robot.see(image_of(robot.rgb(base, *joints)), info_of(CAMERA), joints=joints)
         values = {pair.key: pair.value for pair in status.values}
-        assert status.level == OK and float(values["probability"]) > 0.95 and int(values["n_inliers"]) > 100
+        assert status.level == OK and json.loads(values["probabilities"])[0] > 0.95 and int(values["n_inliers"]) > 100
         assert_right(robot, base)
         found = robot.last("visual_localization/pose")
         assert found.header.frame_id == "map" and found.header.stamp.sec == int(robot.stamp)
@@ -151,7 +152,7 @@ def test_odometry_makes_a_rig_of_ambiguous_views(robot: Robot) -> None:
         masked[180:300, 255:385] = rgb[180:300, 255:385]
         status = robot.see(image_of(masked), info_of(CAMERA), odometry=base_at(7.0, -2.0, 10.0), joints=(pan, 0.0))
         values = {pair.key: pair.value for pair in status.values}
-        alone.append((int(values["n_views"]), float(values["probability"])))
+        alone.append((int(values["n_views"]), json.loads(values["probabilities"])[0]))
         if alone[-1][1] >= 0.95:
             break
     n_views, probability = alone[-1]

@@ -30,6 +30,15 @@ class SequenceResult:
     n_views: int  # localized jointly
     contradiction: str = ""  # between the odometry and the images
 
+    @property
+    def reason(self) -> str:
+        """Say why the pose is not more probable."""
+        joint = self.localization.joint
+        if not self.localization.poses:
+            return f"lost: {joint.n_matches} matches with the map support no pose"
+        support = f"{joint.n_inliers} of {joint.n_matches} matches, {len(joint.rivals)} rivals"
+        return f"lost: probability {self.localization.probability:.2f}, {support}"
+
 
 class ImageSequence:
     """Keeps the last views from about one location, until an image is localized by itself.

@@ -22,6 +22,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -50,6 +51,7 @@ FORMAT_VERSION = 1  # of the folder, as in export.py
 GROUP = 32  # landmarks; the best groups are selected first, and in them the best landmarks
 NEAREST = 16  # landmarks of each keypoint
 BLOCK = 256  # keypoints compared at a time
+MAX_FOCAL_RATIO = 1.5  # between a camera and that of the folder
 TURN_NOISE_DEG = 0.2  # of given rotations, one standard deviation about each axis
 
 
@@ -101,8 +103,8 @@ class RobotLocalizer:
         about = json.loads((folder / "robot.json").read_text(encoding="utf-8"))
         if about.get("format_version") != FORMAT_VERSION:
             raise ValueError(f"{folder}: this program reads format {FORMAT_VERSION}. Export again.")
-        same = {"scale": 1, "rotation": np.eye(3), "translation": np.zeros(3)}
-        frame = same if in_world else about["world_from_map"]
+        identity: dict[str, Any] = {"scale": 1, "rotation": np.eye(3), "translation": np.zeros(3)}
+        frame = identity if in_world else about["world_from_map"]
         camera = about["camera"]
         self._scale = float(frame["scale"])  # metres in a unit of the map
         self._rotation = np.array(frame["rotation"], dtype=np.float64).reshape(3, 3)
@@ -142,6 +144,13 @@ class RobotLocalizer:
             grey = np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
         keypoints = self._sift.extract(grey)
         return keypoints.pixels / np.float32(min(scale, 1)), quantize_descriptors(keypoints.descriptors)
+
+    def difference(self, camera: PinholeCamera) -> str:
+        """Say how much the focal length of a camera differs from the folder's; empty if that hardly matters."""
+        ratio = camera.fx / camera.width * self.camera.width / self.camera.fx
+        if 1 / MAX_FOCAL_RATIO < ratio < MAX_FOCAL_RATIO:
+            return ""
+        return f"the focal length is {ratio:.2f} times that of the robot's folder"
 
     def match(
         self,

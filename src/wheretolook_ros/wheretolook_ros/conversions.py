@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose, Quaternion
+from geometry_msgs.msg import Point, Pose, Quaternion, Vector3, Vector3Stamped
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
@@ -19,15 +19,18 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 Array = NDArray[Any]
 
 REC_709 = np.array((0.2126, 0.7152, 0.0722), dtype=np.float32)  # weights of red, green and blue, as in the maps
-COLORS = {"rgb8": "rgb", "bgr8": "bgr", "rgba8": "rgba", "bgra8": "bgra", "8UC3": "bgr"}
-GREYS = {"mono8": 1, "8UC1": 1, "mono16": 2, "16UC1": 2}  # bytes of a pixel
 BAYERS = {
     "bayer_rggb8": cv2.COLOR_BayerRGGB2RGB,
     "bayer_bggr8": cv2.COLOR_BayerBGGR2RGB,
     "bayer_gbrg8": cv2.COLOR_BayerGBRG2RGB,
     "bayer_grbg8": cv2.COLOR_BayerGRBG2RGB,
 }
-PLUMB_BOB = ("plumb_bob", "rational_polynomial", "thin_prism")  # models of cv2.undistortPoints
+BYTES = {"mono8": 1, "mono16": 2, "rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4} | dict.fromkeys(BAYERS, 1)  # of a pixel
+UNDISTORT: dict[str, Any] = {
+    "plumb_bob": cv2.undistortPoints,
+    "rational_polynomial": cv2.undistortPoints,
+    "equidistant": cv2.fisheye.undistortPoints,
+}
 
 
 def seconds(stamp: Time) -> float:
@@ -43,22 +46,23 @@ def grey_image(message: Image | CompressedImage) -> NDArray[np.uint8]:
             raise ValueError(f"a compressed image of format {message.format!r} cannot be decoded")
         return _grey(decoded, "bgr")
     encoding = message.encoding
-    if encoding not in {*COLORS, *GREYS, *BAYERS}:
+    size = BYTES.get(encoding)
+    if size is None:
         raise ValueError(f"the encoding {encoding!r} is not supported")
-    width = message.width * len(COLORS.get(encoding, " ")) * GREYS.get(encoding, 1)
+    width = message.width * size
     data = np.frombuffer(message.data, dtype=np.uint8)
-    if message.width == 0 or message.step < width or len(data) != message.step * message.height:
+    if width == 0 or message.step < width or len(data) != message.step * message.height:
         raise ValueError(f"{len(data)} bytes are no image of {message.width} x {message.height} px, {encoding}")
     rows = np.ascontiguousarray(data.reshape(message.height, message.step)[:, :width])
     if encoding in BAYERS:
         return _grey(cv2.cvtColor(rows, BAYERS[encoding]), "rgb")
-    if encoding in COLORS:
-        return _grey(rows.reshape(message.height, message.width, -1), COLORS[encoding])
-    return rows if GREYS[encoding] == 1 else rows[:, 0 if message.is_bigendian else 1 :: 2]
+    if size > 2:
+        return _grey(rows.reshape(message.height, message.width, size), encoding)
+    return rows[:, size - 1 - message.is_bigendian :: size] if size == 2 else rows
 
 
 def _grey(image: Array, channels: str) -> NDArray[np.uint8]:
-    weights = np.zeros((1, len(channels)), dtype=np.float32)
+    weights = np.zeros((1, image.shape[2]), dtype=np.float32)
     weights[0, [channels.index(name) for name in "rgb"]] = REC_709
     return np.asarray(cv2.transform(image, weights), dtype=np.uint8)
 
@@ -79,11 +83,8 @@ def pinhole_of(info: CameraInfo, rectified: bool) -> tuple[Array, Callable[[Arra
     distortion = np.array(info.d, dtype=np.float64)
     if rectified or not distortion.any():
         return moved, lambda pixels: pixels
-    if info.distortion_model in PLUMB_BOB:
-        undistort = cv2.undistortPoints
-    elif info.distortion_model == "equidistant":
-        undistort = cv2.fisheye.undistortPoints
-    else:
+    undistort = UNDISTORT.get(info.distortion_model)
+    if undistort is None:
         raise ValueError(f"the distortion model {info.distortion_model!r} is not supported")
 
     def to_pinhole(pixels: Array) -> Array:
@@ -114,6 +115,15 @@ def pose_message(pose: Array) -> Pose:
     return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
 
 
+def direction_message(direction: Array, frame: str, stamp: Time) -> Vector3Stamped:
+    """Convert a direction (3,) of a frame to a message."""
+    x, y, z = direction.tolist()
+    message = Vector3Stamped(vector=Vector3(x=x, y=y, z=z))
+    message.header.frame_id = frame
+    message.header.stamp = stamp
+    return message
+
+
 def compose(a: Array, b: Array) -> Array:
     """Compose poses (3, 4)."""
     return np.column_stack([a[:, :3] @ b[:, :3], a[:, :3] @ b[:, 3] + a[:, 3]])
@@ -127,5 +137,5 @@ def inverse(pose: Array) -> Array:
 def moved_covariance(covariance: Array, lever: Array) -> Array:
     """Move a covariance (6, 6) of position and rotation to a point of the same rigid body, `lever` (3,) away."""
     jacobian = np.eye(6)
-    jacobian[:3, 3:] = -np.cross(lever, np.eye(3)).T
+    jacobian[:3, 3:] = np.cross(np.eye(3), lever).T
     return np.asarray(jacobian @ covariance @ jacobian.T)

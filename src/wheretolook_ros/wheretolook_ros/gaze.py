@@ -8,48 +8,28 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Duration
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Vector3, Vector3Stamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Vector3Stamped
 from nav_msgs.msg import Path
+from rclpy.duration import Duration
+from scipy.spatial.transform import Rotation
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from wheretolook_ros.conversions import Array, compose, pose_matrix, pose_message
-from wheretolook_ros.node import ERROR, OK, WARN, RobotNode, run
+from wheretolook_ros.conversions import Array, compose, direction_message, pose_matrix, pose_message
+from wheretolook_ros.node import OK, WARN, RobotNode, run
 
-PARAMETERS: dict[str, Any] = {
-    "directions": 200,
-    "spacing_m": 0.5,
-    "max_turn_deg": 60.0,
-    "min_score": 0.5,
-    "turn_duration_s": 0.5,
-}
-MODULES = (
-    "wheretolook_robot",
-    "wheretolook_localization.planning.view_sequence",
-    "wheretolook_localization.geometry.poses",
-)
-REUSED = 0.3, 15.0  # metres and degrees of the base within which the best view is not searched again
+REUSED_M = 0.3  # within which the best view is not searched again
 
 
 class GazeNode(RobotNode):
     """Publishes where the head looks."""
 
     def __init__(self) -> None:
-        super().__init__("gaze", PARAMETERS)
-        self._scorer: Any = None
-        self._best: tuple[Array, Array] | None = None  # pose of the base, and direction in the map
-        self._path = np.zeros((0, 3, 4))  # of the base
-        self._directions = np.zeros((0, 3))  # along the path, in the map
-        modules = self.load(*MODULES)
-        if modules is not None:
-            try:
-                self._scorer = modules[0].RobotScorer(self.settings["folder"])
-                self._axes = modules[0].fibonacci_sphere(self.settings["directions"])
-                self._limit = modules[1].TurnLimit.of(self._axes, self.settings["max_turn_deg"], pan_tilt=True)
-                self._best_sequence = modules[1].best_sequence
-                self._looking_along = modules[2].rotation_looking_along
-            except (OSError, ValueError, AttributeError, TypeError) as error:
-                self.report(ERROR, f"the robot's folder cannot be used: {error}")
+        super().__init__("gaze")
+        self._location = np.full(3, np.inf)  # of the base, where the best direction was searched last
+        self._path = np.zeros((0, 3, 4))  # poses of the base
+        package = "wheretolook_localization"
+        modules = "wheretolook_robot", f"{package}.planning.view_sequence", f"{package}.geometry.poses"
+        self._usable = self.open_folder(self._open, *modules)
         self._joints = self.create_publisher(JointTrajectory, "joint_trajectory", 10)
         self._gaze = self.create_publisher(Vector3Stamped, "gaze/direction", 10)
         self._views = self.create_publisher(Path, "gaze/views", 10)
@@ -57,47 +37,49 @@ class GazeNode(RobotNode):
         self.create_subscription(Vector3Stamped, "visual_localization/next_look", self._on_next_look, 10)
         self.create_subscription(Path, "plan", self._on_path, 10)
 
+    def _open(self, robot: Any, view_sequence: Any, poses: Any) -> None:
+        self._scorer = robot.RobotScorer(self.settings["folder"])
+        self._axes = robot.fibonacci_sphere(self.settings["directions"])
+        self._limit = view_sequence.TurnLimit.of(self._axes, self.settings["max_turn_deg"], pan_tilt=True)
+        self._best_sequence = view_sequence.best_sequence
+        self._looking_along = poses.rotation_looking_along
+
     def _on_next_look(self, message: Vector3Stamped) -> None:
-        """Look where the localizer asks, in the base."""
-        if message.header.frame_id != self.settings["base_frame"]:
-            self.report(WARN, f"a next view in the frame {message.header.frame_id!r} cannot be used")
-            return
-        self._look(np.array([message.vector.x, message.vector.y, message.vector.z]), "looking to be localized")
+        """Look where the localizer asks."""
+        try:
+            self.check_frame(message, "base_frame")
+            vector = message.vector
+            self._look(np.array([vector.x, vector.y, vector.z]), "looking to be localized")
+        except ValueError as error:
+            self.report(WARN, f"a next view cannot be used: {error}")
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         """Look along the nearest view of the path, or else along the best view here."""
-        base = self._usable(message)
-        if base is None:
+        if not self._usable:
+            self.report(*self.reported)
             return
-        direction = self._of_path(base)
-        if direction is None:
-            direction = self._of_place(base)
-        if direction is not None:
+        try:
+            self.check_frame(message, "map_frame")
+            base = pose_matrix(message.pose.pose)
+            distance = np.linalg.norm(self._path[:, :, 3] - base[:, 3], axis=1)
+            if distance.min(initial=np.inf) <= self.settings["spacing_m"]:
+                direction = self._path_directions[distance.argmin()]
+            else:
+                direction = self._best(base)
             self._look(direction @ base[:, :3], "looking along the best view")
+        except ValueError as error:
+            self.report(WARN, f"no view at this pose: {error}")
 
-    def _of_path(self, base: Array) -> Array | None:
-        if len(self._path) == 0:
-            return None
-        distance = np.linalg.norm(self._path[:, :, 3] - base[:, 3], axis=1)
-        nearest = int(distance.argmin())
-        return self._directions[nearest] if distance[nearest] <= self.settings["spacing_m"] else None
-
-    def _of_place(self, base: Array) -> Array | None:
-        if self._best is not None:
-            then, direction = self._best
-            cosine = (np.trace(then[:, :3].T @ base[:, :3]) - 1) / 2
-            turned = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-            if np.linalg.norm(then[:, 3] - base[:, 3]) <= REUSED[0] and turned <= REUSED[1]:
-                return direction
-        scores = self._scores(base)
-        if np.isneginf(scores).all():
-            self.report(WARN, "no direction is within the limits of the head")
-            return None
-        best = int(scores.argmax())
-        if scores[best] < self.settings["min_score"]:
-            self.report(WARN, f"no view here is likely to localize: {scores[best]:.2f}")
-        self._best = base, self._axes[best]
-        return np.asarray(self._axes[best])
+    def _best(self, base: Array) -> Array:
+        """The direction in the map that scores best here, or nearby and still within the limits."""
+        near = np.linalg.norm(base[:, 3] - self._location) <= REUSED_M
+        if not near or not self.head.allows(self._direction[None] @ base[:, :3])[0]:
+            scores = self._scores(base)
+            if scores.max() < self.settings["min_score"]:
+                raise ValueError(f"the best score within the limits of the head is {scores.max():.2f}")
+            self._location = base[:, 3]
+            self._direction = self._axes[scores.argmax()]
+        return self._direction
 
     def _scores(self, base: Array) -> Array:
         """Scores (D,) of directions in the map; -inf outside of the head's limits."""
@@ -109,75 +91,46 @@ class GazeNode(RobotNode):
         return scores
 
     def _on_path(self, message: Path) -> None:
-        """Choose a view for each waypoint of a path, `spacing_m` apart, with limited turns between them."""
-        if message.header.frame_id != self.settings["map_frame"] or self._scorer is None:
-            self.report(WARN, f"a path in the frame {message.header.frame_id!r} cannot be used")
-            return
-        try:
-            points = np.array([pose_matrix(pose.pose)[:, 3] for pose in message.poses]).reshape(-1, 3)
-            self._path = _waypoints(points, self.settings["spacing_m"])
-            if len(self._path):
-                scores = np.stack([self._scores(base) for base in self._path])
-                chosen = self._best_sequence(scores, self._limit)
-                self._directions = self._axes[chosen.direction_ids]
-        except Exception as error:  # a path without views: the best view at each pose remains
-            self._path = self._path[:0]
-            self.report(WARN, f"no views along the path: {error}")
-            return
+        """Choose and publish a view for each waypoint of a path, with limited turns between them."""
         views = Path(header=message.header)
-        for base, direction in zip(self._path, self._directions, strict=True):
+        self._path = self._path[:0]
+        try:
+            self.check_frame(message, "map_frame")
+            if not self._usable or not message.poses:
+                raise ValueError("it is empty, or the robot's folder cannot be used")
+            points = np.array([pose_matrix(pose.pose)[:, 3] for pose in message.poses])
+            path = _waypoints(points, self.settings["spacing_m"])
+            chosen = self._best_sequence(np.stack([self._scores(base) for base in path]), self._limit)
+        except Exception as error:  # of the folder's modules, too
+            self.report(WARN, f"no views along a path: {error}")
+            return
+        self._path = path
+        self._path_directions = self._axes[chosen.direction_ids]
+        for base, rotation in zip(path, self._looking_along(self._path_directions), strict=True):
             camera = compose(base, self.head.base_from_camera(0.0, 0.0))
-            camera[:, :3] = self._looking_along(direction).T
+            camera[:, :3] = rotation.T
             views.poses.append(PoseStamped(header=message.header, pose=pose_message(camera)))
         self._views.publish(views)
 
-    def _usable(self, message: PoseWithCovarianceStamped) -> Array | None:
-        if self._scorer is None:
-            self.report(*self._reported)
-            return None
-        try:
-            if message.header.frame_id != self.settings["map_frame"]:
-                raise ValueError(f"its frame is {message.header.frame_id!r}")
-            return pose_matrix(message.pose.pose)
-        except ValueError as error:
-            self.report(WARN, f"a pose cannot be used: {error}")
-            return None
-
     def _look(self, direction: Array, why: str) -> None:
-        """Publish a direction (3,) of the base, and the joints that look along it."""
+        """Publish a direction (3,) of the base, within the limits, and the joints that look along it."""
         joints = self.head.joints(direction)
-        now = self.get_clock().now().to_msg()
         axis = self.head.base_from_camera(*joints)[:, 2]
-        gaze = Vector3Stamped(vector=Vector3(**dict(zip("xyz", axis.tolist(), strict=True))))
-        gaze.header.stamp = now
-        gaze.header.frame_id = self.settings["base_frame"]
-        self._gaze.publish(gaze)
-        seconds = self.settings["turn_duration_s"]
-        reached = Duration(sec=int(seconds), nanosec=int(seconds % 1 * 1e9))
+        self._gaze.publish(direction_message(axis, self.settings["base_frame"], self.get_clock().now().to_msg()))
+        reached = Duration(seconds=self.settings["turn_duration_s"]).to_msg()
         point = JointTrajectoryPoint(positions=list(joints), time_from_start=reached)
-        trajectory = JointTrajectory(
-            joint_names=[self.settings["pan_joint"], self.settings["tilt_joint"]], points=[point]
-        )
-        self._joints.publish(trajectory)
-        self.report(OK, why, pan_deg=f"{np.degrees(joints[0]):.1f}", tilt_deg=f"{np.degrees(joints[1]):.1f}")
+        names = [self.settings["pan_joint"], self.settings["tilt_joint"]]
+        self._joints.publish(JointTrajectory(joint_names=names, points=[point]))
+        self.report(OK, why)
 
 
 def _waypoints(points: Array, spacing: float) -> Array:
-    """Poses (W, 3, 4) of the base at points of a path (N, 3) at least `spacing` apart, with x along the path."""
-    kept: list[int] = []
-    for row, point in enumerate(points):
-        if not kept or np.linalg.norm(point - points[kept[-1]]) >= spacing:
-            kept.append(row)
-    poses = np.zeros((len(kept), 3, 4))
-    for pose, row in zip(poses, kept, strict=True):
-        ahead = (
-            points[min(row + 1, len(points) - 1)] - points[min(row, len(points) - 2)] if len(points) > 1 else (1, 0, 0)
-        )
-        yaw = np.arctan2(ahead[1], ahead[0])
-        pose[:] = np.column_stack(
-            [[[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]], points[row]]
-        )
-    return poses
+    """Poses (W, 3, 4) of the base every `spacing` along a path (N, 3), with x along the path."""
+    steps = np.gradient(points, axis=0) if len(points) > 1 else np.array([(1.0, 0, 0)])
+    lengths = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=1).cumsum()
+    rows = np.searchsorted(lengths, np.arange(0, lengths[-1] + 1e-6, spacing) - 1e-6)
+    yaws = np.arctan2(steps[rows, 1], steps[rows, 0])
+    return np.concatenate([Rotation.from_euler("z", yaws[:, None]).as_matrix(), points[rows, :, None]], axis=2)
 
 
 def main() -> None:

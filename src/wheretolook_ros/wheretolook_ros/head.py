@@ -13,6 +13,11 @@ from wheretolook_ros.conversions import Array
 OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # axes of the optical frame in one with x forward, z up
 
 
+ROUNDING_DEG = 1e-6
+KEPT_S = 10.0  # of a timeline
+TOLERANCE_S = 0.1  # between a time and the nearest value
+
+
 @dataclass(frozen=True)
 class Head:
     """A head at (x, y, z) m with (roll, pitch, yaw) degrees in the base; the camera is where pan and tilt axes meet.
@@ -31,17 +36,21 @@ class Head:
 
     def joints(self, direction: Array) -> tuple[float, float]:
         """Pan and tilt in radians, within the limits, that look most nearly along a direction (3,) of the base."""
-        x, y, z = self._rotation().inv().apply(direction / np.linalg.norm(direction))
-        pan, tilt = np.radians([self.pan_deg, self.tilt_deg])
-        return float(np.clip(np.arctan2(y, x), *pan)), float(np.clip(-np.arcsin(np.clip(z, -1, 1)), *tilt))
+        limits = np.array([self.pan_deg, self.tilt_deg])
+        pan, tilt = np.radians(np.clip(self._angles_deg(direction), limits[:, 0], limits[:, 1]))
+        return float(pan), float(tilt)
 
     def allows(self, directions: Array) -> Array:
         """Which directions (D, 3) of the base are within the limits, (D,) bool."""
-        x, y, z = self._rotation().inv().apply(directions).T
-        pan = np.degrees(np.arctan2(y, x))
-        tilt = -np.degrees(np.arcsin(np.clip(z, -1, 1)))
-        low, high = np.transpose([self.pan_deg, self.tilt_deg])
-        return np.asarray((pan >= low[0]) & (pan <= high[0]) & (tilt >= low[1]) & (tilt <= high[1]))
+        angles = self._angles_deg(directions)
+        limits = np.array([self.pan_deg, self.tilt_deg])
+        inside = (angles >= limits[:, 0] - ROUNDING_DEG) & (angles <= limits[:, 1] + ROUNDING_DEG)
+        return np.asarray(inside.all(axis=1))
+
+    def _angles_deg(self, directions: Array) -> Array:
+        """Pan and tilt (..., 2) of directions (..., 3) of the base."""
+        x, y, z = np.moveaxis(self._rotation().inv().apply(directions), -1, 0)
+        return np.degrees(np.stack([np.arctan2(y, x), -np.arctan2(z, np.hypot(x, y))], axis=-1))
 
     def _rotation(self) -> Rotation:
         return Rotation.from_euler("xyz", self.mount[3:], degrees=True)
@@ -51,8 +60,6 @@ class Head:
 class Timeline:
     """Values (N,) by their time, of the last seconds."""
 
-    keep_s: float = 10.0
-    tolerance_s: float = 0.1
     times: list[float] = field(default_factory=list)
     values: list[Array] = field(default_factory=list)
 
@@ -60,24 +67,20 @@ class Timeline:
         """Add a value; returns False, and forgets the earlier ones, if time jumped back."""
         forward = not self.times or time >= self.times[-1]
         if not forward:
-            self.clear()
+            self.times.clear()
+            self.values.clear()
         self.times.append(time)
         self.values.append(value)
-        old = bisect.bisect_left(self.times, time - self.keep_s)
+        old = bisect.bisect_left(self.times, time - KEPT_S)
         del self.times[:old], self.values[:old]
         return forward
 
-    def clear(self) -> None:
-        """Forget all values."""
-        self.times.clear()
-        self.values.clear()
-
     def at(self, time: float) -> Array | None:
-        """Interpolate linearly; None more than `tolerance_s` away from all values."""
+        """Interpolate linearly; None more than `TOLERANCE_S` away from all values."""
         after = bisect.bisect_left(self.times, time)
         rows = slice(max(after - 1, 0), after + 1)
         times = np.array(self.times[rows])
-        if len(times) == 0 or np.abs(times - time).min() > self.tolerance_s:
+        if len(times) == 0 or np.abs(times - time).min() > TOLERANCE_S:
             return None
         values = np.array(self.values[rows])
         if len(values[0]) == 7 and values[0, 3:] @ values[-1, 3:] < 0:  # the same rotation by the other quaternion

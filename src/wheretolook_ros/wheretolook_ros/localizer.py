@@ -9,7 +9,7 @@ import time
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseWithCovarianceStamped, Vector3, Vector3Stamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, Vector3Stamped
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import QoSPresetProfiles, QoSProfile, ReliabilityPolicy
@@ -19,6 +19,7 @@ from std_srvs.srv import Trigger
 from wheretolook_ros.conversions import (
     Array,
     compose,
+    direction_message,
     grey_image,
     inverse,
     moved_covariance,
@@ -31,20 +32,6 @@ from wheretolook_ros.conversions import (
 from wheretolook_ros.head import Timeline
 from wheretolook_ros.node import ERROR, OK, WARN, RobotNode, run
 
-PARAMETERS: dict[str, Any] = {
-    "enable_continuous_localization": True,
-    "confidence": 0.95,
-    "accuracy_m": 0.05,
-    "accuracy_deg": 0.4,
-    "image_qos": "sensor_data",
-    "rectified": False,
-    "next_look": True,
-    "max_views": 4,
-    "max_move_m": 0.3,
-    "turn_noise_deg": 0.2,
-    "image_timeout_s": 2.0,
-}
-MODULES = ("wheretolook_localization", "wheretolook_localization.geometry.camera", "wheretolook_robot")
 POLL_S = 0.01
 WAIT_S = 0.2  # for odometry and joint states that are not older than the image
 
@@ -53,20 +40,18 @@ class LocalizerNode(RobotNode):
     """Localizes the newest image; by odometry jointly with those before it from the same location."""
 
     def __init__(self) -> None:
-        super().__init__("visual_localization", PARAMETERS)
+        super().__init__("visual_localization")
         self._image: Image | CompressedImage | None = None
         self._pending = False
         self._arrived = time.monotonic()
         self._info: CameraInfo | None = None
-        self._prior: tuple[float, ...] | None = None
+        self._prior: list[float] | None = None
         self._odometry = Timeline()
         self._joints = Timeline()
         self._last_stamp = -np.inf
-        self._sequence: Any = None
         self._scorer: Any = None
-        modules = self.load(*MODULES)
-        if modules is not None:
-            self._open(*modules)
+        package = "wheretolook_localization"
+        self._usable = self.open_folder(self._open, package, f"{package}.geometry.camera", "wheretolook_robot")
         self._poses = self.create_publisher(PoseWithCovarianceStamped, "visual_localization/pose", 10)
         self._looks = self.create_publisher(Vector3Stamped, "visual_localization/next_look", 10)
         sensor = QoSPresetProfiles.get_from_short_key(self.settings["image_qos"])
@@ -84,17 +69,13 @@ class LocalizerNode(RobotNode):
 
     def _open(self, package: Any, camera: Any, robot: Any) -> None:
         folder = self.settings["folder"]
-        try:
-            localizer = package.RobotLocalizer(folder, self.settings["turn_noise_deg"], in_world=True)
-            accuracy = self.settings["accuracy_m"], self.settings["accuracy_deg"]
-            views = self.settings["max_views"], self.settings["max_move_m"]
-            self._sequence = package.ImageSequence(localizer, self.settings["confidence"], accuracy, *views)
-            self._pinhole = camera.PinholeCamera
-            if self.settings["next_look"]:
-                self._scorer = robot.RobotScorer(folder)
-        except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
-            self._sequence = None
-            self.report(ERROR, f"the robot's folder cannot be used: {error}")
+        localizer = package.RobotLocalizer(folder, self.settings["turn_noise_deg"], in_world=True)
+        accuracy = self.settings["accuracy_m"], self.settings["accuracy_deg"]
+        views = self.settings["max_views"], self.settings["max_move_m"]
+        self._sequence = package.ImageSequence(localizer, self.settings["confidence"], accuracy, *views)
+        self._pinhole = camera.PinholeCamera
+        if self.settings["next_look"]:
+            self._scorer = robot.RobotScorer(folder)
 
     def _on_image(self, message: Image | CompressedImage) -> None:
         self._image = message
@@ -112,8 +93,8 @@ class LocalizerNode(RobotNode):
     def _on_joints(self, message: JointState) -> None:
         known = dict(zip(message.name, message.position, strict=False))
         names = self.settings["pan_joint"], self.settings["tilt_joint"]
-        if {*names} & {*known}:
-            self._add(self._joints, message, [known.get(name, 0.0) for name in names], "joint states")
+        if all(name in known for name in names):
+            self._add(self._joints, message, [known[name] for name in names], "joint states")
 
     def _add(self, timeline: Timeline, message: Odometry | JointState, values: list[float], name: str) -> None:
         if not np.isfinite(values).all():
@@ -125,20 +106,18 @@ class LocalizerNode(RobotNode):
         """Forget earlier images and positions."""
         self.report(WARN, f"{reason}: earlier images are forgotten")
         self._last_stamp = -np.inf
-        if self._sequence is not None:
+        if self._usable:
             self._sequence.reset()
 
     def _on_prior(self, message: PoseWithCovarianceStamped) -> None:
-        frame = message.header.frame_id
         try:
-            if frame != self.settings["map_frame"]:
-                raise ValueError(f"its frame is {frame!r}, not {self.settings['map_frame']!r}")
+            self.check_frame(message, "map_frame")
             camera = compose(pose_matrix(message.pose.pose), self.head.base_from_camera(0.0, 0.0))
         except ValueError as error:
             self.report(WARN, f"an initial pose cannot be used: {error}")
             return
-        self._prior = tuple(camera[:, 3].tolist())  # where the head looks is known from an image at the earliest
-        if self._sequence is not None:
+        self._prior = camera[:, 3].tolist()  # where the head looks is known from an image at the earliest
+        if self._usable:
             self._sequence.reset()
 
     def _on_trigger(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -160,16 +139,16 @@ class LocalizerNode(RobotNode):
     def _watch(self) -> None:
         """Report that no image arrives."""
         silence = time.monotonic() - self._arrived
-        if self._sequence is None:
-            self.report(*self._reported)
+        if not self._usable:
+            self.report(*self.reported)
         elif silence > self.settings["image_timeout_s"]:
-            self.report(ERROR, "no image arrives", seconds_without_image=f"{silence:.0f}")
+            self.report(ERROR, "no image arrives", seconds=round(silence))
 
     def _localize(self, message: Image | CompressedImage) -> tuple[bool, str]:
         """Localize an image, publish the pose or report why there is none; returns whether it is confident."""
         self._pending = False
-        if self._sequence is None:
-            return False, self._reported[1]
+        if not self._usable:
+            return False, self.reported[1]
         stamp = seconds(message.header.stamp)
         if stamp < self._last_stamp:
             self._restart(f"the time of images jumped back by {self._last_stamp - stamp:.2f} s")
@@ -179,33 +158,31 @@ class LocalizerNode(RobotNode):
             view, problem = self._matched(message)
             base_from_camera, camera_from_odom = self._camera_at(stamp)
             result = self._sequence.add(view, camera_from_odom)
-            poses = result.localization.poses
-            confident = result.localization.probability >= self.settings["confidence"]
+            best = result.localization
+            confident = best.probability >= self.settings["confidence"]
             if confident:
                 self._prior = None
-                self._publish(poses[0], base_from_camera, message)
+                self._publish(best.poses[0], base_from_camera, message)
             else:
-                problem = _reason(result) + self._ask(result, base_from_camera, message)
+                problem = result.reason + self._ask(best, base_from_camera, message)
         except Exception as error:  # whatever one image holds, the next one is localized
             self.report(ERROR, f"an image cannot be localized: {error}")
             return False, str(error)
         finally:
             self._arrived = time.monotonic()
         problem = "; ".join(filter(None, (problem, result.contradiction)))
-        joint = result.localization.joint
         self.report(
             WARN if problem else OK,
             problem or "localized",
-            probability=f"{result.localization.probability:.4f}",
-            rivals=len(poses) - 1 if poses else 0,
-            rival_probability=f"{max([0.0, *(pose.probability for pose in poses[1:])]):.4f}",
-            n_matches=joint.n_matches,
-            n_inliers=joint.n_inliers,
+            image=f"{stamp:.6f}",
+            probabilities=[round(pose.probability, 4) for pose in best.poses],
+            n_matches=best.joint.n_matches,
+            n_inliers=best.joint.n_inliers,
             n_views=result.n_views,
-            odometry="used" if camera_from_odom is not None else "none at the time of the image",
-            seconds=f"{time.monotonic() - started:.3f}",
+            odometry=camera_from_odom is not None,
+            seconds=f"{self._arrived - started:.3f}",
         )
-        return bool(confident), problem or "localized"
+        return confident, problem or "localized"
 
     def _matched(self, message: Image | CompressedImage) -> tuple[Any, str]:
         """Match an image with the map; also returns what is unusual about its camera. Raises ValueError."""
@@ -221,9 +198,7 @@ class LocalizerNode(RobotNode):
         localizer = self._sequence.localizer
         pixels, descriptors = localizer.extract(grey)
         view = localizer.match(to_pinhole(pixels), descriptors, camera, self._prior)
-        ratio = camera.fx / camera.width * localizer.camera.width / localizer.camera.fx
-        same = 1 / 1.5 < ratio < 1.5
-        return view, "" if same else f"the focal length is {ratio:.2f} times that of the robot's folder"
+        return view, localizer.difference(camera)
 
     def _camera_at(self, stamp: float) -> tuple[Array, Array | None]:
         """Poses (3, 4) of the camera in the base and of odometry in the camera, None if that is unknown then."""
@@ -248,35 +223,20 @@ class LocalizerNode(RobotNode):
         message.pose.covariance = moved_covariance(pose.covariance, lever).ravel().tolist()
         self._poses.publish(message)
 
-    def _ask(self, result: Any, base_from_camera: Array, image: Image | CompressedImage) -> str:
+    def _ask(self, best: Any, base_from_camera: Array, image: Image | CompressedImage) -> str:
         """Publish the next view, as a direction in the base; returns what prevents it."""
         if self._scorer is None:
             return ""
-        up = base_from_camera[2, :3]
-        pan = -np.degrees(self.head.joints(base_from_camera[:, 2])[0])
-        limits = None
-        if np.ptp(self.head.pan_deg) < 360:
-            limits = pan + self.head.pan_deg[0], pan + self.head.pan_deg[1]
         pitch = -self.head.tilt_deg[1], -self.head.tilt_deg[0]
+        pan = np.degrees(self.head.joints(base_from_camera[:, 2])[0])
+        limits = np.subtract(self.head.pan_deg, pan)
         try:
-            chosen = self._sequence.localizer.next_look(result.localization, self._scorer, pitch, limits, up)
-        except Exception as error:
+            chosen = self._sequence.localizer.next_look(best, self._scorer, pitch, limits, base_from_camera[2, :3])
+        except Exception as error:  # such as limits that leave no further view
             return f"; no next view: {error}"
         axis = base_from_camera[:, :3] @ chosen.cam_from_rig[2]
-        message = Vector3Stamped(vector=Vector3(**dict(zip("xyz", axis.tolist(), strict=True))))
-        message.header.stamp = image.header.stamp
-        message.header.frame_id = self.settings["base_frame"]
-        self._looks.publish(message)
+        self._looks.publish(direction_message(axis, self.settings["base_frame"], image.header.stamp))
         return ""
-
-
-def _reason(result: Any) -> str:
-    """Say why a result is not confident."""
-    joint = result.localization.joint
-    if not result.localization.poses:
-        return f"lost: {joint.n_matches} matches with the map support no pose"
-    text = f"lost: probability {result.localization.probability:.2f}, {joint.n_inliers} of {joint.n_matches} matches"
-    return f"{text}, {len(joint.rivals)} rivals"
 
 
 def main() -> None:

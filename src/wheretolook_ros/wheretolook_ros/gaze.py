@@ -78,7 +78,7 @@ class GazeNode(RobotNode):
             if scores.max() < self.settings["min_score"]:
                 raise ValueError(f"the best score within the limits of the head is {scores.max():.2f}")
             self._location = base[:, 3]
-            self._direction = self._axes[scores.argmax()]
+            self._direction: Array = self._axes[scores.argmax()]
         return self._direction
 
     def _scores(self, base: Array) -> Array:

@@ -37,7 +37,7 @@ from wheretolook.space.free_space import FreeSpace
 EVEN_PAN_DEG = (0, 90, 180, -90, 45, 135, -135, -45)
 LIMITS = (0.05, 0.4), (0.25, 2.0)
 DISTINCT_DEG = 5.0
-PATIENCE_S = 60.0
+PATIENCE_S = 150.0
 REC_709 = (0.2126, 0.7152, 0.0722)
 
 
@@ -179,7 +179,7 @@ def main() -> None:
     node.head = node.create_publisher(JointTrajectory, "joint_trajectory", 10)
     node.create_subscription(PoseStamped, "ground_truth", lambda m: node.received.append(("ground_truth", m)), 50)
     settings = {"folder": options.folder}
-    robot = settings | {"mesh": options.mesh, "rate_hz": 8.0, "turn_rate_deg": 360.0}
+    robot = settings | {"mesh": options.mesh, "rate_hz": 2.0, "turn_rate_deg": 360.0}
     with ExitStack() as stack:
         stack.enter_context(running(str(ROOT / "tests" / "ros" / "simulated_robot.py"), robot))
         stack.enter_context(running("wheretolook_ros.localizer", settings | {"next_look": options.policy == "gain"}))

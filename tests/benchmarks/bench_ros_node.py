@@ -56,6 +56,7 @@ def main() -> None:
     images = [image_of(node.rgb(base)) for base in bases]
     began = time.monotonic()
     with running("wheretolook_ros.localizer", node_settings) as process:
+        node.connected("image", "camera_info", "joint_states")
         node.see(images[0], info_of(CAMERA))
         started = time.monotonic() - began
         print(f"first image localized {started:.1f} s after the start, {cpu_seconds(process.pid):.1f} s of CPU time")

@@ -17,7 +17,7 @@ from selection.room import POINTS, WEIGHTS, write_room
 from twins.open3d_renderer import Open3DRenderer
 from wheretolook import WhereToLook
 from wheretolook.features.keypoints import Keypoints
-from wheretolook.features.matching import Matches
+from wheretolook.features.matches import Matches
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.local_origin import local_origin, poses_from

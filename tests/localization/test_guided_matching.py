@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from tests.localization.test_joint import CAMERA, a_room
 
-from wheretolook.features.matching import Matches
+from wheretolook.features.matches import Matches
 from wheretolook.geometry.poses import pose_error, poses_looking_along, transform
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator

@@ -14,7 +14,7 @@ from one_scene import label_viewpoints
 from wheretolook.dataset.viewpoint_files import FIRST_FIELDS, SCHEMA, read_table, write_table
 from wheretolook.dataset.viewpoint_table import LOCALIZED, by_first, is_good, poses
 from wheretolook.features.keypoints import Keypoints
-from wheretolook.features.matching import Matches
+from wheretolook.features.matches import Matches
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import pose_error, transform
 from wheretolook.localization.config import LabelConfig, LocalizerConfig

@@ -12,7 +12,7 @@ from wheretolook.geometry.poses import Float, poses_looking_along, rotation_angl
 from wheretolook.localization.confidence import RIGHT_PLACE, probabilities
 from wheretolook.localization.rig import Look
 from wheretolook.localization.rig_localization import JointLocalization
-from wheretolook.looks.next_look import MIN_ANGLE_DEG, N_DIRECTIONS, NextLookSelector
+from wheretolook.looks.next_look import MIN_ANGLE_DEG, N_DIRECTIONS, NextLookSelector, mean_scores_by_pitch
 from wheretolook.scorers.base import Scorer
 from wheretolook.utils.errors import PlanningError
 
@@ -27,7 +27,7 @@ def scorer(tmp_path_factory: pytest.TempPathFactory) -> Scorer:
 
 @pytest.fixture(scope="module")
 def selector(scorer: Scorer) -> NextLookSelector:
-    return NextLookSelector(scorer, POINTS)
+    return NextLookSelector(scorer, mean_scores_by_pitch(scorer, POINTS))
 
 
 def localization(

@@ -2,40 +2,67 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from synthetic_dataset import CAMERA, make_landmarks
+from wheretolook import load_scorer
+from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.descriptors import quantize_descriptors
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.matching import DescriptorMatcher, match
-from wheretolook.geometry.poses import Float, pose_error, poses_looking_along, transform
+from wheretolook.features.sift import OpenCvSift
+from wheretolook.geometry.lattices import direction_lattice
+from wheretolook.geometry.local_origin import local_origin
+from wheretolook.geometry.poses import Float, camera_centers, pose_error, poses_looking_along, transform
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer
+from wheretolook.looks.next_look import N_DIRECTIONS, NextLookSelector, mean_scores_by_pitch
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.robot.export import export_robot
 from wheretolook.robot.localizer import RobotLocalizer
 from wheretolook.robot.localizer_export import export_localizer
+from wheretolook.robot.wheretolook_robot import RobotScorer
+from wheretolook.scorers.base import Scorer
 from wheretolook.utils.errors import MapError
 
 BUNDLED = Path("data/release/weights/set.safetensors")
 POSES = poses_looking_along([(-0.5, 0.3, 1.2)] * 2, [(1, 0.2, 0), (0.3, 1, 0)])
+PLACES = [(-0.5, 0.3, 1.2), (0.4, -0.6, 1.5), (0.8, 0.8, 1.0)]
 RUN = """
 import sys
-blocked = ("torch", "warp", "onnx", "onnxruntime", "pycolmap", "pandas", "cv2", "wheretolook")
+blocked = ("torch", "warp", "onnx", "pycolmap", "pandas", "cv2", "wheretolook")
 sys.modules.update(dict.fromkeys(blocked, None))  # importing these fails
 import numpy as np
 from wheretolook_localization import RobotLocalizer
+from wheretolook_robot import RobotScorer
 views = np.load("views.npz")
-np.save("pose.npy", RobotLocalizer(".").localize([(views["pixels"], views["descriptors"])])[0].cam_from_world)
+localizer = RobotLocalizer(".")
+result = localizer.localize([localizer.match(views["pixels"], views["descriptors"])])
+np.save("pose.npy", result.poses[0].cam_from_world)
+np.save("next.npy", localizer.next_look(result, RobotScorer(".")).cam_from_rig)
 """
+
+
+@dataclass
+class ByPose:
+    """A scorer that samples the landmarks of each view as the robot does."""
+
+    scorer: Scorer
+
+    def score_directions(self, locations: Float, directions: Float) -> Float:
+        return Scorer.score_directions(self.scorer, locations, directions)
 
 
 def described() -> Landmarks:
@@ -60,8 +87,9 @@ def view_of(landmarks: Landmarks, pose: Float) -> tuple[np.ndarray, np.ndarray]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("robot")
-    export_localizer(described(), described().ids, out)
-    return export_robot(LocalizationMap(described(), CAMERA), BUNDLED, out)
+    source = LocalizationMap(described(), CAMERA)
+    export_localizer(described(), described().ids, mean_scores_by_pitch(load_scorer(source), PLACES), out)
+    return export_robot(source, BUNDLED, out)
 
 
 def test_poses_are_those_of_the_localizer(folder: Path) -> None:
@@ -80,41 +108,118 @@ def test_poses_are_those_of_the_localizer(folder: Path) -> None:
         keypoints = Keypoints(pixels, descriptors)
         looks.append(localizer.look(keypoints, match(matcher, [descriptors], 0.85, 16)[0]))
     for view, look, pose in zip(views, looks, POSES, strict=True):
-        best = robot.localize([view])[0]
+        best = robot.localize([robot.match(*view)]).poses[0]
         assert pose_error(best.cam_from_world, pose)[0] < 0.05
-        expected = localizer.joint.localize([look]).rig_from_world
-        assert expected is not None
-        np.testing.assert_allclose(best.cam_from_world, expected, atol=1e-6)
+        expected = localizer.joint.localize([look])
+        assert expected.rig_from_world is not None
+        np.testing.assert_allclose(best.cam_from_world, expected.rig_from_world, atol=1e-6)
+        np.testing.assert_allclose(best.covariance, expected.covariance, rtol=1e-3)
     turns = POSES[:, :, :3] @ POSES[0, :, :3].T
-    assert pose_error(robot.localize(views, turns)[0].cam_from_world, POSES[0])[0] < 0.02
+    rig = robot.localize([robot.match(*view) for view in views], turns)
+    assert pose_error(rig.poses[0].cam_from_world, POSES[0])[0] < 0.02
+    assert rig.probability == rig.poses[0].probability > 0.9
+
+
+def test_the_next_look_is_that_of_the_selector(folder: Path) -> None:
+    scorer = load_scorer(LocalizationMap(described(), CAMERA))
+    selector = NextLookSelector(ByPose(scorer), mean_scores_by_pitch(scorer, PLACES))
+    localizer = RobotLocalizer(folder)
+    robot_scorer = RobotScorer(folder)
+    axes = direction_lattice(40)
+    scores = ByPose(scorer).score_directions(np.asarray(PLACES), axes)
+    np.testing.assert_allclose(robot_scorer.score_directions(PLACES, axes), scores, atol=1e-5)
+    for n_keypoints in (6, 400):  # of too few matches, and of a certain pose
+        pixels, descriptors = view_of(described(), POSES[0])
+        result = localizer.localize([localizer.match(pixels[:n_keypoints], descriptors[:n_keypoints])])
+        for limits in ((-45.0, 45.0), (-10.0, 10.0)):
+            chosen = localizer.next_look(result, robot_scorer, limits, (-120, 120))
+            expected = selector.select(result.joint, None, limits, (-120, 120))
+            np.testing.assert_allclose(chosen.cam_from_rig, expected.cam_from_rig, atol=1e-6)
+            assert chosen.pan_deg == pytest.approx(expected.pan_deg) and limits[0] <= chosen.pitch_deg <= limits[1]
+            assert chosen.gain == pytest.approx(expected.gain, abs=1e-5)
+
+
+def test_a_prior_adds_the_pose_that_ambiguous_matches_hide(tmp_path: Path) -> None:
+    """Of a map that repeats 30 m away with the same descriptors, Lowe's ratio leaves no match without a prior."""
+    one = described()
+    points = np.concatenate([one.points, one.points + np.array((30.0, 0, 0))])
+    columns = {name: np.concatenate([v, v]) for name, v in vars(one).items() if isinstance(v, np.ndarray)}
+    twice = Landmarks(**columns | {"points": points, "ids": np.arange(len(points))})
+    export_localizer(twice, twice.ids, np.zeros(N_DIRECTIONS), tmp_path)
+    export_robot(LocalizationMap(twice, CAMERA), BUNDLED, tmp_path)
+    robot = RobotLocalizer(tmp_path)
+    view = view_of(one, POSES[0])
+    assert not robot.localize([robot.match(*view)]).poses
+    for prior, x in (((0.0, 0.0, 1.2), -0.5), ((30.0, 0.5, 1.2, 15.0), 29.5)):
+        matched = robot.match(*view, prior=prior)
+        assert matched.near_prior[0][0].shape == (3, 4)
+        center = camera_centers(matched.near_prior[0][0]) + local_origin(points)
+        np.testing.assert_allclose(center, (x, 0.3, 1.2), atol=0.05)
 
 
 def test_the_folder_runs_by_itself(folder: Path) -> None:
     pixels, descriptors = view_of(described(), POSES[0])
     np.savez(folder / "views.npz", pixels=pixels, descriptors=descriptors)
     subprocess.run([sys.executable, "-c", RUN], cwd=folder, check=True)
-    expected = RobotLocalizer(folder).localize([(pixels, descriptors)])[0].cam_from_world
-    np.testing.assert_allclose(np.load(folder / "pose.npy"), expected, atol=1e-12)
+    localizer = RobotLocalizer(folder)
+    expected = localizer.localize([localizer.match(pixels, descriptors)])
+    np.testing.assert_allclose(np.load(folder / "pose.npy"), expected.poses[0].cam_from_world, atol=1e-12)
+    chosen = localizer.next_look(expected, RobotScorer(folder))
+    np.testing.assert_allclose(np.load(folder / "next.npy"), chosen.cam_from_rig, atol=1e-9)
+
+
+def test_keypoints_are_those_of_the_extractor(folder: Path) -> None:
+    rng = np.random.default_rng(0)
+    grey = cv2.GaussianBlur(rng.integers(0, 256, (CAMERA.height, CAMERA.width), np.uint8), (0, 0), 3)
+    grey = cv2.normalize(grey, None, 0, 255, cv2.NORM_MINMAX)
+    (expected,) = OpenCvSift(ExtractorConfig()).extract_batch([np.repeat(grey[:, :, None], 3, axis=2)])
+    pixels, descriptors = RobotLocalizer(folder).extract(grey)
+    assert len(pixels) > 50
+    np.testing.assert_array_equal(pixels, expected.pixels)
+    np.testing.assert_array_equal(descriptors, quantize_descriptors(expected.descriptors))
+    double = cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
+    np.testing.assert_allclose(RobotLocalizer(folder).extract(double)[0], 2 * pixels, atol=1e-3)
 
 
 def test_poses_are_in_the_frame_of_the_map(tmp_path: Path) -> None:
     landmarks = described()
     frame = Similarity(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2.0, 3.0]))
-    export_localizer(landmarks, landmarks.ids, tmp_path)
+    export_localizer(landmarks, landmarks.ids, np.zeros(N_DIRECTIONS), tmp_path)
     there = replace(LocalizationMap(landmarks, CAMERA).frame, world_from_map=frame)
     assert isinstance(there, MapFrame)
     export_robot(LocalizationMap(landmarks, CAMERA, frame=there), BUNDLED, tmp_path)
-    pose = RobotLocalizer(tmp_path).localize([view_of(landmarks, POSES[0])])[0].cam_from_world
+    robot = RobotLocalizer(tmp_path)
+    result = robot.localize([robot.match(*view_of(landmarks, POSES[0]))])
     expected = frame.inverse.apply_to_poses(POSES[:1])[0]
-    np.testing.assert_allclose(pose, expected, atol=0.05)
+    np.testing.assert_allclose(result.poses[0].cam_from_world, expected, atol=0.05)
+    own = result.joint.covariance  # in the world, whose y axis is the map's x axis
+    assert result.poses[0].covariance[0, 0] == pytest.approx(own[1, 1] / 4)
+    assert result.poses[0].covariance[3, 1] == pytest.approx(-own[4, 0] / 2)
 
 
 def test_invalid_input_is_rejected(folder: Path, tmp_path: Path) -> None:
     robot = RobotLocalizer(folder)
     view = view_of(described(), POSES[0])
-    assert robot.localize([(np.zeros((0, 2)), np.zeros((0, 128), np.uint8))]) == []
-    for views, turns in [([view, view], None), ([], None), ([view], np.eye(3)), ([(view[0][1:], view[1])], None)]:
+    nothing = robot.localize([robot.match(np.zeros((0, 2)), np.zeros((0, 128), np.uint8))])
+    assert nothing.poses == () and nothing.probability == 0 and nothing.joint.status == "too_few_matches"
+    matched = robot.match(*view)
+    for views, turns in [([matched, matched], None), ([], None), ([matched], np.eye(3))]:
         with pytest.raises(ValueError):
             robot.localize(views, turns)
+    with pytest.raises(ValueError):
+        robot.match(view[0][1:], view[1])
     with pytest.raises(MapError):
-        export_localizer(replace(described(), descriptors=None), described().ids, tmp_path)
+        export_localizer(replace(described(), descriptors=None), described().ids, np.zeros(N_DIRECTIONS), tmp_path)
+
+
+def test_a_folder_of_another_version_is_rejected(folder: Path, tmp_path: Path) -> None:
+    old = shutil.copytree(folder, tmp_path / "old")
+    (old / "mean_scores.npy").unlink()
+    robot = RobotLocalizer(old)
+    result = robot.localize([robot.match(*view_of(described(), POSES[0]))])
+    with pytest.raises(ValueError, match=r"mean_scores.*Export again"):
+        robot.next_look(result, RobotScorer(old))
+    about = json.loads((old / "robot.json").read_text())
+    (old / "robot.json").write_text(json.dumps(about | {"format_version": 0}))
+    with pytest.raises(ValueError, match=r"format 1\. Export again"):
+        RobotLocalizer(old)

@@ -37,8 +37,8 @@ class Export(CameraOptions, FrameOptions):
         database: the map's database, as of `wheretolook select`.
         mesh: a mesh of the scene, for occlusion.
         spacing: of the grid, in metres.
-        localize: also write the SIFT descriptors and the package wheretolook_localization, which localizes views with
-            NumPy, SciPy and PoseLib.
+        localize: also write the SIFT descriptors and the package wheretolook_localization, which localizes views and
+            selects the next with NumPy, SciPy and PoseLib.
     """
 
     WRITES: ClassVar = "robot.json"
@@ -61,7 +61,7 @@ class Export(CameraOptions, FrameOptions):
         from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
         from wheretolook.robot.export import export_robot, pinhole_of
         from wheretolook.select.waypoints import grid_waypoints
-        from wheretolook.weights.resolve import resolve_weights
+        from wheretolook.weights.resolve import load_scorer, resolve_weights
 
         files = ColmapFiles(self.map, mesh=self.mesh, database=self.database, frame=self.frame_options())
         occlusion = "none" if self.mesh is None else "mesh"
@@ -79,11 +79,13 @@ class Export(CameraOptions, FrameOptions):
         weights = or_shipped(self.weights) if self.weights else resolve_weights("set", None, source.landmarks.features)
         assert weights is not None
         if self.localize:
+            from wheretolook.looks.next_look import mean_scores_by_pitch
             from wheretolook.robot.localizer_export import export_localizer
             from wheretolook.select.image_localizer import ImageLocalizer
 
             described = ImageLocalizer.open(self.map, self.database, self.frame_options()).landmarks
-            export_localizer(described, source.landmarks.ids, self.out)
+            scorer = load_scorer(weights, source.of_camera(camera))
+            export_localizer(described, source.landmarks.ids, mean_scores_by_pitch(scorer), self.out)
         export_robot(source.of_camera(camera), weights, self.out, locations)
         print(source.frame.describe())
         print(f"{len(source.landmarks):,} landmarks, a camera of {camera.width} x {camera.height} px: {self.out}")

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from wheretolook.features.opencv_sift import EDGE_THRESHOLD, MAX_KEYPOINTS, PEAK_THRESHOLD
 from wheretolook.features.registry import all_extractors, runnable_extractors
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import sha256
@@ -35,10 +36,10 @@ class ExtractorConfig:
 
     method: str = "opencv"
     first_octave: int = -1
-    max_keypoints: int = 2048
-    peak_threshold: float = 0.02 / 3
+    max_keypoints: int = MAX_KEYPOINTS
+    peak_threshold: float = PEAK_THRESHOLD
     weights: str = ""
-    edge_threshold: float = field(default=10.0, init=False)
+    edge_threshold: float = field(default=EDGE_THRESHOLD, init=False)
 
     def __post_init__(self) -> None:
         check_choice("extractor method", self.method, runnable_extractors())

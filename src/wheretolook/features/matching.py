@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+from wheretolook.features.matches import Matches
 
 
 class NearestLandmarks(Protocol):
@@ -20,28 +22,6 @@ class NearestLandmarks(Protocol):
     def nearest(
         self, descriptors: NDArray[np.uint8], count: int = 2
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]: ...
-
-
-class Matches(NamedTuple):
-    """2D-3D matches of one image.
-
-    Attributes:
-        keypoints: (M,) rows of keypoints, ascending.
-        landmarks: (M,) rows of their landmarks.
-        near: (K, C) rows of the landmarks whose descriptors are nearest to each keypoint's.
-        squared: (K, C) their squared distances, ascending.
-    """
-
-    keypoints: NDArray[np.int64]
-    landmarks: NDArray[np.int64]
-    near: NDArray[np.int64]
-    squared: NDArray[np.float32]
-
-    @classmethod
-    def none(cls, n_keypoints: int) -> Matches:
-        """No matches of an image with so many keypoints."""
-        rows = np.zeros(0, dtype=np.int64)
-        return cls(rows, rows, np.zeros((n_keypoints, 0), dtype=np.int64), np.zeros((n_keypoints, 0), dtype=np.float32))
 
 
 GROUP = 32  # landmarks; the best groups are selected first, and in them the best landmarks

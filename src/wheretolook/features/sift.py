@@ -12,6 +12,7 @@ from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.descriptors import DescriptorKind, unit_descriptors
 from wheretolook.features.extractor import Extraction, Extractor, check_image
 from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.opencv_sift import RootSift
 from wheretolook.utils.colmap import quiet_colmap
 
 SIFT = DescriptorKind("sift", 128, "uint8", colmap_type=0)
@@ -23,31 +24,11 @@ class OpenCvSift:
     batch = 1
 
     def __init__(self, config: ExtractorConfig) -> None:
-        import cv2
-
-        # OpenCV divides its contrast threshold by the number of layers. Without the precise upscale, keypoints are
-        # biased.
-        contrast = 3 * config.peak_threshold
-        self.config = config
-        self._sift = cv2.SIFT.create(0, 3, contrast, config.edge_threshold, 1.6, enable_precise_upscale=True)
+        self._sift = RootSift(config.max_keypoints, config.first_octave, config.peak_threshold, config.edge_threshold)
 
     def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
         """Keypoints of images (H, W, 3) uint8, those of most contrast first."""
-        return [self._extract(grey_bitmap(rgb).to_array()) for rgb in images]
-
-    def _extract(self, grey: NDArray[np.uint8]) -> Keypoints:
-        keypoints, descriptors = self._sift.detectAndCompute(np.ascontiguousarray(grey), None)
-        if len(keypoints) == 0:
-            return Keypoints.none()
-        octave = np.array([k.octave & 255 for k in keypoints], dtype=np.uint8).view(np.int8)
-        table = np.array([(*k.pt, k.size / 2, k.response, k.angle) for k in keypoints], dtype=np.float32)
-        usable = np.flatnonzero(octave >= self.config.first_octave)
-        x, y, scale, response, angle = table[usable].T
-        keep = usable[np.lexsort((angle, scale, y, x, -response))[: self.config.max_keypoints]]
-        descriptors = descriptors[keep]
-        descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-12))
-        # OpenCV puts (0, 0) at the centre of the top-left pixel.
-        return Keypoints(table[keep, :2] + np.float32(0.5), unit_descriptors(descriptors))
+        return [self._sift.extract(grey_bitmap(rgb).to_array()) for rgb in images]
 
 
 class ColmapSift:

@@ -18,7 +18,7 @@ from wheretolook.localization.estimation import squared_errors
 from wheretolook.localization.rig import Look
 
 if TYPE_CHECKING:
-    from wheretolook.features.matching import Matches
+    from wheretolook.features.matches import Matches
 
 MAX_NEAREST_RATIO = 1.15
 """Maximum ratio of the descriptor distances to a candidate and to the nearest landmark of the map."""

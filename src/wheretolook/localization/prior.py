@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.features.matching import Matches
 from wheretolook.geometry.camera import Camera, field_of_view_deg
 from wheretolook.geometry.poses import Float
-from wheretolook.mapping.landmarks import Landmarks
+
+if TYPE_CHECKING:
+    from wheretolook.features.matches import Matches
 
 MAX_DISTANCE_RATIO = 2.0  # distance over the mean mapping distance: farther landmarks are hardly detected
 YAW_MARGIN_DEG = 30.0  # how far the yaw may be off
@@ -23,10 +25,10 @@ class PosePrior:
     location: tuple[float, float, float]
     yaw_deg: float | None = None
 
-    def allows(self, landmarks: Landmarks, camera: Camera) -> NDArray[np.bool_]:
-        """Return which landmarks (N,) the camera may detect from near the prior, whatever its pitch."""
-        offset: Float = landmarks.points - np.asarray(self.location)
-        allowed = np.linalg.norm(offset, axis=1) <= MAX_DISTANCE_RATIO * landmarks.mapping_distance_m
+    def allows(self, points: Float, mapping_distance_m: Float, camera: Camera) -> NDArray[np.bool_]:
+        """Return which landmarks, points (N, 3) m, the camera may detect from near the prior, whatever its pitch."""
+        offset: Float = points - np.asarray(self.location)
+        allowed = np.linalg.norm(offset, axis=1) <= MAX_DISTANCE_RATIO * mapping_distance_m
         if self.yaw_deg is not None:
             angle = np.degrees(np.arctan2(offset[:, 1], offset[:, 0])) - self.yaw_deg
             limit = max(field_of_view_deg(camera)) / 2 + YAW_MARGIN_DEG

@@ -24,7 +24,7 @@ from wheretolook.utils.processes import WorkerPool, use_one_core, worker_number
 
 if TYPE_CHECKING:
     from wheretolook.features.keypoints import Keypoints
-    from wheretolook.features.matching import Matches
+    from wheretolook.features.matches import Matches
     from wheretolook.localization.localizer import Localization, Localizer
     from wheretolook.rendering.types import Renderer
 

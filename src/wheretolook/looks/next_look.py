@@ -7,7 +7,7 @@ predicts how well every further view would localize.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,6 +21,15 @@ from wheretolook.utils.errors import PlanningError
 if TYPE_CHECKING:
     from wheretolook.localization.rig_localization import JointLocalization
     from wheretolook.scorers.base import Scorer
+
+
+class DirectionScorer(Protocol):
+    """A scorer of the map, here or on a robot."""
+
+    def score_directions(self, locations: Float, directions: Float) -> Float:
+        """Score cameras without roll at locations (L, 3) m along each of directions (D, 3). Returns (L, D)."""
+        ...
+
 
 N_DIRECTIONS = 300
 FULL_SPREAD_DEG = 90.0
@@ -51,6 +60,24 @@ class NextLook:
     gain: float
 
 
+def mean_scores_by_pitch(scorer: Scorer, locations: ArrayLike | None = None) -> Float:
+    """Determine mean scores (N_DIRECTIONS,) of views at locations (L, 3) m, from the lowest pitch of the lattice up.
+
+    Locations are by default those of mapping cameras. Raises PlanningError if neither are known.
+    """
+    if locations is None:
+        poses = scorer.localization_map.mapping_poses
+        if poses is None:
+            raise PlanningError("the map has no mapping cameras", fix="Give locations.")
+        locations = camera_centers(poses)
+    at: Float = np.asarray(locations, dtype=np.float64)
+    at = at[np.linspace(0, len(at) - 1, min(len(at), SAMPLED_LOCATIONS)).astype(int)]
+    axes = direction_lattice(N_DIRECTIONS)
+    window = np.ones(N_DIRECTIONS // 10)
+    mean = np.convolve(scorer.score_directions(at, axes).mean(axis=0)[np.argsort(axes[:, 2])], window, mode="same")
+    return mean / np.convolve(np.ones(N_DIRECTIONS), window, mode="same")
+
+
 class NextLookSelector:
     """Selects next views by expected gain, with any scorer of the map.
 
@@ -59,25 +86,12 @@ class NextLookSelector:
     the nearest earlier view as a fraction of `FULL_SPREAD_DEG`.
     """
 
-    def __init__(self, scorer: Scorer, locations: ArrayLike | None = None) -> None:
-        """Determine mean scores by pitch at locations (L, 3) m, by default at mapping cameras.
-
-        Raises PlanningError if neither are known.
-        """
+    def __init__(self, scorer: DirectionScorer, mean_scores: Float) -> None:
+        """Keep a scorer and the map's mean scores by pitch, of `mean_scores_by_pitch`."""
         self.scorer = scorer
-        if locations is None:
-            poses = scorer.localization_map.mapping_poses
-            if poses is None:
-                raise PlanningError("the map has no mapping cameras", fix="Give locations.")
-            locations = camera_centers(poses)
-        at: Float = np.asarray(locations, dtype=np.float64)
-        at = at[np.linspace(0, len(at) - 1, min(len(at), SAMPLED_LOCATIONS)).astype(int)]
+        self._mean_scores = mean_scores
         self._axes = direction_lattice(N_DIRECTIONS)
-        order = np.argsort(self._axes[:, 2])
-        window = np.ones(N_DIRECTIONS // 10)
-        mean = np.convolve(scorer.score_directions(at, self._axes).mean(axis=0)[order], window, mode="same")
-        self._mean_scores = mean / np.convolve(np.ones(N_DIRECTIONS), window, mode="same")
-        self._heights = self._axes[order, 2]
+        self._heights = np.sort(self._axes[:, 2])
 
     def gains(self, localization: JointLocalization, axes: Float, heights: Float) -> Float:
         """Expected gains (D,) of views along axes (D, 3) in the rig, whose sine of the pitch is heights (D,)."""

@@ -11,17 +11,19 @@ from numpy.typing import NDArray
 
 import wheretolook
 from wheretolook.features.sift import SIFT
+from wheretolook.geometry.poses import Float
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.files import atomic_write, copy_file, write_text
 
 PACKAGE = "wheretolook_localization"  # of the copies, so that an installed wheretolook does not replace them
-FIRST = "wheretolook.robot.localizer"
+FIRST = "wheretolook.robot.image_sequence", "wheretolook.planning.view_sequence"
 ROOT = Path(wheretolook.__file__).parent
 
 
-def export_localizer(landmarks: Landmarks, ids: NDArray[np.int64], out: Path) -> None:
-    """Write descriptors.npy, of the landmarks with ids (N,), and the package `PACKAGE` into a robot's folder.
+def export_localizer(landmarks: Landmarks, ids: NDArray[np.int64], mean_scores: Float, out: Path) -> None:
+    """Write the localizer into a robot's folder: the package `PACKAGE`, descriptors.npy of the landmarks with ids (N,),
+    and mean_scores.npy, of `wheretolook.looks.next_look.mean_scores_by_pitch`.
 
     Raises MapError unless these landmarks have SIFT descriptors.
     """
@@ -33,15 +35,18 @@ def export_localizer(landmarks: Landmarks, ids: NDArray[np.int64], out: Path) ->
         raise MapError(
             "the descriptors are of other landmarks", value=f"{known.sum()} of {len(ids)}", fix="Give --database."
         )
-    with atomic_write(out / "descriptors.npy") as partial, partial.open("wb") as file:
-        np.save(file, landmarks.descriptors[known])
+    for name, array in (("descriptors", landmarks.descriptors[known]), ("mean_scores", mean_scores)):
+        with atomic_write(out / f"{name}.npy") as partial, partial.open("wb") as file:
+            np.save(file, array)
     folder = out / PACKAGE
     for name in _modules():
         path = _path(name)
         assert path is not None
         text = path.read_text(encoding="utf-8").replace("from wheretolook.", f"from {PACKAGE}.")
         write_text(folder / path.relative_to(ROOT), text)
-    write_text(folder / "__init__.py", f"from {PACKAGE}.robot.localizer import RobotLocalizer\n")
+    exported = {"image_sequence": "ImageSequence", "localizer": "RobotLocalizer"}
+    lines = [f"from {PACKAGE}.robot.{module} import {name}\n" for module, name in exported.items()]
+    write_text(folder / "__init__.py", "".join(lines))
     copy_file(ROOT / "localization" / "confidence.json", folder / "localization" / "confidence.json")
 
 
@@ -52,9 +57,9 @@ def _path(module: str) -> Path | None:
 
 
 def _modules() -> set[str]:
-    """Return the names of the modules that localizing imports."""
+    """Return the names of the modules to copy: `FIRST`, and what they import."""
     found: set[str] = set()
-    left = [FIRST]
+    left = [*FIRST]
     while left:
         name = left.pop()
         path = _path(name)

@@ -204,6 +204,12 @@ class RobotScorer:
         parts = parts or [self._views_at(np.zeros(3), rotations, unoccluded)]
         return Views(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Views)))
 
+    def score_directions(self, locations: ArrayLike, directions: ArrayLike) -> Array:
+        """Score views without roll at locations (L, 3) m in the world along each of directions (D, 3). Returns (L, D)."""
+        rotations = rotations_looking_along(directions)
+        rows = [self._views_at(at, rotations, None).score for at in np.asarray(locations, dtype=np.float64)]
+        return np.stack(rows)
+
     def best(
         self,
         position: ArrayLike,

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.dataset.thresholds import checked_accuracy
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.keypoints import Keypoints
-from wheretolook.features.matching import Matches
+from wheretolook.features.matches import Matches
 from wheretolook.features.registry import kind_of, runnable_extractors
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
@@ -212,7 +212,9 @@ class ImageLocalizer:
     def _near(self, matches: Matches, camera: Camera, prior: PosePrior) -> Matches:
         """Return the matches with landmarks that the prior allows."""
         max_ratio = self._localizer.config.max_ratio if self._localizer.kind.in_bytes else None
-        return matches_among(matches, prior.allows(self.landmarks, camera), max_ratio)
+        return matches_among(
+            matches, prior.allows(self.landmarks.points, self.landmarks.mapping_distance_m, camera), max_ratio
+        )
 
     def _prior(self, values: Sequence[float]) -> PosePrior:
         """Return the prior of x, y, z and perhaps yaw, in the map. Raises ConfigError."""

@@ -21,7 +21,7 @@ from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along, rigid_poses
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.inputs.reasons import ReasonCounter
-from wheretolook.looks.next_look import NextLook, NextLookSelector
+from wheretolook.looks.next_look import NextLook, NextLookSelector, mean_scores_by_pitch
 from wheretolook.looks.selection import best_views, separated
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.map_frame import MapFrame
@@ -200,7 +200,7 @@ class WhereToLook:
 
     @cached_property
     def _next_look_selector(self) -> NextLookSelector:
-        return NextLookSelector(self.scorer)
+        return NextLookSelector(self.scorer, mean_scores_by_pitch(self.scorer))
 
     @cached_property
     def _localizer(self) -> ImageLocalizer:

@@ -26,7 +26,7 @@ from wheretolook.localization.joint_labels import SET_COLUMNS, set_label
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.rig import Look, rig_of
 from wheretolook.localization.rig_localization import JointLocalization
-from wheretolook.looks.next_look import NextLookSelector, angles_to_views
+from wheretolook.looks.next_look import NextLookSelector, angles_to_views, mean_scores_by_pitch
 from wheretolook.scorers.base import Scorer
 from wheretolook.utils.markdown import markdown_table
 
@@ -103,7 +103,7 @@ class SimulatedRobot:
     def __init__(self, scene: SceneEnvironment, scorer: Scorer, extractor: ExtractorConfig) -> None:
         self.scene = scene
         self.scorer = scorer
-        self.selector = NextLookSelector(scorer)
+        self.selector = NextLookSelector(scorer, mean_scores_by_pitch(scorer))
         config = LocalizerConfig(method="hypotheses")
         self.localizer = Localizer(scene.landmarks, scene.camera, config, extractor, scene.device)
 

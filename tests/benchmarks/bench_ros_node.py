@@ -1,0 +1,92 @@
+"""Start-up time, rate and memory of the localizer node, on images that arrive as fast as it localizes them.
+
+    python tests/benchmarks/bench_ros_node.py --mesh scene.glb --folder robot --seconds 180
+
+Times are CPU times of the node's process, whatever else runs on the machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).parents[2]
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "benchmarks"), str(ROOT / "src" / "wheretolook_ros")]
+
+import rclpy
+from bench_ros import random_bases
+
+from ros.processes import CAMERA, Robot, environment, image_of, info_of, running
+from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.scenes.loading import load_mesh
+
+TICKS = os.sysconf("SC_CLK_TCK")
+
+
+def cpu_seconds(pid: int) -> float:
+    """CPU time of all threads of a process."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS
+
+
+def resident_mb(pid: int) -> float:
+    """Resident memory of a process."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--mesh", type=Path, required=True)
+    parser.add_argument("--folder", type=Path, required=True)
+    parser.add_argument("--seconds", type=float, default=180)
+    parser.add_argument("--views", type=int, default=40)
+    options = parser.parse_args()
+    os.environ.update(environment())
+    node_settings = {"folder": options.folder, "next_look": "false"}
+    bases = random_bases(options.mesh, options.folder, options.views, 1)
+    renderer = WarpRenderer(load_mesh(options.mesh))
+    rclpy.init()
+    node = Robot(renderer)
+    images = [image_of(node.rgb(base)) for base in bases]
+    began = time.monotonic()
+    with running("wheretolook_ros.localizer", node_settings) as process:
+        node.connected("image", "camera_info", "joint_states")
+        node.see(images[0], info_of(CAMERA))
+        started = time.monotonic() - began
+        print(f"first image localized {started:.1f} s after the start, {cpu_seconds(process.pid):.1f} s of CPU time")
+        node.received.clear()
+        times: list[float] = []
+        memory: list[float] = []
+        begin = time.monotonic()
+        cpu = cpu_seconds(process.pid)
+        number = 0
+        last = begin
+        while time.monotonic() - begin < options.seconds:
+            number += 1
+            node.stamp += 0.1
+            node.send("camera_info", info_of(CAMERA))
+            node.send("image", images[number % len(images)])
+            node.wait(lambda: node.received and node.received[-1][0] == "/diagnostics", "an answer")
+            for name, message in node.received:
+                values = {pair.key: pair.value for pair in message.status[0].values} if name == "/diagnostics" else {}
+                if "image" in values:
+                    times.append(float(values["seconds"]))
+            node.received.clear()
+            if time.monotonic() - last > 10:
+                last = time.monotonic()
+                memory.append(resident_mb(process.pid))
+        used = cpu_seconds(process.pid) - cpu
+    rate = len(times) / used
+    print(f"{len(times)} images: {rate:.2f} per second of CPU time, {np.median(times):.3f} s each in median (wall)")
+    print("resident memory in MB, every 10 s:", " ".join(f"{value:.0f}" for value in memory))
+    rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,197 @@
+"""Starts nodes in processes of their own, and talks to them from the test's."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped, Vector3Stamped
+from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as PathMessage
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
+from trajectory_msgs.msg import JointTrajectory
+from wheretolook_ros.conversions import Array, compose, inverse, pose_message
+from wheretolook_ros.head import Head
+
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.rendering.warp_renderer import WarpRenderer
+
+ROOT = Path(__file__).parents[2]
+HEAD = Head((0.1, 0.0, 1.2, 0.0, 0.0, 0.0))
+SETTINGS = {
+    "image_qos": "system_default",
+    "mount": "[0.1, 0.0, 1.2, 0.0, 0.0, 0.0]",
+    "pan_joint": "pan",
+    "tilt_joint": "tilt",
+}
+JOINTS = ["pan", "tilt"]
+CAMERA = PinholeCamera()
+TIMEOUT_S = 20.0
+
+
+def environment() -> dict[str, str]:
+    """Variables of all processes of a test run: a domain of their own, on this machine only."""
+    path = os.pathsep.join([str(ROOT / "src"), str(ROOT / "src" / "wheretolook_ros"), str(ROOT / "tests")])
+    domain = {"ROS_DOMAIN_ID": str(os.getpid() % 100 + 1), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    domain["FASTDDS_DEFAULT_PROFILES_FILE"] = str(Path(__file__).with_name("fastdds.xml"))
+    return domain | {"PYTHONPATH": path, "ROS_LOG_DIR": str(ROOT / ".pytest_cache" / "ros")}
+
+
+@contextmanager
+def running(module: str, settings: Mapping[str, object], stop: int = signal.SIGTERM) -> Iterator[subprocess.Popen[str]]:
+    """Run a module, or a file, with parameters; at the end it must stop by the signal, without an error."""
+    program = [module] if module.endswith(".py") else ["-m", module]
+    options = [word for name, value in (SETTINGS | settings).items() for word in ("-p", f"{name}:={value}")]
+    command = [sys.executable, *program, "--ros-args", *options]
+    process = subprocess.Popen(command, env=os.environ | environment(), stderr=subprocess.PIPE, text=True)
+    try:
+        yield process
+        assert process.poll() is None, f"{module} ended: {process.communicate()[1]}"
+    except BaseException:
+        process.kill()
+        print(process.communicate()[1])
+        raise
+    process.send_signal(stop)
+    said = process.communicate(timeout=20)[1]
+    assert process.returncode == 0 and "Traceback" not in said, (process.returncode, said)
+
+
+class Robot(Node):
+    """The test's side: publishes what a robot does, and keeps what the nodes answer."""
+
+    def __init__(self, renderer: WarpRenderer | None = None) -> None:
+        super().__init__("robot")
+        self.renderer = renderer
+        self.stamp = 100.0
+        types: dict[str, Any] = {"image": Image, "image/compressed": CompressedImage, "camera_info": CameraInfo}
+        types |= {"odom": Odometry, "joint_states": JointState}
+        self.senders = {name: self.create_publisher(kind, name, 10) for name, kind in types.items()}
+        self.senders["initialpose"] = self.create_publisher(PoseWithCovarianceStamped, "initialpose", 10)
+        self.senders["plan"] = self.create_publisher(PathMessage, "plan", 10)
+        self.received: list[tuple[str, Any]] = []
+        heard: dict[str, Any] = {"visual_localization/pose": PoseWithCovarianceStamped, "/diagnostics": DiagnosticArray}
+        heard |= {"visual_localization/next_look": Vector3Stamped, "joint_trajectory": JointTrajectory}
+        heard |= {"gaze/views": PathMessage, "gaze/direction": Vector3Stamped}
+        for name, kind in heard.items():
+            self.create_subscription(kind, name, lambda message, name=name: self.received.append((name, message)), 50)
+
+    def wait(self, found: Callable[[], Any], what: str) -> Any:
+        """Spin until something is found, and return it."""
+        end = time.monotonic() + TIMEOUT_S
+        while time.monotonic() < end:
+            rclpy.spin_once(self, timeout_sec=0.05)
+            value = found()
+            if value:
+                return value
+        raise AssertionError(f"timeout: {what}; received {[(name, str(m)[:300]) for name, m in self.received[-6:]]}")
+
+    def connected(self, *topics: str) -> None:
+        """Wait until nodes listen to what this one publishes."""
+        senders = [self.senders[topic] for topic in topics]
+        self.wait(lambda: all(sender.get_subscription_count() for sender in senders), f"subscribers of {topics}")
+
+    def last(self, topic: str) -> Any:
+        """The last message of a topic, None without."""
+        return next((message for name, message in reversed(self.received) if name == topic), None)
+
+    def status(self, node: str = "visual_localization") -> DiagnosticStatus | None:
+        """The last diagnostics of a node."""
+        for name, message in reversed(self.received):
+            if name == "/diagnostics" and message.status[0].name.startswith(node):
+                return message.status[0]
+        return None
+
+    def send(self, topic: str, message: Any, stamp: float | None = None) -> None:
+        """Publish with a stamp, by default the present one."""
+        now = self.stamp if stamp is None else stamp
+        message.header.stamp.sec = int(now)
+        message.header.stamp.nanosec = round(now % 1 * 1e9)
+        self.senders[topic].publish(message)
+
+    def rgb(self, base: Array, pan: float = 0.0, tilt: float = 0.0, camera: PinholeCamera = CAMERA) -> Array:
+        """Render what the camera sees."""
+        assert self.renderer is not None
+        pose = inverse(compose(base, HEAD.base_from_camera(pan, tilt)))
+        return np.ascontiguousarray(self.renderer.render(camera, pose[None]).rgb[0], dtype=np.uint8)
+
+    def see(
+        self,
+        message: Image | CompressedImage,
+        info: CameraInfo | None = None,
+        odometry: Array | None = None,
+        joints: tuple[float, float] = (0.0, 0.0),
+        step_s: float = 1.0,
+    ) -> DiagnosticStatus:
+        """Publish an image with what belongs to its time; returns the diagnostics that follow."""
+        self.stamp += step_s
+        self.received.clear()
+        self.send("joint_states", JointState(name=JOINTS, position=list(joints)))
+        if odometry is not None:
+            odom = Odometry()
+            odom.pose.pose = pose_message(odometry)
+            self.send("odom", odom)
+        if info is not None:
+            self.send("camera_info", info)
+            time.sleep(0.2)
+        sent = 0.0
+
+        def answered() -> DiagnosticStatus | None:
+            nonlocal sent
+            if time.monotonic() - sent > 5:  # sensor QoS may drop it
+                self.send("image/compressed" if isinstance(message, CompressedImage) else "image", message)
+                sent = time.monotonic()
+            status = self.status()
+            waits = status is None or "no image arrives" in status.message or "forgotten" in status.message
+            return None if waits else status
+
+        return self.wait(answered, "diagnostics")
+
+
+def info_of(camera: PinholeCamera) -> CameraInfo:
+    """The CameraInfo of a pinhole."""
+    info = CameraInfo(width=camera.width, height=camera.height, distortion_model="plumb_bob", d=[0.0] * 5)
+    matrix = camera.matrix
+    matrix[:2, 2] -= 0.5
+    info.k = matrix.ravel().tolist()
+    info.p = np.column_stack([matrix, np.zeros(3)]).ravel().tolist()
+    return info
+
+
+def image_of(pixels: Array, encoding: str = "rgb8") -> Image:
+    """An image (H, W) or (H, W, C) uint8 as a message, with rows padded by four bytes."""
+    rows = np.pad(pixels.reshape(len(pixels), -1), ((0, 0), (0, 4)))
+    image = Image(height=pixels.shape[0], width=pixels.shape[1], encoding=encoding, step=rows.shape[1])
+    image.data = rows.tobytes()
+    return image
+
+
+def base_at(x: float, y: float, yaw_deg: float) -> Array:
+    """A base on the floor."""
+    cosine, sine = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
+    return np.array([[cosine, -sine, 0, x], [sine, cosine, 0, y], [0, 0, 1, 0]])
+
+
+def mosaic(rgb: Array, first: str) -> Array:
+    """A Bayer image (H, W) with the pattern rggb or gbrg."""
+    pattern = {"rggb": (0, 1, 1, 2), "gbrg": (1, 2, 0, 1)}[first]
+    out = np.empty(rgb.shape[:2], dtype=np.uint8)
+    for k, channel in enumerate(pattern):
+        out[k // 2 :: 2, k % 2 :: 2] = rgb[k // 2 :: 2, k % 2 :: 2, channel]
+    return out
+
+
+def jpeg_of(rgb: Array) -> CompressedImage:
+    """A compressed image."""
+    return CompressedImage(format="rgb8; jpeg compressed bgr8", data=cv2.imencode(".jpg", rgb[:, :, ::-1])[1].tobytes())

@@ -1,0 +1,248 @@
+"""The nodes under ROS, in processes of their own: frames, stamps, covariance, and all bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not installed: pip install '.[ros]'")
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from wheretolook_ros.conversions import Array, compose, inverse, pose_matrix, pose_message
+
+from ros.processes import CAMERA, HEAD, Robot, base_at, environment, image_of, info_of, jpeg_of, mosaic, running
+from ros.room import room_mesh, write_folder
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import pose_error
+from wheretolook.rendering.warp_renderer import WarpRenderer
+
+BASE = base_at(3.2, 2.4, 30.0)
+LOCALIZER = "wheretolook_ros.localizer"
+GAZE = "wheretolook_ros.gaze"
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_folder(room_mesh(), tmp_path_factory.mktemp("room"))
+
+
+@pytest.fixture(scope="module")
+def context() -> Iterator[None]:
+    os.environ.update(environment())
+    rclpy.init()
+    yield
+    rclpy.try_shutdown()
+
+
+@pytest.fixture(scope="module")
+def robot(context: None, folder: Path) -> Iterator[Robot]:
+    """A robot whose images a localizer in another process localizes."""
+    node = Robot(WarpRenderer(room_mesh()))
+    with running(LOCALIZER, {"folder": folder}):
+        node.connected("image", "camera_info", "odom", "joint_states", "initialpose", "image/compressed")
+        status = node.see(image_of(node.rgb(BASE)))
+        assert status.level == ERROR and "no CameraInfo has arrived" in status.message
+        node.see(image_of(node.rgb(BASE)), info_of(CAMERA))
+        yield node
+    node.destroy_node()
+
+
+def pose_of(robot: Robot) -> Array:
+    """The published pose of the base in the map."""
+    return pose_matrix(robot.last("visual_localization/pose").pose.pose)
+
+
+def assert_right(robot: Robot, base: Array, error_m: float = 0.02, error_deg: float = 0.3) -> None:
+    found = robot.wait(lambda: robot.last("visual_localization/pose"), "a pose")
+    position, angle = pose_error(inverse(pose_matrix(found.pose.pose)), inverse(base))
+    assert position < error_m and angle < error_deg, (position, angle)
+
+
+def localizes_again(robot: Robot) -> None:
+    """The node still runs: the next image, with a good camera, is localized."""
+    assert robot.see(image_of(robot.rgb(BASE)), info_of(CAMERA)).message == "localized"
+    assert_right(robot, BASE)
+
+
+def test_frame_stamp_and_covariance(robot: Robot) -> None:
+    errors = []
+    for number, yaw in enumerate((0.0, 100.0, 200.0)):
+        base = base_at(2.6 + 0.3 * number, 2.3, yaw)
+        joints = (0.4, -0.2)
+        status = robot.see(image_of(robot.rgb(base, *joints)), info_of(CAMERA), joints=joints)
+        values = {pair.key: pair.value for pair in status.values}
+        assert status.level == OK and json.loads(values["probabilities"])[0] > 0.95 and int(values["n_inliers"]) > 100
+        assert_right(robot, base)
+        found = robot.last("visual_localization/pose")
+        assert found.header.frame_id == "map" and found.header.stamp.sec == int(robot.stamp)
+        covariance = np.array(found.pose.covariance).reshape(6, 6)
+        np.testing.assert_allclose(covariance, covariance.T)
+        deviation = np.sqrt(np.diagonal(covariance))
+        assert (deviation > 0).all() and deviation[:3].max() < 0.02 and deviation[3:].max() < np.radians(0.4)
+        errors.append((pose_of(robot)[:, 3] - base[:, 3]) / deviation[:3])
+    assert np.abs(errors).max() < 6
+
+
+@pytest.mark.parametrize("encoding", ["bgr8", "rgba8", "mono8", "mono16", "bayer_rggb8", "bayer_gbrg8", "compressed"])
+def test_encodings(robot: Robot, encoding: str) -> None:
+    rgb = robot.rgb(BASE)
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    images = {
+        "bgr8": lambda: image_of(rgb[:, :, ::-1], encoding),
+        "rgba8": lambda: image_of(np.dstack([rgb, np.full_like(grey, 255)]), encoding),
+        "mono8": lambda: image_of(grey, encoding),
+        "mono16": lambda: image_of((grey.astype("<u2") * 256).view(np.uint8).reshape(480, 640, 2), encoding),
+        "bayer_rggb8": lambda: image_of(mosaic(rgb, "rggb"), encoding),
+        "bayer_gbrg8": lambda: image_of(mosaic(rgb, "gbrg"), encoding),
+        "compressed": lambda: jpeg_of(rgb),
+    }
+    assert robot.see(images[encoding](), info_of(CAMERA)).message == "localized"
+    assert_right(robot, BASE)
+
+
+@pytest.mark.parametrize("size", [(320, 240), (1280, 960)])
+def test_another_resolution(robot: Robot, size: tuple[int, int]) -> None:
+    camera = PinholeCamera(*size, size[0] / 2)
+    assert robot.see(image_of(robot.rgb(BASE, camera=camera)), info_of(camera)).message == "localized"
+    assert_right(robot, BASE)
+
+
+def test_distortion_is_removed(robot: Robot) -> None:
+    """An image with barrel distortion, warped from a wider pinhole."""
+    wide = PinholeCamera(1280, 960, 320.0)
+    info = info_of(CAMERA)
+    info.d = [-0.2, 0.03, 0.001, -0.002, 0.0]
+    matrix = np.array(info.k).reshape(3, 3)
+    at = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), axis=-1).reshape(-1, 1, 2)
+    ideal = cv2.undistortPoints(at, matrix, np.array(info.d)).reshape(480, 640, 2)
+    maps = (320 * ideal + (639.5, 479.5)).astype(np.float32)
+    seen = cv2.remap(robot.rgb(BASE, camera=wide), maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)
+    assert robot.see(image_of(seen), info).message == "localized"
+    assert_right(robot, BASE)
+
+
+def test_a_dark_image_is_lost_and_a_next_view_is_published(robot: Robot) -> None:
+    status = robot.see(image_of(np.zeros((480, 640, 3), np.uint8)), info_of(CAMERA), joints=(0.5, 0.0))
+    assert status.level == WARN and status.message == "lost: 0 matches with the map support no pose"
+    assert robot.last("visual_localization/pose") is None
+    chosen = robot.wait(lambda: robot.last("visual_localization/next_look"), "a next view")
+    assert chosen.header.frame_id == "base_link"
+    direction = np.array([chosen.vector.x, chosen.vector.y, chosen.vector.z])
+    before = HEAD.base_from_camera(0.5, 0.0)[:, 2]
+    assert direction @ before < np.cos(np.radians(29)) and np.linalg.norm(direction) == pytest.approx(1)
+    localizes_again(robot)
+
+
+def test_odometry_makes_a_rig_of_ambiguous_views(robot: Robot) -> None:
+    """Through a small window each view alone is not confident; together they are."""
+    base = base_at(3.2, 2.4, 75.0)
+    alone = []
+    for pan in (-0.6, 0.1, 0.8, 1.5):
+        rgb = robot.rgb(base, pan)
+        masked = np.zeros_like(rgb)
+        masked[180:300, 255:385] = rgb[180:300, 255:385]
+        status = robot.see(image_of(masked), info_of(CAMERA), odometry=base_at(7.0, -2.0, 10.0), joints=(pan, 0.0))
+        values = {pair.key: pair.value for pair in status.values}
+        alone.append((int(values["n_views"]), json.loads(values["probabilities"])[0]))
+        if alone[-1][1] >= 0.95:
+            break
+    n_views, probability = alone[-1]
+    assert n_views >= 2 and probability >= 0.95 > alone[0][1], alone
+    assert_right(robot, base, 0.05, 0.4)
+
+
+def test_a_prior_does_no_harm_and_one_of_another_frame_is_reported(robot: Robot) -> None:
+    prior = PoseWithCovarianceStamped()
+    prior.header.frame_id = "odom"
+    prior.pose.pose.orientation.w = 1.0
+    robot.received.clear()
+    robot.send("initialpose", prior)
+    robot.wait(lambda: "its frame is 'odom', not 'map'" in getattr(robot.status(), "message", ""), "a warning")
+    prior.header.frame_id = "map"
+    prior.pose.pose.orientation.w = 0.0
+    robot.send("initialpose", prior)
+    robot.wait(lambda: "an initial pose cannot be used" in robot.status().message and "'odom'" not in robot.status().message,
+               "a warning")  # fmt: skip
+    for base in (base_at(3.0, 2.0, 0.0), base_at(5.0, 4.0, 200.0)):
+        prior.pose.pose = pose_message(base)
+        robot.send("initialpose", prior)
+        robot.wait(lambda: True, "")
+        localizes_again(robot)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"encoding": "yuv422"}, "the encoding 'yuv422' is not supported"),
+        ({"step": 10}, "are no image of 640 x 480 px"),
+        ({"data": b"\0" * 1000}, "1000 bytes are no image of 640 x 480 px"),
+    ],
+)
+def test_an_image_that_cannot_be_read(robot: Robot, change: dict[str, object], message: str) -> None:
+    image = image_of(robot.rgb(BASE))
+    for name, value in change.items():
+        setattr(image, name, value)
+    status = robot.see(image, info_of(CAMERA))
+    assert status.level == ERROR and message in status.message
+    localizes_again(robot)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"k": [0.0] * 9}, "the camera is not calibrated"),
+        ({"distortion_model": "seen_nowhere", "d": [0.1] * 5}, "the distortion model 'seen_nowhere' is not supported"),
+        ({"width": 1280, "height": 960}, "the image has 640 x 480 px, its CameraInfo 1280 x 960"),
+        ({"binning_x": 2}, "binning"),
+        ({"k": [1e-9, 0.0, 0.0, 0.0, 1e-9, 0.0, 0.0, 0.0, 1.0]}, "focal length"),
+    ],
+)
+def test_a_camera_that_cannot_be_used(robot: Robot, change: dict[str, object], message: str) -> None:
+    info = info_of(CAMERA)
+    for name, value in change.items():
+        setattr(info, name, value)
+    status = robot.see(image_of(robot.rgb(BASE)), info)
+    assert status.level == ERROR and message in status.message
+    localizes_again(robot)
+
+
+def test_a_camera_unlike_the_map_s_is_reported(robot: Robot) -> None:
+    camera = PinholeCamera(640, 480, 640.0)
+    status = robot.see(image_of(robot.rgb(BASE, camera=camera)), info_of(camera))
+    assert "the focal length is 2.00 times that of the robot's folder" in status.message and status.level == WARN
+    assert_right(robot, BASE)
+
+
+def test_time_that_jumps_back(robot: Robot) -> None:
+    localizes_again(robot)
+    jumped = robot.see(image_of(robot.rgb(BASE)), info_of(CAMERA), step_s=-50.0)
+    assert jumped.message == "localized"
+    messages = [m.status[0].message for name, m in robot.received if name == "/diagnostics"]
+    assert any("jumped back: earlier images are forgotten" in text for text in messages), messages
+    robot.stamp += 100.0
+    localizes_again(robot)
+
+
+def test_odometry_that_contradicts_the_images(robot: Robot) -> None:
+    still = base_at(0.0, 0.0, 0.0)
+    robot.see(image_of(robot.rgb(BASE)), info_of(CAMERA), odometry=still)
+    other = base_at(2.4, 3.1, 30.0)
+    status = robot.see(image_of(robot.rgb(other)), info_of(CAMERA), odometry=still)
+    assert status.level == WARN and "odometry contradicts the images by 1.06 m" in status.message
+    assert_right(robot, other)
+    moved = compose(compose(still, inverse(other)), BASE)
+    assert robot.see(image_of(robot.rgb(BASE)), info_of(CAMERA), odometry=moved).message == "localized"
+    broken = still.copy()
+    broken[0, 3] = np.nan
+    robot.see(image_of(robot.rgb(BASE)), info_of(CAMERA), odometry=broken)
+    messages = [m.status[0].message for name, m in robot.received if name == "/diagnostics"]
+    assert "odometry are not finite" in " ".join(messages)

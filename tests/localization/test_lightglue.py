@@ -103,7 +103,8 @@ def test_the_features_of_mapping_images_may_be_in_another_file(corridor, tmp_pat
         for features in (None, other)
     )
     np.testing.assert_array_equal(by_file.landmarks, by_database.landmarks)
-    among = Localizer(landmarks, camera, config, map_dir=corridor).match_among(query, np.arange(len(landmarks)))
-    np.testing.assert_array_equal(among.landmarks, by_database.landmarks)
+    localizer = Localizer(landmarks, camera, config, map_dir=corridor)
+    among = localizer.match_among(query, np.arange(len(landmarks)))
+    np.testing.assert_array_equal(among.landmarks, localizer.match_descriptors([query])[0].landmarks)
     with pytest.raises(MapError, match=r"missing\.h5"):
         Localizer(landmarks, camera, config, map_dir=corridor, features=tmp_path / "missing.h5")

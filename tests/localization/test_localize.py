@@ -230,6 +230,10 @@ def test_the_next_view_of_a_rig(room: MappedRoom, photos: Path, capsys: pytest.C
     given = ["--camera", "SIMPLE_PINHOLE,640,480,320,320,240"]
     assert main(["localize", "--map", model, "--images", str(photos / "a.png"), *given, "--next"]) == 0
     assert re.search(r"next view: turn \d+ degrees to the (left|right)", capsys.readouterr().out)
+    limits = ["--pitch", "20", "40", "--pan", "90", "180"]
+    assert main(["localize", "--map", model, "--images", str(photos / "a.png"), *given, "--next", *limits]) == 0
+    found = re.search(r"turn (\d+) degrees to the left, to a pitch of (\d+) degrees", capsys.readouterr().out)
+    assert found is not None and 90 <= int(found[1]) <= 180 and 20 <= int(found[2]) <= 40
     assert main(["localize", "--map", model, "--images", str(photos), *given, "--next"]) != 0
     assert "--turns" in capsys.readouterr().err
 

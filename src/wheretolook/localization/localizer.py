@@ -119,10 +119,14 @@ class Localizer:
 
     def match(self, keypoints: Sequence[Keypoints], camera: Camera | None = None) -> list[Matches]:
         """Match keypoints of several images with landmarks. The result for an image does not depend on the others."""
-        return self._by_lightglue(keypoints, self._match(keypoints, self._matcher), camera)
+        return self.by_lightglue(keypoints, self.match_descriptors(keypoints), camera)
 
-    def match_among(self, keypoints: Keypoints, rows: NDArray[np.int64], camera: Camera | None = None) -> Matches:
-        """Match keypoints of an image with the landmarks in rows (R,) alone."""
+    def match_descriptors(self, keypoints: Sequence[Keypoints]) -> list[Matches]:
+        """Match keypoints of several images with landmarks by their descriptors, also where LightGlue is configured."""
+        return self._match(keypoints, self._matcher)
+
+    def match_among(self, keypoints: Keypoints, rows: NDArray[np.int64]) -> Matches:
+        """Match keypoints of an image with the landmarks in rows (R,) alone, by their descriptors."""
         if len(rows) == 0:
             return Matches.none(len(keypoints))
         descriptors = self.landmarks.descriptors
@@ -130,8 +134,7 @@ class Localizer:
         matcher = DescriptorMatcher if self.kind.in_bytes else SimilarityMatcher
         (found,) = self._match([keypoints], matcher(descriptors[rows], self._device))
         near = rows[np.minimum(found.near, len(rows) - 1)]  # with few landmarks, missing ones have large distances
-        found = found._replace(landmarks=rows[found.landmarks], near=near)
-        return self._by_lightglue([keypoints], [found], camera)[0]
+        return found._replace(landmarks=rows[found.landmarks], near=near)
 
     def _match(
         self, keypoints: Sequence[Keypoints], matcher: DescriptorMatcher | DescriptorIndex | SimilarityMatcher
@@ -144,8 +147,8 @@ class Localizer:
             return matcher.match(descriptors, limit, MAX_NEAREST if several else 1)
         return match(matcher, descriptors, self.config.max_ratio, MAX_NEAREST if several else 2)
 
-    def _by_lightglue(
-        self, keypoints: Sequence[Keypoints], matches: list[Matches], camera: Camera | None
+    def by_lightglue(
+        self, keypoints: Sequence[Keypoints], matches: list[Matches], camera: Camera | None = None
     ) -> list[Matches]:
         """Replace matches by those of LightGlue, if it is configured, with the mapping images that they lead to."""
         if self._guided is None:

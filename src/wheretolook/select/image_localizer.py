@@ -22,7 +22,7 @@ from wheretolook.localization.confidence import ACCURACY, Accuracy, probabilitie
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.prior import PosePrior, matches_among
-from wheretolook.localization.rig_localization import JointLocalizer
+from wheretolook.localization.rig_localization import POSES_OF_A_VIEW, POSES_OF_AN_IMAGE, JointLocalizer
 from wheretolook.localization.turns import checked_turns, read_turns
 from wheretolook.mapping.colmap_model import model_arrays, read_model
 from wheretolook.mapping.config import FrameOptions
@@ -185,7 +185,7 @@ class ImageLocalizer:
         self,
         queries: Sequence[QueryImage],
         keypoints: Sequence[Keypoints],
-        matches: Sequence[Matches],
+        matches: Sequence[Sequence[Matches]],
         cam_from_rig: Float,
         prior: PosePrior | None,
         accuracy: Accuracy,
@@ -193,9 +193,13 @@ class ImageLocalizer:
         rig = self._rigs if len(queries) > 1 else self._localizer.joint
         looks = []
         poses = []
-        for query, of_image, matched, pose in zip(queries, keypoints, matches, cam_from_rig, strict=True):
+        count = POSES_OF_A_VIEW if len(queries) > 1 else POSES_OF_AN_IMAGE
+        for query, of_image, (matched, *others), pose in zip(queries, keypoints, matches, cam_from_rig, strict=True):
             looks.append(self._localizer.look(of_image, matched, query.camera, pose))
-            poses.append(rig.single_view_poses(looks[-1], 2 if len(queries) > 1 else 4))
+            poses.append(rig.single_view_poses(looks[-1], count))
+            for other in others:
+                look = self._localizer.look(of_image, other, query.camera, pose)
+                poses[-1] += rig.single_view_poses(look, count)
             if prior is not None:
                 near = self._near(matched, query.camera, prior)
                 look = self._localizer.look(of_image, near, query.camera, pose)
@@ -203,11 +207,16 @@ class ImageLocalizer:
         joint = rig.localize(looks, poses)
         return Localized.of(queries, joint, probabilities(joint, accuracy), self.frame)
 
-    def _match(self, name: str, keypoints: Keypoints, query: QueryImage) -> Matches:
-        """Match an image with all landmarks, or with those of its pairs."""
+    def _match(self, name: str, keypoints: Keypoints, query: QueryImage) -> list[Matches]:
+        """Match an image with all landmarks, or with those of its pairs; by LightGlue, and then also by descriptors.
+
+        The images that LightGlue matches lead to few rival poses; those by descriptors add the others.
+        """
         if self.pairs is None:
-            return self._localizer.match([keypoints], query.camera)[0]
-        return self._localizer.match_among(keypoints, self.pairs.landmarks(name), query.camera)
+            found = self._localizer.match_descriptors([keypoints])
+        else:
+            found = [self._localizer.match_among(keypoints, self.pairs.landmarks(name))]
+        return [*self._localizer.by_lightglue([keypoints], found, query.camera), *(found if self.lightglue else [])]
 
     def _near(self, matches: Matches, camera: Camera, prior: PosePrior) -> Matches:
         """Return the matches with landmarks that the prior allows."""

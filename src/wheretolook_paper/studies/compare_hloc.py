@@ -39,6 +39,7 @@ from wheretolook.io.poses import images_text
 from wheretolook.localization.confidence import Accuracy, probabilities
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer
+from wheretolook.localization.rig_localization import POSES_OF_AN_IMAGE
 from wheretolook.mapping.colmap_model import colmap_poses, read_model, registered_names
 from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
@@ -229,8 +230,12 @@ def _methods(fold: Fold, features: str, lightglue: str, retrieved: int, device: 
 
 def _localize(localizer: Localizer, query: Keypoints) -> Pose:
     start = time.perf_counter()
-    (matches,) = localizer.match([query])
-    joint = localizer.joint.localize([localizer.look(query, matches)])
+    found = localizer.match_descriptors([query])
+    looks = [localizer.look(query, one) for one in localizer.by_lightglue([query], found)]
+    poses = localizer.joint.single_view_poses(looks[0], POSES_OF_AN_IMAGE)
+    if localizer.config.lightglue:
+        poses += localizer.joint.single_view_poses(localizer.look(query, found[0]), POSES_OF_AN_IMAGE)
+    joint = localizer.joint.localize(looks, [poses])
     seconds = time.perf_counter() - start
     if joint.status != "localized":
         return Pose(None, dict.fromkeys(ACCURACIES, np.nan), seconds)

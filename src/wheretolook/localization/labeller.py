@@ -125,6 +125,8 @@ class _SceneInProgress:
             settings["cameras"] = {number: camera.record() for number, camera in job.cameras}
         # only options that are set: the record decides the names of shards
         settings |= {name: True for name in ("store_matches", "store_pixels") if getattr(job, name)}
+        if job.appearance:
+            settings["appearance"] = job.appearance
         text = json.dumps(settings, sort_keys=True).encode()
         inputs = [name for name in (*SCHEMA.names, CAMERA_ID) if name not in LABELS and name in table]
         shards = []

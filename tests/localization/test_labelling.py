@@ -130,11 +130,12 @@ def test_views_of_several_cameras_are_labelled_as_each_alone(room: MappedRoom) -
         pd.testing.assert_frame_equal(labelled[rows], alone)
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_appearances_depend_on_the_view_alone(room: MappedRoom, views: pd.DataFrame, tmp_path: Path) -> None:
-    """Not on shards, workers or an interruption; without them the table has no such column."""
+    """Not on shards or an interruption; without them the table has no such column."""
     table = views.iloc[:12]
     shards = tmp_path / "shards"
-    changed = label(table, room, shards, appearance=0.8, workers=2, shard_size=5)
+    changed = label(table, room, shards, appearance=0.8, workers=1, shard_size=5)
     shard, *_ = times(shards)
     shard.unlink()
     assert label(table, room, shards, appearance=0.8, workers=1, shard_size=5) == changed

@@ -16,7 +16,6 @@ from wheretolook.dataset.viewpoint_table import APPEARANCE, CAMERA_ID, FIRST, PI
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.poses import Float
-from wheretolook.io.poses import POSE_COLUMNS
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.pipeline import Step, run_pipeline
 from wheretolook.utils.errors import WhereToLookError, WorkerError
@@ -174,8 +173,7 @@ def label_rows(
         camera, matched = batch
         return [localizer.estimate(keypoints, matches, camera) for keypoints, matches in matched]
 
-    pose_values = table[[*POSE_COLUMNS]].to_numpy()
-    drawn = Appearance.of_views(pose_values, appearance, localizer.config.seed) if appearance else []
+    drawn = Appearance.of_views(true_poses, appearance, localizer.config.seed) if appearance else []
     steps = [  # the camera of a batch goes with it from step to step
         Step("render", lambda batch: (batch[0], _images(renderer, batch[0], batch[1], true_poses, drawn))),
         Step("extract", lambda batch: (batch[0], localizer.extractor.extract_batch(batch[1]))),

@@ -40,7 +40,7 @@ class Appearance:
         noise: standard deviation of shot noise in white, in linear light.
         rotation_deg: of the camera during the exposure: pitch and yaw. Blurs by as many pixels in the whole image as
             it moves the middle.
-        defocus_deg: radius of the circle of confusion.
+        defocus_deg: standard deviation of the Gaussian that a point becomes; half the radius of a disc.
         jpeg_quality: of the file; above 100 for none.
         occluders: number of upright boxes with the height and width of people, 1 to 4 m away, that stand on the floor if
             the camera is level and 1 to 1.7 m above it.
@@ -68,19 +68,19 @@ class Appearance:
             vignetting=vignetting,
             noise=0.08 * noise,
             rotation_deg=(0.7 * pitch, 0.7 * yaw),
-            defocus_deg=0.2 * defocus,
-            jpeg_quality=round(101 - 71 * jpeg),
+            defocus_deg=0.1 * defocus,
+            jpeg_quality=round(101 - 71 * jpeg**2),  # most cameras use at least 80
             occluders=int((rng.random(2) < strength / 2).sum()),
             seed=int(rng.integers(2**32)),
         )
 
     @classmethod
-    def of_views(cls, pose_values: Float, limit: float, seed: int) -> list[Appearance]:
-        """Draw the appearances of views, each from a seed and its pose (7,) alone, at strengths from 0 to a limit.
+    def of_views(cls, cam_from_world: Float, limit: float, seed: int) -> list[Appearance]:
+        """Draw the appearances of views, each from a seed and its pose (3, 4) alone, at strengths from 0 to a limit.
 
         Poses count to six decimals, which compact tables keep.
         """
-        keys = np.round(1e6 * pose_values).astype(np.int64)
+        keys = np.round(1e6 * cam_from_world.reshape(-1, 12)).astype(np.int64)
         rngs = [np.random.default_rng(np.array([seed, *key]).view(np.uint32)) for key in keys]
         return [cls.draw(limit * rng.random(), rng) for rng in rngs]
 
@@ -96,10 +96,7 @@ class Appearance:
         down = (rows - y) / camera.mean_focal_px
         light = _LIGHT[rgb]
         for _ in range(self.occluders):
-            distance = 4 ** rng.random()
-            hidden, colors = _person(right * distance, down * distance, rng)
-            hidden &= (depth_m <= 0) | (depth_m > distance)
-            light[hidden] = colors[hidden]
+            _occlude(light, right, down, depth_m, rng)
         kernel = self.blur_kernel(camera.mean_focal_px)
         light = np.asarray(cv2.filter2D(light, -1, kernel, borderType=cv2.BORDER_REPLICATE))
         light *= ((1 + right**2 + down**2) ** -self.vignetting)[..., None] * self.gains
@@ -111,23 +108,27 @@ class Appearance:
         return np.asarray(cv2.imdecode(file, cv2.IMREAD_COLOR), dtype=np.uint8)[..., ::-1]
 
     def blur_kernel(self, focal_px: float) -> NDArray[np.float32]:
-        """Return the image (K, K), K odd, of a point: the disc of its defocus swept along a line; of sum 1."""
-        pitch, yaw, defocus = focal_px * np.tan(np.radians([*self.rotation_deg, self.defocus_deg]))
-        along, turn, area = np.random.default_rng(self.seed).random((3, 4096, 1))
-        disc = defocus * np.sqrt(area) * np.hstack([np.sin(2 * np.pi * turn), np.cos(2 * np.pi * turn)])
-        points = np.round((along - 0.5) * (pitch, yaw) + disc).astype(int)
+        """Return the image (K, K), K odd, of a point of light 1: a Gaussian swept along a line."""
+        rng = np.random.default_rng(self.seed)
+        swept = rng.uniform(-0.5, 0.5, (4096, 1)) * self.rotation_deg
+        spread = rng.normal(scale=self.defocus_deg, size=(4096, 2))
+        points = np.round(focal_px * np.radians(swept + spread)).astype(int)
         half = abs(points).max()
         kernel = np.zeros((2 * half + 1, 2 * half + 1), dtype=np.float32)
         np.add.at(kernel, tuple(points.T + half), 1 / len(points))
         return kernel
 
 
-def _person(right_m: Float, down_m: Float, rng: np.random.Generator) -> tuple[NDArray[np.bool_], NDArray[Any]]:
-    """Draw an occluder, given metres to the right (1, W) and down (H, 1) at its distance: where it is, its colours."""
+def _occlude(
+    light: NDArray[np.float32], right: Float, down: Float, depth_m: NDArray[Any], rng: np.random.Generator
+) -> None:
+    """Draw an occluder into an image, given the tangents of angles to the right (1, W) and down (H, 1)."""
     height, width = PERSON_M
-    rows = (down_m - rng.uniform(1, height)) / height + 1
-    columns = (right_m - rng.choice(right_m[0])) / width + 0.5
+    distance = 4 ** rng.random()
+    rows = (down * distance - rng.uniform(1, height)) / height + 1
+    columns = (right - rng.choice(right[0])) * distance / width + 0.5
     n_rows, n_columns = rng.choice(SHADES)
     colors = rng.uniform(0.1, 1, (n_rows, n_columns, 1)) * rng.uniform(0.1, 0.5, 3)
-    at = (rows * n_rows).astype(int) % n_rows, (columns * n_columns).astype(int) % n_columns
-    return (abs(rows - 0.5) < 0.5) & (abs(columns - 0.5) < 0.5), colors[at]
+    colors = colors[(rows * n_rows).astype(int) % n_rows, (columns * n_columns).astype(int) % n_columns]
+    hidden = (abs(rows - 0.5) < 0.5) & (abs(columns - 0.5) < 0.5) & ((depth_m <= 0) | (depth_m > distance))
+    light[hidden] = colors[hidden]

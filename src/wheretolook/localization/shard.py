@@ -90,8 +90,8 @@ class ShardWorker:
             seconds: dict[str, float] = {}
             renderer, localizer = self._open(job)
             cameras = dict(job.cameras) or job.camera
-            store = job.store_matches, job.store_pixels
-            labelled = label_rows(rows, renderer, localizer, cameras, seconds, *store, job.appearance)
+            options = job.store_matches, job.store_pixels, job.appearance
+            labelled = label_rows(rows, renderer, localizer, cameras, seconds, *options)
             return LabelledShard(labelled, seconds)
         except WhereToLookError:
             raise

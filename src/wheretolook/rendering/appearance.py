@@ -51,7 +51,7 @@ class Appearance:
     gains: tuple[float, ...]
     vignetting: float
     noise: float
-    rotation_deg: tuple[float, float]
+    rotation_deg: tuple[float, ...]
     defocus_deg: float
     jpeg_quality: int
     occluders: int
@@ -60,14 +60,14 @@ class Appearance:
     @classmethod
     def draw(cls, strength: float, rng: np.random.Generator) -> Appearance:
         """Draw parameters in proportion to a strength, 0 to 1; each of two occluders with half of it as probability."""
-        exposure, red, blue, pitch, yaw = strength * rng.uniform(-1, 1, 5)
+        exposure, red, blue, *rotation = strength * rng.uniform(-1, 1, 5)
         vignetting, noise, defocus, jpeg = strength * rng.random(4)
         return cls(
             strength=strength,
             gains=tuple(np.exp2(1.5 * exposure + 0.4 * np.array([red, 0, blue]))),
             vignetting=vignetting,
             noise=0.08 * noise,
-            rotation_deg=(0.7 * pitch, 0.7 * yaw),
+            rotation_deg=tuple(0.7 * np.array(rotation)),
             defocus_deg=0.1 * defocus,
             jpeg_quality=round(101 - 71 * jpeg**2),  # most cameras use at least 80
             occluders=int((rng.random(2) < strength / 2).sum()),
@@ -91,9 +91,8 @@ class Appearance:
         """
         rng = np.random.default_rng(self.seed)
         x, y = camera.principal_point
-        rows, columns = np.ogrid[0.5 : camera.height, 0.5 : camera.width]
-        right = (columns - x) / camera.mean_focal_px  # tangents of the angles from the optical axis
-        down = (rows - y) / camera.mean_focal_px
+        pixels = np.ogrid[0.5 - y : camera.height - y, 0.5 - x : camera.width - x]
+        down, right = (part / camera.mean_focal_px for part in pixels)  # tangents of the angles from the axis
         light = _LIGHT[rgb]
         for _ in range(self.occluders):
             _occlude(light, right, down, depth_m, rng)

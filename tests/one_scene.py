@@ -28,6 +28,8 @@ def label_viewpoints(
     """`label_scenes` for one scene, of the parts of a `SceneJob` and a `LabelTask`: the table with its labels."""
     config = config or LabelConfig()
     extractor = extractor or ExtractorConfig()
-    job = SceneJob(mesh, landmarks, camera, config.localizer, extractor, device, config.store_matches)
+    job = SceneJob(
+        mesh, landmarks, camera, config.localizer, extractor, device, config.store_matches, appearance=config.appearance
+    )
     (scene,) = label_scenes([LabelTask(description, job, table, shards)], config, progress, description)
     return scene.table

@@ -110,6 +110,15 @@ def test_a_compact_table_reads_the_same(many: pd.DataFrame, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("compact", [False, True])
+def test_strengths_of_appearances_are_kept(compact: bool, many: pd.DataFrame, tmp_path: Path) -> None:
+    strengths = np.random.default_rng(0).random(len(many)).astype(np.float32)
+    write_table(many.assign(appearance=strengths), tmp_path / "a.parquet", compact)
+    back = read_table(tmp_path / "a.parquet")
+    assert [*back] == [*SCHEMA.names, "appearance"]
+    np.testing.assert_array_equal(back["appearance"].to_numpy(), strengths)
+
+
+@pytest.mark.parametrize("compact", [False, True])
 def test_damaged_files(compact: bool, many: pd.DataFrame, tmp_path: Path) -> None:
     path = tmp_path / "viewpoints.parquet"
     write_table(many, path, compact)

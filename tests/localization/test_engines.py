@@ -27,6 +27,15 @@ def test_workers_and_shards_do_not_change_the_table(
     assert not multiprocessing.active_children()
 
 
+@SLOW
+def test_workers_do_not_change_appearances(room: MappedRoom, views: pd.DataFrame, tmp_path: Path) -> None:
+    one, three = (
+        label(views, room, tmp_path / str(workers), workers=workers, shard_size=24 // workers, appearance=0.7)
+        for workers in (1, 3)
+    )
+    assert one == three
+
+
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
     """Two nodes of one core each, on this machine."""

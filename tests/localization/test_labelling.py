@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from localization.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, file_bytes, map_room
+from localization.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, file_bytes, label, map_room, times
 from one_scene import label_viewpoints
 from wheretolook.dataset.viewpoint_files import FIRST_FIELDS, SCHEMA, read_table, write_table
 from wheretolook.dataset.viewpoint_table import LOCALIZED, by_first, is_good, poses
@@ -23,6 +23,7 @@ from wheretolook.localization.shard import label_rows
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
+from wheretolook.utils.errors import ConfigError
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -161,3 +162,27 @@ def test_views_of_several_cameras_are_labelled_as_each_alone(room: MappedRoom) -
         rows = table["camera_id"] == number
         alone = label_rows(table[rows], renderer, Localizer(localizer.landmarks, camera), camera)
         pd.testing.assert_frame_equal(labelled[rows], alone)
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_appearances_depend_on_the_view_alone(room: MappedRoom, views: pd.DataFrame, tmp_path: Path) -> None:
+    """Not on shards or an interruption; without them the table has no such column."""
+    table = views.iloc[:12]
+    shards = tmp_path / "shards"
+    changed = label(table, room, shards, appearance=0.8, workers=1, shard_size=5)
+    shard, *_ = times(shards)
+    shard.unlink()
+    assert label(table, room, shards, appearance=0.8, workers=1, shard_size=5) == changed
+    assert label(table, room, tmp_path / "one", appearance=0.8, workers=1, shard_size=12) == changed
+    back = read_table(tmp_path / "one-labelled.parquet")
+    assert back["appearance"].between(0, 0.8).all() and back["appearance"].nunique() == 12
+    clean = label_viewpoints(back, room.mesh, room.landmarks, CAMERA, shards, LabelConfig(workers=1), progress=False)
+    assert [*clean] == SCHEMA.names and is_good(clean).all()
+    assert back["n_inliers"].sum() < clean["n_inliers"].sum()
+
+
+@pytest.mark.parametrize("strength", [-0.1, 1.01, 30.0, np.nan, np.inf])
+def test_appearances_beyond_0_and_1_are_refused(strength: float) -> None:
+    with pytest.raises(ConfigError, match=r"label\.appearance") as error:
+        LabelConfig(appearance=strength)
+    assert error.value.value is strength and error.value.fix

@@ -31,6 +31,7 @@ from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import finished_runs, newest_run
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import fingerprint
+from wheretolook.utils.reading import read_json_object
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook.weights.resolve import load_scorer
 
@@ -153,6 +154,22 @@ def test_matches_are_stored_on_request_and_removed_with_their_labels(copy: Path)
     for scene in scenes:
         with pytest.raises(TableError):
             read_table(scene.table, matches=True)
+
+
+@pytest.mark.usefixtures("in_this_process", "no_pictures_here")
+def test_appearances_replace_the_labels_and_are_removed_again(copy: Path) -> None:
+    scene, *_ = Dataset.load(copy / "data" / "tiny").scenes
+    before = scene.table.read_bytes()
+    changed = ("label", copy, "--label.appearance", "0.6")
+    assert run(*changed) == 0
+    table = scene.read_table()
+    assert table["appearance"].between(0, 0.6).all() and table["appearance"].nunique() == len(table)
+    manifest = read_json_object(scene.label_manifest)
+    assert manifest["appearance"] == 0.6
+    written = scene.table.stat().st_mtime_ns
+    assert run(*changed) == 0 and scene.table.stat().st_mtime_ns == written
+    assert run("label", copy) == 0 and scene.table.read_bytes() == before
+    assert run("label", copy, "--label.appearance", "1.5") == 2
 
 
 @pytest.mark.usefixtures("in_this_process", "no_pictures_here")

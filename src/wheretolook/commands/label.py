@@ -88,8 +88,10 @@ class Label(LabelOptions):
         extractor = extractor_of(files, self.mapping.extractor)
         settings = [self.label.localizer.record(), extractor.record(), files.camera.record()]
         made_from = [existing(files.mesh, SceneError, "scenes"), existing(files.landmarks, MapError, "map")]
-        matches = [name for name in ("store_matches", "store_pixels") if getattr(self.label, name)]
-        return cache_key("label", [*settings, *made_from, files.stage_cache("sample").stored_key, *matches])
+        changes = [name for name in ("store_matches", "store_pixels") if getattr(self.label, name)]
+        if self.label.appearance:
+            changes.append(f"appearance {self.label.appearance}")
+        return cache_key("label", [*settings, *made_from, files.stage_cache("sample").stored_key, *changes])
 
     def _label(
         self, to_label: Mapping[SceneFolder, str], summary: Path, log: Log, progress: Progress

@@ -13,7 +13,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from wheretolook.dataset.viewpoint_table import CAMERA_ID, FIRST, LABELS, PIXELS, poses
+from wheretolook.dataset.viewpoint_table import APPEARANCE, CAMERA_ID, FIRST, LABELS, PIXELS, poses
 from wheretolook.geometry.poses import Float, camera_centers, rotation_from_quaternion
 from wheretolook.io.poses import POSE_COLUMNS, QUATERNION_COLUMNS, TRANSLATION_COLUMNS
 from wheretolook.utils.errors import TableError
@@ -52,6 +52,12 @@ FIRST_FIELDS = pa.schema([SCHEMA.field(name).with_name(f"{FIRST}{name}") for nam
 """Optional columns of a table labelled by several hypotheses: status, errors and inliers of the first RANSAC result,
 exactly as `LocalizerConfig.method` "first" labels."""
 
+APPEARANCE_FIELD = pa.schema([(APPEARANCE, pa.float32())])
+"""An optional column of labels made with `label.appearance`: the strength at which each view's image was changed."""
+
+OPTIONAL_FIELDS = (CAMERA_FIELD, FIRST_FIELDS, APPEARANCE_FIELD)
+"""Optional columns that compact tables keep, too."""
+
 CENTER_DECIMALS = 12  # of a metre; the centres of a location's viewpoints, each computed from its pose, differ by less
 
 _ENCODINGS = {"viewpoint_id": "DELTA_BINARY_PACKED", "error_m": "BYTE_STREAM_SPLIT", "error_deg": "BYTE_STREAM_SPLIT"}
@@ -65,13 +71,12 @@ _COMPACT_FORMAT = {
 def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
     """Write a table atomically as zstd Parquet with checksums; the same rows give the same bytes.
 
-    Columns are those of `SCHEMA`, and of `CAMERA_FIELD`, `FIRST_FIELDS`, `MATCH_FIELDS` and `PIXEL_FIELD` if they are
-    there. A compact table has `COMPACT_SCHEMA`, about 18 bytes a row; read back, its poses agree to 1e-12 and all else
+    Columns are those of `SCHEMA`, and of `OPTIONAL_FIELDS`, `MATCH_FIELDS` and `PIXEL_FIELD` if they are there. A compact table has `COMPACT_SCHEMA`, about 18 bytes a row; read back, its poses agree to 1e-12 and all else
     exactly.
     """
     if compact:
         table = table.assign(**dict(zip(CENTER_COLUMNS, _shared_centers(table).T, strict=True)))
-    optional = [CAMERA_FIELD, FIRST_FIELDS, *([] if compact else [MATCH_FIELDS, PIXEL_FIELD])]
+    optional = [*OPTIONAL_FIELDS, *([] if compact else [MATCH_FIELDS, PIXEL_FIELD])]
     extra = [field for part in optional if {*part.names} <= {*table} for field in part]
     schema = pa.schema([*(COMPACT_SCHEMA if compact else SCHEMA), *extra])
     content = pa.Table.from_pandas(table, schema=schema, preserve_index=False)
@@ -100,7 +105,7 @@ def has_matches(path: Path, pixels: bool = False) -> bool:
 
 
 def read_table(path: Path, matches: bool = False, pixels: bool = False) -> pd.DataFrame:
-    """Read the columns of `SCHEMA`, and of `CAMERA_FIELD` and `FIRST_FIELDS` if present, of a table, compact or not.
+    """Read the columns of `SCHEMA`, and of `OPTIONAL_FIELDS` if present, of a table, compact or not.
 
     With `matches` also those of `MATCH_FIELDS`: in each row two int32 arrays, (M,) of the landmarks matched and (I,) of
     the inliers among them; with `pixels` also `PIXEL_FIELD`, (2 M,) float32. Raises TableError if the file is missing,
@@ -114,7 +119,7 @@ def read_table(path: Path, matches: bool = False, pixels: bool = False) -> pd.Da
         with open_parquet(path, page_checksum_verification=True) as file:
             stored = {*file.schema_arrow.names}
             compact = not stored.isdisjoint(CENTER_COLUMNS)
-            optional = [part for part in (CAMERA_FIELD, FIRST_FIELDS) if {*part.names} <= stored]
+            optional = [part for part in OPTIONAL_FIELDS if {*part.names} <= stored]
             extra = [field for part in optional for field in part] + requested
             schema = pa.schema([*(COMPACT_SCHEMA if compact else SCHEMA), *extra])
             if missing := [name for name in schema.names if name not in stored]:

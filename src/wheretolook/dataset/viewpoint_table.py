@@ -15,6 +15,7 @@ from wheretolook.utils.errors import TableError
 
 CAMERA_ID = "camera_id"  # optional column
 PIXELS = "matched_pixels"  # optional column
+APPEARANCE = "appearance"  # optional column
 
 UNLABELLED = "unlabelled"
 

@@ -27,7 +27,8 @@ class LocalizerConfig:
         lightglue_images: number of these mapping images: those that observe most of the landmarks matched first.
         max_error_px: maximum reprojection error of an inlier in RANSAC.
         min_inliers: inliers that a pose needs: RANSAC finds some pose with a few for almost any image.
-        seed: seed of RANSAC, the same for every image, so that a label depends only on its viewpoint.
+        seed: seed of RANSAC, the same for every image, so that a label depends only on its viewpoint; also of
+            `label.appearance`.
 
     Attributes:
         min_matches: matches needed to estimate a pose: four determine and check one.
@@ -88,6 +89,9 @@ class LabelConfig:
             shards in progress.
         store_matches: store the rows of the landmarks that each view matched (matched_rows) and of the inliers
             (inlier_rows); needed to train matchability.
+        appearance: 0 to 1, the highest strength at which queries are made to resemble photographs: exposure, white
+            balance, vignetting, noise, motion blur, defocus, JPEG, and people in front. Each view's is drawn up to it
+            and stored (appearance).
         store_pixels: store also the pixels of the matches (matched_pixels); needed to localize several looks jointly.
     """
 
@@ -98,6 +102,7 @@ class LabelConfig:
     shard_size: int = 256
     store_matches: bool = False
     store_pixels: bool = False
+    appearance: float = 0.0
 
     def __post_init__(self) -> None:
         check_choice("label.engine", self.engine, ("local", "ray"))
@@ -106,3 +111,6 @@ class LabelConfig:
             raise ConfigError("LightGlue reads the map's database, which does not travel to Ray's machines", fix=fix)
         check_range("workers", self.workers, 0)
         check_range("shard_size", self.shard_size, 1)
+        if not 0 <= self.appearance <= 1:
+            fix = "Give 0 for plain renderings, 0.3 for good photographs, up to 1 for poor ones."
+            raise ConfigError("label.appearance must be within 0 and 1", value=self.appearance, fix=fix)

@@ -124,7 +124,8 @@ class _SceneInProgress:
         if job.cameras:
             settings["cameras"] = {number: camera.record() for number, camera in job.cameras}
         # only options that are set: the record decides the names of shards
-        settings |= {name: True for name in ("store_matches", "store_pixels") if getattr(job, name)}
+        options = ("store_matches", "store_pixels", "appearance")
+        settings |= {name: getattr(job, name) for name in options if getattr(job, name)}
         text = json.dumps(settings, sort_keys=True).encode()
         inputs = [name for name in (*SCHEMA.names, CAMERA_ID) if name not in LABELS and name in table]
         shards = []

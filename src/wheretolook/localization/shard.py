@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from wheretolook.dataset.viewpoint_files import FIRST_FIELDS, MATCH_FIELDS
-from wheretolook.dataset.viewpoint_table import CAMERA_ID, FIRST, PIXELS, poses
+from wheretolook.dataset.viewpoint_table import APPEARANCE, CAMERA_ID, FIRST, PIXELS, poses
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.poses import Float
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from wheretolook.features.keypoints import Keypoints
     from wheretolook.features.matches import Matches
     from wheretolook.localization.localizer import Localization, Localizer
+    from wheretolook.rendering.appearance import Appearance
     from wheretolook.rendering.types import Renderer
 
 BATCH = 8
@@ -47,6 +48,7 @@ class SceneJob:
     store_matches: bool = False  # add `viewpoint_files.MATCH_FIELDS`
     cameras: tuple[tuple[int, Camera], ...] = ()  # by number, if viewpoints have a `camera_id`
     store_pixels: bool = False  # add `viewpoint_files.PIXEL_FIELD`, too
+    appearance: float = 0.0  # highest strength of `rendering.appearance`; add `viewpoint_files.APPEARANCE_FIELD`
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +91,8 @@ class ShardWorker:
             seconds: dict[str, float] = {}
             renderer, localizer = self._open(job)
             cameras = dict(job.cameras) or job.camera
-            labelled = label_rows(rows, renderer, localizer, cameras, seconds, job.store_matches, job.store_pixels)
+            options = job.store_matches, job.store_pixels, job.appearance
+            labelled = label_rows(rows, renderer, localizer, cameras, seconds, *options)
             return LabelledShard(labelled, seconds)
         except WhereToLookError:
             raise
@@ -146,14 +149,18 @@ def label_rows(
     seconds: dict[str, float] | None = None,
     store_matches: bool = False,
     store_pixels: bool = False,
+    appearance: float = 0.0,
 ) -> pd.DataFrame:
     """Render viewpoints, localize the images and measure the errors, in batched steps that overlap.
 
     With several cameras, `camera_id` selects that of a viewpoint. The seconds spent in each step (render, extract,
-    match, pose) are added to `seconds`. A batch that exceeds a GPU's memory is halved. Returns the table with new status, error_m, error_deg and n_inliers, with
-    `viewpoint_files.FIRST_FIELDS` by several hypotheses, `MATCH_FIELDS` if `store_matches`, and also `PIXEL_FIELD` if
-    `store_pixels`.
+    match, pose) are added to `seconds`. A batch that exceeds a GPU's memory is halved. Returns the table with new
+    status, error_m, error_deg and n_inliers, with `viewpoint_files.FIRST_FIELDS` by several hypotheses, `MATCH_FIELDS`
+    if `store_matches`, and also `PIXEL_FIELD` if `store_pixels`. With `appearance` above 0 images are changed at strengths drawn up to it, see
+    `rendering.appearance`, which `APPEARANCE_FIELD` holds.
     """
+    from wheretolook.rendering.appearance import Appearance
+
     true_poses = poses(table)
     if isinstance(cameras, Mapping):
         numbers = table[CAMERA_ID].to_numpy()
@@ -163,9 +170,11 @@ def label_rows(
     batch_size = max(BATCH, localizer.extractor.batch_of(640, 480))
     batches = [(camera, rows) for camera, group in groups for rows in _batches(camera, group, batch_size)]
 
+    drawn = Appearance.of_views(true_poses, appearance, localizer.config.seed) if appearance else []
+
     def render(batch: tuple[Camera, NDArray[np.int64]]) -> tuple[Camera, Sequence[NDArray[np.uint8]]]:
         camera, rows = batch
-        return camera, halving(lambda some: renderer.render(camera, true_poses[some]).rgb)(rows)
+        return camera, halving(lambda some: _images(renderer, camera, some, true_poses, drawn))(rows)
 
     def match(batch: tuple[Camera, list[Keypoints]]) -> tuple[Camera, list[tuple[Keypoints, Matches]]]:
         camera, keypoints = batch
@@ -190,8 +199,21 @@ def label_rows(
         columns |= _labels([result.first or result for result in results], true_poses, FIRST)
     if store_matches or store_pixels:
         columns |= _matches(results, store_pixels)
-    old = [*FIRST_FIELDS.names, *MATCH_FIELDS.names, PIXELS]
+    if drawn:
+        columns[APPEARANCE] = np.array([one.strength for one in drawn], dtype=np.float32)
+    old = [*FIRST_FIELDS.names, *MATCH_FIELDS.names, PIXELS, APPEARANCE]
     return table.drop(columns=old, errors="ignore").assign(**columns)
+
+
+def _images(
+    renderer: Renderer, camera: Camera, rows: NDArray[np.int64], cam_from_world: Float, drawn: Sequence[Appearance]
+) -> NDArray[np.uint8]:
+    """Render some rows of all views as images (B, H, W, 3), with their appearances if these are drawn."""
+    seen = renderer.render(camera, cam_from_world[rows])
+    if not drawn:
+        return seen.rgb
+    views = zip(rows, seen.rgb, seen.depth_m, strict=True)
+    return np.stack([drawn[row].apply(rgb, camera, depth_m) for row, rgb, depth_m in views])
 
 
 def _labels(results: Sequence[Localization], true_poses: Float, prefix: str = "") -> dict[str, Any]:

@@ -96,7 +96,9 @@ def _comparisons(options: ComparePaths, dataset: Dataset, log: Log) -> list[Scen
     for files in scenes:
         scene = open_scene(options, files)
         extractor = extractor_of(files, options.mapping.extractor)
-        job = SceneJob(files.mesh, files.landmarks, scene.camera, options.label.localizer, extractor, scene.device)
+        label = options.label
+        made_from = files.mesh, files.landmarks, scene.camera, label.localizer, extractor, scene.device
+        job = SceneJob(*made_from, appearance=label.appearance)
         folder = dataset.root / "results" / FOLDER / scene.name
         comparisons.append(SceneComparison(scene, dataset, folder, config, weights, job, log))
     return comparisons

@@ -121,6 +121,8 @@ def release_settings(options: Experiment) -> dict[str, Any]:
     settings = {"camera": options.camera.camera.record(), **settings}
     settings["scenes"]["meshes"] = meshes
     settings["label"] = {"localizer": options.label.localizer.record()}
+    if options.label.appearance:
+        settings["label"]["appearance"] = options.label.appearance
     return dict(json.loads(json.dumps(settings, default=str)))
 
 

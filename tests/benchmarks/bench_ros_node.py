@@ -20,8 +20,9 @@ sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "benchmarks"), str(ROO
 
 import rclpy
 from bench_ros import random_bases
+from sensor_msgs.msg import JointState
 
-from ros.processes import CAMERA, Robot, environment, image_of, info_of, running
+from ros.processes import CAMERA, JOINTS, Robot, environment, image_of, info_of, running
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
 
@@ -70,6 +71,7 @@ def main() -> None:
         while time.monotonic() - begin < options.seconds:
             number += 1
             node.stamp += 0.1
+            node.send("joint_states", JointState(name=JOINTS, position=[0.0, 0.0]))
             node.send("camera_info", info_of(CAMERA))
             node.send("image", images[number % len(images)])
             node.wait(lambda: node.received and node.received[-1][0] == "/diagnostics", "an answer")

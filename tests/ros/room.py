@@ -13,7 +13,7 @@ from wheretolook.features.descriptors import quantize_descriptors
 from wheretolook.features.opencv_sift import RootSift
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.looks.next_look import mean_scores_by_pitch
 from wheretolook.mapping.landmarks import Landmarks
@@ -72,9 +72,9 @@ def room_landmarks(mesh: TexturedMesh) -> Landmarks:
     )
 
 
-def write_folder(mesh: TexturedMesh, folder: Path) -> Path:
-    """Export the robot's folder."""
+def write_folder(mesh: TexturedMesh, folder: Path, places: Float | None = None) -> Path:
+    """Export the robot's folder, with the occlusion at places (L, 3) m."""
     landmarks = room_landmarks(mesh)
     source = LocalizationMap(landmarks, PinholeCamera())
     export_localizer(landmarks, landmarks.ids, mean_scores_by_pitch(load_scorer(source), CENTER[None]), folder)
-    return export_robot(source, WEIGHTS, folder, progress=False)
+    return export_robot(source, WEIGHTS, folder, places, progress=False)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -75,3 +77,24 @@ def test_a_robot_that_faces_a_wall_turns_and_drives(tmp_path: Path) -> None:
         assert max(error for error, _ in errors()) < 0.05
     node.destroy_node()
     rclpy.try_shutdown()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "options", "printed"),
+    [
+        ("ros", "--places 1 --policy even --out {out}", "confident"),
+        ("ros_node", "--seconds 3 --views 2", "per second of CPU time"),
+        ("ros_paths", "--paths 1 --min-length 1 --out {out}", "ahead: confident"),
+    ],
+)
+def test_benchmarks_run_small(name: str, options: str, printed: str, tmp_path: Path) -> None:
+    mesh = room_mesh()
+    save_glb(mesh, tmp_path / "room.glb")
+    x, y = np.meshgrid(np.arange(1.0, 6.0), np.arange(1.0, 4.0))
+    folder = write_folder(mesh, tmp_path / "robot", np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 1.2)]))
+    command = [sys.executable, str(ROOT / "tests" / "benchmarks" / f"bench_{name}.py")]
+    command += ["--mesh", str(tmp_path / "room.glb"), "--folder", str(folder)]
+    command += options.format(out=tmp_path / "out.csv").split()
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | environment())
+    assert done.returncode == 0 and printed in done.stdout, done.stdout + done.stderr

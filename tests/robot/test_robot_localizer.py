@@ -35,7 +35,7 @@ from wheretolook.robot.localizer import RobotLocalizer
 from wheretolook.robot.localizer_export import export_localizer
 from wheretolook.robot.wheretolook_robot import RobotScorer
 from wheretolook.scorers.base import Scorer
-from wheretolook.utils.errors import MapError
+from wheretolook.utils.errors import ConfigError, MapError
 
 BUNDLED = Path("data/release/weights/set.safetensors")
 POSES = poses_looking_along([(-0.5, 0.3, 1.2)] * 2, [(1, 0.2, 0), (0.3, 1, 0)])
@@ -206,6 +206,9 @@ def test_invalid_input_is_rejected(folder: Path, tmp_path: Path) -> None:
     for views, turns in [([matched, matched], None), ([], None), ([matched], np.eye(3))]:
         with pytest.raises(ValueError):
             robot.localize(views, turns)
+    for accuracy in ((0.0, 0.0), (np.nan, 0.4)):
+        with pytest.raises(ConfigError, match="two positive limits"):
+            robot.localize([matched], accuracy=accuracy)
     with pytest.raises(ValueError):
         robot.match(view[0][1:], view[1])
     with pytest.raises(MapError):

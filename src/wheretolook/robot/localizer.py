@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wheretolook.dataset.thresholds import checked_accuracy
 from wheretolook.features.descriptors import quantize_descriptors
 from wheretolook.features.matches import Matches
 from wheretolook.features.opencv_sift import RootSift
@@ -193,6 +194,7 @@ class RobotLocalizer:
             turns: rotations `cam_from_rig` (N, 3, 3) of several views, or poses (N, 3, 4) in metres.
             accuracy: limits in metres and degrees that the probability refers to.
         """
+        limits = checked_accuracy(accuracy)
         if (turns is None and len(views) != 1) or not views:
             raise ValueError("several views are localized together by their rotations: give turns")
         poses = np.eye(3, 4)[None] if turns is None else np.asarray(turns, dtype=np.float64)
@@ -203,7 +205,7 @@ class RobotLocalizer:
         looks = [replace(view.look, cam_from_rig=pose) for view, pose in zip(views, poses, strict=True)]
         count = POSES_OF_A_VIEW if len(views) > 1 else POSES_OF_AN_IMAGE
         joint = self._localizer.localize(looks, [view.poses[:count] + view.near_prior for view in views])
-        found = zip((joint, *joint.rivals), probabilities(joint, accuracy), strict=True)
+        found = zip((joint, *joint.rivals), probabilities(joint, limits), strict=True)
         return RobotLocalization(
             joint,
             tuple(

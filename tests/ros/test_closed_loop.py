@@ -86,6 +86,7 @@ def test_a_robot_that_faces_a_wall_turns_and_drives(tmp_path: Path) -> None:
         ("ros", "--places 1 --policy even --out {out}", "confident"),
         ("ros_node", "--seconds 3 --views 2", "per second of CPU time"),
         ("ros_paths", "--paths 1 --min-length 1 --out {out}", "ahead: confident"),
+        ("ros_film", "--min-length 2 --bag {bag} --film {film}", ""),
     ],
 )
 def test_benchmarks_run_small(name: str, options: str, printed: str, tmp_path: Path) -> None:
@@ -95,6 +96,8 @@ def test_benchmarks_run_small(name: str, options: str, printed: str, tmp_path: P
     folder = write_folder(mesh, tmp_path / "robot", np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 1.2)]))
     command = [sys.executable, str(ROOT / "tests" / "benchmarks" / f"bench_{name}.py")]
     command += ["--mesh", str(tmp_path / "room.glb"), "--folder", str(folder)]
-    command += options.format(out=tmp_path / "out.csv").split()
+    film = tmp_path / "film.webp"
+    command += options.format(out=tmp_path / "out.csv", bag=tmp_path / "bag", film=film).split()
     done = subprocess.run(command, capture_output=True, text=True, env=os.environ | environment())
     assert done.returncode == 0 and printed in done.stdout, done.stdout + done.stderr
+    assert film.is_file() == (name == "ros_film")

@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from synthetic_dataset import CAMERA, make_landmarks
 from wheretolook import load_scorer
@@ -31,6 +32,7 @@ from wheretolook.looks.next_look import N_DIRECTIONS, NextLookSelector, mean_sco
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.robot.export import export_robot
+from wheretolook.robot.image_sequence import ImageSequence
 from wheretolook.robot.localizer import RobotLocalizer
 from wheretolook.robot.localizer_export import export_localizer
 from wheretolook.robot.wheretolook_robot import RobotScorer
@@ -195,6 +197,21 @@ def test_poses_are_in_the_frame_of_the_map(tmp_path: Path) -> None:
     own = result.joint.covariance  # in the world, whose y axis is the map's x axis
     assert result.poses[0].covariance[0, 0] == pytest.approx(own[1, 1] / 4)
     assert result.poses[0].covariance[3, 1] == pytest.approx(-own[4, 0] / 2)
+
+
+@pytest.mark.parametrize(("error_deg", "reported"), [(0.0, False), (5.0, True)])
+def test_odometry_whose_rotation_the_images_contradict_is_reported(
+    folder: Path, error_deg: float, reported: bool
+) -> None:
+    """A confidence that no image reaches keeps all views in the rig."""
+    robot = RobotLocalizer(folder)
+    sequence = ImageSequence(robot, confidence=2.0)
+    turn = Rotation.from_euler("y", error_deg, degrees=True).as_matrix()
+    odometry = [POSES[0], np.column_stack([turn @ POSES[1][:, :3], turn @ POSES[1][:, 3]])]
+    views = [robot.match(*view_of(described(), pose)) for pose in POSES]
+    results = [sequence.add(view, pose) for view, pose in zip(views, odometry, strict=True)]
+    assert results[1].n_views == 2 and results[0].contradiction == ""
+    assert ("odometry contradicts the images by" in results[1].contradiction) == reported
 
 
 def test_invalid_input_is_rejected(folder: Path, tmp_path: Path) -> None:

@@ -80,6 +80,7 @@ class ImageSequence:
         others = [kept for kept in self._kept if self._joins(kept[1], cam_from_odom)]
         best = alone
         n_views = 1
+        contradiction = ""
         if others and alone.probability < self.confidence:
             turns = np.stack([compose_poses(pose, invert_poses(cam_from_odom)) for _, pose in others])
             views = [view, *(kept for kept, _ in others)]
@@ -87,13 +88,14 @@ class ImageSequence:
             if joint.probability >= alone.probability:
                 best = joint
                 n_views = len(views)
+                if joint.joint.turn_error_deg:
+                    contradiction = f"odometry contradicts the images by {joint.joint.turn_error_deg:.1f} degrees"
         self._kept = [*others, (view, cam_from_odom)][1 - self.max_views :]
-        contradiction = ""
         if best.probability >= self.confidence:
             pose = best.joint.rig_from_world
             assert pose is not None
             if self._confident is not None:
-                contradiction = _contradiction(*self._confident, pose, cam_from_odom)
+                contradiction = _contradiction(*self._confident, pose, cam_from_odom) or contradiction
             if contradiction:
                 self._kept = self._kept[-1:]
             self._confident = pose, cam_from_odom

@@ -73,14 +73,14 @@ def pinhole_of(info: CameraInfo, rectified: bool) -> tuple[Array, Callable[[Arra
     Both are in pixels of wheretolook. With `rectified`, images are those of image_proc. Raises ValueError for a camera
     that is not calibrated, or of another model.
     """
-    matrix = np.array(info.p, dtype=np.float64).reshape(3, 4)[:, :3] if rectified else np.array(info.k).reshape(3, 3)
+    matrix = np.array(info.p).reshape(3, 4)[:, :3] if rectified else np.array(info.k).reshape(3, 3)
     if not (matrix[0, 0] > 0 and matrix[1, 1] > 0):
         raise ValueError("the camera is not calibrated: the focal length in its CameraInfo is 0")
     if info.binning_x > 1 or info.binning_y > 1 or info.roi.width % info.width or info.roi.height % info.height:
         raise ValueError("binning and regions of interest in a CameraInfo are not supported")
     moved = matrix.copy()
     moved[:2, 2] += 0.5
-    distortion = np.array(info.d, dtype=np.float64)
+    distortion = np.array(info.d)
     if rectified or not distortion.any():
         return moved, lambda pixels: pixels
     undistort = UNDISTORT.get(info.distortion_model)

@@ -205,13 +205,24 @@ def test_odometry_whose_rotation_the_images_contradict_is_reported(
 ) -> None:
     """A confidence that no image reaches keeps all views in the rig."""
     robot = RobotLocalizer(folder)
-    sequence = ImageSequence(robot, confidence=2.0)
+    sequence = ImageSequence(robot)
+    sequence.confidence = 2.0
     turn = Rotation.from_euler("y", error_deg, degrees=True).as_matrix()
     odometry = [POSES[0], np.column_stack([turn @ POSES[1][:, :3], turn @ POSES[1][:, 3]])]
     views = [robot.match(*view_of(described(), pose)) for pose in POSES]
     results = [sequence.add(view, pose) for view, pose in zip(views, odometry, strict=True)]
     assert results[1].n_views == 2 and results[0].contradiction == ""
     assert ("odometry contradicts the images by" in results[1].contradiction) == reported
+
+
+@pytest.mark.parametrize("max_views", [1, 2])
+def test_no_more_than_max_views_are_localized_jointly(folder: Path, max_views: int) -> None:
+    robot = RobotLocalizer(folder)
+    sequence = ImageSequence(robot, max_views=max_views)
+    sequence.confidence = 2.0
+    views = [robot.match(*view_of(described(), pose)) for pose in POSES]
+    found = [sequence.add(view, pose).n_views for view, pose in zip(views, POSES, strict=True)]
+    assert max(found) == max_views
 
 
 def test_invalid_input_is_rejected(folder: Path, tmp_path: Path) -> None:
@@ -226,6 +237,9 @@ def test_invalid_input_is_rejected(folder: Path, tmp_path: Path) -> None:
     for accuracy in ((0.0, 0.0), (np.nan, 0.4)):
         with pytest.raises(ConfigError, match="two positive limits"):
             robot.localize([matched], accuracy=accuracy)
+    for confidence, max_views in ((0.0, 4), (2.0, 4), (np.nan, 4), (0.95, 0)):
+        with pytest.raises(ConfigError):
+            ImageSequence(robot, confidence, max_views=max_views)
     with pytest.raises(ValueError):
         robot.match(view[0][1:], view[1])
     with pytest.raises(MapError):

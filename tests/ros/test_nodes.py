@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,11 +15,13 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS is not installed: pip install '.[ros]'")
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import JointState, RegionOfInterest
 from wheretolook_ros.conversions import Array, compose, inverse, pose_matrix, pose_message
 
-from ros.processes import CAMERA, HEAD, Robot, base_at, environment, image_of, info_of, jpeg_of, mosaic, running
+from ros.processes import CAMERA, HEAD, JOINTS, Robot, base_at, environment, image_of, info_of, jpeg_of, mosaic, running
 from ros.room import room_mesh, write_folder
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import pose_error
@@ -203,6 +206,7 @@ def test_an_image_that_cannot_be_read(robot: Robot, change: dict[str, object], m
         ({"distortion_model": "seen_nowhere", "d": [0.1] * 5}, "the distortion model 'seen_nowhere' is not supported"),
         ({"width": 1280, "height": 960}, "the image has 640 x 480 px, its CameraInfo 1280 x 960"),
         ({"binning_x": 2}, "binning"),
+        ({"roi": RegionOfInterest(width=320, height=240)}, "regions of interest"),
         ({"k": [1e-9, 0.0, 0.0, 0.0, 1e-9, 0.0, 0.0, 0.0, 1.0]}, "focal length"),
     ],
 )
@@ -213,6 +217,42 @@ def test_a_camera_that_cannot_be_used(robot: Robot, change: dict[str, object], m
     status = robot.see(image_of(robot.rgb(BASE)), info)
     assert status.level == ERROR and message in status.message
     localizes_again(robot)
+
+
+def test_a_region_of_interest_of_the_whole_image_is_none(robot: Robot) -> None:
+    info = info_of(CAMERA)
+    info.roi = RegionOfInterest(width=640, height=480)
+    assert robot.see(image_of(robot.rgb(BASE)), info).message == "localized"
+
+
+def test_a_head_whose_joint_states_are_missing(robot: Robot) -> None:
+    """Without them the pose of the base would be wrong by the pan."""
+    robot.stamp += 10.0
+    robot.received.clear()
+    robot.send("image", image_of(robot.rgb(BASE, 0.7)))
+    robot.wait(lambda: "no joint states" in getattr(robot.status(), "message", ""), "an error")
+    assert robot.last("visual_localization/pose") is None
+
+
+def test_images_are_localized_while_odometry_is_late(robot: Robot) -> None:
+    """Images every 50 ms, each newer than the odometry that has arrived."""
+    image = image_of(robot.rgb(BASE))
+    robot.see(image, info_of(CAMERA), odometry=base_at(0.0, 0.0, 0.0))
+    robot.received.clear()
+    for _ in range(60):
+        robot.stamp += 0.05
+        robot.send("joint_states", JointState(name=JOINTS, position=[0.0, 0.0]))
+        odom = Odometry()
+        odom.pose.pose.orientation.w = 1.0
+        robot.send("odom", odom, robot.stamp - 0.06)
+        robot.send("image", image)
+        end = time.monotonic() + 0.05
+        while time.monotonic() < end:
+            rclpy.spin_once(robot, timeout_sec=0.01)
+    poses = [message for name, message in robot.received if name == "visual_localization/pose"]
+    assert len(poses) >= 4, len(poses)
+    image_key = KeyValue(key="image", value=f"{robot.stamp:.6f}")
+    robot.wait(lambda: image_key in getattr(robot.status(), "values", ()), "the newest image")
 
 
 def test_a_camera_unlike_the_map_s_is_reported(robot: Robot) -> None:
@@ -246,3 +286,9 @@ def test_odometry_that_contradicts_the_images(robot: Robot) -> None:
     robot.see(image_of(robot.rgb(BASE)), info_of(CAMERA), odometry=broken)
     messages = [m.status[0].message for name, m in robot.received if name == "/diagnostics"]
     assert "odometry are not finite" in " ".join(messages)
+    unset = Odometry()
+    unset.pose.pose.orientation.w = 0.0
+    robot.received.clear()
+    robot.send("odom", unset)
+    robot.wait(lambda: "a quaternion is 0" in getattr(robot.status(), "message", ""), "a warning")
+    localizes_again(robot)

@@ -6,6 +6,8 @@ import json
 import os
 import shutil
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,10 +20,11 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Vector3Stamped
 from nav_msgs.msg import Path as PathMessage
+from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from wheretolook_ros.conversions import Array, compose, inverse, pose_matrix, pose_message
 
-from ros.processes import CAMERA, HEAD, Robot, base_at, environment, image_of, info_of, running
+from ros.processes import CAMERA, HEAD, JOINTS, Robot, base_at, environment, image_of, info_of, running
 from ros.room import room_mesh, write_folder
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.robot.wheretolook_robot import RobotScorer
@@ -60,7 +63,7 @@ def within_limits(axes: Array) -> Array:
 
 def test_localizing_on_request(node: Robot, folder: Path) -> None:
     with running(LOCALIZER, {"folder": folder, "enable_continuous_localization": "false"}, signal.SIGINT):
-        node.connected("image", "camera_info")
+        node.connected("image", "camera_info", "joint_states")
         client = node.create_client(Trigger, "visual_localization/trigger_localization")
         assert client.wait_for_service(30)
 
@@ -70,6 +73,7 @@ def test_localizing_on_request(node: Robot, folder: Path) -> None:
 
         assert trigger() == Trigger.Response(success=False, message="no image has arrived")
         node.send("camera_info", info_of(CAMERA))
+        node.send("joint_states", JointState(name=JOINTS, position=[0.0, 0.0]))
         node.send("image", image_of(node.rgb(BASE)))
         for _ in range(20):
             rclpy.spin_once(node, timeout_sec=0.05)
@@ -100,6 +104,23 @@ def test_a_folder_of_another_version(node: Robot, folder: Path, tmp_path: Path, 
             said = str(status.message)
             if name == "visual_localization":
                 assert "the robot's folder" in said and ("Export" in said or "No module" in said), said
+
+
+@pytest.mark.parametrize("setting", ["confidence:=abc", "mount:=[1]"])
+def test_a_parameter_of_another_type_ends_the_node_with_its_name(setting: str) -> None:
+    command = [sys.executable, "-m", GAZE, "--ros-args", "-p", setting]
+    if "confidence" in setting:
+        command[2] = LOCALIZER
+    ended = subprocess.run(command, env=os.environ | environment(), capture_output=True, text=True, timeout=30)
+    assert ended.returncode == 1 and "Traceback" not in ended.stderr
+    assert setting.split(":")[0] in ended.stderr and "expecting type" in ended.stderr
+
+
+@pytest.mark.parametrize(("setting", "value"), [("confidence", 0.0), ("confidence", 2.0), ("max_views", 0)])
+def test_a_setting_that_makes_no_sense_is_reported(node: Robot, folder: Path, setting: str, value: float) -> None:
+    with running(LOCALIZER, {"folder": folder, setting: value}):
+        status = node.wait(node.status, "diagnostics")
+        assert status.level == DiagnosticStatus.ERROR and str(value) in status.message
 
 
 def test_the_gaze(node: Robot, folder: Path) -> None:

@@ -16,6 +16,7 @@ from wheretolook.geometry.poses import (
 )
 from wheretolook.localization.confidence import ACCURACY, Accuracy
 from wheretolook.robot.localizer import RobotLocalization, RobotLocalizer, RobotView
+from wheretolook.utils.errors import ConfigError
 
 MIN_TURN_DEG = 20.0  # between views that are localized jointly
 DRIFT = 0.25, 5.0  # m and degrees by which odometry may disagree with two confident poses,
@@ -49,6 +50,8 @@ class ImageSequence:
         accuracy: limits in metres and degrees that probabilities refer to.
         max_views: localized jointly.
         max_move_m: distance between the locations of views that are localized jointly.
+
+    Raises ConfigError unless 0 < confidence <= 1 and at least one view is localized.
     """
 
     def __init__(
@@ -59,6 +62,10 @@ class ImageSequence:
         max_views: int = 4,
         max_move_m: float = 0.3,
     ) -> None:
+        if not 0 < confidence <= 1:
+            raise ConfigError("a confidence is a probability", value=confidence, fix="Give one above 0, such as 0.95.")
+        if max_views < 1:
+            raise ConfigError("at least one view is localized", value=max_views, fix="Give max_views from 1 on.")
         self.localizer = localizer
         self.confidence = confidence
         self.accuracy = accuracy
@@ -90,7 +97,8 @@ class ImageSequence:
                 n_views = len(views)
                 if joint.joint.turn_error_deg:
                     contradiction = f"odometry contradicts the images by {joint.joint.turn_error_deg:.1f} degrees"
-        self._kept = [*others, (view, cam_from_odom)][1 - self.max_views :]
+        kept = [*others, (view, cam_from_odom)]
+        self._kept = kept[max(len(kept) + 1 - self.max_views, 0) :]
         if best.probability >= self.confidence:
             pose = best.joint.rig_from_world
             assert pose is not None

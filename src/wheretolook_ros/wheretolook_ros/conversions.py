@@ -73,14 +73,14 @@ def pinhole_of(info: CameraInfo, rectified: bool) -> tuple[Array, Callable[[Arra
     Both are in pixels of wheretolook. With `rectified`, images are those of image_proc. Raises ValueError for a camera
     that is not calibrated, or of another model.
     """
-    matrix = np.array(info.p, dtype=np.float64).reshape(3, 4)[:, :3] if rectified else np.array(info.k).reshape(3, 3)
+    matrix = np.array(info.p).reshape(3, 4)[:, :3] if rectified else np.array(info.k).reshape(3, 3)
     if not (matrix[0, 0] > 0 and matrix[1, 1] > 0):
         raise ValueError("the camera is not calibrated: the focal length in its CameraInfo is 0")
-    if info.binning_x > 1 or info.binning_y > 1 or info.roi.width or info.roi.height:
+    if info.binning_x > 1 or info.binning_y > 1 or info.roi.width % info.width or info.roi.height % info.height:
         raise ValueError("binning and regions of interest in a CameraInfo are not supported")
     moved = matrix.copy()
     moved[:2, 2] += 0.5
-    distortion = np.array(info.d, dtype=np.float64)
+    distortion = np.array(info.d)
     if rectified or not distortion.any():
         return moved, lambda pixels: pixels
     undistort = UNDISTORT.get(info.distortion_model)
@@ -96,15 +96,20 @@ def pinhole_of(info: CameraInfo, rectified: bool) -> tuple[Array, Callable[[Arra
 
 def pose_matrix(pose: Pose) -> Array:
     """Convert a pose to (3, 4). Raises ValueError for a quaternion of length 0 or a number that is not finite."""
+    return pose_of_numbers(pose_numbers(pose))
+
+
+def pose_numbers(pose: Pose) -> Array:
+    """Convert a pose to x, y, z and a unit quaternion qx, qy, qz, qw, which is not finite if it had length 0."""
     p = pose.position
-    q = pose.orientation
-    return pose_of_numbers(np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w]))
+    q = np.array([pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w])
+    return np.array([p.x, p.y, p.z, *q / np.linalg.norm(q)])
 
 
 def pose_of_numbers(numbers: Array) -> Array:
     """Convert x, y, z, qx, qy, qz, qw to (3, 4); raises as `pose_matrix`."""
     if not np.isfinite(numbers).all():
-        raise ValueError(f"a pose is not finite: {numbers.tolist()}")
+        raise ValueError(f"a pose is not finite, or its quaternion is 0: {numbers.tolist()}")
     return np.column_stack([Rotation.from_quat(numbers[3:]).as_matrix(), numbers[:3]])
 
 

@@ -118,9 +118,8 @@ class GazeNode(RobotNode):
         axis = self.head.base_from_camera(*joints)[:, 2]
         self._gaze.publish(direction_message(axis, self.settings["base_frame"], self.get_clock().now().to_msg()))
         reached = Duration(seconds=self.settings["turn_duration_s"]).to_msg()
-        point = JointTrajectoryPoint(positions=list(joints), time_from_start=reached)
-        names = [self.settings["pan_joint"], self.settings["tilt_joint"]]
-        self._joints.publish(JointTrajectory(joint_names=names, points=[point]))
+        point = JointTrajectoryPoint(positions=joints, time_from_start=reached)
+        self._joints.publish(JointTrajectory(joint_names=self.joint_names, points=[point]))
         self.report(OK, why)
 
 

@@ -34,23 +34,22 @@ class Head:
         turned = self._rotation() * Rotation.from_euler("ZY", [pan, tilt])
         return np.column_stack([turned.as_matrix() @ OPTICAL, self.mount[:3]])
 
-    def joints(self, direction: Array) -> tuple[float, float]:
+    def joints(self, direction: Array) -> list[float]:
         """Pan and tilt in radians, within the limits, that look most nearly along a direction (3,) of the base."""
-        limits = np.array([self.pan_deg, self.tilt_deg])
-        pan, tilt = np.radians(np.clip(self._angles_deg(direction), limits[:, 0], limits[:, 1]))
-        return float(pan), float(tilt)
+        return list(np.radians(self._within(self._angles_deg(direction))))
 
     def allows(self, directions: Array) -> Array:
         """Which directions (D, 3) of the base are within the limits, (D,) bool."""
         angles = self._angles_deg(directions)
-        limits = np.array([self.pan_deg, self.tilt_deg])
-        inside = (angles >= limits[:, 0] - ROUNDING_DEG) & (angles <= limits[:, 1] + ROUNDING_DEG)
-        return np.asarray(inside.all(axis=1))
+        return np.asarray(np.isclose(self._within(angles), angles, rtol=0, atol=ROUNDING_DEG).all(axis=1))
 
     def _angles_deg(self, directions: Array) -> Array:
         """Pan and tilt (..., 2) of directions (..., 3) of the base."""
         x, y, z = np.moveaxis(self._rotation().inv().apply(directions), -1, 0)
         return np.degrees(np.stack([np.arctan2(y, x), -np.arctan2(z, np.hypot(x, y))], axis=-1))
+
+    def _within(self, angles: Array) -> Array:
+        return np.clip(angles, *np.transpose([self.pan_deg, self.tilt_deg]))
 
     def _rotation(self) -> Rotation:
         return Rotation.from_euler("xyz", self.mount[3:], degrees=True)

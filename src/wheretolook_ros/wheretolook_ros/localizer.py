@@ -26,13 +26,13 @@ from wheretolook_ros.conversions import (
     pinhole_of,
     pose_matrix,
     pose_message,
+    pose_numbers,
     pose_of_numbers,
     seconds,
 )
 from wheretolook_ros.head import Timeline
 from wheretolook_ros.node import ERROR, OK, WARN, RobotNode, run
 
-POLL_S = 0.01
 WAIT_S = 0.2  # for odometry and joint states that are not older than the image
 
 
@@ -43,6 +43,7 @@ class LocalizerNode(RobotNode):
         super().__init__("visual_localization")
         self._image: Image | CompressedImage | None = None
         self._pending = False
+        self._waiting: Image | CompressedImage | None = None
         self._arrived = time.monotonic()
         self._info: CameraInfo | None = None
         self._prior: list[float] | None = None
@@ -64,7 +65,7 @@ class LocalizerNode(RobotNode):
         self.create_subscription(PoseWithCovarianceStamped, "initialpose", self._on_prior, 10)
         self.create_service(Trigger, "visual_localization/trigger_localization", self._on_trigger)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # a simulated clock may stand still
-        self.create_timer(POLL_S, self._poll, clock=steady)
+        self.create_timer(0.01, self._poll, clock=steady)
         self.create_timer(1.0, self._watch, clock=steady)
 
     def _open(self, package: Any, camera: Any, robot: Any) -> None:
@@ -86,20 +87,17 @@ class LocalizerNode(RobotNode):
         self._info = message
 
     def _on_odometry(self, message: Odometry) -> None:
-        p = message.pose.pose.position
-        q = message.pose.pose.orientation
-        self._add(self._odometry, message, [p.x, p.y, p.z, q.x, q.y, q.z, q.w], "odometry")
+        self._add(self._odometry, message, pose_numbers(message.pose.pose), "odometry")
 
     def _on_joints(self, message: JointState) -> None:
         known = dict(zip(message.name, message.position, strict=False))
-        names = self.settings["pan_joint"], self.settings["tilt_joint"]
-        if all(name in known for name in names):
-            self._add(self._joints, message, [known[name] for name in names], "joint states")
+        if known.keys() >= {*self.joint_names}:
+            self._add(self._joints, message, np.array([known[name] for name in self.joint_names]), "joint states")
 
-    def _add(self, timeline: Timeline, message: Odometry | JointState, values: list[float], name: str) -> None:
+    def _add(self, timeline: Timeline, message: Odometry | JointState, values: Array, name: str) -> None:
         if not np.isfinite(values).all():
-            self.report(WARN, f"{name} are not finite")
-        elif not timeline.add(seconds(message.header.stamp), np.array(values)):
+            self.report(WARN, f"{name} are not finite, or a quaternion is 0")
+        elif not timeline.add(seconds(message.header.stamp), values):
             self._restart(f"the time of {name} jumped back")
 
     def _restart(self, reason: str) -> None:
@@ -124,17 +122,24 @@ class LocalizerNode(RobotNode):
         if self._image is None:
             response.message = "no image has arrived"
         else:
+            self._pending = False
             response.success, response.message = self._localize(self._image)
         return response
 
     def _poll(self) -> None:
-        """Localize the newest image, once odometry and joint states up to its time have arrived."""
-        if not self._pending or self._image is None:
+        """Localize the newest image, once odometry and joint states up to its time have arrived.
+
+        Newer images wait meanwhile: each could be newer than the odometry.
+        """
+        if self._waiting is None and self._pending:
+            self._waiting, self._pending = self._image, False
+            self._since = time.monotonic()
+        if self._waiting is None:
             return
-        stamp = seconds(self._image.header.stamp)
+        stamp = seconds(self._waiting.header.stamp)
         late = [line for line in (self._odometry, self._joints) if line.times and line.times[-1] < stamp]
-        if not late or time.monotonic() - self._arrived > WAIT_S:
-            self._localize(self._image)
+        if not late or time.monotonic() - self._since > WAIT_S:
+            self._localize(self._waiting)
 
     def _watch(self) -> None:
         """Report that no image arrives."""
@@ -146,7 +151,7 @@ class LocalizerNode(RobotNode):
 
     def _localize(self, message: Image | CompressedImage) -> tuple[bool, str]:
         """Localize an image, publish the pose or report why there is none; returns whether it is confident."""
-        self._pending = False
+        self._waiting = None
         if not self._usable:
             return False, self.reported[1]
         stamp = seconds(message.header.stamp)
@@ -193,8 +198,8 @@ class LocalizerNode(RobotNode):
             size = f"{self._info.width} x {self._info.height}"
             raise ValueError(f"the image has {grey.shape[1]} x {grey.shape[0]} px, its CameraInfo {size}")
         matrix, to_pinhole = pinhole_of(self._info, self.settings["rectified"])
-        centre = float(matrix[0, 2]), float(matrix[1, 2])
-        camera = self._pinhole(grey.shape[1], grey.shape[0], float(matrix[0, 0]), float(matrix[1, 1]), centre)
+        (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
+        camera = self._pinhole(*grey.shape[::-1], fx, fy, (cx, cy))
         localizer = self._sequence.localizer
         pixels, descriptors = localizer.extract(grey)
         view = localizer.match(to_pinhole(pixels), descriptors, camera, self._prior)
@@ -202,10 +207,10 @@ class LocalizerNode(RobotNode):
 
     def _camera_at(self, stamp: float) -> tuple[Array, Array | None]:
         """Poses (3, 4) of the camera in the base and of odometry in the camera, None if that is unknown then."""
-        joints = self._joints.at(stamp)
-        if joints is None and self._joints.times:
-            raise ValueError("no joint states at the time of the image")
-        base_from_camera = self.head.base_from_camera(*(joints if joints is not None else (0.0, 0.0)))
+        joints: Any = self._joints.at(stamp) if any(self.joint_names) else (0.0, 0.0)
+        if joints is None:
+            raise ValueError(f"no joint states of {self.joint_names} at the time of the image")
+        base_from_camera = self.head.base_from_camera(*joints)
         base = self._odometry.at(stamp)
         if base is None:
             return base_from_camera, None
@@ -227,7 +232,7 @@ class LocalizerNode(RobotNode):
         """Publish the next view, as a direction in the base; returns what prevents it."""
         if self._scorer is None:
             return ""
-        pitch = -self.head.tilt_deg[1], -self.head.tilt_deg[0]
+        pitch = np.negative(self.head.tilt_deg[::-1])
         pan = np.degrees(self.head.joints(base_from_camera[:, 2])[0])
         limits = np.subtract(self.head.pan_deg, pan)
         try:

@@ -12,6 +12,7 @@ from typing import Any
 import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
@@ -31,6 +32,7 @@ class RobotNode(Node):
         known = [stored.get(owner, {}).get("ros__parameters", {}) for owner in ("/**", name)]
         declared = self.declare_parameters("", [item for part in (*known, more) for item in part.items()])
         self.settings = {parameter.name: parameter.value for parameter in declared}
+        self.joint_names = [self.settings["pan_joint"], self.settings["tilt_joint"]]
         limits = tuple(self.settings["pan_limits_deg"]), tuple(self.settings["tilt_limits_deg"])
         self.head = Head(tuple(self.settings["mount"]), *limits)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -77,6 +79,8 @@ def run(node: Callable[[], Node]) -> None:
         rclpy.spin(node())
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except InvalidParameterTypeException as error:
+        sys.exit(str(error))
     except Exception:
         if rclpy.ok():  # not because of a signal while a callback runs
             raise

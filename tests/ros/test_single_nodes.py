@@ -23,6 +23,7 @@ from nav_msgs.msg import Path as PathMessage
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from wheretolook_ros.conversions import Array, compose, inverse, pose_matrix, pose_message
+from wheretolook_ros.head import Timeline
 
 from ros.processes import CAMERA, HEAD, JOINTS, Robot, base_at, environment, image_of, info_of, running
 from ros.room import room_mesh, write_folder
@@ -121,6 +122,18 @@ def test_a_setting_that_makes_no_sense_is_reported(node: Robot, folder: Path, se
     with running(LOCALIZER, {"folder": folder, setting: value}):
         status = node.wait(node.status, "diagnostics")
         assert status.level == DiagnosticStatus.ERROR and str(value) in status.message
+
+
+def test_values_are_interpolated_and_never_extrapolated() -> None:
+    """A head that turned since its last state would turn the base."""
+    line = Timeline()
+    assert line.at(0.0) is None
+    for time, value in ((0.0, 0.0), (0.1, 1.0), (0.4, 2.0)):
+        assert line.add(time, np.array([value]))
+    np.testing.assert_allclose(line.at(0.05), [0.5])
+    np.testing.assert_allclose(line.at(0.404), [2.0])
+    assert line.at(0.45) is None and line.at(0.2) is None and line.at(-0.2) is None
+    assert not line.add(0.3, np.array([0.0])) and line.times == [0.3]
 
 
 def test_the_gaze(node: Robot, folder: Path) -> None:

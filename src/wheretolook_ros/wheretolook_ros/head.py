@@ -16,6 +16,7 @@ OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # axes of the optical
 ROUNDING_DEG = 1e-6
 KEPT_S = 10.0  # of a timeline
 TOLERANCE_S = 0.1  # between a time and the nearest value
+LATE_S = 0.005  # a head turns by a degree within it
 
 
 @dataclass(frozen=True)
@@ -75,11 +76,11 @@ class Timeline:
         return forward
 
     def at(self, time: float) -> Array | None:
-        """Interpolate linearly; None more than `TOLERANCE_S` away from all values."""
+        """Interpolate linearly; None if the next value is farther than `TOLERANCE_S`, or the last older than `LATE_S`."""
         after = bisect.bisect_left(self.times, time)
         rows = slice(max(after - 1, 0), after + 1)
         times = np.array(self.times[rows])
-        if len(times) == 0 or np.abs(times - time).min() > TOLERANCE_S:
+        if len(times) == 0 or not -TOLERANCE_S < time - times[-1] < LATE_S:
             return None
         values = np.array(self.values[rows])
         if len(values[0]) == 7 and values[0, 3:] @ values[-1, 3:] < 0:  # the same rotation by the other quaternion

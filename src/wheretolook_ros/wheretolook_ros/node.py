@@ -65,8 +65,8 @@ class RobotNode(Node):
             else:
                 log.error(message)
         self.reported = level, message
-        pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-        status = DiagnosticStatus(level=level, name=self.get_name(), message=message, values=pairs)
+        status = DiagnosticStatus(level=level, name=self.get_name(), message=message)
+        status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
         array = DiagnosticArray(status=[status])
         array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)
@@ -76,7 +76,9 @@ def run(node: Callable[[], Node]) -> None:
     """Run a node until it is interrupted or terminated."""
     rclpy.init()
     try:
-        rclpy.spin(node())
+        started = node()
+        while rclpy.ok():  # with a limit, since a signal does not always end a wait
+            rclpy.spin_once(started, timeout_sec=1)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except InvalidParameterTypeException as error:

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wheretolook.features.keypoints import Keypoints
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera, field_of_view_deg
 from wheretolook.geometry.poses import transform
-from wheretolook.holdout.crops import PANS, crop_keypoints, crop_pixels, crops_of
+from wheretolook.holdout.crops import PANS, crop_pixels, crops_of
 from wheretolook.utils.errors import ConfigError
 
 CAMERAS = [PinholeCamera(640, 480, 320.0), ColmapCamera("SIMPLE_RADIAL", 800, 600, (500.0, 390.0, 310.0, -0.05))]
@@ -42,11 +41,10 @@ def test_the_outer_crops_end_at_the_sides_of_the_photograph() -> None:
     np.testing.assert_allclose(sorted(ends[:2]), [0, pinhole.width], atol=0.6)
 
 
-def test_keypoints_keep_their_descriptors_and_wider_views_are_an_error() -> None:
-    keypoints = Keypoints(np.array([[320.0, 240.0], [5.0, 240.0]], np.float32), np.eye(2, 128, dtype=np.float32))
-    shown = crop_keypoints(CAMERAS[0], keypoints, 30.0, 0)
-    np.testing.assert_array_equal(shown.descriptors, np.eye(1, 128, dtype=np.float32))
+def test_pixels_outside_a_crop_are_not_shown_and_wider_views_are_an_error() -> None:
     pinhole, _ = crops_of(CAMERAS[0], 30.0)
-    np.testing.assert_allclose(shown.pixels, [(pinhole.width / 2, pinhole.height / 2)], atol=1)
+    pixels, shown = crop_pixels(CAMERAS[0], np.array([[320.0, 240.0], [5.0, 240.0]]), 30.0, 0)
+    assert shown.tolist() == [True, False]
+    np.testing.assert_allclose(pixels[0], (pinhole.width / 2, pinhole.height / 2), atol=1)
     with pytest.raises(ConfigError, match="do not show more"):
         crops_of(CAMERAS[0], 95.0)

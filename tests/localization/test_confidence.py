@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import lognorm
 
-from wheretolook.localization.confidence import ACCURACY, RIGHT_PLACE, ConfidenceModel, ErrorModel, probabilities
+from wheretolook.dataset.thresholds import ACCURACY
+from wheretolook.localization.confidence import RIGHT_PLACE, ConfidenceModel, ErrorModel, probabilities
 from wheretolook.localization.rig_localization import JointLocalization
 from wheretolook.utils.errors import WeightsError
 

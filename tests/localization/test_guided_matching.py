@@ -11,8 +11,8 @@ from wheretolook.features.matches import Matches
 from wheretolook.geometry.poses import pose_error, poses_looking_along, transform
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator
-from wheretolook.localization.guided_matching import MAX_NEAREST_RATIO, Candidates, match_under
-from wheretolook.localization.rig import Look
+from wheretolook.localization.guided_matching import match_under
+from wheretolook.localization.rig import MAX_NEAREST_RATIO, Candidates, Look
 from wheretolook.localization.rig_localization import JointLocalizer
 
 

@@ -179,7 +179,8 @@ def image_of(pixels: Array, encoding: str = "rgb8") -> Image:
 
 def base_at(x: float, y: float, yaw_deg: float) -> Array:
     """A base on the floor."""
-    cosine, sine = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
+    cosine = np.cos(np.radians(yaw_deg))
+    sine = np.sin(np.radians(yaw_deg))
     return np.array([[cosine, -sine, 0, x], [sine, cosine, 0, y], [0, 0, 1, 0]])
 
 

@@ -126,12 +126,14 @@ class SimulatedRobot(RobotNode):
         base = self._base.copy()
         base[:2, 3] = at
         if np.linalg.norm(at - self._base[:2, 3]) > 1e-6:
-            cosine, sine = np.cos(heading), np.sin(heading)
+            cosine = np.cos(heading)
+            sine = np.sin(heading)
             base[:2, :2] = [[cosine, -sine], [sine, cosine]]
         step = compose(inverse(self._base), base)
         distance_drift, turn_drift = self.settings["drift"]
         turn = np.arctan2(step[1, 0], step[0, 0]) * turn_drift + self._rng.normal(0, distance_drift) * step[0, 3]
-        cosine, sine = np.cos(turn), np.sin(turn)
+        cosine = np.cos(turn)
+        sine = np.sin(turn)
         error = np.array([[cosine, -sine, 0, 0], [sine, cosine, 0, 0], [0, 0, 1, 0]])
         measured = compose(step, error)
         measured[:, 3] *= 1 + distance_drift

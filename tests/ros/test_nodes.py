@@ -30,7 +30,9 @@ from wheretolook.rendering.warp_renderer import WarpRenderer
 BASE = base_at(3.2, 2.4, 30.0)
 LOCALIZER = "wheretolook_ros.localizer"
 GAZE = "wheretolook_ros.gaze"
-OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+OK = DiagnosticStatus.OK
+WARN = DiagnosticStatus.WARN
+ERROR = DiagnosticStatus.ERROR
 
 
 @pytest.fixture(scope="module")

@@ -163,7 +163,8 @@ def test_the_gaze(node: Robot, folder: Path) -> None:
             assert chosen >= np.max(others) - 0.02
         look = Vector3Stamped()
         look.header.frame_id = "base_link"
-        look.vector.x, look.vector.y, look.vector.z = np.cos(0.5), np.sin(0.5), 0.0
+        look.vector.x = np.cos(0.5)
+        look.vector.y = np.sin(0.5)
         node.received.clear()
         node.send("look", look)
         found = node.wait(lambda: node.last("joint_trajectory"), "a trajectory")

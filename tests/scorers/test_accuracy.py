@@ -157,7 +157,8 @@ def test_scores_rise_with_the_limits_and_are_unchanged_at_the_weights_own(scorer
 def test_views_have_an_accuracy_and_expected_errors(scorer: SetScorer) -> None:
     look = WhereToLook(scorer, direction_lattice(60))
     place = [(0.0, 0.0, 1.5)]
-    own, coarse = look.best(place), look.best(place, accuracy=(0.25, 2))
+    own = look.best(place)
+    coarse = look.best(place, accuracy=(0.25, 2))
     assert coarse.score[0] >= own.score[0] and coarse.method == "set 0.25m_2deg"
     assert coarse.expected_error_m is not None and coarse.expected_error_deg is not None
     assert np.array_equal(look.at_accuracy((0.25, 2)).score(coarse.cam_from_world), coarse.score)

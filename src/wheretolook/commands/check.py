@@ -37,8 +37,8 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
     the model's poses.
 
     Metres: a photograph counts as localized within 5 cm and 0.4 degrees, or --accuracy. Where metres are not known, it
-    is 1 % of the median depth of the photograph instead of 5 cm, and the map is scored as if its median depth were 5 m. A map of this
-    project knows whether it is in metres; for another, give --scale (1 for metres), --distance or --positions. A map
+    is 1 % of the median depth of the photograph instead of 5 cm, and the map is scored as if its median depth were 5 m.
+    A map of this project knows whether it is in metres; for another, give --scale (1 for metres), --distance or --positions. A map
     whose cameras are clearly not level is turned upright first, unless --up states what is up.
 
     Results (--out):

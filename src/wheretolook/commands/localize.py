@@ -40,8 +40,9 @@ class Localize(CameraOptions, FrameOptions):
     Results (--out), in the map's own frame and unit; a row for each image:
       csv, json    x, y, z: camera centre; qw, qx, qy, qz: camera-to-world; json with all rivals
       images.txt   COLMAP's, world-to-camera, the localized images only
-    probability is that of the pose to be within the accuracy; in a map of unknown unit, its median depth counts as 5 m. deviation is one standard deviation of the position. Rivals are other poses that matches support. An image
-    that is not localized has the reason.
+    probability is that of the pose to be within the accuracy; in a map of unknown unit, its median depth counts as 5 m.
+    deviation is one standard deviation of the position. Rivals are other poses that matches support. An image that is
+    not localized has the reason.
 
     Examples:
       wheretolook localize --map sparse/0 --images query.jpg --out pose.csv --figure pose.png

@@ -71,8 +71,8 @@ _COMPACT_FORMAT = {
 def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
     """Write a table atomically as zstd Parquet with checksums; the same rows give the same bytes.
 
-    Columns are those of `SCHEMA`, and of `OPTIONAL_FIELDS`, `MATCH_FIELDS` and `PIXEL_FIELD` if they are there. A compact table has `COMPACT_SCHEMA`, about 18 bytes a row; read back, its poses agree to 1e-12 and all else
-    exactly.
+    Columns are those of `SCHEMA`, and of `OPTIONAL_FIELDS`, `MATCH_FIELDS` and `PIXEL_FIELD` if they are there. A
+    compact table has `COMPACT_SCHEMA`, about 18 bytes a row; read back, its poses agree to 1e-12 and all else exactly.
     """
     if compact:
         table = table.assign(**dict(zip(CENTER_COLUMNS, _shared_centers(table).T, strict=True)))

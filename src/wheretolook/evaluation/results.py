@@ -106,7 +106,8 @@ def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[Nes
     """Yield a nested run for each method, occlusion model and candidate set of joined score tables.
 
     Metrics are those of `first_metrics`, those of all views by their columns, and the others by N, the scene unless it
-    is all of them, and the column, such as `top-5/any_5m_10deg`, `top-1/first_raw_0.05m_0.4deg` (by the first RANSAC result) and `top-1/apartment-210/regret_0.05m_0.4deg`.
+    is all of them, and the column, such as `top-5/any_5m_10deg`, `top-1/first_raw_0.05m_0.4deg` (by the first RANSAC
+    result) and `top-1/apartment-210/regret_0.05m_0.4deg`.
     """
     keys = threshold_keys(table)
     of_pooled = [f"{name}_{key}" for key in keys for name in _OF_EACH_THRESHOLD]

@@ -40,7 +40,8 @@ def views_of(
 ) -> tuple[CandidateViews, Ids]:
     """Return all labelled views of scenes in the order of their tables, and the location_id (L,) of each location.
 
-    If all tables have labels by the first RANSAC result, too, these give a second half of the columns of `good`. Raises a TableError if a table is empty, or a viewpoint has no label.
+    If all tables have labels by the first RANSAC result, too, these give a second half of the columns of `good`. Raises a
+    TableError if a table is empty, or a viewpoint has no label.
     """
     both = all(map(has_first, tables))
     return join_scenes([_scene_views(scene, table, config, both) for scene, table in zip(scenes, tables, strict=True)])

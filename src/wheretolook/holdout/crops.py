@@ -5,9 +5,9 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from wheretolook.features.keypoints import Keypoints
 from wheretolook.geometry.camera import Camera, PinholeCamera, field_of_view_deg
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError
@@ -33,16 +33,10 @@ def crops_of(camera: Camera, fov_deg: float) -> tuple[PinholeCamera, Float]:
     return pinhole, Rotation.from_euler("y", pans[:, None], degrees=True).as_matrix()
 
 
-def crop_pixels(camera: Camera, pixels: Float, fov_deg: float, crop: int) -> tuple[Float, np.ndarray]:
+def crop_pixels(camera: Camera, pixels: Float, fov_deg: float, crop: int) -> tuple[Float, NDArray[np.bool_]]:
     """Return where pixels (K, 2) of a camera's image are in a crop, (K, 2), and which of them it shows, (K,)."""
     pinhole, rotations = crops_of(camera, fov_deg)
     rays = camera.colmap.unproject(np.asarray(pixels, dtype=np.float64)) @ rotations[crop].T
     ahead = rays[:, 2] > 1e-6
     moved = pinhole.project(np.where(ahead[:, None], rays, (0.0, 0.0, 1.0)))
     return moved, ahead & pinhole.in_image(moved)
-
-
-def crop_keypoints(camera: Camera, keypoints: Keypoints, fov_deg: float, crop: int) -> Keypoints:
-    """Return the keypoints of a camera's image that a crop shows, with their pixels there."""
-    pixels, shown = crop_pixels(camera, keypoints.pixels, fov_deg, crop)
-    return Keypoints(pixels[shown].astype(np.float32), keypoints.descriptors[shown])

@@ -18,7 +18,6 @@ from tqdm.auto import tqdm
 from wheretolook.dataset.thresholds import Accuracy
 from wheretolook.dataset.viewpoint_table import LOCALIZED
 from wheretolook.features.keypoints import Keypoints
-from wheretolook.holdout.crops import crop_keypoints, crop_pixels
 from wheretolook.holdout.holdout_blocks import Block, choose_blocks
 from wheretolook.holdout.photo_map import MAX_ERROR_DEG, MAX_ERROR_M, PhotographedMap
 from wheretolook.localization.config import LocalizerConfig
@@ -42,10 +41,10 @@ class HoldoutResult:
     """A block that was held out, the landmarks (without descriptors) of the remaining map, and its localized views.
 
     `views` has a row for each view of a tested photograph: row (of the photograph in the map), crop (of it, 0 is the
-    middle one or itself), image (its name), status (of the
-    localizer), good (whether it localized within the limits), error_m and error_deg (NaN without a pose), limit_m (of
-    error_m), n_matches, n_inliers, n_observed (landmarks of the whole map that it observes), n_kept (those of them that
-    the remaining map still has), and n_landmarks (of the remaining map).
+    middle one or itself), image (its name), status (of the localizer), good (whether it localized within the limits),
+    error_m and error_deg (NaN without a pose), limit_m (of error_m), n_matches, n_inliers, n_observed (landmarks of the
+    whole map that it observes), n_kept (those of them that the remaining map still has), and n_landmarks (of the
+    remaining map).
     """
 
     block: Block
@@ -184,9 +183,8 @@ def _observed(image: Any, source: PhotographedMap, row: int, crop: int) -> NDArr
     """Return the ids of the landmarks that an image of a model observes in a view of it."""
     points = [point for point in image.points2D if point.has_point3D()]
     ids = np.array([point.point3D_id for point in points], dtype=np.int64)
-    if source.fov_deg is not None and points:
-        ids = ids[crop_pixels(source.cameras[row], np.array([point.xy for point in points]), source.fov_deg, crop)[1]]
-    return np.unique(ids)
+    pixels = np.array([point.xy for point in points]).reshape(-1, 2)
+    return np.unique(ids[source.pixels_in_view(row, crop, pixels)[1]])
 
 
 def _localize(job: _Job, landmarks: Landmarks) -> pd.DataFrame:
@@ -198,13 +196,11 @@ def _localize(job: _Job, landmarks: Landmarks) -> pd.DataFrame:
     estimates = []
     poses = []
     for row, (pixels, descriptors) in zip(tested, stored, strict=True):
-        whole = Keypoints(pixels, kind.restore(descriptors))
         for crop in range(source.n_crops):
             camera, pose = source.view(row, crop)
-            shown = whole
-            if source.fov_deg is not None:
-                shown = crop_keypoints(source.cameras[row], whole, source.fov_deg, crop)
-            estimates.append(localizer.estimate(shown, localizer.match([shown])[0], camera))
+            moved, shown = source.pixels_in_view(row, crop, pixels)
+            keypoints = Keypoints(moved[shown].astype(np.float32), kind.restore(descriptors[shown]))
+            estimates.append(localizer.estimate(keypoints, localizer.match([keypoints])[0], camera))
             poses.append(pose)
     rows = np.repeat(job.block.tested, source.n_crops)
     error_m, error_deg = localization_errors(estimates, np.stack(poses))

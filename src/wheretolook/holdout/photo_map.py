@@ -16,7 +16,7 @@ from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import Camera, cameras_by_id
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.geometry.similarity import Similarity
-from wheretolook.holdout.crops import PANS, crops_of
+from wheretolook.holdout.crops import PANS, crop_pixels, crops_of
 from wheretolook.localization.versions import versions
 from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_arrays, read_model, registered_names
 from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, PhotographsConfig, place_name
@@ -89,6 +89,12 @@ class PhotographedMap:
             return self.cameras[row], self.poses[row]
         pinhole, rotations = crops_of(self.cameras[row], self.fov_deg)
         return pinhole, rotations[crop] @ self.poses[row]
+
+    def pixels_in_view(self, row: int, crop: int, pixels: Float) -> tuple[Float, NDArray[np.bool_]]:
+        """Return where pixels (K, 2) of a photograph are in a view of it, (K, 2), and which it shows, (K,)."""
+        if self.fov_deg is None:
+            return pixels, np.ones(len(pixels), dtype=bool)
+        return crop_pixels(self.cameras[row], pixels, self.fov_deg, crop)
 
     @property
     def is_metric(self) -> bool:

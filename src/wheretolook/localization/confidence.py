@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wheretolook.dataset.thresholds import ACCURACY as ACCURACY
-from wheretolook.dataset.thresholds import Accuracy as Accuracy
+from wheretolook.dataset.thresholds import ACCURACY, Accuracy
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.pose_ambiguity import log_ratio
 from wheretolook.utils.errors import WeightsError

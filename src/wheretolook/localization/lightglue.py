@@ -71,7 +71,9 @@ class LightGlueMatcher:
     def match(
         self, query: Keypoints, size: tuple[int, int], landmark_rows: NDArray[np.int64], n_images: int
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows of keypoints and rows of their landmarks (M,) of a query of some width and height, given preliminary landmark matches (M,).
+        """Match a query of a width and height, given the rows (M,) of the landmarks that it matched before.
+
+        Returns rows of keypoints and rows of their landmarks, (M,) each.
 
         If several images lead to different landmarks for a keypoint, or keypoints for a landmark, the best score wins.
         """

@@ -24,8 +24,7 @@ from wheretolook.geometry.local_origin import poses_from
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator
-from wheretolook.localization.guided_matching import Candidates
-from wheretolook.localization.rig import Look
+from wheretolook.localization.rig import Candidates, Look
 from wheretolook.localization.rig_localization import POSES_OF_AN_IMAGE, JointLocalizer
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import MapError
@@ -64,7 +63,8 @@ class Localizer:
     Keypoints are matched to the landmarks' mean descriptors, SIFT with Lowe's ratio test, learned ones as mutual nearest
     neighbours; the pose is estimated by `PoseEstimator`. The extractor must be that of the map, and may be omitted if
     nothing is extracted. The device is "cpu" or a CUDA device. LightGlue (`LocalizerConfig.lightglue`) needs the folder
-    of the map, `map_dir`, and the features of its images, by default its database. Raises MapError if the landmarks have no descriptors, or not the extractor's.
+    of the map, `map_dir`, and the features of its images, by default its database. Raises MapError if the landmarks have
+    no descriptors, or not the extractor's.
     """
 
     def __init__(

@@ -14,7 +14,35 @@ from wheretolook.geometry.poses import Float, camera_centers, compose_poses, inv
 from wheretolook.utils.errors import PoseError
 
 if TYPE_CHECKING:
-    from wheretolook.localization.guided_matching import Candidates
+    from wheretolook.features.matches import Matches
+
+MAX_NEAREST_RATIO = 1.15
+"""Maximum ratio of the descriptor distances to a candidate and to the nearest landmark of the map."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Landmarks whose descriptors are about as near to a keypoint's as the nearest of the map.
+
+    Attributes:
+        keypoints: (M,) rows of an image's keypoints.
+        pixels: (M, 2) their pixels.
+        landmarks: (M,) rows of their candidates.
+        squared: (M,) squared distances of the descriptors.
+    """
+
+    keypoints: NDArray[np.int64]
+    pixels: Float
+    landmarks: NDArray[np.int64]
+    squared: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, pixels: Float, matches: Matches) -> Candidates:
+        """Select from the nearest landmarks of keypoints at pixels (K, 2)."""
+        near = matches.squared <= MAX_NEAREST_RATIO**2 * matches.squared[:, :1]
+        keypoints = np.repeat(np.arange(len(near)), near.sum(1))
+        of_keypoints = np.asarray(pixels, dtype=np.float64)[keypoints]
+        return cls(keypoints, of_keypoints, matches.near[near], matches.squared[near])
 
 
 @dataclass(frozen=True, eq=False)

@@ -156,8 +156,8 @@ def label_rows(
     With several cameras, `camera_id` selects that of a viewpoint. The seconds spent in each step (render, extract,
     match, pose) are added to `seconds`. A batch that exceeds a GPU's memory is halved. Returns the table with new
     status, error_m, error_deg and n_inliers, with `viewpoint_files.FIRST_FIELDS` by several hypotheses, `MATCH_FIELDS`
-    if `store_matches`, and also `PIXEL_FIELD` if `store_pixels`. With `appearance` above 0 images are changed at strengths drawn up to it, see
-    `rendering.appearance`, which `APPEARANCE_FIELD` holds.
+    if `store_matches`, and also `PIXEL_FIELD` if `store_pixels`. With `appearance` above 0 images are changed at
+    strengths drawn up to it (`rendering.appearance`), which `APPEARANCE_FIELD` holds.
     """
     from wheretolook.rendering.appearance import Appearance
 

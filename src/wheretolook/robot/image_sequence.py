@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wheretolook.dataset.thresholds import ACCURACY, Accuracy
 from wheretolook.geometry.poses import (
     Float,
     camera_centers,
@@ -14,7 +15,6 @@ from wheretolook.geometry.poses import (
     pose_error,
     rotation_angle_deg,
 )
-from wheretolook.localization.confidence import ACCURACY, Accuracy
 from wheretolook.robot.localizer import RobotLocalization, RobotLocalizer, RobotView
 from wheretolook.utils.errors import ConfigError
 

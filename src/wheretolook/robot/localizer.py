@@ -27,19 +27,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.dataset.thresholds import checked_accuracy
+from wheretolook.dataset.thresholds import ACCURACY, Accuracy, checked_accuracy
 from wheretolook.features.descriptors import quantize_descriptors
 from wheretolook.features.matches import Matches
 from wheretolook.features.opencv_sift import RootSift
 from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.poses import Float
-from wheretolook.localization.confidence import ACCURACY, Accuracy, probabilities
+from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator
-from wheretolook.localization.guided_matching import Candidates
 from wheretolook.localization.hypotheses import SingleViewPoses
 from wheretolook.localization.prior import PosePrior, matches_among
-from wheretolook.localization.rig import Look
+from wheretolook.localization.rig import Candidates, Look
 from wheretolook.localization.rig_localization import (
     POSES_OF_A_VIEW,
     POSES_OF_AN_IMAGE,
@@ -147,7 +146,7 @@ class RobotLocalizer:
         return keypoints.pixels / np.float32(min(scale, 1)), quantize_descriptors(keypoints.descriptors)
 
     def difference(self, camera: PinholeCamera) -> str:
-        """Say how much the focal length of a camera differs from the folder's; empty if that hardly matters."""
+        """Describe how much the focal length of a camera differs from the folder's; empty if that hardly matters."""
         ratio = camera.fx / camera.width * self.camera.width / self.camera.fx
         if 1 / MAX_FOCAL_RATIO < ratio < MAX_FOCAL_RATIO:
             return ""

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.dataset.thresholds import checked_accuracy
+from wheretolook.dataset.thresholds import ACCURACY, Accuracy, checked_accuracy
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.matches import Matches
 from wheretolook.features.registry import kind_of, runnable_extractors
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
-from wheretolook.localization.confidence import ACCURACY, Accuracy, probabilities
+from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.prior import PosePrior, matches_among

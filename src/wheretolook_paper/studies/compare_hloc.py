@@ -28,6 +28,7 @@ import pycolmap
 from jsonargparse import auto_cli
 from tqdm.auto import tqdm
 
+from wheretolook.dataset.thresholds import Accuracy
 from wheretolook.evaluation.calibration import precision_area, precision_over_coverage
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.extraction import KeypointExtractor
@@ -36,7 +37,7 @@ from wheretolook.features.registry import all_kinds, kind_of
 from wheretolook.geometry.camera import Camera, camera_of
 from wheretolook.geometry.poses import Float, camera_centers, pose_error
 from wheretolook.io.poses import images_text
-from wheretolook.localization.confidence import Accuracy, probabilities
+from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.rig_localization import POSES_OF_AN_IMAGE

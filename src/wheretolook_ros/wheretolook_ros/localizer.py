@@ -33,7 +33,7 @@ from wheretolook_ros.conversions import (
 from wheretolook_ros.head import Timeline
 from wheretolook_ros.node import ERROR, OK, WARN, RobotNode, run
 
-WAIT_S = 0.2  # for odometry and joint states that are not older than the image
+WAIT_S = 0.5  # for odometry and joint states that are not older than the image
 
 
 class LocalizerNode(RobotNode):
@@ -132,7 +132,8 @@ class LocalizerNode(RobotNode):
         Newer images wait meanwhile: each could be newer than the odometry.
         """
         if self._waiting is None and self._pending:
-            self._waiting, self._pending = self._image, False
+            self._waiting = self._image
+            self._pending = False
             self._since = time.monotonic()
         if self._waiting is None:
             return

@@ -18,7 +18,9 @@ from rclpy.node import Node
 
 from wheretolook_ros.head import Head
 
-OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+OK = DiagnosticStatus.OK
+WARN = DiagnosticStatus.WARN
+ERROR = DiagnosticStatus.ERROR
 DEFAULTS = Path(__file__).with_name("wheretolook.yaml")
 
 

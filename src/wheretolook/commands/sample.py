@@ -66,8 +66,9 @@ def _key(scene: SceneEnvironment, config: SampleConfig) -> str:
     elif files.is_scanned:
         space = asdict(scene.config.mapped_space)
     chosen = {name: value for name, value in asdict(config).items() if name != "memory_gb"}
-    if not config.cameras:  # keys of datasets that were sampled before this option existed
-        del chosen["cameras"]
+    for name in ("cameras", "near_map"):
+        if not chosen[name]:  # keys of datasets that were sampled before this option existed
+            del chosen[name]
     chosen["max_directions"] = config.directions_of(files.split)
     made_from = [existing(scene.source, SceneError, stage), existing(files.landmarks, MapError, "map")]
     settings = [chosen, scene.occlusion_config.settings(), space, scene.camera.record()]
@@ -85,6 +86,7 @@ def _cameras(scene: SceneEnvironment, config: SampleConfig) -> Camera | dict[int
 def _sample(scene: SceneEnvironment, config: SampleConfig, log: Log) -> None:
     from wheretolook.dataset.sampling import sample_viewpoints
     from wheretolook.dataset.viewpoint_files import write_table
+    from wheretolook.mapping.colmap_model import colmap_poses
 
     files = scene.files
     with naming_file(scene.source):
@@ -93,7 +95,8 @@ def _sample(scene: SceneEnvironment, config: SampleConfig, log: Log) -> None:
         visible = (scene.landmarks, cameras, scene.occlusion)
         title = f"sample {scene.name}"
         config = replace(config, max_directions=config.directions_of(files.split))
-        table, occlusion = sample_viewpoints(grid, free, *visible, config, scene.device, title)
+        mapped = colmap_poses(files.map) if config.near_map else None
+        table, occlusion = sample_viewpoints(grid, free, *visible, config, scene.device, title, mapped)
     files.stage_cache("sample").clear()
     files.cameras_file.unlink(missing_ok=True)
     if isinstance(cameras, dict):

@@ -8,18 +8,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED, pose_columns
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import VoxelGrid
-from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
+from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along, rotation_looking_along
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.memory import fitting
 from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
 from wheretolook.visibility.survey import Survey, SurveyOptions, survey
 
+NEAR_M = 0.2  # standard deviation along each axis of a location near a mapping image
+NEAR_DEG = 40.0  # largest angle between its directions and that of the image
 BYTES_PER_VIEWPOINT = 600  # while a table of viewpoints is made and written
 
 if TYPE_CHECKING:
@@ -46,11 +49,13 @@ def sample_viewpoints(
     config: SampleConfig = SampleConfig(),
     device: str = "cpu",
     progress: str | None = None,
+    mapped: Float | None = None,
 ) -> tuple[pd.DataFrame, StoredOcclusion]:
     """Choose the viewpoints that see most landmarks at locations (L,) of the grid, and return them with the occlusion.
 
     At every location all directions of the lattice are ranked by the number of landmarks in view (descending, then by
     direction id), and the best K are kept. Several cameras, by number, are assigned to the locations in turn.
+    With `config.near_map`, a share is near the mapping images, whose poses (M, 3, 4) are `mapped`.
     `progress` is the text of a progress bar; `config.max_directions` that of the scene's split. The table is unlabelled
     and sorted by viewpoint id: location id times the number of directions, plus direction id.
 
@@ -60,7 +65,13 @@ def sample_viewpoints(
         ConfigError: so many viewpoints do not fit into memory.
     """
     rng = np.random.default_rng(config.seed)
-    ids = np.sort(_subset(np.asarray(location_ids, dtype=np.int64), config.max_locations, rng))
+    ids = np.asarray(location_ids, dtype=np.int64)
+    near = np.zeros(0, dtype=np.int64)
+    if config.near_map and mapped is not None:
+        near = ids[_near_map(grid.centers()[ids], mapped, round(config.near_map * config.max_locations), rng)]
+        ids = np.setdiff1d(ids, near)
+    n_others = config.max_locations - len(near)
+    ids = np.sort(np.concatenate([near, _subset(ids, n_others, rng) if n_others or not len(near) else ids[:0]]))
     locations = grid.centers()[ids]
     directions = config.axes()
     options = SurveyOptions(
@@ -79,7 +90,10 @@ def sample_viewpoints(
     ]
     seen = _joined(parts, np.concatenate(groups), locations)
     most = config.directions_of("train")
-    visible = (best[counts[best] >= config.min_visible] for counts, best in zip(seen.counts, seen.best, strict=True))
+    visible = [best[counts[best] >= config.min_visible] for counts, best in zip(seen.counts, seen.best, strict=True)]
+    if len(near):
+        assert mapped is not None
+        visible = _along_map(visible, np.isin(ids, near), locations, directions, mapped)
     kept = [np.sort(_subset(directions_seen, most, rng)) for directions_seen in visible]
     location = np.repeat(np.arange(len(ids)), [len(chosen) for chosen in kept])
     direction = np.concatenate(kept)
@@ -100,6 +114,24 @@ def sample_viewpoints(
     assert seen.occlusion is not None
     table = pd.DataFrame(columns).assign(status=UNLABELLED, error_m=nan, error_deg=nan, n_inliers=0)
     return table, seen.occlusion
+
+
+def _near_map(locations: Float, mapped: Float, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Draw rows of at most `count` locations (L, 3), each nearest to a point near a random mapping image."""
+    centers = camera_centers(mapped)[rng.integers(len(mapped), size=count)]
+    return np.unique(cKDTree(locations).query(centers + rng.normal(0, NEAR_M, centers.shape))[1])
+
+
+def _along_map(
+    visible: Sequence[NDArray[np.int64]], near: NDArray[np.bool_], locations: Float, directions: Float, mapped: Float
+) -> list[NDArray[np.int64]]:
+    """Keep, at locations (L, 3) that are `near` (L,), only directions like that of the nearest mapping image."""
+    nearest = cKDTree(camera_centers(mapped)).query(locations)[1]
+    like = directions @ mapped[nearest, 2, :3].T > np.cos(np.radians(NEAR_DEG))
+    return [
+        seen[like[seen, row]] if is_near else seen
+        for row, (seen, is_near) in enumerate(zip(visible, near, strict=True))
+    ]
 
 
 def _check_number(n_viewpoints: int, n_locations: int, max_count: int, n_landmarks: int, config: SampleConfig) -> None:

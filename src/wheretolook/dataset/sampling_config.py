@@ -26,6 +26,8 @@ class SampleConfig(ViewLattice):
         seed: seed of what is drawn at random.
         cameras: number of cameras of a scene, each used at its own locations, with fields of view, sizes and aspect
             ratios drawn from the scene's seed; 0 uses the experiment's camera everywhere.
+        near_map: share of `max_locations`, 0 to 1, that is near mapping images, with directions near theirs, as
+            photographs of a sequence are to each other; needs a grid of about 20 cm.
 
     Attributes:
         distinct_pixels: recorded with samples; landmarks are counted, and `wheretolook_paper.visibility` counts pixels.
@@ -38,6 +40,7 @@ class SampleConfig(ViewLattice):
     max_directions: int | dict[Split, int] = 0
     seed: int = 0
     cameras: int = 0
+    near_map: float = 0.0
     distinct_pixels: bool = field(default=False, init=False)
     memory_gb: float = field(default=2.0, init=False)
 
@@ -45,6 +48,10 @@ class SampleConfig(ViewLattice):
         super().__post_init__()
         for name in ("keep", "min_visible", "max_locations", "cameras"):
             check_range(f"sample.{name}", getattr(self, name), 0)
+        check_range("sample.near_map", self.near_map, 0, 1)
+        if self.near_map and not self.max_locations:
+            fix = "Set sample.max_locations."
+            raise ConfigError("near_map is a share of max_locations, which is 0", value=self.near_map, fix=fix)
         if isinstance(self.max_directions, dict) and set(self.max_directions) != set(get_args(Split)):
             fix = "Give one number, or one for each of train, val and test."
             raise ConfigError("sample.max_directions lacks or misnames a split", value=self.max_directions, fix=fix)

@@ -38,6 +38,11 @@ _WALK_RECORD = {
     "pitch_variation_deg": PITCH_VARIATION_DEG,
 }
 
+# What `vary` draws from the scene's seed: coverage and unevenness of the walk, and a share of the images.
+COVERAGES = 0.15, 0.8
+UNEVENNESS = 0.0, 2.0
+SHARES_OF_IMAGES = 0.4, 1.0
+
 PARTNERS = 10  # images that each image is matched with; time grows with their number
 MAX_EPIPOLAR_ERROR_PX = 2.0  # matches farther from the epipolar line are dropped; keypoints are accurate to a pixel
 MIN_TRIANGULATION_ANGLE_DEG = 1.5  # COLMAP's own limit
@@ -262,6 +267,10 @@ class MapConfig:
         frame: how the frame of an existing model, or of photographs, is related to metres with z up.
         camera: the mapping camera, if not the query camera, such as `{width: 1280, height: 720, fov_deg: 70}`.
         draw_camera: draw the mapping camera from the scene's seed, as `sample.cameras` draws query cameras.
+        vary: draw from the scene's seed how it is photographed: on a walk through a part of it or all, with even spacing
+            or turning on the spot, and with 40 to 100 % of `n_images`. From a few steps, baselines are narrow.
+        appearance: highest strength, 0 to 1, of what a real camera and people in front of it do to mapping images; see
+            `label.appearance`.
         keep_images: keep the rendered images, as `images/` in the map's folder.
         keep_database: keep COLMAP's database of keypoints and matches, as `database.db`.
     """
@@ -275,6 +284,8 @@ class MapConfig:
     frame: FrameOptions = FrameOptions()
     camera: CameraConfig | None = None
     draw_camera: bool = False
+    vary: bool = False
+    appearance: float = 0.0
     keep_images: bool = False
     keep_database: bool = False
 
@@ -283,6 +294,7 @@ class MapConfig:
         if self.camera is not None and self.draw_camera:
             raise ConfigError("give camera or draw_camera, not both", value=self.camera)
         check_positive("max_reprojection_error_px", self.max_reprojection_error_px)
+        check_range("mapping.appearance", self.appearance, 0, 1)
         frame = self.frame
         has_scale = any((frame.scale, frame.distance, frame.positions))
         of_photographs = "photographs have no unit or axes: give distance, positions or marker sizes, and up_in_camera"
@@ -294,8 +306,12 @@ class MapConfig:
 
     def record(self) -> dict[str, Any]:
         """Settings and constants, from which the keys of finished maps are made."""
+        settings = asdict(self)
+        for name in ("vary", "appearance"):  # maps made before these options existed keep their keys
+            if not settings[name]:
+                del settings[name]
         return {
-            **asdict(self),
+            **settings,
             "walk": _WALK_RECORD,
             "extractor": self.extractor.record(),
             "photographs": self.photographs.record(),

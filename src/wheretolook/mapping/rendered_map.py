@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
-from wheretolook.mapping.config import PARTNERS, MapConfig
+from wheretolook.mapping.config import COVERAGES, PARTNERS, SHARES_OF_IMAGES, UNEVENNESS, MapConfig
 from wheretolook.mapping.map_folder import DATABASE_FILE, IMAGES_FOLDER, MapDraft, MapReport, finish_map, replacing_map
 from wheretolook.mapping.triangulation import (
     choose_pairs,
@@ -25,6 +25,7 @@ from wheretolook.mapping.triangulation import (
     triangulate_model,
 )
 from wheretolook.mapping.walk import FreeSpaceQueries, Walk, plan_walk
+from wheretolook.rendering.appearance import Appearance
 from wheretolook.utils.files import write_bytes
 
 if TYPE_CHECKING:
@@ -77,14 +78,16 @@ def build_map(  # a scene has four parts, and the output and its resources are t
         clock = run.clock
         with clock("walk"):
             if poses is None:
-                walk = plan_walk(free_space, mesh.bounds, config.n_images, seed)
+                walk = _walk(free_space, mesh, config, seed)
                 poses = poses_looking_along(walk.positions, walk.directions)
             else:
                 centers = np.asarray(camera_centers(poses), dtype=np.float64)
                 walk = Walk(centers, np.asarray(poses[:, 2, :3]), centers, 1.0, 0.0)
         with clock("render_and_extract"):
             depth: list[NDArray[np.float32]] = []
-            images = _rendered(renderer, camera, poses, depth, folder / IMAGES_FOLDER if config.keep_images else None)
+            drawn = Appearance.of_views(poses, config.appearance, seed) if config.appearance else []
+            keep_in = folder / IMAGES_FOLDER if config.keep_images else None
+            images = _rendered(renderer, camera, poses, drawn, depth, keep_in)
             extracted = extract_with_colors(images, len(poses), "map: render, extract", run)
             stored, colors = zip(*extracted, strict=True)
         with clock("pairs"):
@@ -120,16 +123,35 @@ def _distance_cm(points: Float, mesh: TexturedMesh, raycaster: MeshRaycaster | N
     return 100.0 * (raycaster or MeshRaycaster(mesh)).distance_to_surface(points, limit_m).astype(np.float64)
 
 
+def _walk(free_space: FreeSpaceQueries, mesh: TexturedMesh, config: MapConfig, seed: int) -> Walk:
+    """Plan the walk of a map; with `config.vary`, one of those in `mapping.config`."""
+    if not config.vary:
+        return plan_walk(free_space, mesh.bounds, config.n_images, seed)
+    rng = np.random.default_rng([seed, 1])
+    share, coverage, unevenness = (rng.uniform(*limits) for limits in (SHARES_OF_IMAGES, COVERAGES, UNEVENNESS))
+    return plan_walk(free_space, mesh.bounds, max(2, round(share * config.n_images)), seed, coverage, unevenness)
+
+
 def _rendered(
-    renderer: Renderer, camera: PinholeCamera, poses: Float, depth: list[NDArray[np.float32]], keep_in: Path | None
+    renderer: Renderer,
+    camera: PinholeCamera,
+    poses: Float,
+    drawn: Sequence[Appearance],
+    depth: list[NDArray[np.float32]],
+    keep_in: Path | None,
 ) -> Iterator[NDArray[np.uint8]]:
-    """Render images (H, W, 3) at poses (I, 3, 4), write them to a folder if one is given, and add depth to `depth`."""
+    """Render images (H, W, 3) at poses (I, 3, 4), with their appearances if these are drawn.
+
+    Images are written to a folder if one is given, and depth is added to `depth`.
+    """
     import cv2
 
     for start in range(0, len(poses), _RENDER_BATCH):
         rendering = renderer.render(camera, poses[start : start + _RENDER_BATCH])
-        for index, rgb in enumerate(rendering.rgb, start):
-            depth.append(shrink_depth(rendering.depth_m[index - start]))
+        for index, (rgb, depth_m) in enumerate(zip(rendering.rgb, rendering.depth_m, strict=True), start):
+            depth.append(shrink_depth(depth_m))
+            if drawn:
+                rgb = drawn[index].apply(rgb, camera, depth_m)
             if keep_in is not None:
                 path = keep_in / image_name(index)
                 write_bytes(path, cv2.imencode(path.suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1].tobytes())

@@ -81,11 +81,20 @@ class Walk:
         return _length_m(self.path)
 
 
-def plan_walk(free_space: FreeSpaceQueries, bounds: ArrayLike, n_images: int, seed: int = 0) -> Walk:
+def plan_walk(
+    free_space: FreeSpaceQueries,
+    bounds: ArrayLike,
+    n_images: int,
+    seed: int = 0,
+    coverage: float = COVERAGE,
+    unevenness: float = 0.0,
+) -> Walk:
     """Plan a walk that starts at a random place and goes to the nearest unvisited floor until enough is visited.
 
-    `bounds` (2, 3) metres are the lowest and highest corner of the scene. The poses are spaced evenly along the walk
-    and look mostly along it. Raises ConfigError for fewer than two, SceneError if there is no floor to walk on.
+    `bounds` (2, 3) metres are the lowest and highest corner of the scene; `coverage` is the share of the reachable
+    floor to visit. The poses look mostly along the walk. Their spacings along it are equal, or follow a gamma
+    distribution whose standard deviation is `unevenness` times its mean: above 1, the camera often turns on the spot.
+    Raises ConfigError for fewer than two images, SceneError if there is no floor to walk on.
     """
     if n_images < 2:
         raise ConfigError("a map needs at least two images", value=n_images)
@@ -94,17 +103,17 @@ def plan_walk(free_space: FreeSpaceQueries, bounds: ArrayLike, n_images: int, se
     start = int(rng.integers(len(eyes)))
     radius_m = VISIT_RADIUS_M
     while True:
-        corners, coverage = _visit(steps, start, radius_m)
+        corners, visited = _visit(steps, start, radius_m, coverage)
         path = eyes[corners]
         if len(corners) == 1 or _length_m(path) <= (n_images - 1) * IMAGE_SPACING_M:
             break
         radius_m *= 1.2
-    positions, headings = _along(path, n_images, rng)
+    positions, headings = _along(path, n_images, rng, unevenness)
     varied = positions.copy()
     varied[:, 2] += EYE_HEIGHT_VARIATION_M * rng.uniform(-1, 1, n_images)
     free = free_space.segments_are_free(positions, varied)
     positions = np.where(free[:, None], varied, positions)
-    return Walk(positions, _swing(headings, rng), path, coverage, radius_m)
+    return Walk(positions, _swing(headings, rng), path, visited, radius_m)
 
 
 def _length_m(path: Float) -> float:
@@ -155,8 +164,8 @@ def _reachable_places(free_space: FreeSpaceQueries, bounds: Float) -> tuple[Floa
     return eyes[members], steps[members][:, members]
 
 
-def _visit(steps: csr_matrix, start: int, radius_m: float) -> tuple[NDArray[np.int64], float]:
-    """Walk through a graph of places until enough are within a radius; indices of places, and the share visited."""
+def _visit(steps: csr_matrix, start: int, radius_m: float, coverage: float) -> tuple[NDArray[np.int64], float]:
+    """Walk through a graph of places until a share is within a radius; indices of places, and the share visited."""
     here = start
     corners = [here]
     new = [here]
@@ -164,7 +173,7 @@ def _visit(steps: csr_matrix, start: int, radius_m: float) -> tuple[NDArray[np.i
     while True:
         reached = dijkstra(steps, indices=new, min_only=True, limit=radius_m)
         visited |= np.isfinite(reached)
-        if visited.mean() >= COVERAGE:
+        if visited.mean() >= coverage:
             return np.array(corners), float(visited.mean())
         distance, previous = dijkstra(steps, indices=here, return_predecessors=True)
         target = int(np.where(visited, np.inf, distance).argmin())
@@ -176,10 +185,13 @@ def _visit(steps: csr_matrix, start: int, radius_m: float) -> tuple[NDArray[np.i
         here = target
 
 
-def _along(path: Float, n_images: int, rng: np.random.Generator) -> tuple[Float, Float]:
-    """Space points (n, 3) evenly along a path; also returns the horizontal unit direction of the path at each (n, 2)."""
+def _along(path: Float, n_images: int, rng: np.random.Generator, unevenness: float) -> tuple[Float, Float]:
+    """Space points (n, 3) along a path; also returns the horizontal unit direction of the path at each (n, 2)."""
     start = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     at = np.linspace(0, start[-1], n_images)
+    if unevenness:
+        ends = np.cumsum(rng.gamma(unevenness**-2, size=n_images - 1))
+        at[1:] = start[-1] * ends / ends[-1]
 
     def point(s: Float) -> Float:
         return np.stack([np.interp(s, start, path[:, k]) for k in range(3)], axis=1)

@@ -54,10 +54,9 @@ def walked_distance_m(places: np.ndarray, path: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("coverage", [0.4, 0.7, 1.0])
-def test_walk_is_free_and_covers_what_was_asked(seed, coverage, monkeypatch):
-    monkeypatch.setattr(walk, "COVERAGE", coverage)
+def test_walk_is_free_and_covers_what_was_asked(seed, coverage):
     room = two_rooms(door_m=1.2)
-    route = plan_walk(room, BOUNDS, 150, seed)
+    route = plan_walk(room, BOUNDS, 150, seed, coverage)
     assert room.segments_are_free(route.path[:-1], route.path[1:]).all()
     assert room.is_free(route.positions).all()
     # One more place to visit adds at most the floor within the radius of it, here at most a tenth of all.

@@ -18,9 +18,10 @@ from wheretolook.features.registry import all_extractors, all_kinds
 from wheretolook.mapping.colmap_model import model_arrays, read_model
 from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.errors import ConfigError, MapError, WeightsError
 
 KORNIA_WEIGHTS = "kornia"  # in place of a file
+FIRST_WEIGHTS = {"aliked": -0.3284747, "disk": -0.6789149}  # of the authors' files, whose tensors have equal shapes
 _DATABASE = "database.db"
 
 
@@ -151,6 +152,10 @@ def _network(features: str, weights: str) -> Any:
         return {key: value for key, value in renamed.items() if key in network.state_dict()}
 
     file = "" if weights == KORNIA_WEIGHTS else weights
-    return load_state(
-        network, file, name, [url], prepare, "--label.localizer.lightglue (of localize --lightglue)"
-    ).eval()
+    load_state(network, file, name, [url], prepare, "--label.localizer.lightglue (of localize --lightglue)")
+    known = network.posenc.Wr.weight[0, 0].item()
+    other = next((other for other, value in FIRST_WEIGHTS.items() if abs(known - value) < 1e-6), features)
+    if other != features:
+        problem = f"these are LightGlue weights for {other}, but the map has {features} features"
+        raise WeightsError(problem, path=weights, fix=f"Give {name}.")
+    return network.eval()

@@ -110,7 +110,7 @@ class SimulatedRobot:
     def look(self, rgb: NDArray[np.uint8]) -> Look:
         """Match an image (H, W, 3) with the map."""
         keypoints = self.localizer.extractor.extract(rgb)
-        return self.localizer.look(keypoints, self.localizer.match([keypoints])[0])
+        return Look.of(keypoints.pixels, self.localizer.match([keypoints])[0], self.localizer.camera)
 
     def simulate(
         self, places: Mapping[int, Float], policies: Sequence[str], n_views: int, seed: int, title: str

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import json
 import os
 import re
@@ -66,6 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line. Returns the exit code: 0, 2 for bad input, 130 when interrupted by Ctrl-C or SIGTERM."""
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
+    gc.set_threshold(50_000, *gc.get_threshold()[1:])  # imports create objects that live on
+    atexit.register(gc.freeze)  # collections at the exit after `import torch` would take half a second
     given = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     debug = "--debug" in given
     if not debug:

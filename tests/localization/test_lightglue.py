@@ -63,7 +63,7 @@ def test_a_query_is_localized_by_the_images_that_see_the_same(corridor, tmp_path
     camera = cameras_by_id(model.cameras, corridor)[1]
     _, ((pixels, descriptors),) = read_features(corridor / "database.db", ["010.jpg"])
     query = Keypoints(pixels, KIND.restore(descriptors))
-    config = LocalizerConfig(lightglue=str(weights), lightglue_images=2)
+    config = LocalizerConfig(lightglue=str(weights))
     localizer = Localizer(landmarks, camera, config, map_dir=corridor)
     (matches,) = localizer.match([query])
     keypoints, rows, *_ = matches
@@ -108,7 +108,7 @@ def test_the_features_of_mapping_images_may_be_in_another_file(corridor, tmp_pat
     camera = cameras_by_id(read_model(corridor).cameras, corridor)[1]
     _, ((pixels, descriptors),) = read_features(corridor / "database.db", ["010.jpg"])
     query = Keypoints(pixels, KIND.restore(descriptors))
-    config = LocalizerConfig(lightglue=str(weights), lightglue_images=2)
+    config = LocalizerConfig(lightglue=str(weights))
     other = tmp_path / "features.db"
     shutil.copy(corridor / "database.db", other)
     by_database, by_file = (

@@ -114,9 +114,10 @@ class Localize(CameraOptions, FrameOptions):
         if self.out is not None:
             check_localized_format(self.out)
         paths = self._paths()
-        if self.figure is not None and self.figure.suffix and len(paths) > 1 and self.turns is None:
+        several = len(paths) > 1 and self.turns is None
+        if several and self.figure is not None and self.figure.suffix:
             raise ConfigError("several images need a folder of figures", path=self.figure, fix="Name a folder.")
-        if self.next and len(paths) > 1 and self.turns is None:
+        if several and self.next:
             raise ConfigError("the next view is that of one rig", value=len(paths), fix="Give --turns, or one image.")
         names = distinct_names(paths)
         if self.figure is not None:

@@ -20,6 +20,7 @@ from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import ConfigError, MapError, WeightsError
 
+N_IMAGES = 5  # that a query is matched with
 KORNIA_WEIGHTS = "kornia"  # in place of a file
 FIRST_WEIGHTS = {"aliked": -0.3284747, "disk": -0.6789149}  # of the authors' files, whose tensors have equal shapes
 _DATABASE = "database.db"
@@ -70,7 +71,7 @@ class LightGlueMatcher:
         self._network = _network(supported[landmarks.features], weights).to(self.device)
 
     def match(
-        self, query: Keypoints, size: tuple[int, int], landmark_rows: NDArray[np.int64], n_images: int
+        self, query: Keypoints, size: tuple[int, int], landmark_rows: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Match a query of a width and height, given the rows (M,) of the landmarks that it matched before.
 
@@ -81,7 +82,7 @@ class LightGlueMatcher:
         images = self._images
         voted = np.isin(np.arange(len(self.landmarks)), landmark_rows)[images.landmark]
         votes = np.bincount(images.observer[voted], minlength=len(images.stored))
-        best = np.argsort(-votes, kind="stable")[:n_images]
+        best = np.argsort(-votes, kind="stable")[:N_IMAGES]
         matches = [self._match_image(query, size, int(image)) for image in best[votes[best] > 0]]
         if not matches:
             return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)

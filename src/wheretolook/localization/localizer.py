@@ -150,11 +150,7 @@ class Localizer:
         camera = camera or self.camera
         size = (camera.width, camera.height)
         return [
-            Matches(
-                *self._guided.match(query, size, first.landmarks, self.config.lightglue_images),
-                first.near,
-                first.squared,
-            )
+            Matches(*self._guided.match(query, size, first.landmarks), first.near, first.squared)
             for query, first in zip(keypoints, matches, strict=True)
         ]
 

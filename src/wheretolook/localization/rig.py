@@ -91,14 +91,14 @@ def checked_turns(turns: ArrayLike, n_views: int) -> Float:
     return poses
 
 
-def rig_of(cam_from_world: Float, tolerance_m: float = 1e-6) -> Float:
+def rig_of(cam_from_world: Float) -> Float:
     """cam_from_rig (N, 3, 4) of views (N, 3, 4) from one location; the rig has the axes of the first view.
 
-    Raises PoseError if a view is further from the first than the tolerance.
+    Raises PoseError if a view is elsewhere than the first.
     """
     centers = camera_centers(cam_from_world)
     distance = np.linalg.norm(centers - centers[0], axis=1)
-    if distance.max() > tolerance_m:
+    if distance.max() > 1e-6:
         raise PoseError("these views are not from one location", value=f"{distance.max():.3g} m apart")
     cam_from_rig = compose_poses(cam_from_world, invert_poses(cam_from_world[0]))
     cam_from_rig[:, :, 3] = 0

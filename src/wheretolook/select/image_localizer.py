@@ -82,14 +82,13 @@ class ImageLocalizer:
         arrays = model_arrays(model)
         own = find_frame(path, model, frame, arrays=arrays)
         arrays = own.of_arrays(arrays)
-        stored = None if database is not None or not (path / LANDMARKS_FILE).is_file() else path / LANDMARKS_FILE
-        kept = None if stored is None else Landmarks.load(stored)
-        features = None
-        if kept is None or kept.descriptors is None:
-            kept = None
-            features = database or find_features(path, model)
-        landmarks = load_colmap_landmarks(path, features, None, device, model, arrays=arrays, ambiguity=False)
-        if kept is not None:
+        stored = path / LANDMARKS_FILE
+        kept = Landmarks.load(stored) if database is None and stored.is_file() else None
+        own_descriptors = kept is not None and kept.descriptors is not None
+        features = None if own_descriptors and not lightglue else database or find_features(path, model)
+        described_by = None if own_descriptors else features
+        landmarks = load_colmap_landmarks(path, described_by, None, device, model, arrays=arrays, ambiguity=False)
+        if kept is not None and own_descriptors:
             if not np.array_equal(kept.ids, landmarks.ids):
                 problem = "the file has other landmarks than the model"
                 raise MapError(problem, path=stored, fix="Give --database, or run the map stage again.")
@@ -98,8 +97,6 @@ class ImageLocalizer:
             fix = "Give --database: the model's database.db, or hloc's feats-*.h5."
             raise MapError("the landmarks have no descriptors, so nothing can be localized", path=path, fix=fix)
         extractor = extractor or _extractor_of(path, landmarks)
-        if lightglue and features is None:
-            features = find_features(path, model)
         of_images = None if pairs is None else ImagePairs.read(pairs, arrays, landmarks.ids)
         result = cls(landmarks, own, QueryImages(model, path), extractor, device, of_images, lightglue, features)
         _ = result._localizer.extractor  # so that another extractor and missing weights are reported once

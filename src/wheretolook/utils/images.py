@@ -46,10 +46,10 @@ def read_image(path: Path, flags: int, at_most: int = MAX_PIXELS) -> NDArray[Any
 
     image_size(path, at_most)
     try:
-        image = cv2.imread(str(path), flags)
+        image = None if _is_cut_jpeg(path.read_bytes()) else cv2.imread(str(path), flags)
     except cv2.error as error:
         raise ValueError(error.err) from error
-    if image is None or _is_cut_jpeg(path.read_bytes()):
+    if image is None:
         raise ValueError("this is no image, or not a whole one")
     return image
 

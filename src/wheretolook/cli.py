@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import json
 import os
 import re
@@ -22,7 +24,7 @@ from wheretolook.utils.extras import EXTRAS, missing_package
 from wheretolook.utils.images import MAX_PIXELS
 from wheretolook.utils.logs import quiet_libraries
 from wheretolook.utils.nearest import did_you_mean
-from wheretolook.utils.processes import in_main_thread, interrupt, on_sigterm
+from wheretolook.utils.processes import collect_less_garbage, in_main_thread, interrupt, on_sigterm
 from wheretolook.utils.shipped import or_shipped, shipped, shipped_configs
 from wheretolook.utils.version import VERSION
 
@@ -66,6 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line. Returns the exit code: 0, 2 for bad input, 130 when interrupted by Ctrl-C or SIGTERM."""
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
+    collect_less_garbage()
+    atexit.register(gc.freeze)  # collections at the exit after `import torch` would take half a second
     given = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     debug = "--debug" in given
     if not debug:

@@ -23,7 +23,8 @@ from common import ROOM_M, room_map, use_one_thread
 
 from wheretolook.features.descriptor_index import DescriptorIndex, has_index
 from wheretolook.features.descriptors import quantize_descriptors
-from wheretolook.features.matching import DescriptorMatcher, match
+from wheretolook.features.matches import match
+from wheretolook.features.matching import DescriptorMatcher
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, rotation_looking_along

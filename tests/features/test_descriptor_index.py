@@ -7,7 +7,8 @@ import pytest
 
 from wheretolook.features import descriptor_index
 from wheretolook.features.descriptor_index import DescriptorIndex, has_index
-from wheretolook.features.matching import MAX_NEAREST, DescriptorMatcher, match
+from wheretolook.features.matches import match
+from wheretolook.features.matching import MAX_NEAREST, DescriptorMatcher
 
 
 def stored(values: np.ndarray) -> np.ndarray:

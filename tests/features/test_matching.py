@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from twins.features import nearest
 from wheretolook.features import matching
 from wheretolook.features.descriptors import quantize_descriptors, unit_descriptors
-from wheretolook.features.matching import DescriptorMatcher, match
+from wheretolook.features.matches import match
+from wheretolook.features.matching import DescriptorMatcher
 
 Descriptors = NDArray[np.uint8]
 

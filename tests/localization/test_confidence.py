@@ -1,6 +1,4 @@
-import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +7,6 @@ from scipy.stats import lognorm
 from wheretolook.dataset.thresholds import ACCURACY
 from wheretolook.localization.confidence import RIGHT_PLACE, ConfidenceModel, ErrorModel, probabilities
 from wheretolook.localization.rig_localization import JointLocalization
-from wheretolook.utils.errors import WeightsError
 
 
 def pose(n_inliers: int, deviation_m: float, rivals: tuple[JointLocalization, ...] = ()) -> JointLocalization:
@@ -42,11 +39,3 @@ def test_poses_that_exclude_each_other_have_probabilities_up_to_one_together() -
     found = probabilities(pose(300, 0.01, (strong, pose(30, 0.1))), RIGHT_PLACE)
     assert found.shape == (3,) and found.sum() == pytest.approx(1) and found[0] == found[1] > found[2]
     assert probabilities(JointLocalization("no_pose", (), 0)).tolist() == [0]
-
-
-def test_a_file_without_the_model_of_errors_is_damaged(tmp_path: Path) -> None:
-    stored = json.loads(ConfidenceModel.file.read_text())
-    del stored["errors"]["position"]["slope"]
-    (tmp_path / "confidence.json").write_text(json.dumps(stored))
-    with pytest.raises(WeightsError, match="damaged"):
-        ConfidenceModel.load(tmp_path / "confidence.json")

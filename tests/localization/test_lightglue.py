@@ -22,7 +22,7 @@ from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import load_colmap_landmarks
-from wheretolook.utils.errors import MapError
+from wheretolook.utils.errors import MapError, WeightsError
 
 KIND = all_kinds()["aliked"]
 
@@ -63,7 +63,7 @@ def test_a_query_is_localized_by_the_images_that_see_the_same(corridor, tmp_path
     camera = cameras_by_id(model.cameras, corridor)[1]
     _, ((pixels, descriptors),) = read_features(corridor / "database.db", ["010.jpg"])
     query = Keypoints(pixels, KIND.restore(descriptors))
-    config = LocalizerConfig(lightglue=str(weights), lightglue_images=2)
+    config = LocalizerConfig(lightglue=str(weights))
     localizer = Localizer(landmarks, camera, config, map_dir=corridor)
     (matches,) = localizer.match([query])
     keypoints, rows, *_ = matches
@@ -77,6 +77,19 @@ def test_a_query_is_localized_by_the_images_that_see_the_same(corridor, tmp_path
     assert found.status == "localized" and error_m < 0.02 and error_deg < 0.3
     nothing = Keypoints.none(KIND.dimension)
     assert [len(part) for part in localizer.match([nothing])[0]] == [0, 0, 0, 0]
+
+
+def test_weights_for_other_features_are_an_error_though_their_tensors_fit(corridor, tmp_path):
+    """DISK's file is known by the first weight of its positional encoding."""
+    torch = pytest.importorskip("torch")
+    weights = nearest_neighbour_weights(tmp_path / "disk_lightglue.pth")
+    state = torch.load(weights)
+    state["posenc.Wr.weight"][0, 0] = -0.6789149045944214
+    torch.save(state, weights)
+    landmarks = load_colmap_landmarks(corridor, corridor / "database.db")
+    camera = cameras_by_id(read_model(corridor).cameras, corridor)[1]
+    with pytest.raises(WeightsError, match=r"disk_lightglue\.pth: .* weights for disk, but the map has aliked"):
+        Localizer(landmarks, camera, LocalizerConfig(lightglue=str(weights)), map_dir=corridor)
 
 
 def test_held_out_photographs_of_a_map_of_learned_features_are_localized(corridor, tmp_path):
@@ -95,7 +108,7 @@ def test_the_features_of_mapping_images_may_be_in_another_file(corridor, tmp_pat
     camera = cameras_by_id(read_model(corridor).cameras, corridor)[1]
     _, ((pixels, descriptors),) = read_features(corridor / "database.db", ["010.jpg"])
     query = Keypoints(pixels, KIND.restore(descriptors))
-    config = LocalizerConfig(lightglue=str(weights), lightglue_images=2)
+    config = LocalizerConfig(lightglue=str(weights))
     other = tmp_path / "features.db"
     shutil.copy(corridor / "database.db", other)
     by_database, by_file = (

@@ -18,7 +18,8 @@ from wheretolook.cli import main
 from wheretolook.geometry.poses import Float, pose_error, poses_looking_along
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.io.poses import read_poses
-from wheretolook.localization.turns import checked_turns, read_turns
+from wheretolook.localization.rig import checked_turns
+from wheretolook.localization.turns import read_turns
 from wheretolook.mapping.colmap_model import read_model
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.landmarks import Landmarks
@@ -58,17 +59,20 @@ def test_a_batch_is_localized_and_an_unreadable_image_is_a_row_with_its_reason(
     room: MappedRoom, photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "broken.png").write_bytes(b"no image")
+    cut = cv2.imencode(".jpg", cv2.imread(str(photos / "a.png")))[1].tobytes()
+    (tmp_path / "cut.jpg").write_bytes(cut[: len(cut) // 2])
     out = tmp_path / "poses.csv"
-    images = [str(photos), str(tmp_path / "broken.png")]
+    images = [str(photos), str(tmp_path / "broken.png"), str(tmp_path / "cut.jpg")]
     command = ["localize", *images, "--map", str(room.landmarks.parent), "--out", str(out)]
     assert main([*command, "--figure", str(tmp_path / "figures")]) == 0
     table = pd.read_csv(out)
-    assert table["image"].tolist() == ["a.png", "b.png", "c.png", "broken.png"]
-    assert table["status"].tolist()[-1] == "error" and "broken.png" in table["reason"].iloc[-1]
+    assert table["image"].tolist() == ["a.png", "b.png", "c.png", "broken.png", "cut.jpg"]
+    assert table["status"].tolist()[-2:] == ["error", "error"] and "broken.png" in table["reason"].iloc[-2]
+    assert "not a whole one" in table["reason"].iloc[-1]
     found = table[table["status"] == "localized"]
     assert len(found) >= 2
     assert np.allclose(found[["x", "y", "z"]], (2, 2, 1.4), atol=0.05)
-    assert f"localized: {len(found)} of 4" in capsys.readouterr().out
+    assert f"localized: {len(found)} of 5" in capsys.readouterr().out
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {"a.png", "b.png", "c.png"}
 
 
@@ -114,14 +118,14 @@ def test_an_invalid_option_is_an_error_of_the_batch_not_of_each_image(
 def test_an_interrupted_batch_keeps_its_results(
     room: MappedRoom, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    localize = ImageLocalizer.localize_or_fail
+    localize = ImageLocalizer.localize
 
     def interrupted(self: ImageLocalizer, image: Path, *options: Any) -> Localized:
         if image.name == "c.png":
             raise KeyboardInterrupt
         return localize(self, image, *options)
 
-    monkeypatch.setattr(ImageLocalizer, "localize_or_fail", interrupted)
+    monkeypatch.setattr(ImageLocalizer, "localize", interrupted)
     out = tmp_path / "poses.csv"
     assert main(["localize", str(photos), "--map", str(room.landmarks.parent), "--out", str(out)]) == 130
     assert pd.read_csv(out)["image"].tolist() == ["a.png", "b.png"]
@@ -177,6 +181,29 @@ def test_a_rig_by_yaw_and_pitch_has_the_pose_of_each_image(room: MappedRoom, pho
     assert rows[0]["probability"] > 0.9
 
 
+def test_a_rig_whose_rotations_the_images_contradict_is_not_reported_as_localized(
+    room: MappedRoom, photos: Path, localizer: ImageLocalizer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The pose is kept, as the rotations are refined with it; COLMAP's file, which has no status, leaves it out."""
+    yaw = np.degrees(np.arctan2(AXES[:, 1], AXES[:, 0])) + np.array((0, 8, 0))
+    pitch = np.degrees(np.arcsin(AXES[:, 2] / np.linalg.norm(AXES, axis=1)))
+    turns = tmp_path / "turns.csv"
+    pd.DataFrame({"image": ["a.png", "b.png", "c.png"], "yaw": yaw, "pitch": pitch}).to_csv(turns, index=False)
+    for name in ("pose.csv", "pose.json", "images.txt"):
+        given = ["--map", str(room.landmarks.parent), "--turns", str(turns), "--out", str(tmp_path / name)]
+        assert main(["localize", str(photos), *given]) == 0
+    assert "localized: 0 of 1" in capsys.readouterr().out
+    table = pd.read_csv(tmp_path / "pose.csv")
+    rows = json.loads((tmp_path / "pose.json").read_text())["images"]
+    assert table["status"].tolist() == [row["status"] for row in rows] == 3 * ["contradicted"]
+    assert re.search(r"contradict the given rotations, by up to [78]\.\d degrees", table["reason"].iloc[0])
+    assert np.allclose(table[["x", "y", "z"]], (2, 2, 1.4), atol=0.05)
+    assert ".png" not in (tmp_path / "images.txt").read_text()
+    result = localizer.localize([photos / f"{name}.png" for name in "abc"], turns)
+    assert result.status == "contradicted"
+    assert_near(result.cam_from_world, POSES)
+
+
 def test_results_are_in_the_maps_own_frame_and_unit(room: MappedRoom, photos: Path, tmp_path: Path) -> None:
     centimetres = Similarity(100.0, np.array([(1.0, 0, 0), (0, 0, -1), (0, 1, 0)]), np.array((50.0, 0, 0)))  # z to -y
     model = read_model(room.landmarks.parent)
@@ -202,8 +229,32 @@ def test_a_prior_is_a_hypothesis_and_an_array_an_image(localizer: ImageLocalizer
         localizer.localize(rgb, prior=(1, 2))
     with pytest.raises(ConfigError, match="rotations"):
         localizer.localize([rgb, rgb])
-    with pytest.raises(PoseError):
-        localizer.localize([rgb, rgb], turns=np.ones((2, 3, 3)))
+    for images in ([], None, 5, [None], {"a": rgb}):
+        with pytest.raises((PoseError, ConfigError), match="images"):
+            localizer.localize(images)  # type: ignore[arg-type]
+    nan = np.full((2, 3, 3), np.nan)
+    for turns in (
+        np.ones((2, 3, 3)),
+        nan,
+        np.eye(3),
+        np.tile(np.eye(3), (3, 1, 1)),
+        [np.eye(3), [1]],
+        "xy",
+        np.zeros(0),
+    ):
+        with pytest.raises((PoseError, TableError)):
+            localizer.localize([rgb, rgb], turns=turns)
+    with pytest.raises(ConfigError, match="images"):
+        localizer.localize([], turns=np.zeros((0, 3, 3)))
+    for prior in ("abc", 5, (1, 2, np.nan), [[1, 2, 3]], (1, 2, 3, 4, 5)):
+        with pytest.raises(ConfigError, match="prior"):
+            localizer.localize(rgb, prior=prior)  # type: ignore[arg-type]
+    for accuracy in ("ab", 0.1, (0.1, None)):
+        with pytest.raises(ConfigError, match="accuracy"):
+            localizer.localize(rgb, accuracy=accuracy)  # type: ignore[arg-type]
+    for camera in ("abc", 7.5, (1, 2), 77):
+        with pytest.raises((ConfigError, MapError), match="camera"):
+            localizer.localize(rgb, camera=camera)  # type: ignore[arg-type]
 
 
 def test_the_probability_is_that_of_the_accuracy(localizer: ImageLocalizer, photos: Path) -> None:

@@ -19,7 +19,8 @@ from wheretolook import load_scorer
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.descriptors import quantize_descriptors
 from wheretolook.features.keypoints import Keypoints
-from wheretolook.features.matching import DescriptorMatcher, match
+from wheretolook.features.matches import match
+from wheretolook.features.matching import DescriptorMatcher
 from wheretolook.features.sift import OpenCvSift
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.local_origin import local_origin
@@ -28,6 +29,7 @@ from wheretolook.geometry.similarity import Similarity
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer
+from wheretolook.localization.rig import Look
 from wheretolook.looks.next_look import N_DIRECTIONS, NextLookSelector, mean_scores_by_pitch
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.map_frame import MapFrame
@@ -108,7 +110,7 @@ def test_poses_are_those_of_the_localizer(folder: Path) -> None:
         np.testing.assert_array_equal(own_squared, squared)
         np.testing.assert_array_equal(own_near[:, 0], near[:, 0])
         keypoints = Keypoints(pixels, descriptors)
-        looks.append(localizer.look(keypoints, match(matcher, [descriptors], 0.85, 16)[0]))
+        looks.append(Look.of(keypoints.pixels, match(matcher, [descriptors], 0.85, 16)[0], CAMERA))
     for view, look, pose in zip(views, looks, POSES, strict=True):
         best = robot.localize([robot.match(*view)]).poses[0]
         assert pose_error(best.cam_from_world, pose)[0] < 0.05
@@ -213,6 +215,7 @@ def test_odometry_whose_rotation_the_images_contradict_is_reported(
     results = [sequence.add(view, pose) for view, pose in zip(views, odometry, strict=True)]
     assert results[1].n_views == 2 and results[0].contradiction == ""
     assert ("odometry contradicts the images by" in results[1].contradiction) == reported
+    assert results[1].localization.status == ("contradicted" if reported else "localized")
 
 
 @pytest.mark.parametrize("max_views", [1, 2])
@@ -231,9 +234,26 @@ def test_invalid_input_is_rejected(folder: Path, tmp_path: Path) -> None:
     nothing = robot.localize([robot.match(np.zeros((0, 2)), np.zeros((0, 128), np.uint8))])
     assert nothing.poses == () and nothing.probability == 0 and nothing.joint.status == "too_few_matches"
     matched = robot.match(*view)
-    for views, turns in [([matched, matched], None), ([], None), ([matched], np.eye(3))]:
+    nan = np.full((2, 3, 3), np.nan)
+    for views, turns in [
+        (2, None),
+        (0, None),
+        (1, np.eye(3)),
+        (0, np.zeros((0, 3, 3))),
+        (2, nan),
+        (2, [np.eye(3), [1]]),
+    ]:
         with pytest.raises(ValueError):
-            robot.localize(views, turns)
+            robot.localize(views * [matched], turns)
+    for prior in ((1, 2), "abc", (1, 2, np.nan)):
+        with pytest.raises(ConfigError, match="prior"):
+            robot.match(*view, prior=prior)
+    for pixels, descriptors in [(0, 0), (view[0] * np.nan, view[1]), (view[0], view[1].astype(float))]:
+        with pytest.raises(ValueError):
+            robot.match(pixels, descriptors)
+    for image in (np.zeros((8, 8, 3), np.uint8), np.zeros((8, 8)), np.zeros((0, 8), np.uint8)):
+        with pytest.raises(ValueError, match="grey"):
+            robot.extract(image)
     for accuracy in ((0.0, 0.0), (np.nan, 0.4)):
         with pytest.raises(ConfigError, match="two positive limits"):
             robot.localize([matched], accuracy=accuracy)

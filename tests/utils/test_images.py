@@ -46,6 +46,20 @@ def test_images_are_read_as_they_are(tmp_path: Path) -> None:
     assert image_size(tmp_path / "a.png") == (4, 3)
     np.testing.assert_array_equal(read_image(tmp_path / "a.png", cv2.IMREAD_UNCHANGED), depth)
     (tmp_path / "b.png").write_bytes((tmp_path / "a.png").read_bytes()[:40])
-    for path in (tmp_path / "b.png", tmp_path, Path("/dev/zero"), tmp_path / "no.png", tmp_path / "n\0.png"):
+    cv2.imwrite(str(tmp_path / "a.jpg"), np.random.default_rng(0).integers(0, 255, (99, 99), np.uint8))
+    whole = (tmp_path / "a.jpg").read_bytes()
+    thumbnail = b"\xff\xe1" + (len(whole) + 2).to_bytes(2, "big") + whole
+    padded = whole[:2] + thumbnail + whole[2:] + bytes(100)
+    (tmp_path / "c.jpg").write_bytes(padded)
+    assert read_image(tmp_path / "c.jpg", cv2.IMREAD_UNCHANGED).shape == (99, 99)
+    (tmp_path / "d.jpg").write_bytes(padded[:-200])
+    for path in (
+        tmp_path / "b.png",
+        tmp_path / "d.jpg",
+        tmp_path,
+        Path("/dev/zero"),
+        tmp_path / "no.png",
+        tmp_path / "n\0.png",
+    ):
         with pytest.raises((ValueError, OSError)):
             read_image(path, cv2.IMREAD_UNCHANGED)

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from wheretolook.commands.options import CameraOptions
+from wheretolook.dataset.thresholds import checked_accuracy
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.figures import KINDS
 from wheretolook.mapping.config import FrameOptions
-from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.errors import ConfigError, MapError, WhereToLookError
 from wheretolook.utils.validation import check_choice
 
 if TYPE_CHECKING:
@@ -92,6 +93,7 @@ class Localize(CameraOptions, FrameOptions):
     def __post_init__(self) -> None:
         self.frame_options()
         self.named_camera()
+        checked_accuracy(self.accuracy)
         if self.figure is not None and self.figure.suffix:
             check_choice("format of figures", self.figure.suffix[1:].lower(), KINDS)
         if self.extractor_weights and self.extractor is None:
@@ -112,9 +114,10 @@ class Localize(CameraOptions, FrameOptions):
         if self.out is not None:
             check_localized_format(self.out)
         paths = self._paths()
-        if self.figure is not None and self.figure.suffix and len(paths) > 1 and self.turns is None:
+        several = len(paths) > 1 and self.turns is None
+        if several and self.figure is not None and self.figure.suffix:
             raise ConfigError("several images need a folder of figures", path=self.figure, fix="Name a folder.")
-        if self.next and len(paths) > 1 and self.turns is None:
+        if several and self.next:
             raise ConfigError("the next view is that of one rig", value=len(paths), fix="Give --turns, or one image.")
         names = distinct_names(paths)
         if self.figure is not None:
@@ -163,12 +166,21 @@ class Localize(CameraOptions, FrameOptions):
         """Yield the result of the rig, or of each image, with a progress bar."""
         from tqdm.auto import tqdm
 
+        from wheretolook.localization.prior import PosePrior
+        from wheretolook.select.localized import FAILED, Localized
+
+        if self.prior is not None:
+            PosePrior.of(self.prior, localizer.frame.world_from_map)
         camera = localizer.images.known_camera(self.named_camera())
         if self.turns is not None or len(paths) == 1:
             yield localizer.localize(paths, self.turns, camera, self.prior, self.accuracy)
             return
         for path, name in zip(tqdm(paths, desc="localize", unit="image"), names, strict=True):
-            yield localizer.localize_or_fail(path, name, camera, self.prior, self.accuracy)
+            try:
+                result = localizer.localize(path, None, camera, self.prior, self.accuracy, [name])
+            except WhereToLookError as error:
+                result = Localized((name,), FAILED, str(error), frame=localizer.frame)
+            yield result
 
     def _draw(self, result: Localized, localizer: ImageLocalizer) -> None:
         from wheretolook.figures.style import save_figure
@@ -198,6 +210,6 @@ class Localize(CameraOptions, FrameOptions):
         if len(results) <= 10:
             for result in results:
                 print(f"{', '.join(result.names)}: {result.describe()}")
-        found = [result for result in results if result.cam_from_world is not None]
+        found = [result for result in results if result.status == "localized"]
         sure = sum(result.probability >= 0.95 for result in found)
         print(f"localized: {len(found)} of {len(results)}, {sure} with a probability of at least 95 %")

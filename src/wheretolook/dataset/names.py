@@ -9,3 +9,4 @@ LOCK = ".lock"  # in a dataset's folder: held by stages that change it, shared b
 LOCALIZED = "localized"
 TOO_FEW_MATCHES = "too_few_matches"
 NO_POSE = "no_pose"
+CONTRADICTED = "contradicted"  # of a rig: there is a pose, but the images contradict the given rotations

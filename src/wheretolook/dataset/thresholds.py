@@ -18,7 +18,10 @@ ACCURACY: Accuracy = THRESHOLDS[0]
 
 def checked_accuracy(accuracy: Sequence[float]) -> Accuracy:
     """Return limits of the errors in metres and degrees. Raises ConfigError unless they are two positive numbers."""
-    limits = tuple(float(limit) for limit in accuracy)
+    try:
+        limits = tuple(float(limit) for limit in accuracy)
+    except (TypeError, ValueError):
+        limits = ()
     if len(limits) != 2 or not all(limit > 0 for limit in limits):
         raise ConfigError("an accuracy has two positive limits", value=accuracy, fix="Give metres,degrees: 0.05,0.4.")
     return limits

@@ -1,28 +1,13 @@
-"""Matches keypoints with landmarks by Lowe's ratio test: exact nearest neighbours, by matrix products."""
+"""Finds the exact nearest landmarks of descriptors, by matrix products."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cache
-from typing import Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-
-from wheretolook.features.matches import Matches
-
-
-class NearestLandmarks(Protocol):
-    """Finds landmarks by their descriptors; see `DescriptorMatcher.nearest`."""
-
-    n_landmarks: int
-
-    def nearest(
-        self, descriptors: NDArray[np.uint8], count: int = 2
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]: ...
-
 
 GROUP = 32  # landmarks; the best groups are selected first, and in them the best landmarks
 CPU_GROUP = 16  # divides it; matching an image takes a tenth less than with 32
@@ -130,29 +115,3 @@ def _byte_products_are_fast() -> bool:
     except RuntimeError:  # not supported at all
         return False
     return torch.equal(product.long(), left @ right)
-
-
-def match(
-    matcher: NearestLandmarks, descriptors: Sequence[NDArray[np.uint8]], max_ratio: float, count: int = 2
-) -> list[Matches]:
-    """2D-3D matches of several images, from their descriptors (K_i, 128) uint8, with each keypoint's nearest landmarks.
-
-    A match passes Lowe's ratio test (IJCV 2004, Sec. 7.1): the nearest landmark's distance is less than `max_ratio` of
-    the second nearest's. A landmark keeps only its nearest keypoint. With a single landmark, nothing matches.
-    """
-    lengths = [len(of_image) for of_image in descriptors]
-    if sum(lengths) == 0 or matcher.n_landmarks < 2:
-        return [Matches.none(length) for length in lengths]
-    near, squared = matcher.nearest(np.concatenate(descriptors), count)
-    ends = np.cumsum(lengths)[:-1]
-    return [
-        _by_ratio(*of_image, max_ratio) for of_image in zip(np.split(near, ends), np.split(squared, ends), strict=True)
-    ]
-
-
-def _by_ratio(near: NDArray[np.int64], squared: NDArray[np.int64], max_ratio: float) -> Matches:
-    keypoints = np.flatnonzero(squared[:, 0] < max_ratio**2 * squared[:, 1])
-    landmarks = near[keypoints, 0]
-    order = np.lexsort((keypoints, squared[keypoints, 0], landmarks))
-    unique = np.sort(order[np.unique(landmarks[order], return_index=True)[1]])
-    return Matches(keypoints[unique], landmarks[unique], near, squared.astype(np.float32))

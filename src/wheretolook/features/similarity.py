@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wheretolook.features.matching import GROUP, Matches, largest
+from wheretolook.features.matches import Matches
+from wheretolook.features.matching import GROUP, largest
 
 _PRODUCTS = {"cpu": 2**22, "cuda": 2**25}  # per block: a CPU keeps them in its cache, on a GPU more are slower
 _BATCH = {"cpu": 1, "cuda": 16}  # images per batch; learned extractors give few keypoints per image

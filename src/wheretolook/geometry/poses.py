@@ -58,7 +58,7 @@ def rotation_looking_along(directions: ArrayLike) -> Float:
     straight up or down, the image's x axis is the world's. Directions need not be of unit length. Raises PoseError if
     one has no length, or entries that are not finite.
     """
-    forward = _numbers(directions)
+    forward = as_numbers(directions)
     length = np.linalg.norm(forward, axis=-1, keepdims=True)
     usable = (length > 0) & np.isfinite(length)
     if not usable.all():
@@ -78,8 +78,8 @@ def poses_looking_along(locations: ArrayLike, directions: ArrayLike) -> Float:
     They are broadcast to each other. Raises PoseError if they cannot be, a location is not finite, or a direction is not
     or has no length.
     """
-    at = _numbers(locations)
-    along = _numbers(directions)
+    at = as_numbers(locations)
+    along = as_numbers(directions)
     try:
         shape = np.broadcast_shapes(at.shape, along.shape)
     except ValueError:
@@ -129,7 +129,7 @@ def pose_error(cam_from_world_a: ArrayLike, cam_from_world_b: ArrayLike) -> tupl
     return error_m, rotation_angle_deg(a[..., :3], b[..., :3])
 
 
-def _numbers(values: ArrayLike) -> NDArray[np.float64]:
+def as_numbers(values: ArrayLike) -> NDArray[np.float64]:
     """Return values as float64. Raises PoseError for text, complex numbers and lists of different lengths."""
     try:
         return np.asarray(values).astype(np.float64, casting="same_kind", copy=False)
@@ -139,7 +139,7 @@ def _numbers(values: ArrayLike) -> NDArray[np.float64]:
 
 def check_poses(cam_from_world: ArrayLike) -> NDArray[np.float64]:
     """The poses as float64 (B, 3, 4). Raises PoseError, a ValueError, on another shape or entries not finite or too large."""
-    poses = _numbers(cam_from_world)
+    poses = as_numbers(cam_from_world)
     if poses.ndim != 3 or poses.shape[1:] != (3, 4):
         raise PoseError("cam_from_world must have shape (B, 3, 4)", value=poses.shape)
     invalid = np.flatnonzero(~(np.abs(poses) <= MAX_ENTRY).all(axis=(1, 2)))
@@ -153,7 +153,7 @@ def rigid_poses(poses: ArrayLike) -> NDArray[np.float64]:
 
     Raises PoseError, as `check_poses`, and if one is no rigid transform.
     """
-    matrices = _numbers(poses)
+    matrices = as_numbers(poses)
     if matrices.ndim == 2:
         matrices = matrices[None]
     homogeneous = matrices.ndim == 3 and matrices.shape[1:] == (4, 4)
@@ -171,7 +171,7 @@ def rigid_poses(poses: ArrayLike) -> NDArray[np.float64]:
 
 def check_locations(locations: ArrayLike) -> NDArray[np.float64]:
     """The locations as float64 (..., 3). Raises PoseError, a ValueError, on entries that are not finite."""
-    at = _numbers(locations)
+    at = as_numbers(locations)
     finite = np.isfinite(at).all(axis=-1)
     if not finite.all():
         raise PoseError("a camera's location is NaN or infinite", value=at[~finite].reshape(-1, 3)[0].tolist())

@@ -21,7 +21,6 @@ from numpy.typing import ArrayLike
 from wheretolook.dataset.thresholds import ACCURACY, Accuracy
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.pose_ambiguity import log_ratio
-from wheretolook.utils.errors import WeightsError
 from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.shipped_model import LogisticRegression
 
@@ -89,14 +88,10 @@ class ConfidenceModel(LogisticRegression):
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read the JSON file of both factors. Raises a WeightsError if it is damaged."""
+        """Read the JSON file of both factors."""
         place = super().load(path)
-        try:
-            stored = read_json_object(path)["errors"]
-            errors = tuple(ErrorModel(**stored[name]) for name in ("position", "orientation"))
-        except (OSError, KeyError, TypeError) as error:
-            raise WeightsError(f"a damaged file of {cls.about}: {error}", path=path, fix="Fit it again.") from error
-        return cls(place.weights, place.bias, errors)
+        errors = read_json_object(path)["errors"]
+        return cls(place.weights, place.bias, tuple(ErrorModel(**errors[name]) for name in ("position", "orientation")))
 
     def of(self, localization: JointLocalization, accuracy: Accuracy = ACCURACY) -> float:
         """Probability that a joint pose is within an accuracy, 0 if there is no pose."""

@@ -22,9 +22,9 @@ class LocalizerConfig:
             landmark.
         min_similarity: minimum cosine of mutual nearest neighbours for learned features; by default the extractor's.
         lightglue: file of LightGlue weights for the map's features (aliked_lightglue.pth), or kornia for its copy. A
-            query is then matched with mapping images, as in hloc, instead of with landmarks. Needs a map with its
+            query is then matched with mapping images, as in hloc, instead of with landmarks: with the five that observe most of
+            the landmarks matched first. Needs a map with its
             database (`mapping.keep_database`) and the extra `learned`.
-        lightglue_images: number of these mapping images: those that observe most of the landmarks matched first.
         max_error_px: maximum reprojection error of an inlier in RANSAC.
         min_inliers: inliers that a pose needs: RANSAC finds some pose with a few for almost any image.
         seed: seed of RANSAC, the same for every image, so that a label depends only on its viewpoint; also of
@@ -41,7 +41,6 @@ class LocalizerConfig:
     max_ratio: float = 0.85
     min_similarity: float | None = None
     lightglue: str = ""
-    lightglue_images: int = 5
     min_matches: int = field(default=4, init=False)
     max_error_px: float = 8.0
     min_inliers: int = 10
@@ -55,7 +54,6 @@ class LocalizerConfig:
         check_range("max_ratio", self.max_ratio, 1e-9, 1)
         if self.min_similarity is not None:
             check_range("min_similarity", self.min_similarity, -1, 1)
-        check_range("lightglue_images", self.lightglue_images, 1)
         check_range("min_inliers", self.min_inliers, 4)
         check_positive("max_error_px", self.max_error_px)
 
@@ -68,7 +66,7 @@ class LocalizerConfig:
         if self.min_similarity is None:
             del record["min_similarity"]
         if not self.lightglue:
-            del record["lightglue"], record["lightglue_images"]
+            del record["lightglue"]
         elif Path(self.lightglue).is_file():
             record["lightglue"] = sha256(Path(self.lightglue))
         return record

@@ -18,9 +18,11 @@ from wheretolook.features.registry import all_extractors, all_kinds
 from wheretolook.mapping.colmap_model import model_arrays, read_model
 from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.errors import ConfigError, MapError, WeightsError
 
+N_IMAGES = 5  # that a query is matched with
 KORNIA_WEIGHTS = "kornia"  # in place of a file
+FIRST_WEIGHTS = {"aliked": -0.3284747, "disk": -0.6789149}  # of the authors' files, whose tensors have equal shapes
 _DATABASE = "database.db"
 
 
@@ -69,7 +71,7 @@ class LightGlueMatcher:
         self._network = _network(supported[landmarks.features], weights).to(self.device)
 
     def match(
-        self, query: Keypoints, size: tuple[int, int], landmark_rows: NDArray[np.int64], n_images: int
+        self, query: Keypoints, size: tuple[int, int], landmark_rows: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Match a query of a width and height, given the rows (M,) of the landmarks that it matched before.
 
@@ -80,7 +82,7 @@ class LightGlueMatcher:
         images = self._images
         voted = np.isin(np.arange(len(self.landmarks)), landmark_rows)[images.landmark]
         votes = np.bincount(images.observer[voted], minlength=len(images.stored))
-        best = np.argsort(-votes, kind="stable")[:n_images]
+        best = np.argsort(-votes, kind="stable")[:N_IMAGES]
         matches = [self._match_image(query, size, int(image)) for image in best[votes[best] > 0]]
         if not matches:
             return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -151,6 +153,10 @@ def _network(features: str, weights: str) -> Any:
         return {key: value for key, value in renamed.items() if key in network.state_dict()}
 
     file = "" if weights == KORNIA_WEIGHTS else weights
-    return load_state(
-        network, file, name, [url], prepare, "--label.localizer.lightglue (of localize --lightglue)"
-    ).eval()
+    load_state(network, file, name, [url], prepare, "--label.localizer.lightglue (of localize --lightglue)")
+    known = network.posenc.Wr.weight[0, 0].item()
+    other = next((other for other, value in FIRST_WEIGHTS.items() if abs(known - value) < 1e-6), features)
+    if other != features:
+        problem = f"these are LightGlue weights for {other}, but the map has {features} features"
+        raise WeightsError(problem, path=weights, fix=f"Give {name}.")
+    return network.eval()

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,8 @@ from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.descriptor_index import DescriptorIndex, has_index
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import Keypoints
-from wheretolook.features.matching import MAX_NEAREST, DescriptorMatcher, Matches, match
+from wheretolook.features.matches import Matches, match
+from wheretolook.features.matching import MAX_NEAREST, DescriptorMatcher
 from wheretolook.features.registry import all_kinds, kind_of
 from wheretolook.features.similarity import SimilarityMatcher
 from wheretolook.geometry.camera import Camera
@@ -24,7 +25,7 @@ from wheretolook.geometry.local_origin import poses_from
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator
-from wheretolook.localization.rig import Candidates, Look
+from wheretolook.localization.rig import Look
 from wheretolook.localization.rig_localization import POSES_OF_AN_IMAGE, JointLocalizer
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import MapError
@@ -32,7 +33,7 @@ from wheretolook.utils.errors import MapError
 if TYPE_CHECKING:
     from wheretolook.localization.lightglue import LightGlueMatcher
 
-IDENTITY: Float = np.eye(3, 4)
+Matcher = DescriptorMatcher | DescriptorIndex | SimilarityMatcher
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,18 +87,15 @@ class Localizer:
         if extractor is not None:
             self._check_extractor()
         self._device = device
-        self._matcher: DescriptorMatcher | DescriptorIndex | SimilarityMatcher
-        if self.kind.in_bytes and config.method == "hypotheses" and has_index(len(landmarks), device):
-            self._matcher = DescriptorIndex(landmarks.descriptors)
-        else:
-            matcher = DescriptorMatcher if self.kind.in_bytes else SimilarityMatcher
-            self._matcher = matcher(landmarks.descriptors, device)
+        self._descriptors = landmarks.descriptors
+        indexed = self.kind.in_bytes and config.method == "hypotheses" and has_index(len(landmarks), device)
+        self._matcher = DescriptorIndex(self._descriptors) if indexed else self._matcher_of(self._descriptors)
         self._guided: LightGlueMatcher | None = None
         if config.lightglue:
             from wheretolook.localization.lightglue import LightGlueMatcher
 
             self._guided = LightGlueMatcher(landmarks, map_dir, config.lightglue, device, features)
-        self._camera = camera
+        self.camera = camera
         self.estimator = PoseEstimator(landmarks.points, config)
 
     @cached_property
@@ -121,24 +119,20 @@ class Localizer:
         """Match keypoints of several images with landmarks. The result for an image does not depend on the others."""
         return self.by_lightglue(keypoints, self.match_descriptors(keypoints), camera)
 
-    def match_descriptors(self, keypoints: Sequence[Keypoints]) -> list[Matches]:
-        """Match keypoints of several images with landmarks by their descriptors, also where LightGlue is configured."""
-        return self._match(keypoints, self._matcher)
-
     def match_among(self, keypoints: Keypoints, rows: NDArray[np.int64]) -> Matches:
         """Match keypoints of an image with the landmarks in rows (R,) alone, by their descriptors."""
         if len(rows) == 0:
             return Matches.none(len(keypoints))
-        descriptors = self.landmarks.descriptors
-        assert descriptors is not None
-        matcher = DescriptorMatcher if self.kind.in_bytes else SimilarityMatcher
-        (found,) = self._match([keypoints], matcher(descriptors[rows], self._device))
+        (found,) = self.match_descriptors([keypoints], self._matcher_of(self._descriptors[rows]))
         near = rows[np.minimum(found.near, len(rows) - 1)]  # with few landmarks, missing ones have large distances
         return found._replace(landmarks=rows[found.landmarks], near=near)
 
-    def _match(
-        self, keypoints: Sequence[Keypoints], matcher: DescriptorMatcher | DescriptorIndex | SimilarityMatcher
-    ) -> list[Matches]:
+    def _matcher_of(self, descriptors: NDArray[Any]) -> Matcher:
+        return (DescriptorMatcher if self.kind.in_bytes else SimilarityMatcher)(descriptors, self._device)
+
+    def match_descriptors(self, keypoints: Sequence[Keypoints], matcher: Matcher | None = None) -> list[Matches]:
+        """Match keypoints of several images with landmarks by their descriptors, also where LightGlue is configured."""
+        matcher = matcher or self._matcher
         descriptors = [self.kind.store(of_image.descriptors) for of_image in keypoints]
         several = self.config.method == "hypotheses"
         if isinstance(matcher, SimilarityMatcher):
@@ -153,24 +147,12 @@ class Localizer:
         """Replace matches by those of LightGlue, if it is configured, with the mapping images that they lead to."""
         if self._guided is None:
             return matches
-        camera = camera or self._camera
+        camera = camera or self.camera
         size = (camera.width, camera.height)
         return [
-            Matches(
-                *self._guided.match(query, size, first.landmarks, self.config.lightglue_images),
-                first.near,
-                first.squared,
-            )
+            Matches(*self._guided.match(query, size, first.landmarks), first.near, first.squared)
             for query, first in zip(keypoints, matches, strict=True)
         ]
-
-    def look(
-        self, keypoints: Keypoints, matches: Matches, camera: Camera | None = None, cam_from_rig: Float = IDENTITY
-    ) -> Look:
-        """Return a view of a rig, for `JointLocalizer`, from an image's keypoints and their matches."""
-        candidates = Candidates.of(keypoints.pixels, matches)
-        pixels = keypoints.pixels[matches.keypoints].astype(np.float64)
-        return Look(cam_from_rig, pixels, matches.landmarks, camera or self._camera, candidates)
 
     @cached_property
     def joint(self) -> JointLocalizer:
@@ -184,14 +166,14 @@ class Localizer:
         if len(rows) < self.config.min_matches:
             return Localization(TOO_FEW_MATCHES, None, rows[:0], rows, pixels)
         if self.config.method == "hypotheses":
-            look = self.look(keypoints, matches, camera)
+            look = Look.of(keypoints.pixels, matches, camera or self.camera)
             found = self.joint.single_view_poses(look, POSES_OF_AN_IMAGE)
             best = self.joint.localize([look], [found])
             inlier_rows = best.looks[0].rows[best.inliers[0]] if best.inliers else rows[:0]
             in_map = [(poses_from(pose, -self.estimator.origin), inliers) for pose, inliers in found[:1]]
             first = self._first(in_map[0] if in_map else None, pixels, rows)
             return Localization(best.status, best.rig_from_world, inlier_rows, rows, pixels, first)
-        return self._first(self.estimator.estimate(pixels, rows, camera or self._camera), pixels, rows)
+        return self._first(self.estimator.estimate(pixels, rows, camera or self.camera), pixels, rows)
 
     def _first(
         self, estimated: tuple[Float, NDArray[np.bool_]] | None, pixels: NDArray[np.float32], rows: NDArray[np.int64]

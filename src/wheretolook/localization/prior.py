@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -9,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import Camera, field_of_view_deg
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, as_numbers
+from wheretolook.geometry.similarity import Similarity
+from wheretolook.utils.errors import ConfigError, PoseError
 
 if TYPE_CHECKING:
     from wheretolook.features.matches import Matches
@@ -18,16 +21,28 @@ MAX_DISTANCE_RATIO = 2.0  # distance over the mean mapping distance: farther lan
 YAW_MARGIN_DEG = 30.0  # how far the yaw may be off
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PosePrior:
     """A rough location (3,) m in the world of the map, and the yaw of an image in degrees, if known."""
 
-    location: tuple[float, float, float]
+    location: Float
     yaw_deg: float | None = None
+
+    @classmethod
+    def of(cls, values: Sequence[float], world_from_map: Similarity) -> PosePrior:
+        """Convert x, y, z and perhaps yaw in the map. Raises ConfigError unless they are finite numbers."""
+        try:
+            numbers = as_numbers(values)
+        except PoseError:
+            numbers = np.zeros(0)
+        if numbers.shape not in ((3,), (4,)) or not np.isfinite(numbers).all():
+            fix = "Give x,y,z in the map, and perhaps the yaw in degrees."
+            raise ConfigError("this is no prior of the pose", value=values, fix=fix)
+        return cls(world_from_map.apply(numbers[:3]), float(numbers[3]) if len(numbers) == 4 else None)
 
     def allows(self, points: Float, mapping_distance_m: Float, camera: Camera) -> NDArray[np.bool_]:
         """Return which landmarks, points (N, 3) m, the camera may detect from near the prior, whatever its pitch."""
-        offset: Float = points - np.asarray(self.location)
+        offset: Float = points - self.location
         allowed = np.linalg.norm(offset, axis=1) <= MAX_DISTANCE_RATIO * mapping_distance_m
         if self.yaw_deg is not None:
             angle = np.degrees(np.arctan2(offset[:, 1], offset[:, 0])) - self.yaw_deg

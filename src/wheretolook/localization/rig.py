@@ -1,8 +1,7 @@
-"""Matches of the views of a rig, and rigs whose views only rotate."""
+"""Matches of the views of a rig, and the poses of its views."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -10,11 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.camera import Camera
-from wheretolook.geometry.poses import Float, camera_centers, compose_poses, invert_poses
+from wheretolook.geometry.poses import Float, as_numbers, camera_centers, compose_poses, invert_poses, rigid_poses
 from wheretolook.utils.errors import PoseError
 
 if TYPE_CHECKING:
     from wheretolook.features.matches import Matches
+
+IDENTITY: Float = np.eye(3, 4)
 
 MAX_NEAREST_RATIO = 1.15
 """Maximum ratio of the descriptor distances to a candidate and to the nearest landmark of the map."""
@@ -41,8 +42,7 @@ class Candidates:
         """Select from the nearest landmarks of keypoints at pixels (K, 2)."""
         near = matches.squared <= MAX_NEAREST_RATIO**2 * matches.squared[:, :1]
         keypoints = np.repeat(np.arange(len(near)), near.sum(1))
-        of_keypoints = np.asarray(pixels, dtype=np.float64)[keypoints]
-        return cls(keypoints, of_keypoints, matches.near[near], matches.squared[near])
+        return cls(keypoints, pixels[keypoints], matches.near[near], matches.squared[near])
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +58,13 @@ class Look:
     camera: Camera
     candidates: Candidates | None = None  # for all its keypoints, if they are to be matched again under each hypothesis
 
+    @classmethod
+    def of(cls, pixels: Float, matches: Matches, camera: Camera, cam_from_rig: Float = IDENTITY) -> Look:
+        """Combine the matches of an image with their candidates, from the pixels (K, 2) of all its keypoints."""
+        at: Float = np.asarray(pixels, dtype=np.float64)
+        candidates = Candidates.of(at, matches)
+        return cls(cam_from_rig, at[matches.keypoints], matches.landmarks, camera, candidates)
+
     def __post_init__(self) -> None:
         rotation = self.cam_from_rig[:, :3]
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
@@ -67,20 +74,31 @@ class Look:
             raise PoseError("a view needs a pixel (x, y) for each row of a landmark", value=value)
 
 
-def turned_looks(turns: ArrayLike, matches: Sequence[tuple[Float, NDArray[np.int64]]], camera: Camera) -> list[Look]:
-    """Views of a camera rotated about its centre, from rotations `cam_from_rig` (N, 3, 3) and (pixels, rows) of each."""
-    poses = np.pad(np.asarray(turns, dtype=np.float64), ((0, 0), (0, 0), (0, 1)))
-    return [Look(pose, pixels, rows, camera) for pose, (pixels, rows) in zip(poses, matches, strict=True)]
+def checked_turns(turns: ArrayLike, n_views: int) -> Float:
+    """Return rotations (N, 3, 3) or poses (N, 3, 4) of cameras in a rig as exactly rigid poses (N, 3, 4).
+
+    Raises PoseError if one is not rigid, or there are more or fewer than views.
+    """
+    from scipy.spatial.transform import Rotation
+
+    poses = as_numbers(turns)
+    if poses.shape[1:] == (3, 3):
+        poses = np.pad(poses, ((0, 0), (0, 0), (0, 1)))
+    poses = rigid_poses(poses)
+    if len(poses) != n_views:
+        raise PoseError("each view needs a rotation", value=f"{len(poses)} rotations of {n_views} views")
+    poses[:, :, :3] = Rotation.from_matrix(poses[:, :, :3]).as_matrix()  # of rounded numbers
+    return poses
 
 
-def rig_of(cam_from_world: Float, tolerance_m: float = 1e-6) -> Float:
+def rig_of(cam_from_world: Float) -> Float:
     """cam_from_rig (N, 3, 4) of views (N, 3, 4) from one location; the rig has the axes of the first view.
 
-    Raises PoseError if a view is further from the first than the tolerance.
+    Raises PoseError if a view is elsewhere than the first.
     """
     centers = camera_centers(cam_from_world)
     distance = np.linalg.norm(centers - centers[0], axis=1)
-    if distance.max() > tolerance_m:
+    if distance.max() > 1e-6:
         raise PoseError("these views are not from one location", value=f"{distance.max():.3g} m apart")
     cam_from_rig = compose_poses(cam_from_world, invert_poses(cam_from_world[0]))
     cam_from_rig[:, :, 3] = 0

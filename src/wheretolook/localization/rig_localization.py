@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.dataset.names import LOCALIZED, NO_POSE, TOO_FEW_MATCHES
+from wheretolook.dataset.names import CONTRADICTED, LOCALIZED, NO_POSE, TOO_FEW_MATCHES
 from wheretolook.geometry.local_origin import poses_from
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.estimation import PoseEstimator
@@ -29,7 +29,6 @@ from wheretolook.localization.hypotheses import (
 from wheretolook.localization.pose_ambiguity import PoseAmbiguity, most_likely, strongest_rival
 from wheretolook.localization.rig import Look
 from wheretolook.localization.turn_errors import turn_errors
-from wheretolook.utils.errors import PoseError
 from wheretolook.utils.validation import check_range
 
 POSES_OF_A_VIEW = 2
@@ -44,7 +43,8 @@ class JointLocalization:
     """The pose that the matches of one view or several support best, how well, and the rival hypotheses.
 
     Attributes:
-        status: "localized", "too_few_matches" or "no_pose", as for a single image.
+        status: "localized", "too_few_matches" or "no_pose", as for a single image; "contradicted" if there is a pose, but
+            the images contradict the known rotations.
         looks: the views with the matches that the pose is judged by; under guided matching those found with it.
         rig_from_world: (3, 4); None if there is none. With too few inliers it is kept, but the status is "no_pose".
         cams_from_world: (N, 3, 4) poses of the views, including their refined rotations if these were not exact.
@@ -110,12 +110,6 @@ class JointLocalizer:
         """Ambiguity of the map."""
         return PoseAmbiguity(self.estimator.points)
 
-    def localize_together(self, looks: Sequence[Look]) -> JointLocalization:
-        """Localize two views or more. Raises PoseError for fewer."""
-        if len(looks) < 2:
-            raise PoseError("joint localization needs two views or more", value=len(looks))
-        return self.localize(looks)
-
     def single_view_poses(self, look: Look, count: int = POSES_OF_A_VIEW) -> SingleViewPoses:
         """Localize a view as a single image, then repeatedly the matches that agree with no earlier pose.
 
@@ -146,7 +140,9 @@ class JointLocalizer:
         if single_view_poses is None:
             count = POSES_OF_A_VIEW if len(looks) > 1 else POSES_OF_AN_IMAGE
             single_view_poses = [self.single_view_poses(look, count) for look in looks]
-        noise_deg, error_deg = self._turn_noise(looks, single_view_poses)
+        noise_deg, error_deg = self.turn_noise_deg, 0.0
+        if self.check_turns and len(looks) > 1:
+            noise_deg, error_deg = turn_errors(self.estimator, looks, single_view_poses, noise_deg)
         rig = RigMatches(self.estimator, looks, noise_deg)
         first = len(looks) == 1 and self.estimator.config.method == "first"
         if first:
@@ -157,15 +153,9 @@ class JointLocalizer:
                 hypotheses = distinct([rig.guided(hypothesis) for hypothesis in hypotheses])
         if not hypotheses:
             return JointLocalization(NO_POSE, tuple(looks), n_matches, turn_error_deg=error_deg)
-        return replace(self._ranked(hypotheses, n_matches, first), turn_error_deg=error_deg)
-
-    def _turn_noise(self, looks: Sequence[Look], poses: Sequence[SingleViewPoses]) -> tuple[float, float]:
-        """Return the noise of the known rotations to assume, and their largest error if the images contradict them."""
-        if self.check_turns and len(looks) > 1:
-            errors = turn_errors(self.estimator, looks, poses, self.turn_noise_deg)
-            if errors is not None and errors.contradictory:
-                return max(errors.noise_deg, self.turn_noise_deg), errors.largest_deg
-        return self.turn_noise_deg, 0.0
+        best = self._ranked(hypotheses, n_matches, first)
+        status = CONTRADICTED if error_deg and best.status == LOCALIZED else best.status
+        return replace(best, status=status, turn_error_deg=error_deg)
 
     def _ranked(self, hypotheses: Sequence[Hypothesis], n_matches: int, first: bool) -> JointLocalization:
         """Compare hypotheses; return the best with the others as its rivals."""

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import combinations, product
 
 import numpy as np
 
-from wheretolook.geometry.poses import pose_error
+from wheretolook.geometry.poses import camera_centers, compose_poses, pose_error
 from wheretolook.localization.estimation import PoseEstimator
 from wheretolook.localization.hypotheses import Hypothesis, RigMatches, SingleViewPoses
 from wheretolook.localization.rig import Look
@@ -21,38 +20,24 @@ MAX_DEVIATION_DEG = 1.0  # with larger ones, poses from a small part of the imag
 MOVE_M = 0.02  # of a camera that turns about its base
 
 
-@dataclass(frozen=True)
-class TurnErrors:
-    """Errors of the rotations between views, where two views have own poses at the same location.
-
-    Attributes:
-        noise_deg: standard deviation, about each axis, of each rotation that explains the errors.
-        largest_deg: largest error of the rotation between two views.
-        contradictory: whether an error exceeds `MAX_DEVIATIONS` of the assumed noise and of the poses' own deviations.
-    """
-
-    noise_deg: float
-    largest_deg: float
-    contradictory: bool
-
-
 def turn_errors(
     estimator: PoseEstimator, looks: Sequence[Look], poses: Sequence[SingleViewPoses], noise_deg: float
-) -> TurnErrors | None:
-    """Estimate the errors of known rotations from each view's poses as a single image, given their assumed noise.
+) -> tuple[float, float]:
+    """Compare known rotations, given their assumed noise, with each view's poses as a single image.
 
     Wrong poses of two views hardly ever agree in their location, so those that do are compared in their orientation.
-    Returns None if no two views agree in their location.
+    Returns the noise about each axis that explains the errors, and the largest error between two views, in degrees: if
+    an error exceeds `MAX_DEVIATIONS` of the assumed noise and of the poses' own deviations. Otherwise the assumed noise
+    and 0.
     """
     own = [_own_poses(estimator, look, of_view) for look, of_view in zip(looks, poses, strict=True)]
     pairs = [_smallest_error(first, second) for first, second in combinations(own, 2)]
-    compared = np.array([pair for pair in pairs if pair is not None])
-    if len(compared) == 0:
-        return None
+    compared = np.array([pair for pair in pairs if pair is not None]).reshape(-1, 2)
     error, variance = compared.T
+    if (error <= MAX_DEVIATIONS * np.sqrt(2 * noise_deg**2 + variance)).all():
+        return noise_deg, 0.0
     noise = np.sqrt(np.maximum(error**2 / 3 - variance, 0).mean() / 2)
-    limit = MAX_DEVIATIONS * np.sqrt(2 * noise_deg**2 + variance)
-    return TurnErrors(float(noise), float(error.max()), bool((error > limit).any()))
+    return max(float(noise), noise_deg), float(error.max())
 
 
 def _own_poses(estimator: PoseEstimator, look: Look, poses: SingleViewPoses) -> list[Hypothesis]:
@@ -65,15 +50,19 @@ def _own_poses(estimator: PoseEstimator, look: Look, poses: SingleViewPoses) -> 
 def _smallest_error(first: Sequence[Hypothesis], second: Sequence[Hypothesis]) -> tuple[float, float] | None:
     """Return the angle (deg) between two views' poses of the rig, and its variance about the least certain axis (deg^2).
 
-    Of all pairs of poses at the same location the one with the smallest angle; None if there is none.
+    Of all pairs of poses that place the second view at the same location the one with the smallest angle; None if there
+    is none. An error of the rotation moves this location by up to its chord times the distance between the views.
     """
     errors = []
     for pose, other in product(first, second):
         covariance = pose.covariance + other.covariance
         deviation_m = np.sqrt(np.trace(covariance[:3, :3]))
-        error_m, error_deg = pose_error(pose.rig_from_world, other.rig_from_world)
-        near = error_m < MAX_DEVIATIONS * deviation_m + MOVE_M and deviation_m < MAX_POSITION_DEVIATION_M
-        if near:
+        (place,) = other.rig.cam_from_rig
+        error_m, error_deg = pose_error(compose_poses(place, pose.rig_from_world), other.cams_from_world[0])
+        apart_m = np.linalg.norm(camera_centers(place) - camera_centers(pose.rig.cam_from_rig[0]))
+        moved_m = 2 * np.sin(np.radians(error_deg) / 2) * apart_m
+        limit_m = MAX_DEVIATIONS * deviation_m + MOVE_M + moved_m
+        if error_m < limit_m and deviation_m < MAX_POSITION_DEVIATION_M:
             variance = np.degrees(1) ** 2 * np.linalg.eigvalsh(covariance[3:, 3:])[-1]
             if variance < MAX_DEVIATION_DEG**2:
                 errors.append((float(error_deg), float(variance)))

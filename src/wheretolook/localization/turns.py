@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path, PurePath
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from wheretolook.geometry.poses import Float, camera_centers, rigid_poses
+from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.io.poses import NAME_COLUMNS, QUATERNION_COLUMNS, NamedRows, poses_of_rows, read_named_rows
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import path_ends
@@ -35,21 +34,6 @@ def read_turns(path: Path, images: Sequence[str]) -> Float:
     poses = poses[_rows_of(table, [PurePath(name) for name in images])]
     centers = camera_centers(poses)
     poses[:, :, 3] = -np.einsum("nij,nj->ni", poses[:, :, :3], centers - centers[0])
-    return poses
-
-
-def checked_turns(turns: ArrayLike, n_images: int) -> Float:
-    """Return rotations (N, 3, 3) or poses (N, 3, 4) of the cameras in the rig as poses (N, 3, 4).
-
-    Raises PoseError if one is not rigid, TableError if there are more or fewer than images.
-    """
-    poses = np.asarray(turns, dtype=np.float64)
-    if poses.shape[1:] == (3, 3):
-        poses = np.pad(poses, ((0, 0), (0, 0), (0, 1)))
-    poses = rigid_poses(poses)
-    poses[:, :, :3] = Rotation.from_matrix(poses[:, :, :3]).as_matrix()  # of rounded numbers
-    if len(poses) != n_images:
-        raise TableError("each image needs a rotation", value=f"{len(poses)} rotations of {n_images} images")
     return poses
 
 

@@ -22,23 +22,23 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.dataset.thresholds import ACCURACY, Accuracy, checked_accuracy
 from wheretolook.features.descriptors import quantize_descriptors
-from wheretolook.features.matches import Matches
+from wheretolook.features.matches import match
 from wheretolook.features.opencv_sift import RootSift
-from wheretolook.geometry.camera import Camera, PinholeCamera
+from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float
+from wheretolook.geometry.similarity import Similarity
 from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator
 from wheretolook.localization.hypotheses import SingleViewPoses
 from wheretolook.localization.prior import PosePrior, matches_among
-from wheretolook.localization.rig import Candidates, Look
+from wheretolook.localization.rig import IDENTITY, Look, checked_turns
 from wheretolook.localization.rig_localization import (
     POSES_OF_A_VIEW,
     POSES_OF_AN_IMAGE,
@@ -82,6 +82,11 @@ class RobotLocalization:
     poses: tuple[RobotPose, ...]  # the best and its rivals; empty if there is none
 
     @property
+    def status(self) -> str:
+        """As of `JointLocalization`: "contradicted" if the images contradict the given rotations."""
+        return self.joint.status
+
+    @property
     def probability(self) -> float:
         """Probability of the best pose; 0 if there is none."""
         return self.poses[0].probability if self.poses else 0.0
@@ -103,12 +108,12 @@ class RobotLocalizer:
         about = json.loads((folder / "robot.json").read_text(encoding="utf-8"))
         if about.get("format_version") != FORMAT_VERSION:
             raise ValueError(f"{folder}: this program reads format {FORMAT_VERSION}. Export again.")
-        identity: dict[str, Any] = {"scale": 1, "rotation": np.eye(3), "translation": np.zeros(3)}
-        frame = identity if in_world else about["world_from_map"]
+        self._world_from_map = Similarity(1.0, np.eye(3), np.zeros(3))
+        if not in_world:
+            frame = about["world_from_map"]
+            rotation, translation = np.array(frame["rotation"]), np.array(frame["translation"])
+            self._world_from_map = Similarity(float(frame["scale"]), rotation, translation)
         camera = about["camera"]
-        self._scale = float(frame["scale"])  # metres in a unit of the map
-        self._rotation = np.array(frame["rotation"], dtype=np.float64).reshape(3, 3)
-        self._translation = np.array(frame["translation"], dtype=np.float64)
         centre = camera["cx"], camera["cy"]
         size = int(camera["width"]), int(camera["height"])
         self.camera = PinholeCamera(*size, camera["fx"], camera["fy"], centre)
@@ -119,7 +124,7 @@ class RobotLocalizer:
         if descriptors.shape != (len(points), 128) or descriptors.dtype != np.uint8:
             raise ValueError(f"{folder}: descriptors and landmarks are of different exports. Export again.")
         padded = -(-max(len(points), NEAREST * GROUP) // GROUP) * GROUP
-        self._n_landmarks = len(points)
+        self.n_landmarks = len(points)
         self._descriptors = np.zeros((128, padded), dtype=np.float32)
         self._descriptors[:, : len(points)] = descriptors.T
         self._config = LocalizerConfig(method="hypotheses")
@@ -135,6 +140,8 @@ class RobotLocalizer:
 
         An image with more pixels across than the map's camera has is reduced to that size first.
         """
+        if grey.ndim != 2 or grey.dtype != np.uint8 or grey.size == 0:
+            raise ValueError(f"a grey image is an array (H, W) uint8, not {grey.shape} {grey.dtype}")
         if self._sift is None:
             self._sift = RootSift()
         scale = self.camera.width / grey.shape[1]
@@ -169,17 +176,22 @@ class RobotLocalizer:
         """
         at = np.asarray(pixels, dtype=np.float64)
         described = np.asarray(descriptors)
-        if at.shape != (len(described), 2) or described.shape[1:] != (128,) or described.dtype != np.uint8:
-            raise ValueError(f"pixels (K, 2) and descriptors (K, 128) uint8, not {at.shape} and {described.shape}")
-        matches = self._matches(described)
-        look = self._look(at, matches, camera or self.camera)
+        n = described.size // 128
+        if (
+            at.shape != (n, 2)
+            or described.shape != (n, 128)
+            or described.dtype != np.uint8
+            or not np.isfinite(at).all()
+        ):
+            problem = "finite pixels (K, 2) and descriptors (K, 128) uint8"
+            raise ValueError(f"{problem}, not {at.shape} and {described.shape} {described.dtype}")
+        (matches,) = match(self, [described], self._config.max_ratio, NEAREST)
+        look = Look.of(at, matches, camera or self.camera)
         near: SingleViewPoses = ()
         if prior is not None:
-            location = self._scale * self._rotation @ np.asarray(prior[:3]) + self._translation
-            yaw_deg = prior[3] if len(prior) > 3 else None
-            rough = PosePrior((location[0], location[1], location[2]), yaw_deg)
+            rough = PosePrior.of(prior, self._world_from_map)
             allowed = rough.allows(self._points, self._mapping_distance_m, look.camera)
-            of_prior = self._look(at, matches_among(matches, allowed, self._config.max_ratio), look.camera)
+            of_prior = Look.of(at, matches_among(matches, allowed, self._config.max_ratio), look.camera)
             near = self._localizer.single_view_poses(of_prior, 1)
         return RobotView(look, self._localizer.single_view_poses(look, POSES_OF_AN_IMAGE), near)
 
@@ -196,19 +208,16 @@ class RobotLocalizer:
         limits = checked_accuracy(accuracy)
         if (turns is None and len(views) != 1) or not views:
             raise ValueError("several views are localized together by their rotations: give turns")
-        poses = np.eye(3, 4)[None] if turns is None else np.asarray(turns, dtype=np.float64)
-        if poses.shape not in ((len(views), 3, 3), (len(views), 3, 4)):
-            raise ValueError(f"turns must be one rotation for each view, ({len(views)}, 3, 3), not {poses.shape}")
-        if poses.shape[2] == 3:
-            poses = np.pad(poses, ((0, 0), (0, 0), (0, 1)))
+        poses = IDENTITY[None] if turns is None else checked_turns(turns, len(views))
         looks = [replace(view.look, cam_from_rig=pose) for view, pose in zip(views, poses, strict=True)]
         count = POSES_OF_A_VIEW if len(views) > 1 else POSES_OF_AN_IMAGE
         joint = self._localizer.localize(looks, [view.poses[:count] + view.near_prior for view in views])
         found = zip((joint, *joint.rivals), probabilities(joint, limits), strict=True)
+        to_map = self._world_from_map.inverse.apply_to_poses
         return RobotLocalization(
             joint,
             tuple(
-                RobotPose(self._in_map(pose.rig_from_world), float(probability), pose.n_inliers, self._covariance(pose))
+                RobotPose(to_map(pose.rig_from_world), float(probability), pose.n_inliers, self._covariance(pose))
                 for pose, probability in found
                 if pose.rig_from_world is not None
             ),
@@ -230,46 +239,28 @@ class RobotLocalizer:
             raise ValueError("the folder has no mean_scores.npy. Export again.")
         return NextLookSelector(scorer, self._mean_scores).select(result.joint, up, pitch_deg, pan_deg)
 
-    def nearest(self, descriptors: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Find the nearest landmarks of descriptors (K, 128): rows and squared distances, ascending, (K, NEAREST)."""
-        parts = [self._nearest(descriptors[row : row + BLOCK]) for row in range(0, len(descriptors), BLOCK)]
+    def nearest(
+        self, descriptors: NDArray[np.uint8], count: int = NEAREST
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Find the nearest landmarks of descriptors (K, 128): rows and squared distances, ascending, (K, count)."""
+        parts = [self._nearest(descriptors[row : row + BLOCK], count) for row in range(0, len(descriptors), BLOCK)]
         return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
 
-    def _nearest(self, descriptors: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    def _nearest(self, descriptors: NDArray[np.uint8], count: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         product = descriptors.astype(np.float32) @ self._descriptors  # exact: whole numbers below 2^24
-        product[:, self._n_landmarks :] = -(2.0**28)
+        product[:, self.n_landmarks :] = -(2.0**28)
         groups = product.reshape(len(product), GROUP, -1)
-        best = np.argpartition(-groups.max(axis=1), NEAREST - 1, axis=1)[:, :NEAREST]
+        best = np.argpartition(-groups.max(axis=1), count - 1, axis=1)[:, :count]
         rows = (best[:, None] + np.arange(GROUP)[:, None] * groups.shape[2]).reshape(len(product), -1)
         values = np.take_along_axis(product, rows, axis=1)
-        order = np.argpartition(-values, NEAREST - 1, axis=1)[:, :NEAREST]
+        order = np.argpartition(-values, count - 1, axis=1)[:, :count]
         order = np.take_along_axis(order, np.argsort(-np.take_along_axis(values, order, 1), axis=1), 1)
         squared = np.maximum(2 * (512**2 - np.take_along_axis(values, order, 1)), 0)
         return np.take_along_axis(rows, order, 1), squared
-
-    def _matches(self, descriptors: NDArray[np.uint8]) -> Matches:
-        """Match descriptors (K, 128) with the map: Lowe's ratio test, and each landmark's nearest keypoint."""
-        if len(descriptors) == 0 or self._n_landmarks < 2:
-            return Matches.none(len(descriptors))
-        near, squared = self.nearest(descriptors)
-        keypoints = np.flatnonzero(squared[:, 0] < self._config.max_ratio**2 * squared[:, 1])
-        landmarks = near[keypoints, 0]
-        order = np.lexsort((keypoints, squared[keypoints, 0], landmarks))
-        unique = np.sort(order[np.unique(landmarks[order], return_index=True)[1]])
-        return Matches(keypoints[unique], landmarks[unique], near, squared)
-
-    def _look(self, pixels: Float, matches: Matches, camera: Camera) -> Look:
-        of_all = Candidates.of(pixels, matches)
-        return Look(np.eye(3, 4), pixels[matches.keypoints], matches.landmarks, camera, of_all)
 
     def _covariance(self, pose: JointLocalization) -> Float:
         """Transform the covariance of a pose to the map's own frame and unit."""
         if not np.isfinite(pose.covariance).all():
             return pose.covariance
-        to_map = np.kron(np.diag([1 / self._scale, 1]), self._rotation.T)
+        to_map = np.kron(np.diag([1 / self._world_from_map.scale, 1]), self._world_from_map.rotation.T)
         return to_map @ pose.covariance @ to_map.T
-
-    def _in_map(self, pose: Float) -> Float:
-        """Transform a pose (3, 4) of the world, in metres, to the map's own frame and unit."""
-        moved = (pose[:, :3] @ self._translation + pose[:, 3]) / self._scale
-        return np.column_stack([pose[:, :3] @ self._rotation, moved])

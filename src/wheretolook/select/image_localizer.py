@@ -22,8 +22,9 @@ from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.prior import PosePrior, matches_among
+from wheretolook.localization.rig import IDENTITY, Look, checked_turns
 from wheretolook.localization.rig_localization import POSES_OF_A_VIEW, POSES_OF_AN_IMAGE, JointLocalizer
-from wheretolook.localization.turns import checked_turns, read_turns
+from wheretolook.localization.turns import read_turns
 from wheretolook.mapping.colmap_model import model_arrays, read_model
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.georeference import REPORT_FILE
@@ -32,9 +33,9 @@ from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.map_folder import LANDMARKS_FILE
 from wheretolook.mapping.map_frame import MapFrame, find_frame
 from wheretolook.mapping.sources import find_features
-from wheretolook.select.localized import FAILED, Localized
+from wheretolook.select.localized import Localized
 from wheretolook.select.query_images import QueryImage, QueryImages, distinct_names
-from wheretolook.utils.errors import ConfigError, MapError, WhereToLookError
+from wheretolook.utils.errors import ConfigError, MapError, PoseError
 from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.records import from_record
 
@@ -81,14 +82,13 @@ class ImageLocalizer:
         arrays = model_arrays(model)
         own = find_frame(path, model, frame, arrays=arrays)
         arrays = own.of_arrays(arrays)
-        stored = None if database is not None or not (path / LANDMARKS_FILE).is_file() else path / LANDMARKS_FILE
-        kept = None if stored is None else Landmarks.load(stored)
-        features = None
-        if kept is None or kept.descriptors is None:
-            kept = None
-            features = database or find_features(path, model)
-        landmarks = load_colmap_landmarks(path, features, None, device, model, arrays=arrays, ambiguity=False)
-        if kept is not None:
+        stored = path / LANDMARKS_FILE
+        kept = Landmarks.load(stored) if database is None and stored.is_file() else None
+        own_descriptors = kept is not None and kept.descriptors is not None
+        features = None if own_descriptors and not lightglue else database or find_features(path, model)
+        described_by = None if own_descriptors else features
+        landmarks = load_colmap_landmarks(path, described_by, None, device, model, arrays=arrays, ambiguity=False)
+        if kept is not None and own_descriptors:
             if not np.array_equal(kept.ids, landmarks.ids):
                 problem = "the file has other landmarks than the model"
                 raise MapError(problem, path=stored, fix="Give --database, or run the map stage again.")
@@ -97,8 +97,6 @@ class ImageLocalizer:
             fix = "Give --database: the model's database.db, or hloc's feats-*.h5."
             raise MapError("the landmarks have no descriptors, so nothing can be localized", path=path, fix=fix)
         extractor = extractor or _extractor_of(path, landmarks)
-        if lightglue and features is None:
-            features = find_features(path, model)
         of_images = None if pairs is None else ImagePairs.read(pairs, arrays, landmarks.ids)
         result = cls(landmarks, own, QueryImages(model, path), extractor, device, of_images, lightglue, features)
         _ = result._localizer.extractor  # so that another extractor and missing weights are reported once
@@ -142,70 +140,40 @@ class ImageLocalizer:
                 given, or there are several without turns.
             TableError, PoseError: the file of turns, or a rotation, is not valid.
         """
-        given = [images] if isinstance(images, (str, Path, np.ndarray)) else list(images)
+        given = [images] if isinstance(images, (str, Path, np.ndarray)) else images
+        if not isinstance(given, Sequence) or not all(isinstance(one, (str, Path, np.ndarray)) for one in given):
+            raise PoseError("images are files or arrays (H, W, 3)", value=type(images).__name__)
         paths = [str(n) if isinstance(image, np.ndarray) else str(image) for n, image in enumerate(given)]
-        cam_from_rig: Float = np.eye(3, 4)[None]
+        cam_from_rig: Float = IDENTITY[None]
         if isinstance(turns, (str, Path)):
             cam_from_rig = self._usable(read_turns(Path(turns), paths))
         elif turns is not None:
             cam_from_rig = self._usable(checked_turns(turns, len(given)))
-        elif len(given) != 1:
-            fix = "Give turns, or localize one image after another."
+        if len(given) != len(cam_from_rig) or not given:
+            fix = "Give one image, or turns."
             raise ConfigError("several images are localized together by their rotations", value=len(given), fix=fix)
         camera = self.images.known_camera(camera)
         names = names or distinct_names([Path(path) for path in paths])
         queries = [self.images.read(image, name, camera) for image, name in zip(given, names, strict=True)]
-        near = None if prior is None else self._prior(prior)
+        near = None if prior is None else PosePrior.of(prior, self.frame.world_from_map)
         limits = checked_accuracy(accuracy)
-        keypoints = [self._localizer.extractor.extract(query.rgb) for query in queries]
-        matches = [self._match(*of_image) for of_image in zip(paths, keypoints, queries, strict=True)]
-        return self._localized(queries, keypoints, matches, cam_from_rig, near, limits)
-
-    def localize_or_fail(
-        self,
-        image: Path,
-        name: str,
-        camera: Camera | int | None = None,
-        prior: Sequence[float] | None = None,
-        accuracy: Accuracy = ACCURACY,
-    ) -> Localized:
-        """Localize an image of a batch, and name it: an error becomes the reason why it is not localized.
-
-        Raises ConfigError if the prior or the accuracy is invalid, as they are those of all images.
-        """
-        if prior is not None:
-            self._prior(prior)
-        checked_accuracy(accuracy)
-        try:
-            return self.localize(image, None, camera, prior, accuracy, [name])
-        except WhereToLookError as error:
-            return Localized((name,), FAILED, str(error), frame=self.frame)
-
-    def _localized(
-        self,
-        queries: Sequence[QueryImage],
-        keypoints: Sequence[Keypoints],
-        matches: Sequence[Sequence[Matches]],
-        cam_from_rig: Float,
-        prior: PosePrior | None,
-        accuracy: Accuracy,
-    ) -> Localized:
         rig = self._rigs if len(queries) > 1 else self._localizer.joint
         looks = []
         poses = []
-        count = POSES_OF_A_VIEW if len(queries) > 1 else POSES_OF_AN_IMAGE
-        for query, of_image, (matched, *others), pose in zip(queries, keypoints, matches, cam_from_rig, strict=True):
-            looks.append(self._localizer.look(of_image, matched, query.camera, pose))
-            poses.append(rig.single_view_poses(looks[-1], count))
-            for other in others:
-                look = self._localizer.look(of_image, other, query.camera, pose)
-                poses[-1] += rig.single_view_poses(look, count)
-            if prior is not None:
-                near = self._near(matched, query.camera, prior)
-                look = self._localizer.look(of_image, near, query.camera, pose)
-                poses[-1] += rig.single_view_poses(look, 1)
+        for path, query, pose in zip(paths, queries, cam_from_rig, strict=True):
+            keypoints = self._localizer.extractor.extract(query.rgb)
+            found = self._match(path, keypoints, query)
+            views = [Look.of(keypoints.pixels, matches, query.camera, pose) for matches in found]
+            count = POSES_OF_A_VIEW if len(queries) > 1 else POSES_OF_AN_IMAGE
+            poses.append(sum((rig.single_view_poses(view, count) for view in views), ()))
+            looks.append(views[0])
+            if near is not None:
+                max_ratio = self._localizer.config.max_ratio if self._localizer.kind.in_bytes else None
+                allowed = near.allows(self.landmarks.points, self.landmarks.mapping_distance_m, query.camera)
+                matches = matches_among(found[0], allowed, max_ratio)
+                poses[-1] += rig.single_view_poses(Look.of(keypoints.pixels, matches, query.camera, pose), 1)
         joint = rig.localize(looks, poses)
-        return Localized.of(queries, joint, probabilities(joint, accuracy), self.frame)
+        return Localized.of(queries, joint, probabilities(joint, limits), self.frame)
 
     def _match(self, name: str, keypoints: Keypoints, query: QueryImage) -> list[Matches]:
         """Match an image with all landmarks, or with those of its pairs; by LightGlue, and then also by descriptors.
@@ -217,22 +185,6 @@ class ImageLocalizer:
         else:
             found = [self._localizer.match_among(keypoints, self.pairs.landmarks(name))]
         return [*self._localizer.by_lightglue([keypoints], found, query.camera), *(found if self.lightglue else [])]
-
-    def _near(self, matches: Matches, camera: Camera, prior: PosePrior) -> Matches:
-        """Return the matches with landmarks that the prior allows."""
-        max_ratio = self._localizer.config.max_ratio if self._localizer.kind.in_bytes else None
-        return matches_among(
-            matches, prior.allows(self.landmarks.points, self.landmarks.mapping_distance_m, camera), max_ratio
-        )
-
-    def _prior(self, values: Sequence[float]) -> PosePrior:
-        """Return the prior of x, y, z and perhaps yaw, in the map. Raises ConfigError."""
-        numbers = np.asarray(values, dtype=np.float64)
-        if numbers.shape not in ((3,), (4,)) or not np.isfinite(numbers).all():
-            fix = "Give x,y,z in the map, and perhaps the yaw in degrees."
-            raise ConfigError("this is no prior of the pose", value=values, fix=fix)
-        location = self.frame.world_from_map.apply(numbers[:3]).tolist()
-        return PosePrior(tuple(location), float(numbers[3]) if len(numbers) == 4 else None)
 
     def _usable(self, cam_from_rig: Float) -> Float:
         """Return poses in a rig with positions only if the map's unit is known. Raises ConfigError if they are needed."""

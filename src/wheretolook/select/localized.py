@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE
+from wheretolook.dataset.names import CONTRADICTED, LOCALIZED, NO_POSE
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation
@@ -33,9 +33,11 @@ class Localized:
 
     Attributes:
         names: N names of the images.
-        status: "localized"; "too_few_matches" or "no_pose"; "error" in a batch, for an image that cannot be used.
-        reason: why it is not localized, or that the images contradict the given rotations.
-        cam_from_world: (N, 3, 4), world-to-camera; camera x right, y down, z forward. None unless localized.
+        status: "localized"; "contradicted", if the images contradict the given rotations, which are then refined with the
+            pose; "too_few_matches" or "no_pose"; "error" in a batch, for an image that cannot be used.
+        reason: why it is not localized.
+        cam_from_world: (N, 3, 4), world-to-camera; camera x right, y down, z forward. None unless localized or
+            contradicted.
         probability: that the pose is right (`wheretolook.localization.confidence`).
         n_matches: matches of all images with the map.
         n_inliers: of these, or of those found again under the pose, the ones that agree with it.
@@ -71,19 +73,21 @@ class Localized:
         values: dict[str, Any] = {"names": names, "frame": frame, "images": tuple(images), "joint": joint}
         values["cameras"] = tuple(image.camera for image in images)
         values |= {"n_matches": joint.n_matches, "n_inliers": joint.n_inliers}
-        if joint.status != LOCALIZED:
+        contradiction = ""
+        if joint.turn_error_deg:
+            contradiction = f"the images contradict the given rotations, by up to {joint.turn_error_deg:.1f} degrees"
+        if joint.status not in (LOCALIZED, CONTRADICTED):
             found = f"{joint.n_inliers} of {joint.n_matches} matches agree with the best pose"
             reason = found if joint.status == NO_POSE else f"{joint.n_matches} matches with the map"
-            return cls(status=joint.status, reason=reason, **values)
+            return cls(status=joint.status, reason="; ".join(filter(None, (reason, contradiction))), **values)
         assert joint.cams_from_world is not None
-        if joint.turn_error_deg:
-            values["reason"] = f"the images contradict the given rotations, by up to {joint.turn_error_deg:.1f} degrees"
         rivals = [
             cls.of(images, rival, p, frame) for rival, p in zip(joint.rivals, probabilities[1:, None], strict=True)
         ]
         rivals = [rival for rival in rivals if rival.status == LOCALIZED]
         return cls(
-            status=LOCALIZED,
+            status=joint.status,
+            reason=contradiction,
             cam_from_world=frame.world_from_map.inverse.apply_to_poses(joint.cams_from_world),
             probability=float(probabilities[0]),
             deviation=(joint.deviation[0] / unit, joint.deviation[1]),
@@ -96,7 +100,7 @@ class Localized:
 
     @property
     def positions(self) -> Float:
-        """Camera centres in the map (N, 3); NaN unless localized."""
+        """Camera centres in the map (N, 3); NaN without a pose."""
         return np.full((len(self), 3), np.nan) if self.cam_from_world is None else camera_centers(self.cam_from_world)
 
     def describe(self) -> str:
@@ -170,7 +174,7 @@ def save_localized(results: Sequence[Localized], path: Path) -> None:
         scale = {"scale": frame.scale.source, "metres_per_unit": frame.world_from_map.scale}
         write_json(path, {"frames": about, **scale, "images": [row for result in results for row in _records(result)]})
     else:
-        found = [result for result in results if result.cam_from_world is not None]
+        found = [result for result in results if result.status == LOCALIZED]
         names = [name for result in found for name in result.names]
         poses = [pose for result in found for pose in np.asarray(result.cam_from_world)]
         write_text(path, images_text(names, np.reshape(poses, (-1, 3, 4))))

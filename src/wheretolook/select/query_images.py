@@ -49,6 +49,8 @@ class QueryImages:
 
     def known_camera(self, camera: Camera | int | None) -> Camera | None:
         """Return a camera, given as one or by its camera_id. Raises MapError if the model has no such camera."""
+        if camera is not None and not isinstance(camera, (int, Camera)):
+            raise ConfigError("this is no camera", value=camera, fix="Give a Camera, or a camera_id of the model.")
         return camera_of_model(self.model, self.folder, camera) if isinstance(camera, int) else camera
 
     def read(self, image: str | Path | NDArray[np.uint8], name: str, camera: Camera | None = None) -> QueryImage:

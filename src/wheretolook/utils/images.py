@@ -46,9 +46,20 @@ def read_image(path: Path, flags: int, at_most: int = MAX_PIXELS) -> NDArray[Any
 
     image_size(path, at_most)
     try:
-        image = cv2.imread(str(path), flags)
+        image = None if _is_cut_jpeg(path.read_bytes()) else cv2.imread(str(path), flags)
     except cv2.error as error:
         raise ValueError(error.err) from error
     if image is None:
         raise ValueError("this is no image, or not a whole one")
     return image
+
+
+def _is_cut_jpeg(data: bytes) -> bool:
+    """Return whether a JPEG lacks its end, the marker FFD9 after the first scan: OpenCV fills the missing part with grey.
+
+    A thumbnail in the header has an end of its own, so segments are skipped by their lengths.
+    """
+    at = 2
+    while data[at : at + 1] == b"\xff" and data[at + 1 : at + 2] != b"\xda":
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return data.startswith(b"\xff\xd8") and data.find(b"\xff\xd9", at) < 0

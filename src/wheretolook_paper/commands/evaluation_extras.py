@@ -97,10 +97,10 @@ def compare_looks(scene: SceneFolder, scorer: Scorer, config: LookConfig, progre
 
     Raises a TableError if the labels lack the pixels of their matches.
     """
-    from wheretolook.localization.joint_labels import label_sets
     from wheretolook.looks.joint_visibility import candidate_views
     from wheretolook.looks.selection import score_of_set
     from wheretolook.looks.set_score import SetScoreModel
+    from wheretolook_paper.evaluation.joint_labels import label_sets
     from wheretolook_paper.evaluation.look_strategies import choose_set
 
     table = read_table(scene.table, pixels=True)

@@ -22,17 +22,17 @@ from wheretolook.evaluation.calibration import precision_area
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.localization.config import LocalizerConfig
-from wheretolook.localization.joint_labels import SET_COLUMNS, set_label
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.rig import Look, rig_of
 from wheretolook.localization.rig_localization import JointLocalization
 from wheretolook.looks.next_look import NextLookSelector, angles_to_views, mean_scores_by_pitch
 from wheretolook.scorers.base import Scorer
 from wheretolook.utils.markdown import markdown_table
+from wheretolook_paper.evaluation.joint_labels import SET_COLUMNS, set_label
 
 COLUMNS = ("location_id", "policy", "n_looks", "hypothesis", *SET_COLUMNS[2:-1])
 """Columns of `simulate`: `hypothesis` is 0 for the chosen pose, and counts its rivals; others are those of
-`wheretolook.localization.joint_labels`."""
+`wheretolook_paper.evaluation.joint_labels`."""
 
 
 class Place:
@@ -110,7 +110,7 @@ class SimulatedRobot:
     def look(self, rgb: NDArray[np.uint8]) -> Look:
         """Match an image (H, W, 3) with the map."""
         keypoints = self.localizer.extractor.extract(rgb)
-        return self.localizer.look(keypoints, self.localizer.match([keypoints])[0])
+        return Look.of(keypoints.pixels, self.localizer.match([keypoints])[0], self.localizer.camera)
 
     def simulate(
         self, places: Mapping[int, Float], policies: Sequence[str], n_views: int, seed: int, title: str

@@ -112,7 +112,7 @@ def localize_views(localizer: Localizer, camera: Camera, cam_from_world: ArrayLi
     estimates = tuple(
         _estimate(joint.localize(views[k : k + 1]), views[k : k + 1], true[k : k + 1]) for k in range(len(views))
     )
-    return LookStory(camera, true, images, estimates, _estimate(joint.localize_together(views), views, true))
+    return LookStory(camera, true, images, estimates, _estimate(joint.localize(views), views, true))
 
 
 def _estimate(pose: JointLocalization, views: Sequence[Look], true: Float) -> Estimate:

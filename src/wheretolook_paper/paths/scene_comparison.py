@@ -15,7 +15,6 @@ from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_files import SCHEMA
 from wheretolook.dataset.viewpoint_table import UNLABELLED
-from wheretolook.localization.joint_labels import label_sets
 from wheretolook.localization.labeller import MANIFEST, LabelTask
 from wheretolook.localization.shard import SceneJob
 from wheretolook.planning.config import FORWARD
@@ -24,6 +23,7 @@ from wheretolook.scorers.registry import is_probability
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.files import fingerprint
 from wheretolook.utils.reading import read_json_object
+from wheretolook_paper.evaluation.joint_labels import label_sets
 from wheretolook_paper.paths.config import PathsConfig
 from wheretolook_paper.paths.joint_localization import (
     OUTCOME,

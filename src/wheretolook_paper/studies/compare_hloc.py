@@ -40,6 +40,7 @@ from wheretolook.io.poses import images_text
 from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer
+from wheretolook.localization.rig import Look
 from wheretolook.localization.rig_localization import POSES_OF_AN_IMAGE
 from wheretolook.mapping.colmap_model import colmap_poses, read_model, registered_names
 from wheretolook.mapping.feature_files import read_features
@@ -232,10 +233,10 @@ def _methods(fold: Fold, features: str, lightglue: str, retrieved: int, device: 
 def _localize(localizer: Localizer, query: Keypoints) -> Pose:
     start = time.perf_counter()
     found = localizer.match_descriptors([query])
-    looks = [localizer.look(query, one) for one in localizer.by_lightglue([query], found)]
+    looks = [Look.of(query.pixels, one, localizer.camera) for one in localizer.by_lightglue([query], found)]
     poses = localizer.joint.single_view_poses(looks[0], POSES_OF_AN_IMAGE)
     if localizer.config.lightglue:
-        poses += localizer.joint.single_view_poses(localizer.look(query, found[0]), POSES_OF_AN_IMAGE)
+        poses += localizer.joint.single_view_poses(Look.of(query.pixels, found[0], localizer.camera), POSES_OF_AN_IMAGE)
     joint = localizer.joint.localize(looks, [poses])
     seconds = time.perf_counter() - start
     if joint.status != "localized":

@@ -12,8 +12,8 @@ from planning.rooms import CAMERA, room_landmarks
 from wheretolook.dataset.viewpoint_table import pose_columns
 from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.localization.estimation import PoseEstimator
-from wheretolook.localization.joint_labels import label_sets
 from wheretolook.planning.config import StopConfig
+from wheretolook_paper.evaluation.joint_labels import label_sets
 from wheretolook_paper.figures.paths import paths_figure
 from wheretolook_paper.paths.config import PathsConfig
 from wheretolook_paper.paths.joint_localization import (

@@ -15,7 +15,7 @@ from wheretolook.dataset.viewpoint_files import SCHEMA
 from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
-from wheretolook.geometry.poses import camera_centers, transform
+from wheretolook.geometry.poses import camera_centers, poses_looking_along, transform
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import ConfigError
 from wheretolook.visibility.occlusion import NoOcclusion, StoredOcclusion
@@ -46,6 +46,28 @@ def test_rows_say_what_their_viewpoint_sees(landmarks: Landmarks) -> None:
     np.testing.assert_allclose(camera_centers(poses(table)), GRID.centers()[table["location_id"]], atol=1e-12)
     np.testing.assert_allclose(poses(table)[:, 2, :3], fibonacci_sphere(100)[table["direction_id"]], atol=1e-12)
     assert (table["viewpoint_id"] == table["location_id"] * 100 + table["direction_id"]).all()
+
+
+def test_a_share_of_the_viewpoints_is_near_mapping_images(landmarks: Landmarks) -> None:
+    grid = VoxelGrid((-2.0, -2.0, 0.0), (2.0, 2.0, 2.0), (20, 20, 10))
+    mapped = poses_looking_along(np.array([[-1.5, -1.5, 1.0], [-1.5, 1.5, 1.0]]), np.eye(3)[[0, 0]])
+    config = SampleConfig(directions=400, keep=0, min_visible=0, max_locations=60, max_directions=8, near_map=0.5)
+    arguments = (grid, np.arange(len(grid)), landmarks, CAMERA, NoOcclusion(), config)
+    table, _ = sample_viewpoints(*arguments, mapped=mapped)
+    assert table.groupby("location_id").size().eq(8).all() and table["location_id"].nunique() == 60
+    centers = camera_centers(poses(table))
+    distance_m = np.linalg.norm(centers[:, None] - camera_centers(mapped), axis=2).min(1)
+    ahead = poses(table)[:, 2, 0]  # cosine to the axis of both images
+    near = pd.Series(ahead > np.cos(np.radians(40))).groupby(table["location_id"]).all()
+    assert 20 <= near.sum() <= 30  # of 30 draws some share a voxel; of the others eight random directions never agree
+    distance_m = pd.Series(distance_m).groupby(table["location_id"]).first()
+    # three standard deviations of 0.2 m along each axis and half a voxel's diagonal
+    assert distance_m[near].max() < np.sqrt(3) * (0.6 + 0.1) and distance_m[~near].median() > 1
+
+
+def test_near_map_is_a_share_of_a_number_of_locations() -> None:
+    with pytest.raises(ConfigError, match="max_locations"):
+        SampleConfig(near_map=0.5)
 
 
 def test_each_location_looks_with_one_of_several_cameras(landmarks: Landmarks) -> None:

@@ -12,10 +12,12 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping import triangulation
+from wheretolook.mapping.colmap_model import colmap_poses
 from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG, MapConfig
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.rendered_map import build_map
 from wheretolook.mapping.walk import plan_walk
+from wheretolook.rendering.appearance import Appearance
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.utils.errors import MapError
 
@@ -66,6 +68,26 @@ def test_model_reopens_with_the_poses_of_the_walk(built, room, room_free_space):
         image = model.images[index + 1]
         assert image.name == f"{index:05d}.png" and image.has_pose
         np.testing.assert_allclose(image.cam_from_world().matrix(), pose, atol=1e-9)
+
+
+def test_a_varied_map_with_appearance_is_of_fewer_and_changed_images(built, room, room_free_space, renderer, tmp_path):
+    """The changed images are those of `Appearance` at the map's own poses."""
+    import cv2
+
+    config = MapConfig(n_images=20, keep_images=True, vary=True, appearance=1.0)
+    report = build_map(
+        room, renderer, room_free_space, CAMERA, config, SEED, tmp_path / "map", workers=1, progress=False
+    )
+    assert 8 <= report.n_images < 20
+    poses = colmap_poses(tmp_path / "map")
+    changes = []
+    for index, appearance in enumerate(Appearance.of_views(poses, 1.0, SEED)):
+        rendering = renderer.render(CAMERA, poses[index : index + 1])
+        expected = appearance.apply(rendering.rgb[0], CAMERA, rendering.depth_m[0])
+        image = cv2.imread(str(tmp_path / "map" / "images" / f"{index:05d}.png"))[..., ::-1]
+        assert np.abs(image.astype(int) - expected).mean() < 0.1
+        changes.append(np.abs(image.astype(int) - rendering.rgb[0]).mean())
+    assert min(changes) > 0.5 and max(changes) > 10
 
 
 def test_landmarks_project_to_their_keypoints(built):

@@ -87,6 +87,18 @@ def test_poses_are_spaced_evenly_along_the_walk_and_look_ahead(monkeypatch):
     assert heights.min() >= 1.25 and heights.max() <= 1.65 and np.ptp(heights) > 0.2
 
 
+@pytest.mark.parametrize("unevenness", [0.5, 1.0, 2.0])
+def test_spacings_vary_by_the_share_asked_for(unevenness):
+    room = two_rooms(door_m=1.2)
+    even = plan_walk(room, BOUNDS, 2000, 3)
+    route = plan_walk(room, BOUNDS, 2000, 3, unevenness=unevenness)
+    np.testing.assert_array_equal(route.path, even.path)
+    assert room.is_free(route.positions).all()
+    steps = np.linalg.norm(np.diff(route.positions[:, :2], axis=0), axis=1)
+    # the coefficient of variation of a gamma distribution of shape k is 1 / sqrt(k)
+    assert np.std(steps) / np.mean(steps) == pytest.approx(unevenness, rel=0.15)
+
+
 def test_only_the_largest_reachable_part_is_walked(monkeypatch):
     monkeypatch.setattr(walk, "COVERAGE", 1.0)
     route = plan_walk(two_rooms(door_m=0.0), BOUNDS, 60)  # no door

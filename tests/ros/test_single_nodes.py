@@ -155,7 +155,7 @@ def test_values_are_interpolated_and_never_extrapolated() -> None:
     assert line.at(0.45) is None and line.at(0.2) is None and line.at(-0.2) is None
     with pytest.raises(ValueError, match=r"time jumped back by 0\.10 s; earlier values are discarded"):
         line.add(stamp_of(0.3), np.array([0.0]))
-    with pytest.raises(ValueError, match="a value is not finite"):
+    with pytest.raises(ValueError, match="a number is not finite"):
         line.add(stamp_of(0.3), np.array([np.nan]))
     assert line.end() == pytest.approx(0.3) and len(line.rows) == 1
 
@@ -195,6 +195,11 @@ def test_the_gaze(node: Robot, folder: Path) -> None:
         node.send("look", look)
         found = node.wait(lambda: node.last("joint_trajectory"), "a trajectory")
         np.testing.assert_allclose(found.points[0].positions, (0.5, 0.0), atol=1e-9)
+        look.vector.x = np.nan
+        node.send("look", look)
+        node.wait(
+            lambda: "next_look: a number is not finite" in getattr(node.status("gaze"), "message", ""), "a warning"
+        )
         look.header.frame_id = "elsewhere"
         node.send("look", look)
         node.wait(

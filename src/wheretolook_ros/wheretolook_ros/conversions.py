@@ -39,6 +39,13 @@ def seconds(stamp: Time) -> float:
     return stamp.sec + 1e-9 * stamp.nanosec
 
 
+def finite(values: Array) -> Array:
+    """Return values; raises ValueError if one is not finite."""
+    if not np.isfinite(values).all():
+        raise ValueError("a number is not finite")
+    return values
+
+
 def grey_image(message: Image | CompressedImage) -> NDArray[np.uint8]:
     """Convert an image to grey (H, W) uint8. Raises ValueError for an encoding or a size that cannot be used."""
     if isinstance(message, CompressedImage):
@@ -102,10 +109,7 @@ def pose_matrix(pose: Pose) -> Array:
     """Convert a pose to (3, 4). Raises ValueError for a quaternion of length 0 or a number that is not finite."""
     p = pose.position
     q = pose.orientation
-    matrix = np.column_stack([Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), [p.x, p.y, p.z]])
-    if not np.isfinite(matrix).all():
-        raise ValueError("the pose has a number that is not finite")
-    return matrix
+    return finite(np.column_stack([Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), [p.x, p.y, p.z]]))
 
 
 def pose_message(pose: Array) -> Pose:

@@ -1,4 +1,4 @@
-"""Points a camera on a pan-tilt head: to the best view at the robot's pose or along its path, or to the next view if lost.
+"""Points a camera on a head: to the best view at the robot's pose or along its path, or to the next view if lost.
 
 Topics and parameters: docs/robots.md.
 """
@@ -14,7 +14,7 @@ from rclpy.duration import Duration
 from scipy.spatial.transform import Rotation
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from wheretolook_ros.conversions import Array, direction_message, pose_matrix, pose_message
+from wheretolook_ros.conversions import Array, direction_message, finite, pose_matrix, pose_message
 from wheretolook_ros.node import OK, RobotNode, run
 
 REUSED_M = 0.3  # within which the best view is not searched again
@@ -61,8 +61,8 @@ class GazeNode(RobotNode):
 
     def _best(self, base: Array) -> Array:
         """The direction in the map that scores best here, or nearby and still within the limits."""
-        near = np.linalg.norm(base[:, 3] - self._location) <= REUSED_M
-        if not near or not self.head.nearest(self._direction @ base[:, :3])[1]:
+        moved = np.linalg.norm(base[:, 3] - self._location)
+        if moved > REUSED_M or not self.head.nearest(self._direction @ base[:, :3])[1]:
             scores = self._scores(base)
             if scores.max() < self.settings.min_score:
                 raise ValueError(f"the best score within the head's limits is {scores.max():.2f}, below min_score")
@@ -75,8 +75,8 @@ class GazeNode(RobotNode):
         looks, allowed = self.head.nearest(self._axes @ base[:, :3])
         scores = np.full(len(looks), -np.inf)
         if allowed.any():
-            location = base @ self.head.location
-            scores[allowed] = self._scorer.score_directions(location[None], looks[allowed] @ base[:, :3].T)[0]
+            location = (base @ self.head.location)[None]
+            scores[allowed] = self._scorer.score_directions(location, looks[allowed] @ base[:, :3].T)[0]
         return scores
 
     def _on_path(self, message: Path) -> None:
@@ -110,13 +110,13 @@ class GazeNode(RobotNode):
 
     def _look(self, direction: Array, why: str) -> None:
         """Publish a direction (3,) of the base, within the limits, and the joints that look along it."""
-        joints = self.head.joints(direction)
-        axis = self.head.base_from_camera(*joints)[:, 2]
+        joints = self.head.joints(finite(direction))
+        axis, _ = self.head.nearest(direction)
         self._gaze.publish(direction_message(axis, self.settings.base_frame, self.get_clock().now().to_msg()))
         moved = {name: value for name, value in zip(self.joint_names, joints.tolist(), strict=True) if name}
         reached = Duration(seconds=self.settings.turn_duration_s).to_msg()
-        point = JointTrajectoryPoint(positions=moved.values(), time_from_start=reached)
-        self._joints.publish(JointTrajectory(joint_names=moved.keys(), points=[point]))
+        point = JointTrajectoryPoint(positions=[*moved.values()], time_from_start=reached)
+        self._joints.publish(JointTrajectory(joint_names=[*moved], points=[point]))
         self.report(OK, why)
 
 

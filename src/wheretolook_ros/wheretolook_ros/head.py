@@ -11,7 +11,7 @@ from builtin_interfaces.msg import Time
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from wheretolook_ros.conversions import Array, seconds
+from wheretolook_ros.conversions import Array, finite, seconds
 
 OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # axes of the optical frame in one with x forward, z up
 SLACK_DEG = 8.0  # of a search on both sides of an angle that is fixed: half the angle between 200 directions
@@ -33,10 +33,7 @@ class Head:
     """
 
     def __init__(
-        self,
-        mount: Sequence[float],
-        pan_deg: Sequence[float] = (-180.0, 180.0),
-        tilt_deg: Sequence[float] = (-45.0, 45.0),
+        self, mount: Sequence[float], pan_deg: ArrayLike = (-180.0, 180.0), tilt_deg: ArrayLike = (-45.0, 45.0)
     ) -> None:
         """Mount a head at (x, y, z) m with (roll, pitch, yaw) degrees in the base, with limits of its joints."""
         self.location = np.array([*mount[:3], 1.0])
@@ -78,20 +75,18 @@ class Timeline:
 
     def add(self, stamp: Time, values: Array) -> None:
         """Add values. Raises ValueError if one is not finite or, with the earlier ones discarded, if time jumped back."""
-        if not np.isfinite(values).all():
-            raise ValueError("a value is not finite")
-        time = seconds(stamp)
-        back = self.end() - time
+        row = finite(np.append(seconds(stamp), values))
+        back = self.end() - row[0]
         if back > 0:
             self.rows.clear()
-        self.rows.append(np.append(time, values))
+        self.rows.append(row)
         del self.rows[:-KEPT]
         if back > 0:
             raise ValueError(f"time jumped back by {back:.2f} s; earlier values are discarded")
 
     def end(self) -> float:
         """Return the last time, -inf if there is none."""
-        return float(self.rows[-1][0]) if self.rows else -np.inf
+        return self.rows[-1][0] if self.rows else -np.inf
 
     def at(self, time: float) -> Array | None:
         """Interpolate linearly; None if the next row is farther than `TOLERANCE_S`, or the last older than `LATE_S`."""

@@ -38,9 +38,9 @@ class LocalizerNode(RobotNode):
 
     def __init__(self) -> None:
         super().__init__("visual_localization")
-        self._image: AnyImage | None = None
-        self._pending: AnyImage | None = None
-        self._waiting: AnyImage | None = None
+        self._image: AnyImage | None = None  # the newest
+        self._pending: AnyImage | None = None  # the newest, until it is its turn
+        self._waiting: AnyImage | None = None  # for odometry and joint states
         self._arrived = time.monotonic()
         self._info: CameraInfo | None = None
         self._prior: list[float] | None = None

@@ -28,7 +28,6 @@ DEFAULTS = Path(__file__).with_name("wheretolook.yaml")
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # of timers: a simulated clock may stand still
 QOS = ("sensor_data", "system_default")
 
-
 LIMITS = "[lowest, highest] in degrees", lambda value: len(value) == 2 and -180 <= value[0] <= value[1] <= 180
 ALLOWED = {
     "mount": ("six finite numbers", lambda value: len(value) == 6 and bool(np.isfinite(value).all())),
@@ -48,8 +47,7 @@ class RobotNode(Node):
         super().__init__(name)
         stored = yaml.safe_load(DEFAULTS.read_text(encoding="utf-8"))
         defaults = stored["/**"]["ros__parameters"] | stored.get(name, {}).get("ros__parameters", {})
-        declared = self.declare_parameters("", list(defaults.items()))
-        given = {parameter.name: parameter.value for parameter in declared}
+        given = {known.name: known.value for known in self.declare_parameters("", [*defaults.items()])}
         for parameter, value in given.items():
             rule, accepts = ALLOWED.get(parameter, OTHERS)
             if not accepts(value):
@@ -90,8 +88,9 @@ class RobotNode(Node):
 
     def check_frame(self, message: Any, setting: str) -> None:
         """Raise ValueError unless a message is in the frame that a parameter names."""
-        if message.header.frame_id != getattr(self.settings, setting):
-            raise ValueError(f"frame is {message.header.frame_id!r}, expected {getattr(self.settings, setting)!r}")
+        expected = getattr(self.settings, setting)
+        if message.header.frame_id != expected:
+            raise ValueError(f"frame is {message.header.frame_id!r}, expected {expected!r}")
 
     def report(self, level: bytes, message: str, **values: object) -> None:
         """Publish diagnostics, and log a message that differs from the last one."""

@@ -40,7 +40,7 @@ SETTINGS = {
 }
 JOINTS = ["pan", "tilt"]
 CAMERA = PinholeCamera()
-TIMEOUT_S = 20.0
+TIMEOUT_S = 60.0  # of a machine that does other work
 
 
 def environment() -> dict[str, str]:

@@ -25,10 +25,10 @@ sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "src" / "wheretolook_ros")]
 import rclpy
 from geometry_msgs.msg import PoseStamped
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
-from wheretolook_ros.conversions import Array, compose, inverse, pose_matrix, pose_message, seconds
+from wheretolook_ros.conversions import Array, pose_matrix, pose_message, seconds
 
 from ros.processes import CAMERA, HEAD, JOINTS, Robot, environment, running
-from wheretolook.geometry.poses import pose_error
+from wheretolook.geometry.poses import compose_poses, invert_poses, pose_error
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.robot.localizer import RobotLocalizer
 from wheretolook.scenes.loading import load_mesh
@@ -101,7 +101,7 @@ class Trial:
 
     def _here(self, truths: dict[float, Array], stamp: float) -> bool:
         truth = truths.get(round(stamp, 4))
-        camera = compose(self.base, HEAD.base_from_camera(0, 0))[:, 3]
+        camera = compose_poses(self.base, HEAD.base_from_camera(0, 0))[:, 3]
         return truth is not None and np.linalg.norm(truth[:, 3] - camera) < 1e-3
 
     def _count(self, truth: Array) -> None:
@@ -117,7 +117,9 @@ class Trial:
             self.node.head.publish(JointTrajectory(joint_names=JOINTS, points=[point]))
 
     def _outcome(self, found: Array | None, elapsed: float) -> dict[str, object]:
-        error_m, error_deg = (np.nan, np.nan) if found is None else pose_error(inverse(found), inverse(self.base))
+        error_m, error_deg = (
+            (np.nan, np.nan) if found is None else pose_error(invert_poses(found), invert_poses(self.base))
+        )
         views = min(len(self.axes), self.max_views)
         return {
             "confident": found is not None,
@@ -134,7 +136,7 @@ def first_poses(mesh: Path, folder: Path, bases: list[Array]) -> list[dict[str, 
     localizer = RobotLocalizer(folder)
     rows = []
     for base in bases:
-        pose = inverse(compose(base, HEAD.base_from_camera(0, 0)))
+        pose = invert_poses(compose_poses(base, HEAD.base_from_camera(0, 0)))
         grey = (renderer.render(CAMERA, pose[None]).rgb[0] @ REC_709).astype(np.uint8)
         result = localizer.localize([localizer.match(*localizer.extract(grey))])
         row: dict[str, object] = {"first_m": np.nan, "first_deg": np.nan, "first_probability": result.probability}

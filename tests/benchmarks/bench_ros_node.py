@@ -1,8 +1,10 @@
 """Start-up time, rate and memory of the localizer node, on images that arrive as fast as it localizes them.
 
     python tests/benchmarks/bench_ros_node.py --mesh scene.glb --folder robot --seconds 180
+    python tests/benchmarks/bench_ros_node.py --mesh scene.glb --folder robot --seconds 3600 --rate 1.5
 
-Times are CPU times of the node's process, whatever else runs on the machine.
+Times are CPU times of the node's process, whatever else runs on the machine. With a rate, images come with odometry,
+every tenth is black, and the node publishes next views, so that all it does can keep memory.
 """
 
 from __future__ import annotations
@@ -20,7 +22,9 @@ sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "benchmarks"), str(ROO
 
 import rclpy
 from bench_ros import random_bases
+from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
+from wheretolook_ros.conversions import pose_message
 
 from ros.processes import CAMERA, JOINTS, Robot, environment, image_of, info_of, running
 from wheretolook.rendering.warp_renderer import WarpRenderer
@@ -40,6 +44,12 @@ def resident_mb(pid: int) -> float:
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
+def seconds_of_images(node: Robot) -> list[float]:
+    """Seconds that each localized image took, by the diagnostics received."""
+    reports = [message.status[0].values for name, message in node.received if name == "/diagnostics"]
+    return [float(pair.value) for values in reports for pair in values if pair.key == "seconds" and len(values) > 1]
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -47,14 +57,17 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--seconds", type=float, default=180)
     parser.add_argument("--views", type=int, default=40)
+    parser.add_argument("--rate", type=float, default=0, help="images per second; 0: as fast as it localizes them")
     options = parser.parse_args()
     os.environ.update(environment())
-    node_settings = {"folder": options.folder, "next_look": "false"}
+    node_settings = {"folder": options.folder, "next_look": str(options.rate > 0).lower()}
     bases = random_bases(options.mesh, options.folder, options.views, 1)
     renderer = WarpRenderer(load_mesh(options.mesh))
     rclpy.init()
     node = Robot(renderer)
     images = [image_of(node.rgb(base)) for base in bases]
+    if options.rate:
+        images[::10] = [image_of(np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)) for _ in images[::10]]
     began = time.monotonic()
     with running("wheretolook_ros.localizer", node_settings) as process:
         node.connected("image", "camera_info", "joint_states")
@@ -63,7 +76,6 @@ def main() -> None:
         print(f"first image localized {started:.1f} s after the start, {cpu_seconds(process.pid):.1f} s of CPU time")
         node.received.clear()
         times: list[float] = []
-        memory: list[float] = []
         begin = time.monotonic()
         cpu = cpu_seconds(process.pid)
         number = 0
@@ -73,20 +85,21 @@ def main() -> None:
             node.stamp += 0.1
             node.send("joint_states", JointState(name=JOINTS, position=[0.0, 0.0]))
             node.send("camera_info", info_of(CAMERA))
+            if options.rate:
+                odometry = Odometry()
+                odometry.pose.pose = pose_message(bases[number % len(bases)])
+                node.send("odom", odometry)
             node.send("image", images[number % len(images)])
-            node.wait(lambda: node.received and node.received[-1][0] == "/diagnostics", "an answer")
-            for name, message in node.received:
-                values = {pair.key: pair.value for pair in message.status[0].values} if name == "/diagnostics" else {}
-                if "image" in values:
-                    times.append(float(values["seconds"]))
+            times += node.wait(lambda: seconds_of_images(node), "an answer")
             node.received.clear()
-            if time.monotonic() - last > 10:
+            while options.rate and time.monotonic() < begin + number / options.rate:
+                rclpy.spin_once(node, timeout_sec=0.05)
+            if time.monotonic() - last > options.seconds / 60:
                 last = time.monotonic()
-                memory.append(resident_mb(process.pid))
+                print(f"{last - begin:.0f} s: {len(times)} images, {resident_mb(process.pid):.1f} MB", flush=True)
         used = cpu_seconds(process.pid) - cpu
     rate = len(times) / used
     print(f"{len(times)} images: {rate:.2f} per second of CPU time, {np.median(times):.3f} s each in median (wall)")
-    print("resident memory in MB, every 10 s:", " ".join(f"{value:.0f}" for value in memory))
     rclpy.try_shutdown()
 
 

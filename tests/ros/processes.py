@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -15,17 +16,18 @@ from typing import Any
 import cv2
 import numpy as np
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped, Vector3Stamped
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
 from trajectory_msgs.msg import JointTrajectory
-from wheretolook_ros.conversions import Array, compose, inverse, pose_message
+from wheretolook_ros.conversions import Array, pose_message
 from wheretolook_ros.head import Head
 
 from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import compose_poses, invert_poses
 from wheretolook.rendering.warp_renderer import WarpRenderer
 
 ROOT = Path(__file__).parents[2]
@@ -38,7 +40,7 @@ SETTINGS = {
 }
 JOINTS = ["pan", "tilt"]
 CAMERA = PinholeCamera()
-TIMEOUT_S = 20.0
+TIMEOUT_S = 60.0  # of a machine that does other work
 
 
 def environment() -> dict[str, str]:
@@ -55,17 +57,24 @@ def running(module: str, settings: Mapping[str, object], stop: int = signal.SIGT
     program = [module] if module.endswith(".py") else ["-m", module]
     options = [word for name, value in (SETTINGS | settings).items() for word in ("-p", f"{name}:={value}")]
     command = [sys.executable, *program, "--ros-args", *options]
-    process = subprocess.Popen(command, env=os.environ | environment(), stderr=subprocess.PIPE, text=True)
-    try:
-        yield process
-        assert process.poll() is None, f"{module} ended: {process.communicate()[1]}"
-    except BaseException:
-        process.kill()
-        print(process.communicate()[1])
-        raise
-    process.send_signal(stop)
-    said = process.communicate(timeout=20)[1]
-    assert process.returncode == 0 and "Traceback" not in said, (process.returncode, said)
+    with tempfile.TemporaryFile("w+") as errors:  # a pipe that nobody reads would stop the node when it is full
+        process = subprocess.Popen(command, env=os.environ | environment(), stderr=errors, text=True)
+
+        def said() -> str:
+            errors.seek(0)
+            return errors.read()
+
+        try:
+            yield process
+            assert process.poll() is None, f"{module} ended: {said()}"
+        except BaseException:
+            process.kill()
+            process.wait()
+            print(said())
+            raise
+        process.send_signal(stop)
+        process.wait(timeout=20)
+        assert process.returncode == 0 and "Traceback" not in said(), (process.returncode, said())
 
 
 class Robot(Node):
@@ -75,6 +84,7 @@ class Robot(Node):
         super().__init__("robot")
         self.renderer = renderer
         self.stamp = 100.0
+        self.joints = JOINTS
         types: dict[str, Any] = {"image": Image, "image/compressed": CompressedImage, "camera_info": CameraInfo}
         types |= {"odom": Odometry, "joint_states": JointState}
         self.senders = {name: self.create_publisher(kind, name, 10) for name, kind in types.items()}
@@ -108,10 +118,12 @@ class Robot(Node):
 
     def status(self, node: str = "visual_localization") -> DiagnosticStatus | None:
         """The last diagnostics of a node."""
-        for name, message in reversed(self.received):
-            if name == "/diagnostics" and message.status[0].name.startswith(node):
-                return message.status[0]
-        return None
+        return next(reversed(self.statuses(node)), None)
+
+    def statuses(self, node: str = "visual_localization") -> list[DiagnosticStatus]:
+        """All diagnostics of a node."""
+        reports = [message.status[0] for name, message in self.received if name == "/diagnostics"]
+        return [status for status in reports if status.name == node]
 
     def send(self, topic: str, message: Any, stamp: float | None = None) -> None:
         """Publish with a stamp, by default the present one."""
@@ -123,7 +135,7 @@ class Robot(Node):
     def rgb(self, base: Array, pan: float = 0.0, tilt: float = 0.0, camera: PinholeCamera = CAMERA) -> Array:
         """Render what the camera sees."""
         assert self.renderer is not None
-        pose = inverse(compose(base, HEAD.base_from_camera(pan, tilt)))
+        pose = invert_poses(compose_poses(base, HEAD.base_from_camera(pan, tilt)))
         return np.ascontiguousarray(self.renderer.render(camera, pose[None]).rgb[0], dtype=np.uint8)
 
     def see(
@@ -134,10 +146,10 @@ class Robot(Node):
         joints: tuple[float, float] = (0.0, 0.0),
         step_s: float = 1.0,
     ) -> DiagnosticStatus:
-        """Publish an image with what belongs to its time; returns the diagnostics that follow."""
+        """Publish an image with what belongs to its time; returns the diagnostics of this image."""
         self.stamp += step_s
         self.received.clear()
-        self.send("joint_states", JointState(name=JOINTS, position=list(joints)))
+        self.send("joint_states", JointState(name=self.joints, position=list(joints)))
         if odometry is not None:
             odom = Odometry()
             odom.pose.pose = pose_message(odometry)
@@ -146,15 +158,16 @@ class Robot(Node):
             self.send("camera_info", info)
             time.sleep(0.2)
         sent = 0.0
+        stamp = f"{self.stamp:.6f}"
 
         def answered() -> DiagnosticStatus | None:
             nonlocal sent
             if time.monotonic() - sent > 5:  # sensor QoS may drop it
                 self.send("image/compressed" if isinstance(message, CompressedImage) else "image", message)
                 sent = time.monotonic()
-            status = self.status()
-            waits = status is None or "no image arrives" in status.message or "forgotten" in status.message
-            return None if waits else status
+            return next(
+                (status for status in self.statuses() if KeyValue(key="image", value=stamp) in status.values), None
+            )
 
         return self.wait(answered, "diagnostics")
 

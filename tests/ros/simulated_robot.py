@@ -18,10 +18,11 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from trajectory_msgs.msg import JointTrajectory
-from wheretolook_ros.conversions import Array, compose, inverse, pose_matrix, pose_message
+from wheretolook_ros.conversions import Array, pose_matrix, pose_message
 from wheretolook_ros.node import RobotNode, run
 
 from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import compose_poses, invert_poses
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
 
@@ -42,10 +43,12 @@ class SimulatedRobot(RobotNode):
     """Renders, moves and measures itself thirty times a second."""
 
     def __init__(self) -> None:
-        super().__init__("simulated_robot", PARAMETERS)
+        super().__init__("simulated_robot")
+        for known in self.declare_parameters("", list(PARAMETERS.items())):
+            setattr(self.settings, known.name, known.value)
         self.camera = PinholeCamera()
-        self._renderer = WarpRenderer(load_mesh(self.settings["mesh"]))
-        self._rng = np.random.default_rng(self.settings["seed"])
+        self._renderer = WarpRenderer(load_mesh(self.settings.mesh))
+        self._rng = np.random.default_rng(self.settings.seed)
         self._base: Array | None = None  # in the map
         self._odometry = np.eye(3, 4)
         self._joints = np.zeros(2)
@@ -66,7 +69,9 @@ class SimulatedRobot(RobotNode):
 
     def _on_place(self, message: PoseStamped) -> None:
         base = pose_matrix(message.pose)
-        self._odometry = compose(self._odometry, compose(inverse(self._base), base) if self._base is not None else base)
+        self._odometry = compose_poses(
+            self._odometry, compose_poses(invert_poses(self._base), base) if self._base is not None else base
+        )
         self._base = base
         self._route = self._route[:0]
         self._joints = np.zeros(2)
@@ -83,27 +88,25 @@ class SimulatedRobot(RobotNode):
         if self._base is None:
             return
         self._time += TICK_S
-        if self.settings["simulated_clock"]:
+        if self.settings.simulated_clock:
             now = Time(seconds=self._time).to_msg()
             self._clocks.publish(ClockMessage(clock=now))
         else:
             now = self.get_clock().now().to_msg()
-        step = np.radians(self.settings["turn_rate_deg"]) * TICK_S
+        step = np.radians(self.settings.turn_rate_deg) * TICK_S
         turning = np.abs(self._target - self._joints).max() > 1e-6
         self._joints += np.clip(self._target - self._joints, -step, step)
         self._drive()
-        state = JointState(
-            name=[self.settings["pan_joint"], self.settings["tilt_joint"]], position=self._joints.tolist()
-        )
+        state = JointState(name=[self.settings.pan_joint, self.settings.tilt_joint], position=self._joints.tolist())
         state.header.stamp = now
         self._states.publish(state)
-        odometry = Odometry(child_frame_id=self.settings["base_frame"])
+        odometry = Odometry(child_frame_id=self.settings.base_frame)
         odometry.header.frame_id = "odom"
         odometry.header.stamp = now
         odometry.pose.pose = pose_message(self._odometry)
         self._odometries.publish(odometry)
-        due = self._time - self._last_image >= 1 / self.settings["rate_hz"] - 1e-6
-        if due and (not turning or self.settings["images_while_turning"]):
+        due = self._time - self._last_image >= 1 / self.settings.rate_hz - 1e-6
+        if due and (not turning or self.settings.images_while_turning):
             self._last_image = self._time
             self._see(now)
 
@@ -111,7 +114,7 @@ class SimulatedRobot(RobotNode):
         """Move along the route; odometry measures the step with its drift."""
         if len(self._route) == 0 or self._base is None:
             return
-        left = self.settings["speed"] * TICK_S
+        left = self.settings.speed * TICK_S
         at = self._base[:2, 3].copy()
         while len(self._route) and left > 0:
             ahead = self._route[0] - at
@@ -129,21 +132,21 @@ class SimulatedRobot(RobotNode):
             cosine = np.cos(heading)
             sine = np.sin(heading)
             base[:2, :2] = [[cosine, -sine], [sine, cosine]]
-        step = compose(inverse(self._base), base)
-        distance_drift, turn_drift = self.settings["drift"]
+        step = compose_poses(invert_poses(self._base), base)
+        distance_drift, turn_drift = self.settings.drift
         turn = np.arctan2(step[1, 0], step[0, 0]) * turn_drift + self._rng.normal(0, distance_drift) * step[0, 3]
         cosine = np.cos(turn)
         sine = np.sin(turn)
         error = np.array([[cosine, -sine, 0, 0], [sine, cosine, 0, 0], [0, 0, 1, 0]])
-        measured = compose(step, error)
+        measured = compose_poses(step, error)
         measured[:, 3] *= 1 + distance_drift
-        self._odometry = compose(self._odometry, measured)
+        self._odometry = compose_poses(self._odometry, measured)
         self._base = base
 
     def _see(self, now: Any) -> None:
         assert self._base is not None
-        map_from_camera = compose(self._base, self.head.base_from_camera(*self._joints))
-        rgb = self._renderer.render(self.camera, inverse(map_from_camera)[None]).rgb[0]
+        map_from_camera = compose_poses(self._base, self.head.base_from_camera(*self._joints))
+        rgb = self._renderer.render(self.camera, invert_poses(map_from_camera)[None]).rgb[0]
         info = CameraInfo(width=self.camera.width, height=self.camera.height, distortion_model="plumb_bob")
         matrix = self.camera.matrix
         matrix[:2, 2] -= 0.5
@@ -153,7 +156,7 @@ class SimulatedRobot(RobotNode):
         image = Image(height=rgb.shape[0], width=rgb.shape[1], encoding="rgb8", step=3 * rgb.shape[1])
         image.data = np.ascontiguousarray(rgb, dtype=np.uint8).tobytes()
         truth = PoseStamped(pose=pose_message(map_from_camera))
-        for message, frame in ((info, "camera"), (truth, self.settings["map_frame"]), (image, "camera")):
+        for message, frame in ((info, "camera"), (truth, self.settings.map_frame), (image, "camera")):
             message.header.stamp = now
             message.header.frame_id = frame
         self._truths.publish(truth)

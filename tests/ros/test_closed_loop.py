@@ -15,11 +15,11 @@ pytest.importorskip("rclpy", reason="ROS is not installed: pip install '.[ros]'"
 import rclpy
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path as PathMessage
-from wheretolook_ros.conversions import compose, inverse, pose_matrix, pose_message, seconds
+from wheretolook_ros.conversions import pose_matrix, pose_message, seconds
 
 from ros.processes import HEAD, ROOT, Robot, base_at, environment, running
 from ros.room import room_mesh, write_folder
-from wheretolook.geometry.poses import pose_error
+from wheretolook.geometry.poses import compose_poses, invert_poses, pose_error
 from wheretolook.scenes.loading import save_glb
 
 SIMULATOR = str(ROOT / "tests" / "ros" / "simulated_robot.py")
@@ -47,7 +47,7 @@ def test_a_robot_that_faces_a_wall_turns_and_drives(tmp_path: Path) -> None:
         for name, message in node.received:
             truth = truths.get(round(seconds(message.header.stamp), 4)) if name.endswith("localization/pose") else None
             if truth is not None:
-                position = compose(pose_matrix(message.pose.pose), HEAD.base_from_camera(0.0, 0.0))[:, 3]
+                position = compose_poses(pose_matrix(message.pose.pose), HEAD.base_from_camera(0.0, 0.0))[:, 3]
                 found.append((float(np.linalg.norm(position - truth[:, 3])), seconds(message.header.stamp)))
         return found
 
@@ -63,7 +63,7 @@ def test_a_robot_that_faces_a_wall_turns_and_drives(tmp_path: Path) -> None:
         assert errors()[0][0] < 0.05 and errors()[0][1] > 1000
         assert any(name == "visual_localization/next_look" for name, _ in node.received)
         first = pose_matrix(node.last("visual_localization/pose").pose.pose)
-        position, angle = pose_error(inverse(first), inverse(base))
+        position, angle = pose_error(invert_poses(first), invert_poses(base))
         assert position < 0.05 and angle < 0.4
         node.received.clear()
         path = PathMessage()

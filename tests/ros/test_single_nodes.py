@@ -17,16 +17,18 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS is not installed: pip install '.[ros]'")
 
 import rclpy
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Vector3Stamped
 from nav_msgs.msg import Path as PathMessage
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
-from wheretolook_ros.conversions import Array, compose, inverse, pose_matrix, pose_message
+from wheretolook_ros.conversions import Array, pose_matrix, pose_message
 from wheretolook_ros.head import Timeline
 
 from ros.processes import CAMERA, HEAD, JOINTS, Robot, base_at, environment, image_of, info_of, running
 from ros.room import room_mesh, write_folder
+from wheretolook.geometry.poses import compose_poses, invert_poses
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.robot.wheretolook_robot import RobotScorer
 
@@ -72,7 +74,7 @@ def test_localizing_on_request(node: Robot, folder: Path) -> None:
             future = client.call_async(Trigger.Request())
             return node.wait(lambda: future.done() and future.result(), "an answer")
 
-        assert trigger() == Trigger.Response(success=False, message="no image has arrived")
+        assert trigger() == Trigger.Response(success=False, message="no image received yet")
         node.send("camera_info", info_of(CAMERA))
         node.send("joint_states", JointState(name=JOINTS, position=[0.0, 0.0]))
         node.send("image", image_of(node.rgb(BASE)))
@@ -96,32 +98,50 @@ def test_a_folder_of_another_version(node: Robot, folder: Path, tmp_path: Path, 
         else:
             shutil.rmtree(old / "wheretolook_localization" / "looks")
     with running(LOCALIZER, {"folder": old}), running(GAZE, {"folder": old}, signal.SIGINT):
-        node.connected("image", "plan")
         for name in ("visual_localization", "gaze"):
-            node.send("image", image_of(np.zeros((4, 4, 3), np.uint8)))
-            node.send("plan", PathMessage(poses=[PoseStamped()]))
-            status = node.wait(lambda name=name: node.status(name), f"diagnostics of {name}")
-            assert status.level in (DiagnosticStatus.ERROR, DiagnosticStatus.WARN)
-            said = str(status.message)
-            if name == "visual_localization":
-                assert "the robot's folder" in said and ("Export" in said or "No module" in said), said
+            node.wait(lambda name=name: node.status(name), f"diagnostics of {name}")
+        node.received.clear()
+        status = node.wait(node.status, "diagnostics every second")
+        assert (
+            status.level == DiagnosticStatus.ERROR and "a folder of `wheretolook export --localize`" in status.message
+        )
+        assert "Export" in status.message or "No module" in status.message, status.message
 
 
-@pytest.mark.parametrize("setting", ["confidence:=abc", "mount:=[1]"])
-def test_a_parameter_of_another_type_ends_the_node_with_its_name(setting: str) -> None:
-    command = [sys.executable, "-m", GAZE, "--ros-args", "-p", setting]
-    if "confidence" in setting:
-        command[2] = LOCALIZER
+@pytest.mark.parametrize(
+    ("node_name", "setting", "message"),
+    [
+        ("localizer", "confidence:=abc", "'confidence' to 'abc' of type 'STRING', expecting type 'DOUBLE'"),
+        ("gaze", "mount:=[1]", "'mount'"),
+        ("gaze", "mount:=[1.0]", "parameter mount is [1.]; it must be six finite numbers"),
+        ("localizer", "mount:=[0, 0, 1.2, 0, 0, 0]", "mount:=[0, 0, 1.2, 0, 0, 0]'. Error: Sequence"),
+        ("localizer", "image_qos:=foo", "parameter image_qos is foo; it must be sensor_data or system_default"),
+        (
+            "gaze",
+            "pan_limits_deg:=[60.0, -60.0]",
+            "parameter pan_limits_deg is [ 60. -60.]; it must be [lowest, highest]",
+        ),
+        (
+            "gaze",
+            "tilt_limits_deg:=[30.0]",
+            "parameter tilt_limits_deg is [30.]; it must be [lowest, highest] in degrees",
+        ),
+        ("localizer", "confidence:=0.0", "parameter confidence is 0.0; it must be above 0 and at most 1"),
+        ("localizer", "max_views:=0", "parameter max_views is 0; it must be positive and finite"),
+        ("localizer", "accuracy_m:=-0.1", "parameter accuracy_m is -0.1; it must be positive and finite"),
+        ("gaze", "use_sim_time:=maybe", "'use_sim_time'"),
+    ],
+)
+def test_a_parameter_that_is_not_allowed_ends_the_node(node_name: str, setting: str, message: str) -> None:
+    command = [sys.executable, "-m", f"wheretolook_ros.{node_name}", "--ros-args", "-p", setting]
     ended = subprocess.run(command, env=os.environ | environment(), capture_output=True, text=True, timeout=30)
-    assert ended.returncode == 1 and "Traceback" not in ended.stderr
-    assert setting.split(":")[0] in ended.stderr and "expecting type" in ended.stderr
+    assert ended.returncode == 1 and "Traceback" not in ended.stderr, ended.stderr
+    lines = [line for line in ended.stderr.splitlines() if "[rcl]" not in line]
+    assert len(lines) == 1 and message in lines[0], ended.stderr
 
 
-@pytest.mark.parametrize(("setting", "value"), [("confidence", 0.0), ("confidence", 2.0), ("max_views", 0)])
-def test_a_setting_that_makes_no_sense_is_reported(node: Robot, folder: Path, setting: str, value: float) -> None:
-    with running(LOCALIZER, {"folder": folder, setting: value}):
-        status = node.wait(node.status, "diagnostics")
-        assert status.level == DiagnosticStatus.ERROR and str(value) in status.message
+def stamp_of(time: float) -> Time:
+    return Time(sec=int(time), nanosec=round(time % 1 * 1e9))
 
 
 def test_values_are_interpolated_and_never_extrapolated() -> None:
@@ -129,11 +149,15 @@ def test_values_are_interpolated_and_never_extrapolated() -> None:
     line = Timeline()
     assert line.at(0.0) is None
     for time, value in ((0.0, 0.0), (0.1, 1.0), (0.4, 2.0)):
-        assert line.add(time, np.array([value]))
+        line.add(stamp_of(time), np.array([value]))
     np.testing.assert_allclose(line.at(0.05), [0.5])
     np.testing.assert_allclose(line.at(0.404), [2.0])
     assert line.at(0.45) is None and line.at(0.2) is None and line.at(-0.2) is None
-    assert not line.add(0.3, np.array([0.0])) and line.times == [0.3]
+    with pytest.raises(ValueError, match=r"time jumped back by 0\.10 s; earlier values are discarded"):
+        line.add(stamp_of(0.3), np.array([0.0]))
+    with pytest.raises(ValueError, match="a number is not finite"):
+        line.add(stamp_of(0.3), np.array([np.nan]))
+    assert line.end() == pytest.approx(0.3) and len(line.rows) == 1
 
 
 def test_the_gaze(node: Robot, folder: Path) -> None:
@@ -156,10 +180,12 @@ def test_the_gaze(node: Robot, folder: Path) -> None:
             assert trajectory.joint_names == ["pan", "tilt"]
             pan, tilt = trajectory.points[0].positions
             assert abs(pan) <= np.radians(60) + 1e-9 and abs(tilt) <= np.radians(20) + 1e-9
-            camera = compose(base, HEAD.base_from_camera(pan, tilt))
-            chosen = scorer.score(inverse(camera))[0]
+            camera = compose_poses(base, HEAD.base_from_camera(pan, tilt))
+            chosen = scorer.score(invert_poses(camera))[0]
             grid = [(a, b) for a in np.linspace(-1, 1, 9) for b in np.linspace(-0.3, 0.3, 5)]
-            others = [scorer.score(inverse(compose(base, HEAD.base_from_camera(*joints))))[0] for joints in grid]
+            others = [
+                scorer.score(invert_poses(compose_poses(base, HEAD.base_from_camera(*joints))))[0] for joints in grid
+            ]
             assert chosen >= np.max(others) - 0.02
         look = Vector3Stamped()
         look.header.frame_id = "base_link"
@@ -169,10 +195,17 @@ def test_the_gaze(node: Robot, folder: Path) -> None:
         node.send("look", look)
         found = node.wait(lambda: node.last("joint_trajectory"), "a trajectory")
         np.testing.assert_allclose(found.points[0].positions, (0.5, 0.0), atol=1e-9)
+        look.vector.x = np.nan
+        node.send("look", look)
+        node.wait(
+            lambda: "next_look: a number is not finite" in getattr(node.status("gaze"), "message", ""), "a warning"
+        )
         look.header.frame_id = "elsewhere"
         node.send("look", look)
         node.wait(
-            lambda: "its frame is 'elsewhere', not 'base_link'" in getattr(node.status("gaze"), "message", ""),
+            lambda: (
+                "next_look: frame is 'elsewhere', expected 'base_link'" in getattr(node.status("gaze"), "message", "")
+            ),
             "a warning",
         )
 
@@ -192,3 +225,61 @@ def test_the_gaze(node: Robot, folder: Path) -> None:
         axes = cameras[:, :, 2]
         assert within_limits(axes).all()
         assert np.degrees(np.arccos(np.clip((axes[1:] * axes[:-1]).sum(1), -1, 1))).max() <= 60
+
+
+PAN_ONLY = {"tilt_joint": '""', "tilt_limits_deg": "[10.0, 40.0]"}  # the camera looks down by 10 degrees
+TILT_ONLY = {"pan_joint": '""'}
+
+
+def test_localizing_by_a_head_with_pan_only(node: Robot, folder: Path) -> None:
+    with running(LOCALIZER, {"folder": folder} | PAN_ONLY):
+        node.connected("image", "camera_info", "joint_states")
+        node.joints = ["wheel", "pan"]
+        image = image_of(node.rgb(BASE, 0.4, np.radians(10)))
+        assert node.see(image, info_of(CAMERA), joints=(7.0, 0.4)).message == "localized"
+        found = node.wait(lambda: node.last("visual_localization/pose"), "a pose")
+        np.testing.assert_allclose(pose_matrix(found.pose.pose), BASE, atol=0.02)
+        dark = image_of(np.zeros((480, 640, 3), np.uint8))
+        assert "no next view" not in node.see(dark, info_of(CAMERA), joints=(7.0, 0.4)).message
+        vector = node.wait(lambda: node.last("visual_localization/next_look"), "a next view").vector
+        assert np.degrees(np.arcsin(-vector.z)) == pytest.approx(10)
+        assert abs(np.degrees(np.arctan2(vector.y, vector.x) - 0.4)) > 25
+
+
+@pytest.mark.parametrize("missing", ["tilt", "pan"])
+def test_the_gaze_of_a_head_with_one_joint(node: Robot, folder: Path, missing: str) -> None:
+    scorer = RobotScorer(folder)
+    with running(GAZE, {"folder": folder} | (PAN_ONLY if missing == "tilt" else TILT_ONLY)):
+        node.senders["pose"] = node.create_publisher(PoseWithCovarianceStamped, "visual_localization/pose", 10)
+        node.connected("plan", "pose")
+        message = PoseWithCovarianceStamped()
+        message.header.frame_id = "map"
+        for base in (BASE, base_at(2.0, 3.0, -100.0)):
+            message.pose.pose = pose_message(base)
+            node.received.clear()
+            node.send("pose", message)
+            trajectory = node.wait(lambda: node.last("joint_trajectory"), "a trajectory")
+            moved = {"tilt": "pan", "pan": "tilt"}[missing]
+            assert trajectory.joint_names == [moved] and len(trajectory.points[0].positions) == 1
+            angle = trajectory.points[0].positions[0]
+            if missing == "tilt":
+                grid = [(pan, np.radians(10)) for pan in np.linspace(-np.pi, np.pi, 25)]
+                joints = (angle, np.radians(10))
+            else:
+                grid = [(0.0, tilt) for tilt in np.radians(np.linspace(-45, 45, 10))]
+                joints = (0.0, angle)
+            axis = HEAD.base_from_camera(*joints)[:, 2]
+            direction = node.wait(lambda: node.last("gaze/direction"), "a direction").vector
+            np.testing.assert_allclose((direction.x, direction.y, direction.z), axis, atol=1e-9)
+            scores = [scorer.score(invert_poses(compose_poses(base, HEAD.base_from_camera(*at))))[0] for at in grid]
+            chosen = scorer.score(invert_poses(compose_poses(base, HEAD.base_from_camera(*joints))))[0]
+            assert chosen >= np.max(scores) - 0.02
+        path = PathMessage()
+        path.header.frame_id = "map"
+        for x in np.linspace(1.5, 4.5, 31):
+            path.poses.append(PoseStamped(pose=pose_message(base_at(x, 2.5, 0.0))))
+        node.send("plan", path)
+        views = node.wait(lambda: node.last("gaze/views"), "views along the path")
+        axes = np.array([pose_matrix(view.pose)[:, 2] for view in views.poses])
+        fixed = -np.arcsin(axes[:, 2]) if missing == "tilt" else np.arctan2(axes[:, 1], axes[:, 0])
+        np.testing.assert_allclose(np.degrees(fixed), 10 if missing == "tilt" else 0, atol=1e-6)

@@ -36,9 +36,9 @@ class SequenceResult:
         """Say why the pose is not more probable."""
         joint = self.localization.joint
         if not self.localization.poses:
-            return f"lost: {joint.n_matches} matches with the map support no pose"
-        support = f"{joint.n_inliers} of {joint.n_matches} matches, {len(joint.rivals)} rivals"
-        return f"lost: probability {self.localization.probability:.2f}, {support}"
+            return f"lost: no pose from {joint.n_matches} matches with the map"
+        support = f"{joint.n_inliers} of {joint.n_matches} matches are inliers, {len(joint.rivals)} rival poses"
+        return f"lost: probability {self.localization.probability:.3f}, {support}"
 
 
 class ImageSequence:

@@ -157,7 +157,7 @@ class RobotLocalizer:
         ratio = camera.fx / camera.width * self.camera.width / self.camera.fx
         if 1 / MAX_FOCAL_RATIO < ratio < MAX_FOCAL_RATIO:
             return ""
-        return f"the focal length is {ratio:.2f} times that of the robot's folder"
+        return f"the focal length, relative to the width, is {ratio:.2f} times that of the map's camera"
 
     def match(
         self,

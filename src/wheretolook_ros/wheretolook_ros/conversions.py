@@ -15,10 +15,11 @@ from geometry_msgs.msg import Point, Pose, Quaternion, Vector3, Vector3Stamped
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Header
 
 Array = NDArray[Any]
 
-REC_709 = np.array((0.2126, 0.7152, 0.0722), dtype=np.float32)  # weights of red, green and blue, as in the maps
+REC_709 = {"r": 0.2126, "g": 0.7152, "b": 0.0722}  # as in the maps
 BAYERS = {
     "bayer_rggb8": cv2.COLOR_BayerRGGB2RGB,
     "bayer_bggr8": cv2.COLOR_BayerBGGR2RGB,
@@ -35,7 +36,14 @@ UNDISTORT: dict[str, Any] = {
 
 def seconds(stamp: Time) -> float:
     """Convert a stamp to seconds."""
-    return float(stamp.sec + 1e-9 * stamp.nanosec)
+    return stamp.sec + 1e-9 * stamp.nanosec
+
+
+def finite(values: Array) -> Array:
+    """Return values; raises ValueError if one is not finite."""
+    if not np.isfinite(values).all():
+        raise ValueError("a number is not finite")
+    return values
 
 
 def grey_image(message: Image | CompressedImage) -> NDArray[np.uint8]:
@@ -43,104 +51,84 @@ def grey_image(message: Image | CompressedImage) -> NDArray[np.uint8]:
     if isinstance(message, CompressedImage):
         decoded = cv2.imdecode(np.frombuffer(message.data, dtype=np.uint8), cv2.IMREAD_COLOR)
         if decoded is None:
-            raise ValueError(f"a compressed image of format {message.format!r} cannot be decoded")
+            raise ValueError(f"cannot decode the compressed image of format {message.format!r}")
         return _grey(decoded, "bgr")
     encoding = message.encoding
     size = BYTES.get(encoding)
     if size is None:
-        raise ValueError(f"the encoding {encoding!r} is not supported")
+        raise ValueError(f"image encoding {encoding!r} is not supported, only {', '.join(BYTES)}")
     width = message.width * size
     data = np.frombuffer(message.data, dtype=np.uint8)
-    if width == 0 or message.step < width or len(data) != message.step * message.height:
-        raise ValueError(f"{len(data)} bytes are no image of {message.width} x {message.height} px, {encoding}")
+    if not 0 < width <= message.step or len(data) != message.step * message.height:
+        size_px = f"{message.width} x {message.height} px {encoding}, step {message.step}"
+        raise ValueError(f"{len(data)} bytes of data do not fit an image of {size_px}")
     rows = np.ascontiguousarray(data.reshape(message.height, message.step)[:, :width])
     if encoding in BAYERS:
         return _grey(cv2.cvtColor(rows, BAYERS[encoding]), "rgb")
     if size > 2:
         return _grey(rows.reshape(message.height, message.width, size), encoding)
-    return rows[:, size - 1 - message.is_bigendian :: size] if size == 2 else rows
+    if size == 1:
+        return rows
+    values = rows.view(">u2" if message.is_bigendian else "<u2")  # of 10 to 16 bits, which no field states
+    return (values >> max(int(values.max()).bit_length() - 8, 0)).astype(np.uint8)
 
 
 def _grey(image: Array, channels: str) -> NDArray[np.uint8]:
-    weights = np.zeros((1, image.shape[2]), dtype=np.float32)
-    weights[0, [channels.index(name) for name in "rgb"]] = REC_709
-    return np.asarray(cv2.transform(image, weights), dtype=np.uint8)
+    weights = [REC_709.get(name, 0.0) for name in channels[: image.shape[2]]]
+    return cv2.transform(image, np.array([weights])).astype(np.uint8)
 
 
-def pinhole_of(info: CameraInfo, rectified: bool) -> tuple[Array, Callable[[Array], Array]]:
-    """Return a camera's matrix (3, 3), and what moves pixels (K, 2) of its images to those of that pinhole.
+def pinhole_of(info: CameraInfo, rectified: bool) -> tuple[tuple[Any, ...], Callable[[Array], Array]]:
+    """Return fx, fy and (cx, cy) of a camera, and what moves pixels (K, 2) of its images to those of that pinhole.
 
     Both are in pixels of wheretolook. With `rectified`, images are those of image_proc. Raises ValueError for a camera
     that is not calibrated, or of another model.
     """
-    matrix = np.array(info.p).reshape(3, 4)[:, :3] if rectified else np.array(info.k).reshape(3, 3)
-    if not (matrix[0, 0] > 0 and matrix[1, 1] > 0):
-        raise ValueError("the camera is not calibrated: the focal length in its CameraInfo is 0")
+    matrix = np.reshape(info.p, (3, 4))[:, :3] if rectified else np.reshape(info.k, (3, 3))
+    (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
+    if not (fx > 0 and fy > 0):
+        raise ValueError("the camera is not calibrated: no positive focal length in camera_info")
     if info.binning_x > 1 or info.binning_y > 1 or info.roi.width % info.width or info.roi.height % info.height:
-        raise ValueError("binning and regions of interest in a CameraInfo are not supported")
-    moved = matrix.copy()
-    moved[:2, 2] += 0.5
+        raise ValueError("camera_info has binning or a region of interest, which is not supported")
+    pinhole = fx, fy, (cx + 0.5, cy + 0.5)
     distortion = np.array(info.d)
     if rectified or not distortion.any():
-        return moved, lambda pixels: pixels
+        return pinhole, lambda pixels: pixels
     undistort = UNDISTORT.get(info.distortion_model)
     if undistort is None:
-        raise ValueError(f"the distortion model {info.distortion_model!r} is not supported")
+        raise ValueError(f"distortion model {info.distortion_model!r} is not supported, only {', '.join(UNDISTORT)}")
 
     def to_pinhole(pixels: Array) -> Array:
-        at = np.asarray(pixels, dtype=np.float64).reshape(-1, 1, 2) - 0.5
-        return np.asarray(undistort(at, matrix, distortion, P=matrix)).reshape(-1, 2) + 0.5 if len(at) else pixels
+        moved = undistort(pixels[:, None] - 0.5, matrix, distortion, P=matrix) if len(pixels) else pixels
+        return np.reshape(moved, (-1, 2)) + 0.5
 
-    return moved, to_pinhole
+    return pinhole, to_pinhole
 
 
 def pose_matrix(pose: Pose) -> Array:
     """Convert a pose to (3, 4). Raises ValueError for a quaternion of length 0 or a number that is not finite."""
-    return pose_of_numbers(pose_numbers(pose))
-
-
-def pose_numbers(pose: Pose) -> Array:
-    """Convert a pose to x, y, z and a unit quaternion qx, qy, qz, qw, which is not finite if it had length 0."""
     p = pose.position
-    q = np.array([pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w])
-    return np.array([p.x, p.y, p.z, *q / np.linalg.norm(q)])
-
-
-def pose_of_numbers(numbers: Array) -> Array:
-    """Convert x, y, z, qx, qy, qz, qw to (3, 4); raises as `pose_matrix`."""
-    if not np.isfinite(numbers).all():
-        raise ValueError(f"a pose is not finite, or its quaternion is 0: {numbers.tolist()}")
-    return np.column_stack([Rotation.from_quat(numbers[3:]).as_matrix(), numbers[:3]])
+    q = pose.orientation
+    return finite(np.column_stack([Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), [p.x, p.y, p.z]]))
 
 
 def pose_message(pose: Array) -> Pose:
     """Convert a pose (3, 4) to a message."""
-    x, y, z = pose[:, 3].tolist()
-    qx, qy, qz, qw = Rotation.from_matrix(pose[:, :3]).as_quat().tolist()
-    return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+    quaternion = Rotation.from_matrix(pose[:, :3]).as_quat()
+    return Pose(position=_named(Point, pose[:, 3]), orientation=_named(Quaternion, quaternion))
 
 
 def direction_message(direction: Array, frame: str, stamp: Time) -> Vector3Stamped:
     """Convert a direction (3,) of a frame to a message."""
-    x, y, z = direction.tolist()
-    message = Vector3Stamped(vector=Vector3(x=x, y=y, z=z))
-    message.header.frame_id = frame
-    message.header.stamp = stamp
-    return message
+    return Vector3Stamped(header=Header(frame_id=frame, stamp=stamp), vector=_named(Vector3, direction))
 
 
-def compose(a: Array, b: Array) -> Array:
-    """Compose poses (3, 4)."""
-    return np.column_stack([a[:, :3] @ b[:, :3], a[:, :3] @ b[:, 3] + a[:, 3]])
-
-
-def inverse(pose: Array) -> Array:
-    """Invert a pose (3, 4)."""
-    return np.column_stack([pose[:, :3].T, -pose[:, :3].T @ pose[:, 3]])
+def _named(kind: Any, values: Array) -> Any:
+    return kind(**dict(zip("xyzw", values.tolist(), strict=False)))
 
 
 def moved_covariance(covariance: Array, lever: Array) -> Array:
     """Move a covariance (6, 6) of position and rotation to a point of the same rigid body, `lever` (3,) away."""
     jacobian = np.eye(6)
     jacobian[:3, 3:] = np.cross(np.eye(3), lever).T
-    return np.asarray(jacobian @ covariance @ jacobian.T)
+    return jacobian @ covariance @ jacobian.T

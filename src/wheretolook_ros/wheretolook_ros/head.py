@@ -1,88 +1,97 @@
-"""A camera on a robot: fixed, or on a pan-tilt head whose joints are known over time."""
+"""A camera on a robot: fixed, or on a head with pan, tilt or both, whose joints are known over time."""
 
 from __future__ import annotations
 
-import bisect
-from dataclasses import dataclass, field
+from bisect import bisect_left
+from collections.abc import Sequence
+from operator import itemgetter
 
 import numpy as np
+from builtin_interfaces.msg import Time
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from wheretolook_ros.conversions import Array
+from wheretolook_ros.conversions import Array, finite, seconds
 
 OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # axes of the optical frame in one with x forward, z up
-
-
+SLACK_DEG = 8.0  # of a search on both sides of an angle that is fixed: half the angle between 200 directions
 ROUNDING_DEG = 1e-6
-KEPT_S = 10.0  # of a timeline
+KEPT = 2000  # rows of a timeline
 TOLERANCE_S = 0.1  # between a time and the nearest value
 LATE_S = 0.005  # a head turns by a degree within it
 
 
-@dataclass(frozen=True)
 class Head:
-    """A head at (x, y, z) m with (roll, pitch, yaw) degrees in the base; the camera is where pan and tilt axes meet.
+    """A head in the base; the camera is where pan and tilt axes meet.
 
-    Pan turns left, tilt turns down, as rotations about z and y do. Limits are in degrees.
+    Pan turns left, tilt turns down, as rotations about z and y do. A joint that does not move has two equal limits.
+
+    Attributes:
+        location: homogeneous coordinates (4,) in the base.
+        rest: pan and tilt (2,) in radians within the limits and nearest to 0.
+        searched_deg: limits of pan and tilt (2, 2), so wide that a lattice has directions in them; see `nearest`.
     """
 
-    mount: tuple[float, ...]
-    pan_deg: tuple[float, float] = (-180.0, 180.0)
-    tilt_deg: tuple[float, float] = (-45.0, 45.0)
+    def __init__(
+        self, mount: Sequence[float], pan_deg: ArrayLike = (-180.0, 180.0), tilt_deg: ArrayLike = (-45.0, 45.0)
+    ) -> None:
+        """Mount a head at (x, y, z) m with (roll, pitch, yaw) degrees in the base, with limits of its joints."""
+        self.location = np.array([*mount[:3], 1.0])
+        self._mounted = Rotation.from_euler("xyz", mount[3:], degrees=True)
+        limits = np.array([pan_deg, tilt_deg])
+        self._limits = limits.T
+        self.searched_deg = limits.mean(axis=1, keepdims=True) + np.maximum(np.diff(limits) / 2, SLACK_DEG) * (-1, 1)
+        self.rest = np.radians(np.clip(0, *self._limits))
 
     def base_from_camera(self, pan: float, tilt: float) -> Array:
         """Pose (3, 4) of the camera's optical frame with joints in radians."""
-        turned = self._rotation() * Rotation.from_euler("ZY", [pan, tilt])
-        return np.column_stack([turned.as_matrix() @ OPTICAL, self.mount[:3]])
+        return np.column_stack([self._turned([pan, tilt]) @ OPTICAL, self.location[:3]])
 
-    def joints(self, direction: Array) -> list[float]:
-        """Pan and tilt in radians, within the limits, that look most nearly along a direction (3,) of the base."""
-        return list(np.radians(self._within(self._angles_deg(direction))))
+    def joints(self, directions: Array) -> Array:
+        """Pan and tilt (..., 2) in radians, within the limits, that look most nearly along directions (..., 3)."""
+        return np.radians(np.clip(self._angles_deg(directions), *self._limits))
 
-    def allows(self, directions: Array) -> Array:
-        """Which directions (D, 3) of the base are within the limits, (D,) bool."""
+    def nearest(self, directions: Array) -> tuple[Array, Array]:
+        """Move directions (..., 3) of the base into the limits; also returns which are within those of a search."""
         angles = self._angles_deg(directions)
-        return np.asarray(np.isclose(self._within(angles), angles, rtol=0, atol=ROUNDING_DEG).all(axis=1))
+        searched = np.clip(angles, *self.searched_deg.T)
+        within = np.isclose(searched, angles, rtol=0, atol=ROUNDING_DEG).all(axis=-1)
+        return self._turned(self.joints(directions))[..., 0], within
+
+    def _turned(self, joints: ArrayLike) -> Array:
+        return (self._mounted * Rotation.from_euler("ZY", joints)).as_matrix()
 
     def _angles_deg(self, directions: Array) -> Array:
         """Pan and tilt (..., 2) of directions (..., 3) of the base."""
-        x, y, z = np.moveaxis(self._rotation().inv().apply(directions), -1, 0)
+        x, y, z = np.moveaxis(self._mounted.inv().apply(directions), -1, 0)
         return np.degrees(np.stack([np.arctan2(y, x), -np.arctan2(z, np.hypot(x, y))], axis=-1))
 
-    def _within(self, angles: Array) -> Array:
-        return np.clip(angles, *np.transpose([self.pan_deg, self.tilt_deg]))
 
-    def _rotation(self) -> Rotation:
-        return Rotation.from_euler("xyz", self.mount[3:], degrees=True)
-
-
-@dataclass
 class Timeline:
-    """Values (N,) by their time, of the last seconds."""
+    """Values of the last seconds: rows of a time and the values (N,)."""
 
-    times: list[float] = field(default_factory=list)
-    values: list[Array] = field(default_factory=list)
+    def __init__(self) -> None:
+        self.rows: list[Array] = []
 
-    def add(self, time: float, value: Array) -> bool:
-        """Add a value; returns False, and forgets the earlier ones, if time jumped back."""
-        forward = not self.times or time >= self.times[-1]
-        if not forward:
-            self.times.clear()
-            self.values.clear()
-        self.times.append(time)
-        self.values.append(value)
-        old = bisect.bisect_left(self.times, time - KEPT_S)
-        del self.times[:old], self.values[:old]
-        return forward
+    def add(self, stamp: Time, values: Array) -> None:
+        """Add values. Raises ValueError if one is not finite or, with the earlier ones discarded, if time jumped back."""
+        row = finite(np.append(seconds(stamp), values))
+        back = self.end() - row[0]
+        if back > 0:
+            self.rows.clear()
+        self.rows.append(row)
+        del self.rows[:-KEPT]
+        if back > 0:
+            raise ValueError(f"time jumped back by {back:.2f} s; earlier values are discarded")
+
+    def end(self) -> float:
+        """Return the last time, -inf if there is none."""
+        return self.rows[-1][0] if self.rows else -np.inf
 
     def at(self, time: float) -> Array | None:
-        """Interpolate linearly; None if the next value is farther than `TOLERANCE_S`, or the last older than `LATE_S`."""
-        after = bisect.bisect_left(self.times, time)
-        rows = slice(max(after - 1, 0), after + 1)
-        times = np.array(self.times[rows])
-        if len(times) == 0 or not -TOLERANCE_S < time - times[-1] < LATE_S:
+        """Interpolate linearly; None if the next row is farther than `TOLERANCE_S`, or the last older than `LATE_S`."""
+        after = bisect_left(self.rows, time, key=itemgetter(0))
+        rows = np.array(self.rows[max(after - 1, 0) : after + 1])
+        if len(rows) == 0 or not -TOLERANCE_S < time - rows[-1, 0] < LATE_S:
             return None
-        values = np.array(self.values[rows])
-        if len(values[0]) == 7 and values[0, 3:] @ values[-1, 3:] < 0:  # the same rotation by the other quaternion
-            values[-1, 3:] *= -1
-        return np.array([np.interp(time, times, column) for column in values.T])
+        return np.array([np.interp(time, rows[:, 0], column) for column in rows.T[1:]])

@@ -67,8 +67,8 @@ def weights_of(method: str, path: Path, localization_map: LocalizationMap) -> Pa
         some_trees(localization_map).save(path, {})
         return path
     torch.manual_seed(0)
-    mean = (80.0, 60.0, 0.0, 0.0, 2.0, *[0.5] * 10)
-    std = (40.0, 30.0, *[1.0] * 13)
+    mean = (80.0, 60.0, 0.0, 0.0, 2.0, *[0.5] * (len(ALL_CHANNELS) - 5))
+    std = (40.0, 30.0, *[1.0] * (len(ALL_CHANNELS) - 2))
     if method.startswith("mlp"):
         network = ViewpointNetwork(NetworkSpec(FeatureStatistics(CHANNELS, mean[:5], std[:5]), hidden=(16,)))
     elif method == "conv":

@@ -38,10 +38,11 @@ _WALK_RECORD = {
     "pitch_variation_deg": PITCH_VARIATION_DEG,
 }
 
+MIN_VARIED_IMAGES = 8
 # What `vary` draws from the scene's seed: coverage and unevenness of the walk, and a share of the images.
 COVERAGES = 0.15, 0.8
 UNEVENNESS = 0.0, 2.0
-SHARES_OF_IMAGES = 0.4, 1.0
+SHARES_OF_IMAGES = 0.08, 1.0  # uniform in the logarithm
 
 PARTNERS = 10  # images that each image is matched with; time grows with their number
 MAX_EPIPOLAR_ERROR_PX = 2.0  # matches farther from the epipolar line are dropped; keypoints are accurate to a pixel
@@ -268,7 +269,7 @@ class MapConfig:
         camera: the mapping camera, if not the query camera, such as `{width: 1280, height: 720, fov_deg: 70}`.
         draw_camera: draw the mapping camera from the scene's seed, as `sample.cameras` draws query cameras.
         vary: draw from the scene's seed how it is photographed: on a walk through a part of it or all, with even spacing
-            or turning on the spot, and with 40 to 100 % of `n_images`. From a few steps, baselines are narrow.
+            or turning on the spot, and with 8 to 100 % of `n_images`. From a few steps, baselines are narrow.
         appearance: highest strength, 0 to 1, of what a real camera and people in front of it do to mapping images; see
             `label.appearance`.
         keep_images: keep the rendered images, as `images/` in the map's folder.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
-from wheretolook.mapping.config import COVERAGES, PARTNERS, SHARES_OF_IMAGES, UNEVENNESS, MapConfig
+from wheretolook.mapping.config import COVERAGES, MIN_VARIED_IMAGES, PARTNERS, SHARES_OF_IMAGES, UNEVENNESS, MapConfig
 from wheretolook.mapping.map_folder import DATABASE_FILE, IMAGES_FOLDER, MapDraft, MapReport, finish_map, replacing_map
 from wheretolook.mapping.triangulation import (
     choose_pairs,
@@ -128,8 +128,9 @@ def _walk(free_space: FreeSpaceQueries, mesh: TexturedMesh, config: MapConfig, s
     if not config.vary:
         return plan_walk(free_space, mesh.bounds, config.n_images, seed)
     rng = np.random.default_rng([seed, 1])
-    share, coverage, unevenness = (rng.uniform(*limits) for limits in (SHARES_OF_IMAGES, COVERAGES, UNEVENNESS))
-    return plan_walk(free_space, mesh.bounds, max(2, round(share * config.n_images)), seed, coverage, unevenness)
+    log_share, coverage, unevenness = (rng.uniform(*x) for x in (np.log(SHARES_OF_IMAGES), COVERAGES, UNEVENNESS))
+    n_images = max(MIN_VARIED_IMAGES, round(np.exp(log_share) * config.n_images))
+    return plan_walk(free_space, mesh.bounds, min(n_images, config.n_images), seed, coverage, unevenness)
 
 
 def _rendered(

@@ -49,17 +49,27 @@ EXPECTED = (
 )
 """Outputs of `expected_statistics`."""
 
-ALL_STATISTICS = (*EXPECTED, "axis_height", "log_expected_cells")
-"""All statistics of a view; the last is log(1 + cells of the sphere expected to hold a detected landmark)."""
+AVERAGED = ("ambiguity", "map_size")
+"""Attributes averaged over the landmarks expected to be detected: from ambiguous matches of a large map, RANSAC finds
+wrong poses with as many inliers as right ones have in a small map."""
+
+ALL_STATISTICS = (*EXPECTED, "axis_height", *(f"mean_{name}" for name in AVERAGED), "log_expected_cells")
+"""All statistics of a view. Means are of standardized attributes; the last is log(1 + cells of the sphere expected to hold
+a detected landmark)."""
 
 DEFAULT_STATISTICS = (
     "log_expected_inliers",
     "log_visible",
     "log_position_variance",
     "log_orientation_variance",
+    "mean_ambiguity",
+    "mean_map_size",
     "log_expected_cells",
 )
-"""Inputs of the head by default: chosen by cross-validation over the scenes of configs/cameras.yaml."""
+"""Inputs of the head by default: chosen by cross-validation over the scenes of configs/cameras.yaml, the means by held-out
+photographs."""
+
+N_SUMS = N_EXPECTED + len(AVERAGED)  # sums over the landmarks of a view, before those of attention
 
 CELLS = 30
 """Cells that 180 degrees are cut into, across and down: 6 degrees each, the same for every camera."""
@@ -95,6 +105,7 @@ class SetNetwork(LandmarkNetwork):
         self._inputs = [ALL_STATISTICS.index(name) for name in view_statistics]
         self.needs_cells = "log_expected_cells" in view_statistics
         self.matchability = MatchabilityNetwork(statistics, width, hidden)
+        self.averaged = [self.attributes.index(name) for name in AVERAGED if name in self.attributes]
         self.attention = None
         if pooled:
             layers = nn.Linear(len(self.attributes), width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
@@ -160,7 +171,10 @@ class SetNetwork(LandmarkNetwork):
 
     def parts(self, values: Tensor, log_odds: Tensor) -> Tensor:
         """Return what landmarks (..., A) with log-odds of detection (...) add to their view's sums, (..., D)."""
+        averaged = self.matchability.input(values)[..., self.averaged]
+        averaged = nn.functional.pad(averaged, (0, len(AVERAGED) - len(self.averaged)))  # earlier weights lack map_size
         expected = expected_parts(values, log_odds, self.attributes)
+        expected = torch.cat([expected, expected[..., :1] * averaged], -1)
         if self.attention is None:
             return expected
         attended = self.attention(values)
@@ -171,7 +185,7 @@ class SetNetwork(LandmarkNetwork):
         """Return logits (B,) from sums (B, D) over each view's landmarks, and `expected_cells` (B,) if they are an input."""
         features = [self.statistics_of(sums, n_visible, axis_height, cells)[:, self._inputs]]
         if self.attention is not None:
-            features.append(sums[:, N_EXPECTED + 1 :] / (sums[:, N_EXPECTED : N_EXPECTED + 1] + 1e-6))
+            features.append(sums[:, N_SUMS + 1 :] / (sums[:, N_SUMS : N_SUMS + 1] + 1e-6))
         joined = torch.cat(features, 1).float()
         if self.training and len(joined) < 2:  # one view has no spread of its own; a process's share may be empty
             standard = self.standard
@@ -185,6 +199,7 @@ class SetNetwork(LandmarkNetwork):
     ) -> Tensor:
         """Return `ALL_STATISTICS` (B, S) from what `logits` takes, without the last if `cells` are not given."""
         known = [expected_statistics(sums[:, :N_EXPECTED], n_visible, self.pose_variances), axis_height[:, None]]
+        known.append((sums[:, N_EXPECTED:N_SUMS] / (sums[:, :1] + 1e-6)).float())
         if cells is not None:
             known.append(cells.log1p()[:, None])
         return torch.cat(known, 1)

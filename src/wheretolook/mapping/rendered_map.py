@@ -127,7 +127,7 @@ def _walk(free_space: FreeSpaceQueries, mesh: TexturedMesh, config: MapConfig, s
     """Plan the walk of a map; with `config.vary`, one of those in `mapping.config`."""
     if not config.vary:
         return plan_walk(free_space, mesh.bounds, config.n_images, seed)
-    rng = np.random.default_rng([seed, 1])
+    rng = np.random.default_rng([seed, 2])  # [seed, 1] draws the mapping camera
     share, coverage, unevenness = (rng.uniform(*limits) for limits in (SHARES_OF_IMAGES, COVERAGES, UNEVENNESS))
     return plan_walk(free_space, mesh.bounds, max(2, round(share * config.n_images)), seed, coverage, unevenness)
 

@@ -50,7 +50,7 @@ class RobotNode(Node):
         given = {known.name: known.value for known in self.declare_parameters("", [*defaults.items()])}
         for parameter, value in given.items():
             rule, accepts = ALLOWED.get(parameter, OTHERS)
-            if not accepts(value):
+            if value is None or not accepts(value):  # None for an empty list
                 sys.exit(f"parameter {parameter} is {np.array(value)}; it must be {rule}")
         self.settings = SimpleNamespace(**given)
         self.joint_names = [self.settings.pan_joint, self.settings.tilt_joint]

@@ -30,7 +30,7 @@ QOS = ("sensor_data", "system_default")
 
 LIMITS = "[lowest, highest] in degrees", lambda value: len(value) == 2 and -180 <= value[0] <= value[1] <= 180
 ALLOWED = {
-    "mount": ("six finite numbers", lambda value: len(value) == 6 and bool(np.isfinite(value).all())),
+    "mount": ("six finite numbers", lambda value: len(value) == 6 and np.isfinite(value).all()),
     "pan_limits_deg": LIMITS,
     "tilt_limits_deg": LIMITS,
     "image_qos": (" or ".join(QOS), lambda value: value in QOS),

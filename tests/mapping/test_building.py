@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
 
+from wheretolook.commands.map import _mapping_camera
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import poses_looking_along
@@ -15,7 +17,7 @@ from wheretolook.mapping import triangulation
 from wheretolook.mapping.colmap_model import colmap_poses
 from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG, MapConfig
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
-from wheretolook.mapping.rendered_map import build_map
+from wheretolook.mapping.rendered_map import _walk, build_map
 from wheretolook.mapping.walk import plan_walk
 from wheretolook.rendering.appearance import Appearance
 from wheretolook.rendering.warp_renderer import WarpRenderer
@@ -88,6 +90,16 @@ def test_a_varied_map_with_appearance_is_of_fewer_and_changed_images(built, room
         assert np.abs(image.astype(int) - expected).mean() < 0.1
         changes.append(np.abs(image.astype(int) - rendering.rgb[0]).mean())
     assert min(changes) > 0.5 and max(changes) > 10
+
+
+def test_the_number_of_images_does_not_depend_on_the_drawn_camera(room, room_free_space):
+    config = MapConfig(n_images=100, vary=True)
+    numbers, sizes = [], []
+    for seed in range(40):
+        numbers.append(len(_walk(room_free_space, room, config, seed).positions))
+        camera = _mapping_camera(replace(config, draw_camera=True), CAMERA, seed)
+        sizes.append(np.log(max(camera.width, camera.height)))
+    assert abs(np.corrcoef(numbers, sizes)[0, 1]) < 0.5
 
 
 def test_landmarks_project_to_their_keypoints(built):

@@ -99,18 +99,16 @@ def test_spacings_vary_by_the_share_asked_for(unevenness):
     assert np.std(steps) / np.mean(steps) == pytest.approx(unevenness, rel=0.15)
 
 
-def test_only_the_largest_reachable_part_is_walked(monkeypatch):
-    monkeypatch.setattr(walk, "COVERAGE", 1.0)
-    route = plan_walk(two_rooms(door_m=0.0), BOUNDS, 60)  # no door
+def test_only_the_largest_reachable_part_is_walked():
+    route = plan_walk(two_rooms(door_m=0.0), BOUNDS, 60, coverage=1.0)  # no door
     assert (route.positions[:, 0] < 4).all() or (route.positions[:, 0] > 4).all()
 
 
 def test_walk_climbs_to_another_storey(monkeypatch):
     monkeypatch.setattr(walk, "EYE_HEIGHT_VARIATION_M", 0.1)
-    monkeypatch.setattr(walk, "COVERAGE", 0.95)
     scene = TwoStoreys(SIZE, 0.2)
     bounds = np.array([(0, 0, 0), (8, 6, 5.2)])
-    route = plan_walk(scene, bounds, 300, 1)
+    route = plan_walk(scene, bounds, 300, 1, coverage=0.95)
     assert scene.segments_are_free(route.path[:-1], route.path[1:]).all()
     floor = scene.floor_below(route.positions)
     height = route.positions[:, 2] - floor

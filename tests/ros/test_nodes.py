@@ -18,7 +18,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from sensor_msgs.msg import Image, JointState, RegionOfInterest
+from sensor_msgs.msg import CompressedImage, Image, JointState, RegionOfInterest
 from wheretolook_ros.conversions import Array, grey_image, pose_matrix, pose_message
 
 from ros.processes import CAMERA, HEAD, JOINTS, Robot, base_at, environment, image_of, info_of, jpeg_of, mosaic, running
@@ -122,6 +122,14 @@ def test_encodings(robot: Robot, encoding: str) -> None:
     }
     assert robot.see(images[encoding](), info_of(CAMERA)).message == "localized"
     assert_right(robot, BASE)
+
+
+def test_compressed_images_of_12_bits_are_scaled_as_others() -> None:
+    grey = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
+    grey[0, 0] = 255
+    png = cv2.imencode(".png", grey.astype(np.uint16) * 16 + 7)[1].tobytes()
+    scaled = grey_image(CompressedImage(format="mono16; png compressed", data=png))
+    assert np.abs(scaled.astype(int) - grey).max() <= 1
 
 
 def test_16_bits_are_shifted_by_the_brightest_pixel() -> None:

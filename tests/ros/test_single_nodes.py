@@ -24,7 +24,7 @@ from nav_msgs.msg import Path as PathMessage
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from wheretolook_ros.conversions import Array, pose_matrix, pose_message
-from wheretolook_ros.head import Timeline
+from wheretolook_ros.head import Head, Timeline
 
 from ros.processes import CAMERA, HEAD, JOINTS, Robot, base_at, environment, image_of, info_of, running
 from ros.room import room_mesh, write_folder
@@ -114,6 +114,7 @@ def test_a_folder_of_another_version(node: Robot, folder: Path, tmp_path: Path, 
         ("localizer", "confidence:=abc", "'confidence' to 'abc' of type 'STRING', expecting type 'DOUBLE'"),
         ("gaze", "mount:=[1]", "'mount'"),
         ("gaze", "mount:=[1.0]", "parameter mount is [1.]; it must be six finite numbers"),
+        ("gaze", "mount:=[]", "parameter mount is None; it must be six finite numbers"),
         ("localizer", "mount:=[0, 0, 1.2, 0, 0, 0]", "mount:=[0, 0, 1.2, 0, 0, 0]'. Error: Sequence"),
         ("localizer", "image_qos:=foo", "parameter image_qos is foo; it must be sensor_data or system_default"),
         (
@@ -142,6 +143,20 @@ def test_a_parameter_that_is_not_allowed_ends_the_node(node_name: str, setting: 
 
 def stamp_of(time: float) -> Time:
     return Time(sec=int(time), nanosec=round(time % 1 * 1e9))
+
+
+@pytest.mark.parametrize(
+    ("limits", "asked", "pan", "within"),
+    [((-90, 180), -170, 180, False), ((180, 180), -179, 180, True), ((-180, -170), 100, -180, False)],
+)
+def test_a_head_turns_to_the_nearer_of_its_limits(
+    limits: tuple[float, float], asked: float, pan: float, within: bool
+) -> None:
+    """Also across 180 degrees: -170 is 10 degrees from 180, and 80 from -90."""
+    head = Head([0.0] * 6, limits)
+    direction = np.array([np.cos(np.radians(asked)), np.sin(np.radians(asked)), 0])
+    np.testing.assert_allclose(np.degrees(head.joints(direction)), (pan, 0), atol=1e-9)
+    assert head.nearest(direction)[1] == within
 
 
 def test_values_are_interpolated_and_never_extrapolated() -> None:

@@ -127,7 +127,7 @@ def _walk(free_space: FreeSpaceQueries, mesh: TexturedMesh, config: MapConfig, s
     """Plan the walk of a map; with `config.vary`, one of those in `mapping.config`."""
     if not config.vary:
         return plan_walk(free_space, mesh.bounds, config.n_images, seed)
-    rng = np.random.default_rng([seed, 1])
+    rng = np.random.default_rng([seed, 2])  # [seed, 1] draws the mapping camera
     log_share, coverage, unevenness = (rng.uniform(*x) for x in (np.log(SHARES_OF_IMAGES), COVERAGES, UNEVENNESS))
     n_images = max(MIN_VARIED_IMAGES, round(np.exp(log_share) * config.n_images))
     return plan_walk(free_space, mesh.bounds, min(n_images, config.n_images), seed, coverage, unevenness)

@@ -57,9 +57,11 @@ def read_image(path: Path, flags: int, at_most: int = MAX_PIXELS) -> NDArray[Any
 def _is_cut_jpeg(data: bytes) -> bool:
     """Return whether a JPEG lacks its end, the marker FFD9 after the first scan: OpenCV fills the missing part with grey.
 
-    A thumbnail in the header has an end of its own, so segments are skipped by their lengths.
+    A thumbnail in the header has an end of its own, so segments are skipped by their lengths; fill bytes FF may precede
+    a marker.
     """
     at = 2
     while data[at : at + 1] == b"\xff" and data[at + 1 : at + 2] != b"\xda":
-        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        is_fill = data[at + 1 : at + 2] == b"\xff"
+        at += 1 if is_fill else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
     return data.startswith(b"\xff\xd8") and data.find(b"\xff\xd9", at) < 0

@@ -49,16 +49,16 @@ def finite(values: Array) -> Array:
 def grey_image(message: Image | CompressedImage) -> NDArray[np.uint8]:
     """Convert an image to grey (H, W) uint8. Raises ValueError for an encoding or a size that cannot be used."""
     if isinstance(message, CompressedImage):
-        decoded = cv2.imdecode(np.frombuffer(message.data, dtype=np.uint8), cv2.IMREAD_COLOR)
+        decoded = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
         if decoded is None:
             raise ValueError(f"cannot decode the compressed image of format {message.format!r}")
-        return _grey(decoded, "bgr")
+        return _grey(_bytes(decoded), "bgr")
     encoding = message.encoding
     size = BYTES.get(encoding)
     if size is None:
         raise ValueError(f"image encoding {encoding!r} is not supported, only {', '.join(BYTES)}")
     width = message.width * size
-    data = np.frombuffer(message.data, dtype=np.uint8)
+    data = np.frombuffer(message.data, np.uint8)
     if not 0 < width <= message.step or len(data) != message.step * message.height:
         size_px = f"{message.width} x {message.height} px {encoding}, step {message.step}"
         raise ValueError(f"{len(data)} bytes of data do not fit an image of {size_px}")
@@ -69,8 +69,12 @@ def grey_image(message: Image | CompressedImage) -> NDArray[np.uint8]:
         return _grey(rows.reshape(message.height, message.width, size), encoding)
     if size == 1:
         return rows
-    values = rows.view(">u2" if message.is_bigendian else "<u2")  # of 10 to 16 bits, which no field states
-    return (values >> max(int(values.max()).bit_length() - 8, 0)).astype(np.uint8)
+    return _bytes(rows.view(">u2" if message.is_bigendian else "<u2"))
+
+
+def _bytes(values: Array) -> NDArray[np.uint8]:
+    """Scale values of 8 to 16 bits, a number that no message states, by the brightest one."""
+    return (values >> max(int(values.max(initial=0)).bit_length() - 8, 0)).astype(np.uint8)
 
 
 def _grey(image: Array, channels: str) -> NDArray[np.uint8]:

@@ -62,9 +62,10 @@ class Head:
         return (self._mounted * Rotation.from_euler("ZY", joints)).as_matrix()
 
     def _angles_deg(self, directions: Array) -> Array:
-        """Pan and tilt (..., 2) of directions (..., 3) of the base."""
+        """Pan and tilt (..., 2) of directions (..., 3) of the base, nearest to the middle of their limits."""
         x, y, z = np.moveaxis(self._mounted.inv().apply(directions), -1, 0)
-        return np.degrees(np.stack([np.arctan2(y, x), -np.arctan2(z, np.hypot(x, y))], axis=-1))
+        angles = np.degrees(np.stack([np.arctan2(y, x), -np.arctan2(z, np.hypot(x, y))], axis=-1))
+        return angles - 360 * np.round((angles - self._limits.mean(axis=0)) / 360)
 
 
 class Timeline:

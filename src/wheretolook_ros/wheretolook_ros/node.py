@@ -30,7 +30,7 @@ QOS = ("sensor_data", "system_default")
 
 LIMITS = "[lowest, highest] in degrees", lambda value: len(value) == 2 and -180 <= value[0] <= value[1] <= 180
 ALLOWED = {
-    "mount": ("six finite numbers", lambda value: len(value) == 6 and bool(np.isfinite(value).all())),
+    "mount": ("six finite numbers", lambda value: len(value) == 6 and np.isfinite(value).all()),
     "pan_limits_deg": LIMITS,
     "tilt_limits_deg": LIMITS,
     "image_qos": (" or ".join(QOS), lambda value: value in QOS),
@@ -50,7 +50,7 @@ class RobotNode(Node):
         given = {known.name: known.value for known in self.declare_parameters("", [*defaults.items()])}
         for parameter, value in given.items():
             rule, accepts = ALLOWED.get(parameter, OTHERS)
-            if not accepts(value):
+            if value is None or not accepts(value):  # None for an empty list
                 sys.exit(f"parameter {parameter} is {np.array(value)}; it must be {rule}")
         self.settings = SimpleNamespace(**given)
         self.joint_names = [self.settings.pan_joint, self.settings.tilt_joint]

@@ -54,9 +54,9 @@ def grey_image(message: Image | CompressedImage) -> NDArray[np.uint8]:
             raise ValueError(f"cannot decode the compressed image of format {message.format!r}")
         return _grey(_bytes(decoded), "bgr")
     encoding = message.encoding
-    size = BYTES.get(encoding)
-    if size is None:
+    if encoding not in BYTES:
         raise ValueError(f"image encoding {encoding!r} is not supported, only {', '.join(BYTES)}")
+    size = BYTES[encoding]
     width = message.width * size
     data = np.frombuffer(message.data, np.uint8)
     if not 0 < width <= message.step or len(data) != message.step * message.height:
@@ -90,7 +90,7 @@ def pinhole_of(info: CameraInfo, rectified: bool) -> tuple[tuple[Any, ...], Call
     """
     matrix = np.reshape(info.p, (3, 4))[:, :3] if rectified else np.reshape(info.k, (3, 3))
     (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
-    if not (fx > 0 and fy > 0):
+    if not min(fx, fy) > 0:
         raise ValueError("the camera is not calibrated: no positive focal length in camera_info")
     if info.binning_x > 1 or info.binning_y > 1 or info.roi.width % info.width or info.roi.height % info.height:
         raise ValueError("camera_info has binning or a region of interest, which is not supported")
@@ -98,9 +98,9 @@ def pinhole_of(info: CameraInfo, rectified: bool) -> tuple[tuple[Any, ...], Call
     distortion = np.array(info.d)
     if rectified or not distortion.any():
         return pinhole, lambda pixels: pixels
-    undistort = UNDISTORT.get(info.distortion_model)
-    if undistort is None:
+    if info.distortion_model not in UNDISTORT:
         raise ValueError(f"distortion model {info.distortion_model!r} is not supported, only {', '.join(UNDISTORT)}")
+    undistort = UNDISTORT[info.distortion_model]
 
     def to_pinhole(pixels: Array) -> Array:
         moved = undistort(pixels[:, None] - 0.5, matrix, distortion, P=matrix) if len(pixels) else pixels
@@ -118,8 +118,8 @@ def pose_matrix(pose: Pose) -> Array:
 
 def pose_message(pose: Array) -> Pose:
     """Convert a pose (3, 4) to a message."""
-    quaternion = Rotation.from_matrix(pose[:, :3]).as_quat()
-    return Pose(position=_named(Point, pose[:, 3]), orientation=_named(Quaternion, quaternion))
+    turned = _named(Quaternion, Rotation.from_matrix(pose[:, :3]).as_quat())
+    return Pose(position=_named(Point, pose[:, 3]), orientation=turned)
 
 
 def direction_message(direction: Array, frame: str, stamp: Time) -> Vector3Stamped:

@@ -75,8 +75,8 @@ class GazeNode(RobotNode):
         looks, allowed = self.head.nearest(self._axes @ base[:, :3])
         scores = np.full(len(looks), -np.inf)
         if allowed.any():
-            location = (base @ self.head.location)[None]
-            scores[allowed] = self._scorer.score_directions(location, looks[allowed] @ base[:, :3].T)[0]
+            views = looks[allowed] @ base[:, :3].T
+            scores[allowed] = self._scorer.score_directions([base @ self.head.location], views)[0]
         return scores
 
     def _on_path(self, message: Path) -> None:
@@ -111,11 +111,11 @@ class GazeNode(RobotNode):
     def _look(self, direction: Array, why: str) -> None:
         """Publish a direction (3,) of the base, within the limits, and the joints that look along it."""
         joints = self.head.joints(finite(direction))
-        axis, _ = self.head.nearest(direction)
+        axis = self.head.nearest(direction)[0]
         self._gaze.publish(direction_message(axis, self.settings.base_frame, self.get_clock().now().to_msg()))
         moved = {name: value for name, value in zip(self.joint_names, joints.tolist(), strict=True) if name}
-        reached = Duration(seconds=self.settings.turn_duration_s).to_msg()
-        point = JointTrajectoryPoint(positions=[*moved.values()], time_from_start=reached)
+        point = JointTrajectoryPoint(positions=[*moved.values()])
+        point.time_from_start = Duration(seconds=self.settings.turn_duration_s).to_msg()
         self._joints.publish(JointTrajectory(joint_names=[*moved], points=[point]))
         self.report(OK, why)
 

@@ -79,11 +79,9 @@ class Timeline:
         row = finite(np.append(seconds(stamp), values))
         back = self.end() - row[0]
         if back > 0:
-            self.rows.clear()
-        self.rows.append(row)
-        del self.rows[:-KEPT]
-        if back > 0:
+            self.rows = [row]
             raise ValueError(f"time jumped back by {back:.2f} s; earlier values are discarded")
+        self.rows = [*self.rows[-KEPT:], row]
 
     def end(self) -> float:
         """Return the last time, -inf if there is none."""

@@ -94,13 +94,12 @@ class LocalizerNode(RobotNode):
         positions = dict(zip(message.name, message.position, strict=False))
         if positions.keys() >= {*filter(None, self.joint_names)}:
             joints = zip(self.joint_names, self.head.rest, strict=True)
-            values = np.array([positions.get(name, rest) for name, rest in joints])
-            self._joints.add(message.header.stamp, values)
+            self._joints.add(message.header.stamp, np.array([positions.get(name, rest) for name, rest in joints]))
 
     def _on_prior(self, message: PoseWithCovarianceStamped) -> None:
         self.check_frame(message, "map_frame")
-        location = pose_matrix(message.pose.pose) @ self.head.location
-        self._prior = location.tolist()  # where the head looks is known from an image at the earliest
+        # where the head looks is known from an image at the earliest
+        self._prior = (pose_matrix(message.pose.pose) @ self.head.location).tolist()
         self._sequence.reset()
 
     def _on_trigger(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -223,7 +222,7 @@ class LocalizerNode(RobotNode):
             chosen = self._sequence.localizer.next_look(best, self._scorer, -tilt[::-1], turns, base_from_camera[2, :3])
         except Exception as error:  # such as limits that leave no further view
             return f"; no next view: {error}"
-        axis, _ = self.head.nearest(base_from_camera[:, :3] @ chosen.cam_from_rig[2])
+        axis = self.head.nearest(base_from_camera[:, :3] @ chosen.cam_from_rig[2])[0]
         self._looks.publish(direction_message(axis, self.settings.base_frame, image.header.stamp))
         return ""
 

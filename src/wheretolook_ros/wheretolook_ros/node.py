@@ -17,7 +17,6 @@ from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from std_msgs.msg import Header
 
 from wheretolook_ros.head import Head
 
@@ -26,14 +25,13 @@ WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
 DEFAULTS = Path(__file__).with_name("wheretolook.yaml")
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # of timers: a simulated clock may stand still
-QOS = ("sensor_data", "system_default")
 
 LIMITS = "[lowest, highest] in degrees", lambda value: len(value) == 2 and -180 <= value[0] <= value[1] <= 180
 ALLOWED = {
     "mount": ("six finite numbers", lambda value: len(value) == 6 and np.isfinite(value).all()),
     "pan_limits_deg": LIMITS,
     "tilt_limits_deg": LIMITS,
-    "image_qos": (" or ".join(QOS), lambda value: value in QOS),
+    "image_qos": ("sensor_data or system_default", lambda value: value in ("sensor_data", "system_default")),
     "confidence": ("above 0 and at most 1", lambda value: 0 < value <= 1),
 }
 OTHERS = "positive and finite", lambda value: isinstance(value, str | bool) or 0 < value < np.inf
@@ -103,10 +101,11 @@ class RobotNode(Node):
             else:
                 log.error(message)
         self.reported = level, message
-        pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-        status = DiagnosticStatus(level=level, name=self.get_name(), message=message, values=pairs)
-        now = Header(stamp=self.get_clock().now().to_msg())
-        self._diagnostics.publish(DiagnosticArray(header=now, status=[status]))
+        status = DiagnosticStatus(level=level, name=self.get_name(), message=message)
+        status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(array)
 
 
 def run(node: Callable[[], Node]) -> None:

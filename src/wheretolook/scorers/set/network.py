@@ -62,12 +62,12 @@ DEFAULT_STATISTICS = (
     "log_visible",
     "log_position_variance",
     "log_orientation_variance",
-    "mean_ambiguity",
-    "mean_map_size",
     "log_expected_cells",
 )
-"""Inputs of the head by default: chosen by cross-validation over the scenes of configs/cameras.yaml, the means by held-out
-photographs."""
+"""Inputs of the head by default: chosen by cross-validation over the scenes of configs/cameras.yaml."""
+
+OF_MANY_MAPS = (*DEFAULT_STATISTICS, *(f"mean_{name}" for name in AVERAGED))
+"""Inputs of the head if it is trained on many maps (docs/research/cameras.md)."""
 
 N_SUMS = N_EXPECTED + len(AVERAGED)  # sums over the landmarks of a view, before those of attention
 

@@ -43,7 +43,7 @@ class SetScorer(LandmarkScorer):
     def __init__(self, localization_map: LocalizationMap, trained: TrainedNetwork[SetNetwork]) -> None:
         super().__init__(localization_map, trained.network.attributes, trained.training_range, trained.camera)
         self.name = trained.method
-        self.local = "map_size" not in trained.network.attributes
+        self.local = not trained.network.uses("map_size")
         self.trained = trained
         self.network = trained.network.to(localization_map.device)
         self.accuracy = trained.accuracy

@@ -66,12 +66,13 @@ def sample_viewpoints(
     """
     rng = np.random.default_rng(config.seed)
     ids = np.asarray(location_ids, dtype=np.int64)
-    near = np.zeros(0, dtype=np.int64)
+    n_others = config.max_locations or len(ids)
+    near = ids[:0]
     if config.near_map and mapped is not None:
         near = ids[_near_map(grid.centers()[ids], mapped, round(config.near_map * config.max_locations), rng)]
         ids = np.setdiff1d(ids, near)
-    n_others = config.max_locations - len(near)
-    ids = np.sort(np.concatenate([near, _subset(ids, n_others, rng) if n_others or not len(near) else ids[:0]]))
+        n_others -= len(near)
+    ids = np.sort(np.concatenate([near, _subset(ids, n_others, rng) if n_others else ids[:0]]))
     locations = grid.centers()[ids]
     directions = config.axes()
     options = SurveyOptions(

@@ -111,8 +111,8 @@ class RobotLocalizer:
         self._world_from_map = Similarity(1.0, np.eye(3), np.zeros(3))
         if not in_world:
             frame = about["world_from_map"]
-            rotation, translation = np.array(frame["rotation"]), np.array(frame["translation"])
-            self._world_from_map = Similarity(float(frame["scale"]), rotation, translation)
+            rotation = np.array(frame["rotation"])
+            self._world_from_map = Similarity(float(frame["scale"]), rotation, np.array(frame["translation"]))
         camera = about["camera"]
         centre = camera["cx"], camera["cy"]
         size = int(camera["width"]), int(camera["height"])

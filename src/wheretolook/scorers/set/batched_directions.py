@@ -25,7 +25,7 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.scorers.matchability.network import N_EXPECTED, bearing_precision
 from wheretolook.scorers.set.accuracy import probabilities
-from wheretolook.scorers.set.network import N_SUMS, SetNetwork, expected_cells
+from wheretolook.scorers.set.network import SetNetwork, expected_cells
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.visibility.listing import FrustumLister, ListedViews, Surroundings
 from wheretolook.visibility.occlusion import DevicePoints
@@ -192,8 +192,8 @@ class BatchedDirections:
         place = used.cumsum(0, dtype=torch.int32) - 1
         seen = used.nonzero()[:, 0]
         base, terms = self._described(wp.to_torch(nearby.offsets).index_select(0, seen), rows[seen] * stride)
-        sums = torch.zeros((len(n_visible), N_SUMS), device=self.device)
-        n_averaged = self._averaged.shape[1]
+        n_sums = self.trained.network.n_sums
+        sums = torch.zeros((len(n_visible), n_sums), device=self.device)
         cells = torch.zeros(len(n_visible), device=self.device)
         visible = torch.from_numpy(n_visible).to(sums)
         each = visible / torch.from_numpy(np.diff(starts)).to(self.device).clamp(min=1)
@@ -208,7 +208,7 @@ class BatchedDirections:
             p_detect = torch.sparse_csr_tensor(ends, here, log_odds.sigmoid(), size=(len(part) - 1, len(terms)))
             of_terms = p_detect @ terms
             sums[views, :16] = of_terms[:, :16]
-            sums[views, N_EXPECTED : N_EXPECTED + n_averaged] = of_terms[:, 16:]
+            sums[views, N_EXPECTED:n_sums] = of_terms[:, 16:]
             of_view = torch.arange(len(part) - 1, device=self.device).repeat_interleave(ends.diff())
             cells[views] = expected_cells(image[span], log_odds, of_view, each[views], IMAGE)
         height = torch.from_numpy(heights).to(sums)

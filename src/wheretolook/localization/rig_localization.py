@@ -140,7 +140,8 @@ class JointLocalizer:
         if single_view_poses is None:
             count = POSES_OF_A_VIEW if len(looks) > 1 else POSES_OF_AN_IMAGE
             single_view_poses = [self.single_view_poses(look, count) for look in looks]
-        noise_deg, error_deg = self.turn_noise_deg, 0.0
+        noise_deg = self.turn_noise_deg
+        error_deg = 0.0
         if self.check_turns and len(looks) > 1:
             noise_deg, error_deg = turn_errors(self.estimator, looks, single_view_poses, noise_deg)
         rig = RigMatches(self.estimator, looks, noise_deg)

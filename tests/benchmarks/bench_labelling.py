@@ -69,7 +69,7 @@ def time_steps(folder: SceneFolder, views: np.ndarray, batch: int, device: str, 
     for warm_up in (True, False):
         watch = Stopwatch(device)
         if not warm_up and hasattr(network, "dkd"):
-            watch.time_method(network, "extract_dense_map", "of it dense maps")
+            watch.time_method(aliked_batch, "_maps", "of it network")
             watch.time_method(aliked_batch, "_detected", "detection")
             watch.time_method(aliked_batch, "_described", "description")
         for start in range(0, min(len(views), 2 * batch) if warm_up else len(views), batch):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from twins.features import mutual_matches
-from wheretolook.features.aliked_batch import detect_and_describe, detect_by_kornia
+from wheretolook.features.aliked_batch import detect_and_describe
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.descriptors import unit_descriptors
 from wheretolook.features.extraction import KeypointExtractor
@@ -116,24 +116,32 @@ def test_learned_extractors_give_unit_descriptors_within_the_image(method, tmp_p
         assert nothing.descriptors.shape == (0, kind_of(method).dimension)
 
 
-@pytest.mark.parametrize("least", [0.0, 0.9])  # as a share of scores: of all maxima, and of few
+@pytest.mark.parametrize("least", [0.0, 0.9, 0.9999])  # as a share of scores: of all maxima, of few, of some images
 def test_aliked_finds_in_a_batch_what_kornia_finds_image_by_image(least, tmp_path):
     torch = pytest.importorskip("torch")
-    extractor = KeypointExtractor(ExtractorConfig("aliked", weights=str(untrained("aliked", tmp_path))))
-    network = extractor._extraction._network
+    kornia = pytest.importorskip("kornia.feature")
+    weights = untrained("aliked", tmp_path)
+    network = KeypointExtractor(ExtractorConfig("aliked", weights=str(weights)))._extraction._network
+    reference = kornia.ALIKED("aliked-n16rot").eval()
+    reference.load_state_dict(torch.load(weights), strict=False)
     whole = np.stack([image(seed) for seed in range(4)])
     whole[2] = 128  # two images with flat parts, one has nothing else
     whole[3, :50] = 40
     images = torch.from_numpy(whole).permute(0, 3, 1, 2) / 255
     with torch.inference_mode():
-        scores = network.extract_dense_map(images)[1]
-        network.dkd.scores_th = float(scores.quantile(least)) if least else float(scores.min()) - 1e-3
-        network.dkd.n_limit = 300  # of which some images have more
+        scores = reference.extract_dense_map(images)[1]
+        for each in (network, reference):
+            each.dkd.scores_th = float(scores.quantile(least)) if least else float(scores.min()) - 1e-3
+            each.dkd.n_limit = 300  # of which some images have more
         found = detect_and_describe(network, images)
-        plain = detect_by_kornia(network, images)
+        plain = [(each.keypoints, each.descriptors, each.keypoint_scores) for each in reference(images)]
     assert len(found) == 4 and any(0 < len(each[2]) < 300 for each in plain)
-    for (pixels, descriptors, scored), expected in zip(found, plain, strict=True):
-        assert len(pixels) == len(expected[0])
+    for result, expected in zip(found, plain, strict=True):
+        assert len(result[0]) == len(expected[0])
+        orders = (np.lexsort(pixels.numpy().round(1).T) for pixels, _, _ in (result, expected))
+        (pixels, descriptors, scored), expected = (
+            [v[rows] for v in values] for values, rows in zip((result, expected), orders, strict=True)
+        )
         np.testing.assert_allclose(pixels, expected[0], atol=1e-3)
         np.testing.assert_allclose(descriptors, expected[1], atol=2e-4)
         np.testing.assert_allclose(scored, expected[2], atol=1e-5)

@@ -19,7 +19,7 @@ _LEAST_SCORE = 0.2  # of a keypoint, the authors' own
 def _build(config: ExtractorConfig, device: str) -> Extraction:
     from torch import Tensor, nn
 
-    from wheretolook.features.aliked_batch import detect_and_describe
+    from wheretolook.features.aliked_batch import detect_and_describe, simplify
     from wheretolook.features.learned import Detection, LearnedExtraction, kornia_feature, load_state
 
     class Aliked(LearnedExtraction):
@@ -27,7 +27,7 @@ def _build(config: ExtractorConfig, device: str) -> Extraction:
 
         def make(self) -> nn.Module:
             network = kornia_feature().ALIKED("aliked-n16rot", config.max_keypoints, _LEAST_SCORE)
-            return load_state(network, config.weights, _FILE, _URLS)
+            return simplify(load_state(network, config.weights, _FILE, _URLS))
 
         def detect(self, images: Tensor) -> list[Detection]:
             # ALIKED counts pixels from the middle of the first

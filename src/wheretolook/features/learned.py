@@ -61,7 +61,7 @@ class LearnedExtraction(ABC):
         keypoints: list[Keypoints] = []
         with torch.inference_mode(), one_thread():
             for part in parts:
-                whole = torch.from_numpy(np.stack(part)).to(self.device)
+                whole = torch.from_numpy(np.ascontiguousarray(part)).to(self.device)
                 keypoints += self._keypoints(self.detect(whole.permute(0, 3, 1, 2).float() / 255))
         return keypoints
 

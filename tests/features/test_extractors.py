@@ -121,9 +121,12 @@ def test_aliked_finds_in_a_batch_what_kornia_finds_image_by_image(least, tmp_pat
     torch = pytest.importorskip("torch")
     kornia = pytest.importorskip("kornia.feature")
     weights = untrained("aliked", tmp_path)
+    state = torch.load(weights)
+    state["desc_head.offset_conv.2.weight"] *= 200  # so that descriptors are of places far away, some outside the image
+    torch.save(state, weights)
     network = KeypointExtractor(ExtractorConfig("aliked", weights=str(weights)))._extraction._network
     reference = kornia.ALIKED("aliked-n16rot").eval()
-    reference.load_state_dict(torch.load(weights), strict=False)
+    reference.load_state_dict(state, strict=False)
     whole = np.stack([image(seed) for seed in range(4)])
     whole[2] = 128  # two images with flat parts, one has nothing else
     whole[3, :50] = 40
@@ -132,10 +135,10 @@ def test_aliked_finds_in_a_batch_what_kornia_finds_image_by_image(least, tmp_pat
         scores = reference.extract_dense_map(images)[1]
         for each in (network, reference):
             each.dkd.scores_th = float(scores.quantile(least)) if least else float(scores.min()) - 1e-3
-            each.dkd.n_limit = 300  # of which some images have more
+            each.dkd.n_limit = 100  # of which some images have more
         found = detect_and_describe(network, images)
         plain = [(each.keypoints, each.descriptors, each.keypoint_scores) for each in reference(images)]
-    assert len(found) == 4 and any(0 < len(each[2]) < 300 for each in plain)
+    assert len(found) == 4 and any(0 < len(each[2]) < 100 for each in plain)
     for result, expected in zip(found, plain, strict=True):
         assert len(result[0]) == len(expected[0])
         orders = (np.lexsort(pixels.numpy().round(1).T) for pixels, _, _ in (result, expected))

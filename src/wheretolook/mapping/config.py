@@ -262,7 +262,7 @@ class MapConfig:
         max_reprojection_error_px: landmarks with a larger mean reprojection error are removed from the map (the
             paper's 0.5 px).
         photographs: a folder of photographs to map instead of a mesh; of the other settings, only `extractor` and
-            `keep_database` then count, and options of renders are rejected.
+            `keep_database` then count; `camera`, `draw_camera`, `vary`, `appearance` and `keep_images` are rejected.
         existing: an existing model to import instead; then only `extractor`, `keep_database`, `frame` and
             `photographs.images` and `.scale` also count.
         frame: how the frame of an existing model, or of photographs, is related to metres with z up.

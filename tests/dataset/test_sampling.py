@@ -65,6 +65,22 @@ def test_a_share_of_the_viewpoints_is_near_mapping_images(landmarks: Landmarks) 
     assert distance_m[near].max() < np.sqrt(3) * (0.6 + 0.1) and distance_m[~near].median() > 1
 
 
+def test_near_map_and_keep_take_the_best_of_the_directions_near_those_of_images(landmarks: Landmarks) -> None:
+    grid = VoxelGrid((-2.0, -2.0, 0.0), (2.0, 2.0, 2.0), (20, 20, 10))
+    mapped = poses_looking_along(np.array([[-1.5, -1.5, 1.0], [-1.5, 1.5, 1.0]]), np.array([[0.5, 1, 0]] * 2))
+    options = {"directions": 400, "max_locations": 60, "near_map": 0.5}
+    tables = []
+    for keep in (0, 5):
+        config = SampleConfig(**options, keep=keep)  # type: ignore[arg-type]
+        arguments = (grid, np.arange(len(grid)), landmarks, CAMERA, NoOcclusion(), config)
+        tables.append(sample_viewpoints(*arguments, mapped=mapped)[0])
+    everything, best = tables
+    assert everything["location_id"].nunique() == best["location_id"].nunique() == 60
+    expected = everything.sort_values("visibility_rank").groupby("location_id").head(5).sort_values("viewpoint_id")
+    pd.testing.assert_frame_equal(best, expected.reset_index(drop=True))
+    assert best["visibility_rank"].max() >= 5  # not the five that see most of all
+
+
 def test_near_map_is_a_share_of_a_number_of_locations() -> None:
     with pytest.raises(ConfigError, match="max_locations"):
         SampleConfig(near_map=0.5)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from wheretolook.geometry.camera import CameraConfig
 from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, MarkerConfig, PhotographsConfig
 from wheretolook.mapping.georeference import (
     MapScale,
@@ -141,6 +143,18 @@ def test_invalid_settings_are_rejected() -> None:
     ):
         with pytest.raises(ConfigError):
             MapConfig(**settings)
+
+
+@pytest.mark.parametrize(
+    "source", [{"photographs": PhotographsConfig(Path("photos"))}, {"existing": ExistingModelConfig(Path("model"))}]
+)
+def test_options_of_renders_are_rejected_by_name_for_other_maps(source: dict[str, Any]) -> None:
+    of_renders = {"camera": CameraConfig(), "draw_camera": True, "vary": True, "appearance": 0.4, "keep_images": True}
+    MapConfig(**source, keep_database=True)
+    for name, value in of_renders.items():
+        MapConfig(**{name: value})
+        with pytest.raises(ConfigError, match=rf"photographs or a model.*'mapping\.{name}'"):
+            MapConfig(**source, **{name: value})
 
 
 def test_a_mislabelled_position_of_many_is_left_out(caplog: pytest.LogCaptureFixture) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from box_scenes import furnished_room
 from selection.room import write_room
 from wheretolook.cli import main
 from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -57,11 +59,22 @@ def test_a_mesh_and_the_camera_of_the_robot(model: Path, tmp_path: Path) -> None
     np.testing.assert_allclose(robot.score(views), expected, atol=1e-5, rtol=0)
 
 
+def test_the_accuracy_of_scores(model: Path, tmp_path: Path) -> None:
+    scores = []
+    for options in ((), ("--accuracy", "0.05,0.4"), ("--accuracy", "0.5,5")):
+        assert export(model, tmp_path / "robot", *options) == 0
+        scores.append(RobotScorer(tmp_path / "robot").score_directions([(2.5, 2.5, 1.5)], fibonacci_sphere(50))[0])
+        assert json.loads((tmp_path / "robot" / "robot.json").read_text())["accuracy"] in ([0.05, 0.4], [0.5, 5.0])
+    np.testing.assert_array_equal(scores[0], scores[1])
+    assert (scores[2] >= scores[0]).all() and scores[2].mean() > scores[0].mean() + 0.01
+
+
 @pytest.mark.parametrize(
     "options",
     [
         ("--map", "nowhere"), ("--camera", "PINHOLE 640"), ("--camera-id", "7"), ("--weights", "none.safetensors"),
         ("--mesh", "none.glb"), ("--camera", "OPENCV_FISHEYE,320,240,160,160,160,120,0,0,0,0"), ("--spacing", "-1"),
+        ("--accuracy", "0,1"), ("--accuracy", "0.25"),
     ],
 )  # fmt: skip
 def test_invalid_options(options: tuple[str, ...], model: Path, tmp_path: Path) -> None:

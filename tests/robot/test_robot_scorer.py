@@ -118,6 +118,23 @@ def test_scores_are_those_of_pytorch(name: str, camera: Camera, tmp_path: Path) 
     np.testing.assert_allclose(robot.score(poses[7]), expected[7:8], atol=TOLERANCE, rtol=0)
 
 
+@pytest.mark.parametrize("name", NETWORKS)
+def test_scores_at_any_accuracy_are_those_of_pytorch(name: str, tmp_path: Path) -> None:
+    weights = tmp_path / "set.safetensors"
+    random_network(len(name), **NETWORKS[name]).save(weights)
+    localization_map = LocalizationMap(walls(1500, len(name)), CAMERAS["paper"])
+    poses = some_poses(120, len(name))
+    for accuracy in ((0.001, 0.01), (0.02, 0.2), (0.25, 2.0), (1e3, 90.0), (np.inf, np.inf)):
+        for file in (weights, BUNDLED):
+            scorer = load_scorer(file, localization_map).at_accuracy(accuracy)
+            expected = scorer.score(poses)
+            folder = export_robot(localization_map, file, tmp_path / "robot", accuracy=accuracy)
+            views = RobotScorer(folder).views(poses)
+            np.testing.assert_allclose(views.score, expected, atol=TOLERANCE, rtol=0)
+            np.testing.assert_array_equal(views.in_range, scorer.in_range(poses))
+            assert json.loads((folder / "robot.json").read_text())["accuracy"] == [*accuracy]
+
+
 @pytest.mark.parametrize("n", [1, 60, 25_000])
 def test_bundled_weights_on_maps_of_any_size(n: int, tmp_path: Path) -> None:
     """From views without landmarks to views with more than are sampled."""

@@ -4,27 +4,32 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pycolmap
 import pytest
 from numpy.typing import NDArray
 from scipy.stats import lognorm
 
+from selection.room import write_room
 from synthetic_dataset import CAMERA, make_landmarks
 from wheretolook.dataset.thresholds import ACCURACY
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.lattices import direction_lattice
+from wheretolook.geometry.lattices import direction_lattice, fibonacci_sphere
 from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.similarity import Similarity
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.colmap_model import write_model
 from wheretolook.scorers.registry import find, make_scorer
 from wheretolook.scorers.set.accuracy import STATISTICS, AccuracyModel, LogError
 from wheretolook.scorers.set.network import ALL_STATISTICS
 from wheretolook.scorers.set.score import SetScorer
 from wheretolook.select.where_to_look import WhereToLook
-from wheretolook.utils.errors import ConfigError, WeightsError
+from wheretolook.utils.errors import ConfigError, MapWarning, OutOfRangeWarning, WeightsError
 from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.studies import fit_accuracy
 
@@ -88,7 +93,7 @@ def test_errors_and_limits_scale_with_the_unit() -> None:
     statistics = views()
     larger = statistics.copy()
     larger[:, ALL_STATISTICS.index("log_position_variance")] += 2 * math.log(10)
-    assert MODEL.log_p_within(larger, (0.5, 0.4)) == pytest.approx(MODEL.log_p_within(statistics, ACCURACY))
+    assert MODEL.quantiles(larger, (0.5, 0.4)) == pytest.approx(MODEL.quantiles(statistics, ACCURACY))
     assert MODEL.expected_errors(larger) == pytest.approx(MODEL.expected_errors(statistics) * (10, 1))
     median_m = np.exp(MODEL.log_errors(statistics)[:, 0])
     assert MODEL.expected_errors(statistics)[:, 0] == pytest.approx(lognorm(0.9, scale=median_m).mean())
@@ -171,6 +176,72 @@ def test_views_have_an_accuracy_and_expected_errors(scorer: SetScorer) -> None:
     assert visible.best(place).expected_error_m is None
     with pytest.raises(ConfigError, match="visible"):
         visible.best(place, accuracy=(0.25, 2))
+
+
+def sphere(radius_m: float) -> SetScorer:
+    """The bundled scorer of landmarks on a sphere around the origin."""
+    landmarks = make_landmarks(np.random.default_rng(0), 2000)
+    points = fibonacci_sphere(2000) * radius_m
+    of_map = {
+        "triangulation_angle_deg": np.full(2000, 8.0, np.float32),
+        "mapping_distance_m": np.full(2000, radius_m, np.float32),
+        "mapping_direction": -fibonacci_sphere(2000).astype(np.float32),
+    }
+    scorer = load_scorer(LocalizationMap(replace(landmarks, points=points, **of_map), PinholeCamera(400, 300, 200.0)))
+    assert isinstance(scorer, SetScorer)
+    return scorer
+
+
+@pytest.mark.parametrize("radius_m", [6.0, 35.0])
+def test_the_depth_that_is_in_range_depends_on_the_accuracy(radius_m: float) -> None:
+    """The weights store a mean distance of 0.3726 to 15.2239 m, at 5 cm."""
+    scorer = sphere(radius_m)
+    views = poses_looking_along(np.zeros((8, 3)), direction_lattice(8))
+    for accuracy_m in (0.005, 0.0196, 0.0198, 0.05, 0.25, 1.0):
+        at = scorer.at_accuracy((accuracy_m, 0.4))
+        is_inside = radius_m < 15.2239 and radius_m / accuracy_m < 15.2239 / 0.05
+        assert (at.in_range(views) == is_inside).all() and (at.report(views).in_range == is_inside).all()
+        assert (at.at_accuracy(ACCURACY).in_range(views) == scorer.in_range(views)).all()
+
+
+def test_it_warns_once_of_depth_relative_to_the_accuracy() -> None:
+    scorer = sphere(6.0)
+    views = poses_looking_along(np.zeros((8, 3)), direction_lattice(8))
+    for accuracy in (ACCURACY, (0.02, 0.2), (0.25, 2.0)):
+        assert not warnings_of(scorer.at_accuracy(accuracy), views)
+    (warned,) = warnings_of(scorer.at_accuracy((0.01, 0.1)), views)
+    assert warned.startswith("set 0.01m_0.1deg: 8 of 8 views") and "6 m (in range: 0.373 to 3.04)" in warned
+    assert not warnings_of(scorer.at_accuracy((0.01, 0.1)), views)
+    (warned,) = warnings_of(sphere(35.0), views)
+    assert "35 m (in range: 0.373 to 15.2)" in warned
+
+
+def test_depth_over_accuracy_does_not_depend_on_an_unknown_unit(tmp_path: Path) -> None:
+    """1 % of the depth is in range in any unit; in metres, 5 cm are a smaller share of a larger depth."""
+    room = pycolmap.Reconstruction(write_room(tmp_path / "metric"))
+    for image in room.images.values():  # the room's images also observe what is behind them
+        for row, point in enumerate(image.points2D):
+            known = point.has_point3D()
+            if known and (image.cam_from_world() * room.points3D[point.point3D_id].xyz)[2] < 0.1:
+                room.delete_observation(image.image_id, row)
+    found = {}
+    for unit in (1.0, 10.0):
+        write_model(room, tmp_path / f"{unit}")
+        for frame in ({}, {"scale": 1.0}):
+            with warnings.catch_warnings(action="ignore", category=MapWarning):
+                scorer = load_scorer(LocalizationMap.from_colmap(tmp_path / f"{unit}", **frame))
+            assert isinstance(scorer, SetScorer) and scorer.localization_map.mapping_poses is not None
+            views = scorer.localization_map.mapping_poses
+            found[unit, bool(frame)] = scorer.in_range(views).mean(), len(warnings_of(scorer, views))
+        Similarity(10.0, np.eye(3), np.zeros(3)).transform_model(room)
+    assert found == {(1.0, False): (1, 0), (1.0, True): (1, 0), (10.0, False): (1, 0), (10.0, True): (0, 1)}
+
+
+def warnings_of(scorer: SetScorer, views: Float) -> list[str]:
+    """Texts of the warnings of range of scoring views."""
+    with warnings.catch_warnings(record=True, action="always", category=OutOfRangeWarning) as warned:
+        scorer.score(views)
+    return [str(one.message) for one in warned]
 
 
 def test_landmarks_mapped_from_one_place_are_out_of_range(poses: Float) -> None:

@@ -20,6 +20,7 @@ from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping.config import MapConfig
 from wheretolook.scans.config import RgbdConfig
 from wheretolook.scenes.loading import save_glb
+from wheretolook.utils.errors import MapWarning
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +45,8 @@ def test_a_recording_is_mapped_and_sampled(experiment):
     assert run(Scenes, experiment, again.append) == dataset == Dataset.load(experiment.root)
     assert "reusing" in again[0]
 
+    with pytest.warns(MapWarning, match=r"room: mapping\.vary"):
+        run(Map, replace(experiment, mapping=replace(experiment.mapping, vary=True)), said.append)
     run(Map, experiment, said.append)
     assert not scene.is_photographed and len(scene.read_landmarks()) > 200
     run(Sample, experiment, said.append)

@@ -74,6 +74,17 @@ def test_where_only_the_camera_is_known(camera: PinholeCamera, inside: bool) -> 
     assert TrainingRange.of_camera(None).contains(views_at([[1.0]], camera)).all()
 
 
+def test_a_finer_accuracy_is_in_range_at_distances_as_many_times_shorter() -> None:
+    known = TrainingRange({"distance_m": (0.4, 15.0), "in_view": (1.0, 100.0)})
+    assert known.at_accuracy(1.0) == known.at_accuracy(5.0) == known
+    assert known.at_accuracy(0.2).bounds == {"distance_m": (0.4, 3.0), "in_view": (1.0, 100.0)}
+    assert known.at_accuracy(0.01).bounds["distance_m"] == (0.15, 0.15)  # ascending, as robots demand
+    views = views_at([[2.9], [3.1], [14.9], [15.1]])
+    assert known.at_accuracy(0.2).contains(views).tolist() == [True, False, False, False]
+    assert known.at_accuracy(5.0).contains(views).tolist() == [True, True, True, False]
+    assert "3.1 m (in range: 0.4 to 3)" in known.at_accuracy(0.2).complaint(views[:2])
+
+
 def test_views_without_landmarks_have_no_range() -> None:
     assert TrainingRange.of(views_at([[], []])).bounds == {}
     with pytest.raises((TypeError, IndexError, ValueError)):

@@ -98,7 +98,11 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         """
         config = self.adapt
         frame = self.frame_options()
-        reject((config.map is None and frame != FrameOptions(), "the map's scale and up belong to --map", vars(frame)))
+        appearance = config.map and self.label.appearance
+        reject(
+            (config.map is None and frame != FrameOptions(), "the map's scale and up belong to --map", vars(frame)),
+            (bool(appearance), "label.appearance is for renders, not for the photographs of --map", appearance),
+        )
         if config.map is not None:
             return self._adapt_map(config.map, log, progress)
         refuse_release(self.root)

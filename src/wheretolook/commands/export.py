@@ -37,6 +37,8 @@ class Export(CameraOptions, FrameOptions):
         database: the map's database, as of `wheretolook select`.
         mesh: a mesh of the scene, for occlusion.
         spacing: of the grid, in metres.
+        accuracy: limits of the errors in metres and degrees that scores refer to; by default those of the weights,
+            0.05,0.4. In a map of unknown unit, metres are those of a median depth of 5 m.
         localize: also write the SIFT descriptors and the package wheretolook_localization, which localizes views and
             selects the next with NumPy, SciPy and PoseLib.
     """
@@ -49,6 +51,7 @@ class Export(CameraOptions, FrameOptions):
     database: Path | None = None
     mesh: Path | None = None
     spacing: float = 0.5
+    accuracy: tuple[float, float] | None = None
     localize: bool = False
 
     def __post_init__(self) -> None:
@@ -85,8 +88,10 @@ class Export(CameraOptions, FrameOptions):
 
             described = ImageLocalizer.open(self.map, self.database, self.frame_options()).landmarks
             scorer = load_scorer(weights, source.of_camera(camera))
+            if self.accuracy is not None:
+                scorer = scorer.at_accuracy(self.accuracy)
             export_localizer(described, source.landmarks.ids, mean_scores_by_pitch(scorer), self.out)
-        export_robot(source.of_camera(camera), weights, self.out, locations)
+        export_robot(source.of_camera(camera), weights, self.out, locations, accuracy=self.accuracy)
         print(source.frame.describe())
         print(f"{len(source.landmarks):,} landmarks, a camera of {camera.width} x {camera.height} px: {self.out}")
         if locations is None:

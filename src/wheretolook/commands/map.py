@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 import zlib
 from collections import Counter
 from dataclasses import asdict, dataclass, field, replace
@@ -30,7 +31,7 @@ from wheretolook.mapping.map_frame import read_frame
 from wheretolook.mapping.sources import source_of_map
 from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.confine import check_folder_name, path_within
-from wheretolook.utils.errors import ConfigError, MapError, SceneError
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError
 from wheretolook.utils.files import fingerprint, size_and_time
 
 
@@ -101,6 +102,8 @@ def _map_mesh(options: Map, files: SceneFolder, log: Log) -> None:
         "draw_camera",
     )  # the mapping camera is a part of the key itself
     settings = {name: value for name, value in config.record().items() if name not in unused}
+    if files.is_scanned and config.vary:
+        warnings.warn(f"{files.name}: mapping.vary has no effect on the frames of a scan", MapWarning, stacklevel=2)
     scene = open_scene(options, files)
     seed = _seed(files)
     made_from = existing(files.mesh, SceneError, "scenes")

@@ -76,7 +76,10 @@ def sample_viewpoints(
     locations = grid.centers()[ids]
     directions = config.axes()
     options = SurveyOptions(
-        keep=config.keep, device=device, memory_bytes=round(config.memory_gb * 1e9), progress=progress
+        keep=0 if len(near) else config.keep,
+        device=device,
+        memory_bytes=round(config.memory_gb * 1e9),
+        progress=progress,
     )
     rotations = rotation_looking_along(directions)
     several = cameras if isinstance(cameras, Mapping) else {0: cameras}
@@ -95,7 +98,7 @@ def sample_viewpoints(
     if len(near):
         assert mapped is not None
         visible = _along_map(visible, np.isin(ids, near), locations, directions, mapped)
-    kept = [np.sort(_subset(directions_seen, most, rng)) for directions_seen in visible]
+    kept = [np.sort(_subset(seen_there[: config.keep or None], most, rng)) for seen_there in visible]
     location = np.repeat(np.arange(len(ids)), [len(chosen) for chosen in kept])
     direction = np.concatenate(kept)
     _check_number(len(direction), len(ids), int(seen.counts.max(initial=0)), len(landmarks.points), config)

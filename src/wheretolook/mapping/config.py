@@ -262,14 +262,15 @@ class MapConfig:
         max_reprojection_error_px: landmarks with a larger mean reprojection error are removed from the map (the
             paper's 0.5 px).
         photographs: a folder of photographs to map instead of a mesh; of the other settings, only `extractor` and
-            `keep_database` then count.
+            `keep_database` then count; `camera`, `draw_camera`, `vary`, `appearance` and `keep_images` are rejected.
         existing: an existing model to import instead; then only `extractor`, `keep_database`, `frame` and
             `photographs.images` and `.scale` also count.
         frame: how the frame of an existing model, or of photographs, is related to metres with z up.
         camera: the mapping camera, if not the query camera, such as `{width: 1280, height: 720, fov_deg: 70}`.
         draw_camera: draw the mapping camera from the scene's seed, as `sample.cameras` draws query cameras.
         vary: draw from the scene's seed how it is photographed: on a walk through a part of it or all, with even spacing
-            or turning on the spot, and with 8 to 100 % of `n_images`. From a few steps, baselines are narrow.
+            or turning on the spot, and with 8 to 100 % of `n_images`. From a few steps, baselines are narrow. Scans
+            ignore it, with a warning.
         appearance: highest strength, 0 to 1, of what a real camera and people in front of it do to mapping images; see
             `label.appearance`.
         keep_images: keep the rendered images, as `images/` in the map's folder.
@@ -300,8 +301,12 @@ class MapConfig:
         has_scale = any((frame.scale, frame.distance, frame.positions))
         of_photographs = "photographs have no unit or axes: give distance, positions or marker sizes, and up_in_camera"
         no_model = self.existing.model is None
+        of_renders = ("camera", "draw_camera", "vary", "appearance", "keep_images")
+        given = [f"mapping.{name}" for name in of_renders if getattr(self, name)]
+        is_rendered = no_model and self.photographs.images is None
         reject(
             (self.photographs.scale.has_sizes and has_scale, "the scale is given twice: leave out marker sizes", None),
+            (not is_rendered and bool(given), "these are for maps of renders, not of photographs or a model", given),
             (no_model and bool(frame.scale or frame.up), of_photographs, frame.scale or frame.up),
         )
 

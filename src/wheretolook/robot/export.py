@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from wheretolook.dataset.thresholds import Accuracy, checked_accuracy
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera, describe_camera
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -16,7 +17,7 @@ from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.set.score import MAX_LANDMARKS
 from wheretolook.training.trained_network import TrainedNetwork
-from wheretolook.training.training_range import TrainingRange, camera_quantities
+from wheretolook.training.training_range import camera_quantities
 from wheretolook.utils.errors import CameraError
 from wheretolook.utils.files import copy_file, sha256, write_bytes, write_json
 from wheretolook.utils.npz_files import save_npz
@@ -34,6 +35,7 @@ def export_robot(
     out: str | Path,
     places: Float | None = None,
     progress: bool = True,
+    accuracy: Accuracy | None = None,
 ) -> Path:
     """Write scorer.onnx, landmarks.npz, robot.json and wheretolook_robot.py, which documents them, into a folder.
 
@@ -43,6 +45,7 @@ def export_robot(
         out: folder; existing files are replaced.
         places: (L, 3) m, locations whose occlusion is stored; None for no occlusion.
         progress: show a bar.
+        accuracy: limits of the errors in metres and degrees that the scores refer to; None for those of the weights.
 
     Returns:
         The folder.
@@ -62,7 +65,8 @@ def export_robot(
     trained = TrainedNetwork.load(weights, SetNetwork, "set")
     landmarks = localization_map.landmarks
     places = np.empty((0, 3)) if places is None else np.asarray(places, dtype=np.float64).reshape(-1, 3)
-    content = set_graph(trained).SerializeToString()
+    accuracy = trained.accuracy if accuracy is None else checked_accuracy(accuracy)
+    content = set_graph(trained, accuracy).SerializeToString()
     arrays: dict[str, NDArray[Any]] = {
         "points": landmarks.points,
         "directions": landmarks.mapping_direction,
@@ -70,7 +74,11 @@ def export_robot(
         "places": places,
         "unoccluded": _unoccluded(localization_map, places, progress),
     }
-    about = {"n_landmarks": len(landmarks), "weights_sha256": sha256(weights), **_description(trained, camera)}
+    about = {
+        "n_landmarks": len(landmarks),
+        "weights_sha256": sha256(weights),
+        **_description(trained, camera, accuracy),
+    }
     about["world_from_map"] = localization_map.frame.world_from_map.record()
     write_bytes(out / "scorer.onnx", content)
     save_npz(out / "landmarks.npz", arrays)
@@ -79,9 +87,9 @@ def export_robot(
     return out
 
 
-def _description(trained: TrainedNetwork[SetNetwork], camera: PinholeCamera) -> dict[str, Any]:
-    """Describe camera, inputs and training range of a network for robot.json."""
-    training_range = trained.training_range or TrainingRange.of_camera(trained.camera)
+def _description(trained: TrainedNetwork[SetNetwork], camera: PinholeCamera, accuracy: Accuracy) -> dict[str, Any]:
+    """Describe camera, inputs, accuracy and training range of a network for robot.json."""
+    training_range = trained.range_at(accuracy)
     return {
         "format_version": FORMAT_VERSION,
         "wheretolook": VERSION,
@@ -89,6 +97,7 @@ def _description(trained: TrainedNetwork[SetNetwork], camera: PinholeCamera) -> 
         "attributes": list(trained.network.attributes),
         "map_attributes": list(MAP_ATTRIBUTES),
         "most": MAX_LANDMARKS,
+        "accuracy": list(accuracy),
         "range": training_range.record(),
         "serves_camera": bool(training_range.contains(camera_quantities(camera)[None])[0]),
     }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from copy import deepcopy
+from math import sqrt
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import logsigmoid
 
+from wheretolook.dataset.thresholds import Accuracy
+from wheretolook.scorers.set.accuracy import AccuracyModel
 from wheretolook.scorers.set.network import CELLS, SetNetwork
 from wheretolook.training.trained_network import TrainedNetwork
 
@@ -39,17 +42,42 @@ def pose_variances(information: Tensor) -> tuple[Tensor, Tensor]:
     return (rows[:, :, 6:] * unit).sum(-1), log_det
 
 
+TAIL = (
+    0.17087277,
+    -0.82215223,
+    1.48851587,
+    -1.13520398,
+    0.27886807,
+    -0.18628806,
+    0.09678418,
+    0.37409196,
+    1.00002368,
+    -1.95865941,
+)
+"""Polynomial in the log of half the complementary error function, within 1.2e-7 (Numerical Recipes in C, 6.2)."""
+
+
+def log_ndtr(x: Tensor) -> Tensor:
+    """Return the log of the standard normal distribution function at x (...), which ONNX lacks."""
+    t = 1 / (1 + x.abs() / sqrt(8))
+    polynomial = torch.zeros_like(t)
+    for coefficient in TAIL:
+        polynomial = polynomial * t + coefficient
+    below = t.log() - x * x / 2 + polynomial  # at -|x|
+    return torch.where(x > 0, torch.log1p(-below.exp()), below)
+
+
 class RobotNetwork(nn.Module):
-    """A calibrated set network on views padded with landmarks that are not theirs."""
+    """A calibrated set network, with probabilities at an accuracy, on views padded with landmarks that are not theirs."""
 
     borders: Tensor
 
-    def __init__(self, trained: TrainedNetwork[SetNetwork]) -> None:
+    def __init__(self, trained: TrainedNetwork[SetNetwork], accuracy: Accuracy) -> None:
         super().__init__()
+        self.trained = trained
+        self.accuracy = accuracy
         self.network = deepcopy(trained.network).cpu().eval()
         self.network.pose_variances = pose_variances
-        self.scale = trained.scale
-        self.offset = trained.offset
         # tangents of the borders of the cells, rounded up, so that no rounding of an arctangent decides
         exact = np.tan((np.arange(1, CELLS) / CELLS - 0.5) * np.pi)
         single = exact.astype(np.float32)
@@ -75,9 +103,14 @@ class RobotNetwork(nn.Module):
         own = torch.arange(values.shape[1]) < n_sampled[:, None]
         each = (n_visible.double() / n_sampled.clamp(min=1))[:, None]  # visible landmarks per sampled one
         sums = (network.parts(values, log_odds).double() * own[..., None]).sum(1) * each
-        cells = self._expected_cells(values, log_odds, own, each) if network.needs_cells else None
-        logits = network.logits(sums, n_visible, axis_height, cells)
-        return torch.sigmoid(logits.double() * self.scale + self.offset), sums[:, 0].float()
+        is_own = self.accuracy == self.trained.accuracy
+        cells = self._expected_cells(values, log_odds, own, each) if network.needs_cells or not is_own else None
+        view = sums, n_visible, axis_height, cells
+        probability = self.trained.calibrated(network.logits(*view).double()).sigmoid()
+        if not is_own:
+            known = self.trained.accuracy, probability, network.statistics_of(*view).double()
+            probability = AccuracyModel.bundled().at(self.accuracy, *known, torch, log_ndtr)
+        return probability, sums[:, 0].float()
 
     def _expected_cells(self, values: Tensor, log_odds: Tensor, own: Tensor, each: Tensor) -> Tensor:
         """Compute `expected_cells` (B,) of padded views."""
@@ -91,15 +124,15 @@ class RobotNetwork(nn.Module):
         return (1 - (log_missed * each).exp()).sum(1)
 
 
-def set_graph(trained: TrainedNetwork[SetNetwork]) -> Any:
-    """Return the `onnx.ModelProto` of a calibrated set network; inputs and outputs are those of `RobotNetwork`."""
+def set_graph(trained: TrainedNetwork[SetNetwork], accuracy: Accuracy) -> Any:
+    """Return the `onnx.ModelProto` of a `RobotNetwork`, with its inputs and outputs."""
     example = (torch.zeros(2, 3, len(trained.network.attributes)), torch.tensor([3, 2]), torch.tensor([5, 2]))
     axes = {name: {0: "B"} for name in (*INPUTS, *OUTPUTS)}
     axes["values"] = {0: "B", 1: "K"}
     file: Any = io.BytesIO()
     with warnings.catch_warnings(action="ignore"):  # the default exporter needs another package
         torch.onnx.export(
-            RobotNetwork(trained),
+            RobotNetwork(trained, accuracy),
             (*example, torch.zeros(2)),
             file,
             dynamo=False,

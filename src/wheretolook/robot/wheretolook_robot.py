@@ -3,15 +3,16 @@
 This file needs NumPy and onnxruntime, neither PyTorch nor the rest of wheretolook. `wheretolook export --map SPARSE
 --out FOLDER` writes it together with the files it reads:
 
-    scorer.onnx     network from the visible landmarks of a view to the probability that the view localizes
+    scorer.onnx     network from the visible landmarks of a view to the probability that the view localizes within
+                    the accuracy in robot.json
     landmarks.npz   map with N landmarks:
         points      (N, 3) float64, metres in the world
         directions  (N, 3) float32, unit mean direction from the mapping cameras to the landmark, in the world
         attributes  (N, M) float32, attributes of each landmark; NaN if unknown
         places      (L, 3) float64, locations with known occlusion; L = 0 without
         unoccluded  (L, ceil(N / 8)) uint8, bits packed by `numpy.packbits`: 1 if the landmark is unoccluded
-    robot.json      camera, names of the attributes, range of the training views, and the similarity from the map's own
-                    frame to the world
+    robot.json      camera, accuracy in metres and degrees, names of the attributes, range of the training views, and
+                    the similarity from the map's own frame to the world
 
 Usage, in that folder:
 

@@ -85,7 +85,7 @@ class BinnedNetworkScorer(BinnedScorer):
         self.name = trained.method
         self.trained = trained
         self.training_range = trained.training_range or TrainingRange({})
-        self._watch = RangeWatch(self.training_range)
+        self._watch = RangeWatch(bool(self.training_range.bounds))
         self.network: Any = network.to(self.device).eval()
         pixels = {"u": trained_camera.width / camera.width, "v": trained_camera.height / camera.height}
         scales = [pixels.get(name, 1.0) for name in self.channels]
@@ -94,7 +94,7 @@ class BinnedNetworkScorer(BinnedScorer):
     def score_bins(self, binned: BinnedViews) -> Float:
         """(B,) probabilities in [0, 1]."""
         if self._watch.watching and "z" in binned.channels:
-            self._watch.check(self.name, [_depths(binned)])
+            self._watch.check(self.name, self.training_range, [_depths(binned)])
         binned = binned if binned.channels == self.channels else binned.select(self.channels)
         scores = np.empty(len(binned))
         block = self.network.scored_at_once

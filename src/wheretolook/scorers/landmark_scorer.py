@@ -38,8 +38,7 @@ class LandmarkScorer(Scorer):
         self.describer = LandmarkDescriber(localization_map, attributes)
         self._of_camera = camera_quantities(localization_map.camera)
         self._serves_camera = bool(self.training_range.contains(self._of_camera[None])[0])
-        watching = self.training_range.bounds_landmarks or not self._serves_camera
-        self._watch = RangeWatch(self.training_range, watching)
+        self._watch = RangeWatch(self.training_range.bounds_landmarks or not self._serves_camera)
 
     def in_range(self, cam_from_world: Float) -> NDArray[np.bool_]:
         """Return which poses (B, 3, 4) have views like the training views, (B,) bool."""

@@ -59,6 +59,11 @@ class TrainedNetwork(Generic[NetworkT]):
         """Return calibrated log-odds of the network's logits, in the same shape and precision."""
         return self.scale * logits + self.offset
 
+    def range_at(self, accuracy: Accuracy) -> TrainingRange:
+        """Return the range of scores at an accuracy; without a stored one, that of the training camera."""
+        known = self.training_range or TrainingRange.of_camera(self.camera)
+        return known.at_accuracy(accuracy[0] / self.accuracy[0])
+
     def save(self, path: Path, training: Mapping[str, Any] | None = None) -> None:
         """Write one safetensors file, atomically, with JSON values about the training in its header."""
         header = self.network.description()

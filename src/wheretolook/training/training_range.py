@@ -75,6 +75,19 @@ class TrainingRange:
         bounds = dict(record)
         return cls({name: (float(bounds[name][0]), float(bounds[name][1])) for name in QUANTITIES if name in bounds})
 
+    def at_accuracy(self, ratio: float) -> TrainingRange:
+        """Return the range for an accuracy `ratio` times that of the training labels.
+
+        Errors grow with distance, so a finer accuracy is in range up to distances as many times shorter. A coarser one
+        does not extend the range: spaces of that size are not covered.
+        """
+        bounds = dict(self.bounds)
+        for name in bounds.keys() & DISTANCES:
+            low, high = bounds[name]
+            farthest = high * min(ratio, 1.0)
+            bounds[name] = min(low, farthest), farthest
+        return TrainingRange(bounds)
+
     def record(self) -> dict[str, list[float]]:
         """Return the bounds as JSON values."""
         return {name: list(bounds) for name, bounds in self.bounds.items()}
@@ -113,25 +126,24 @@ class TrainingRange:
             if outside[:, column].any():
                 low, high = self.bounds[name]
                 value = np.median(with_landmarks[outside[:, column], column])
-                parts.append(f"{text.format(value)} (trained on: {low:.3g} to {high:.3g})")
+                parts.append(f"{text.format(value)} (in range: {low:.3g} to {high:.3g})")
         return f"{n_outside} of {len(outside)} views are unlike the training views: {', '.join(parts)}"
 
 
+@dataclass
 class RangeWatch:
     """Checks scored views until it has warned; `watching` is whether there is anything left to check."""
 
-    def __init__(self, training_range: TrainingRange, watching: bool = True) -> None:
-        self.training_range = training_range
-        self.watching = watching and bool(training_range.bounds)
+    watching: bool
 
-    def check(self, name: str, quantities: Sequence[Float]) -> None:
+    def check(self, name: str, training_range: TrainingRange, quantities: Sequence[Float]) -> None:
         """Warn once, with an `OutOfRangeWarning`, if too many views of `quantities`, parts (B, 6), are out of range.
 
         The warning points to the caller of the calling function.
         """
         if not self.watching or not quantities:
             return
-        if complaint := self.training_range.complaint(np.concatenate(quantities), TOLERATED):
+        if complaint := training_range.complaint(np.concatenate(quantities), TOLERATED):
             self.watching = False
             text = f"{name}: {complaint}. Their scores are less reliable; Scorer.in_range returns which."
             warnings.warn(text, OutOfRangeWarning, stacklevel=3)

@@ -103,7 +103,7 @@ class ExpectedScorer(LandmarkScorer):
     def score(self, cam_from_world: Float) -> Float:
         """Return (B,) in [0, 1]; metrics of information are not bounded by 1."""
         sums = self._expectation.sums(self.describer, cam_from_world)
-        self._watch.check(self.name, [self._expectation.quantities])
+        self._watch.check(self.name, self.training_range, [self._expectation.quantities])
         if self.kind == "bins":
             return sums[:, 16] / BINS**2
         if self.kind == "inliers":

@@ -30,7 +30,6 @@ from wheretolook.geometry.poses import Float
 from wheretolook.scorers.set.network import ALL_STATISTICS, SetNetwork
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import WeightsError
-from wheretolook.utils.probability import finite_log_odds
 from wheretolook.utils.reading import read_json_object
 from wheretolook.utils.shipped_model import LogisticRegression
 
@@ -47,13 +46,17 @@ class LogError:
 STATISTICS = ("log_visible", "log_orientation_variance", "log_expected_cells")
 """Features of the errors. None depends on the unit of length: errors scale with the deviation of the position."""
 
-FEATURES = [ALL_STATISTICS.index(name) for name in STATISTICS]
+FEATURES = [ALL_STATISTICS.index(name) for name in (*STATISTICS, "log_position_variance")]
+ORIENTATION = ALL_STATISTICS.index("log_orientation_variance")
 MARGIN = 1e-5  # of probabilities from 0 and 1, so that their log-odds are finite
 
 
 @dataclass(frozen=True)
 class AccuracyModel(LogisticRegression):
-    """Both factors."""
+    """Both factors.
+
+    Methods take arrays, or tensors if `xp` is torch instead of NumPy.
+    """
 
     names = ("log_odds", "log_orientation_variance")
     about = "the accuracy of views"
@@ -83,37 +86,47 @@ class AccuracyModel(LogisticRegression):
     def _deviations(self) -> Float:
         return np.array([error.deviation for error in self.errors])
 
-    def p_right_place(self, own: Float, statistics: Float) -> Float:
+    def p_right_place(self, own: Any, statistics: Any, xp: Any = np) -> Any:
         """Return P(right place) (B,) of views with the network's probabilities (B,) and `ALL_STATISTICS` (B, S)."""
-        variance = statistics[:, ALL_STATISTICS.index("log_orientation_variance")]
-        return self.predict_proba(np.stack([finite_log_odds(own, MARGIN), variance], axis=-1))
+        finite = xp.clip(own, MARGIN, 1 - MARGIN)
+        of_odds, of_variance = self.weights
+        log_odds = of_odds * xp.log(finite / (1 - finite)) + of_variance * statistics[:, ORIENTATION] + self.bias
+        return 1 / (1 + xp.exp(-log_odds))
 
-    def log_errors(self, statistics: Float) -> Float:
+    def log_errors(self, statistics: Any, xp: Any = np) -> Any:
         """Return the means (B, 2) of the logs of the errors (m, degrees) at the right place."""
-        weights = np.array([error.weights for error in self.errors])
-        means = statistics[:, FEATURES] @ weights.T + [error.bias for error in self.errors]
-        means[:, 0] += statistics[:, ALL_STATISTICS.index("log_position_variance")] / 2
-        return np.asarray(means)
+        weights = np.array([(*error.weights, power) for error, power in zip(self.errors, (0.5, 0.0), strict=True)])
+        biases = np.array([error.bias for error in self.errors])
+        return statistics[:, FEATURES] @ xp.asarray(weights.T) + xp.asarray(biases)
 
     def expected_errors(self, statistics: Float) -> Float:
         """Return the expected errors (B, 2) at the right place, in metres and degrees."""
         return np.asarray(np.exp(self.log_errors(statistics) + self._deviations**2 / 2))
 
-    def log_p_within(self, statistics: Float, accuracy: Accuracy) -> Float:
-        """Return the log (B,) of F at an accuracy."""
-        return np.asarray(log_ndtr((np.log(accuracy) - self.log_errors(statistics)) / self._deviations).min(axis=-1))
+    def quantiles(self, statistics: Any, accuracy: Accuracy, xp: Any = np) -> Any:
+        """Return the quantiles (B,) of the standard normal distribution that have the probability F at an accuracy."""
+        off = xp.asarray(np.log(accuracy)) - self.log_errors(statistics, xp)
+        return xp.amin(off / xp.asarray(self._deviations), -1)
 
-    def at(self, accuracy: Accuracy, own: Accuracy, probability: Float, statistics: Float) -> Float:
-        """Return probabilities (B,) at an accuracy from those (B,) at a network's own accuracy, and `ALL_STATISTICS`."""
-        asked, known = (self.log_p_within(statistics, limits) for limits in (accuracy, own))
-        place = np.maximum(probability, self.p_right_place(probability, statistics))
-        missed = np.expm1(np.minimum(known, -np.finfo(float).tiny))
-        share = 1 - np.expm1(np.maximum(asked, known)) / missed
-        return np.where(
-            asked <= known,
-            probability * np.exp(np.minimum(asked - known, 0)),
-            probability + (place - probability) * share,
-        )
+    def at(
+        self,
+        accuracy: Accuracy,
+        own: Accuracy,
+        probability: Any,
+        statistics: Any,
+        xp: Any = np,
+        log_cdf: Any = log_ndtr,
+    ) -> Any:
+        """Return probabilities (B,) at an accuracy from those (B,) at a network's own accuracy, and `ALL_STATISTICS`.
+
+        `log_cdf` is the log of the standard normal distribution function.
+        """
+        asked, known = (self.quantiles(statistics, limits, xp) for limits in (accuracy, own))
+        place = xp.maximum(probability, self.p_right_place(probability, statistics, xp))
+        # one of both is neutral: 1 from the network's own accuracy on, 0 up to it
+        factor = xp.exp(log_cdf(xp.minimum(asked, known)) - log_cdf(known))
+        share = 1 - xp.exp(log_cdf(-xp.maximum(asked, known)) - log_cdf(-known))
+        return probability * factor + (place - probability) * share
 
 
 def probabilities(
@@ -131,7 +144,7 @@ def probabilities(
     if accuracy == trained.accuracy:
         return own
     statistics = statistics_of(trained.network, sums, n_visible, axis_height, cells)
-    return AccuracyModel.bundled().at(accuracy, trained.accuracy, own, statistics)
+    return np.asarray(AccuracyModel.bundled().at(accuracy, trained.accuracy, own, statistics))
 
 
 def statistics_of(network: SetNetwork, *view: Tensor) -> Float:

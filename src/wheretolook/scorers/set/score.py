@@ -57,6 +57,7 @@ class SetScorer(LandmarkScorer):
         scorer.accuracy = checked_accuracy(accuracy)
         own = scorer.accuracy == self.trained.accuracy
         scorer.name = self.trained.method if own else f"{self.trained.method} {threshold_key(accuracy)}"
+        scorer.training_range = self.trained.range_at(scorer.accuracy)
         scorer._batched = None
         return scorer
 
@@ -70,7 +71,7 @@ class SetScorer(LandmarkScorer):
             scores[rows] = probabilities(
                 self.trained, self.accuracy, *self._sums(cam_from_world[rows], described, n_visible)
             )
-        self._watch.check(self.name, quantities)
+        self._watch.check(self.name, self.training_range, quantities)
         return scores
 
     def report(self, cam_from_world: Float) -> ViewReport:

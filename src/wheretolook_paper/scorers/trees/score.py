@@ -35,5 +35,5 @@ class TreesScorer(LandmarkScorer):
             quantities += self._quantities(described, described.counts)
             pooled = pool(described, block, self.localization_map.camera)
             scores[begin : begin + BLOCK] = expit(self.trees.logits(pooled.cpu().numpy()))
-        self._watch.check(self.name, quantities)
+        self._watch.check(self.name, self.training_range, quantities)
         return scores

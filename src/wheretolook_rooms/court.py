@@ -7,14 +7,12 @@ import numpy as np
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook_rooms import decor, furniture, large, materials
 from wheretolook_rooms.large import Furnished
-from wheretolook_rooms.layout import Lamp, Layout
+from wheretolook_rooms.layout import Layout
 from wheretolook_rooms.materials import Material
 from wheretolook_rooms.patches import Patch, box, move, plane
 from wheretolook_rooms.plan import Opening, Plan
 from wheretolook_rooms.shell import REVEAL_M, Finish, build_shell, reveal, wall_items
 from wheretolook_rooms.style import ACCENTS, WALLS, Style
-
-SUN_M = 300.0  # distance of the lamp that is the sun
 
 
 def court(config: ApartmentConfig, seed: int) -> Furnished:
@@ -57,7 +55,7 @@ def court(config: ApartmentConfig, seed: int) -> Furnished:
     large.hang_pictures(style, layout, round(width / 4 * config.texture_richness), (0.8, 2.5), 1.8)
     patches = shell + windows + layout.placed(height)
     sky = large.sky(room.width, room.depth, height)
-    return Furnished(patches, _sun(rng), [(sky, False)], rng, periods_m=(1.0, 6.0), light_spacing_m=0.3)
+    return Furnished(patches, large.sun(rng), [(sky, False)], rng, periods_m=(1.0, 6.0), light_spacing_m=0.3)
 
 
 def _facade(style: Style) -> Material:
@@ -88,15 +86,3 @@ def _bed(style: Style) -> list[Patch]:
     """A raised flower bed with a tall plant."""
     plant = decor.plant(style, float(style.rng.uniform(1.5, 3)), 30, 0.9)
     return large.pool(style, 0, 0, 1.0) + move(plant, shift=(0, 0, 0.45))
-
-
-def _sun(rng: np.random.Generator) -> list[Lamp]:
-    """The sun, or on half of the days none."""
-    azimuth = rng.uniform(0, 2 * np.pi)
-    elevation = rng.uniform(0.6, 1.3)
-    if rng.random() < 0.5:
-        return []
-    x = SUN_M * np.cos(elevation) * np.cos(azimuth)
-    y = SUN_M * np.cos(elevation) * np.sin(azimuth)
-    red, green, blue = (strength * SUN_M**2 for strength in (8.0, 7.4, 6.4))
-    return [Lamp((float(x), float(y), float(SUN_M * np.sin(elevation))), 0, (red, green, blue))]

@@ -18,11 +18,11 @@ from wheretolook_rooms.style import ACCENTS, WALLS, Style
 def court(config: ApartmentConfig, seed: int) -> Furnished:
     """A court of 12 to 40 m between facades of two to four storeys, drawn from the seed."""
     rng = np.random.default_rng([seed, 5])
-    width = float(rng.uniform(12, 40))
-    storey = float(rng.uniform(2.9, 3.6))
+    width = rng.uniform(12, 40)
+    storey = rng.uniform(2.9, 3.6)
     n_storeys = int(rng.integers(2, 5))
     height = storey * n_storeys
-    room = large.one_room(width, float(rng.uniform(0.5, 1)) * width)
+    room = large.one_room(width, rng.uniform(0.5, 1) * width)
     style = Style(rng, config.texture_richness, config.clutter)
     stone = materials.plain(rng, (0.78, 0.76, 0.71), shared=True)
     ground = (
@@ -34,8 +34,8 @@ def court(config: ApartmentConfig, seed: int) -> Furnished:
     glass = [materials.plain(rng, colour, mottle=0.04) for colour in ((0.1, 0.12, 0.15), (0.2, 0.23, 0.26))]
     glass.append(materials.fabric(rng, (0.75, 0.72, 0.65), second=(0.6, 0.58, 0.5), pattern="stripes"))
     for side in range(4):
-        bay = float(rng.uniform(2.6, 4.5))
-        opening = float(rng.uniform(0.3, 0.5)) * bay
+        bay = rng.uniform(2.6, 4.5)
+        opening = rng.uniform(0.3, 0.5) * bay
         for floor in range(0 if style.bernoulli(0.5) else 1, n_storeys):
             large.add_windows(room, side, bay, opening, floor * storey + 0.9, (floor + 0.8) * storey)
         for o in room.openings[side]:
@@ -84,5 +84,5 @@ def _window(style: Style, o: Opening, stone: Material, glass: Material) -> list[
 
 def _bed(style: Style) -> list[Patch]:
     """A raised flower bed with a tall plant."""
-    plant = decor.plant(style, float(style.rng.uniform(1.5, 3)), 30, 0.9)
+    plant = decor.plant(style, style.rng.uniform(1.5, 3), 30, 0.9)
     return large.pool(style, 0, 0, 1.0) + move(plant, shift=(0, 0, 0.45))

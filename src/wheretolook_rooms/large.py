@@ -65,13 +65,13 @@ def large_pattern(style: Style) -> Material:
     rng = style.rng
     colour = materials.vary(rng, style.pick(WALLS), 0.06)
     second = materials.vary(rng, style.pick(FRONTS), 0.06)
-    side = float(rng.uniform(0.8, 2.5))
+    side = rng.uniform(0.8, 2.5)
     if style.bernoulli(0.3):
         return materials.wallpaper(rng, colour, second, period_m=side, motif=True)
-    size = (side, side * float(rng.uniform(0.5, 1)))
+    size = (side, side * rng.uniform(0.5, 1))
     every = int(rng.integers(2, 6)) if style.bernoulli(0.5) else 0
     chequered = second if style.bernoulli(0.4) else None
-    veins = style.richness * float(rng.uniform(0.5, 2))
+    veins = style.richness * rng.uniform(0.5, 2)
     brick = style.bernoulli(0.4)
     grout = (0.5, 0.49, 0.47)
     return materials.tiles(

@@ -27,13 +27,12 @@ def changed(furnished: Furnished, strength: float, seed: int) -> Furnished:
     that only the light in the texture differs. Removed ones have no triangles.
     """
     rng = np.random.default_rng([seed, 8])
-    patches = _rearranged(furnished.patches, strength, rng)
     lamps: list[Lamp] = []
     for lamp in furnished.lamps:
         if lamp.position[2] < large.SUN_M / 2:
             red, green, blue = np.exp(1.5 * strength * rng.normal()) * np.array(lamp.colour)
             lamps.append(replace(lamp, colour=(red, green, blue)))
-    return replace(furnished, patches=patches, lamps=lamps or large.sun(rng))
+    return replace(furnished, patches=_rearranged(furnished.patches, strength, rng), lamps=lamps or large.sun(rng))
 
 
 def _rearranged(patches: Sequence[Patch], strength: float, rng: np.random.Generator) -> list[Patch]:
@@ -65,8 +64,8 @@ def _moved(piece: list[Patch], others: Float, rng: np.random.Generator) -> list[
     others = others[((low < others[:, 1] + reach) & (others[:, 0] < high + reach)).all(1)]
     flat = others[(np.abs(others[..., 2] - low[2]) < GAP_M).all(1), :, :2]
     for _ in range(TRIES):
-        to = middle + rng.uniform(-REACH_M, REACH_M)
-        moved = move(move(piece, shift=-middle), angle_rad=rng.normal(0, TURN_RAD), shift=to)
+        turn = rng.normal(0, TURN_RAD)
+        moved = move(move(piece, shift=-middle), angle_rad=turn, shift=middle + rng.uniform(-REACH_M, REACH_M))
         bounds = _bounds(moved)
         stands = (flat[:, 0] < bounds.min((0, 1))[:2]) & (bounds.max((0, 1))[:2] < flat[:, 1])
         overlaps = (bounds[:, None, 0] + GAP_M < others[:, 1]) & (others[:, 0] + GAP_M < bounds[:, None, 1])

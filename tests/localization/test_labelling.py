@@ -11,6 +11,8 @@ import pytest
 
 from localization.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, file_bytes, label, map_room, times
 from one_scene import label_viewpoints
+from wheretolook.commands.scenes import Scenes
+from wheretolook.commands.scenes_config import MeshSource, ScenesConfig
 from wheretolook.dataset.viewpoint_files import FIRST_FIELDS, SCHEMA, read_table, write_table
 from wheretolook.dataset.viewpoint_table import LOCALIZED, by_first, is_good, poses
 from wheretolook.features.keypoints import Keypoints
@@ -24,7 +26,7 @@ from wheretolook.localization.shard import label_rows
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh, save_glb
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.errors import ConfigError, SceneError
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -207,6 +209,16 @@ def test_half_of_the_locations_show_the_changed_mesh(room: MappedRoom, tmp_path:
     pd.testing.assert_frame_equal(labelled[~is_changed].drop(columns="changes"), alone, check_dtype=False)
     again = label_rows(labelled, WarpRenderer(mesh), localizer, CAMERA)
     assert "changes" not in again and is_good(again).all()
+
+
+def test_scenes_from_files_do_not_change(room: MappedRoom, tmp_path: Path) -> None:
+    loaded = ScenesConfig(train=0, test=0, meshes=(MeshSource(room.mesh, name="room"),))
+    scenes = Scenes(name="own", data=tmp_path, device="cpu", scenes=loaded)
+    (files,) = scenes.run(log=lambda line: None).scenes
+    with pytest.raises(SceneError, match=r"label\.changes") as error:
+        scenes.change(files, 0.5)
+    assert error.value.path == files.folder and "label.changes 0" in error.value.fix
+    assert not (files.folder / "changed.glb").exists()
 
 
 @pytest.mark.parametrize("strength", [-0.1, 1.01, np.nan])

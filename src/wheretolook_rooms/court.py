@@ -7,24 +7,22 @@ import numpy as np
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook_rooms import decor, furniture, large, materials
 from wheretolook_rooms.large import Furnished
-from wheretolook_rooms.layout import Lamp, Layout
+from wheretolook_rooms.layout import Layout
 from wheretolook_rooms.materials import Material
 from wheretolook_rooms.patches import Patch, box, move, plane
 from wheretolook_rooms.plan import Opening, Plan
 from wheretolook_rooms.shell import REVEAL_M, Finish, build_shell, reveal, wall_items
 from wheretolook_rooms.style import ACCENTS, WALLS, Style
 
-SUN_M = 300.0  # distance of the lamp that is the sun
-
 
 def court(config: ApartmentConfig, seed: int) -> Furnished:
     """A court of 12 to 40 m between facades of two to four storeys, drawn from the seed."""
     rng = np.random.default_rng([seed, 5])
-    width = float(rng.uniform(12, 40))
-    storey = float(rng.uniform(2.9, 3.6))
+    width = rng.uniform(12, 40)
+    storey = rng.uniform(2.9, 3.6)
     n_storeys = int(rng.integers(2, 5))
     height = storey * n_storeys
-    room = large.one_room(width, float(rng.uniform(0.5, 1)) * width)
+    room = large.one_room(width, rng.uniform(0.5, 1) * width)
     style = Style(rng, config.texture_richness, config.clutter)
     stone = materials.plain(rng, (0.78, 0.76, 0.71), shared=True)
     ground = (
@@ -36,8 +34,8 @@ def court(config: ApartmentConfig, seed: int) -> Furnished:
     glass = [materials.plain(rng, colour, mottle=0.04) for colour in ((0.1, 0.12, 0.15), (0.2, 0.23, 0.26))]
     glass.append(materials.fabric(rng, (0.75, 0.72, 0.65), second=(0.6, 0.58, 0.5), pattern="stripes"))
     for side in range(4):
-        bay = float(rng.uniform(2.6, 4.5))
-        opening = float(rng.uniform(0.3, 0.5)) * bay
+        bay = rng.uniform(2.6, 4.5)
+        opening = rng.uniform(0.3, 0.5) * bay
         for floor in range(0 if style.bernoulli(0.5) else 1, n_storeys):
             large.add_windows(room, side, bay, opening, floor * storey + 0.9, (floor + 0.8) * storey)
         for o in room.openings[side]:
@@ -57,7 +55,7 @@ def court(config: ApartmentConfig, seed: int) -> Furnished:
     large.hang_pictures(style, layout, round(width / 4 * config.texture_richness), (0.8, 2.5), 1.8)
     patches = shell + windows + layout.placed(height)
     sky = large.sky(room.width, room.depth, height)
-    return Furnished(patches, _sun(rng), [(sky, False)], rng, periods_m=(1.0, 6.0), light_spacing_m=0.3)
+    return Furnished(patches, large.sun(rng), [(sky, False)], rng, periods_m=(1.0, 6.0), light_spacing_m=0.3)
 
 
 def _facade(style: Style) -> Material:
@@ -86,17 +84,5 @@ def _window(style: Style, o: Opening, stone: Material, glass: Material) -> list[
 
 def _bed(style: Style) -> list[Patch]:
     """A raised flower bed with a tall plant."""
-    plant = decor.plant(style, float(style.rng.uniform(1.5, 3)), 30, 0.9)
+    plant = decor.plant(style, style.rng.uniform(1.5, 3), 30, 0.9)
     return large.pool(style, 0, 0, 1.0) + move(plant, shift=(0, 0, 0.45))
-
-
-def _sun(rng: np.random.Generator) -> list[Lamp]:
-    """The sun, or on half of the days none."""
-    azimuth = rng.uniform(0, 2 * np.pi)
-    elevation = rng.uniform(0.6, 1.3)
-    if rng.random() < 0.5:
-        return []
-    x = SUN_M * np.cos(elevation) * np.cos(azimuth)
-    y = SUN_M * np.cos(elevation) * np.sin(azimuth)
-    red, green, blue = (strength * SUN_M**2 for strength in (8.0, 7.4, 6.4))
-    return [Lamp((float(x), float(y), float(SUN_M * np.sin(elevation))), 0, (red, green, blue))]

@@ -8,7 +8,7 @@ import numpy as np
 
 from wheretolook_rooms import artwork, materials
 from wheretolook_rooms.materials import Material
-from wheretolook_rooms.patches import Patch, box, cushion, cylinder, lathe, move, plane, slab_between, tube
+from wheretolook_rooms.patches import Patch, box, cushion, cylinder, lathe, movable, move, plane, slab_between, tube
 from wheretolook_rooms.style import Style
 
 
@@ -30,12 +30,14 @@ def books_in_row(style: Style, length: float, height: float, depth: float) -> li
         printed = style.bernoulli(0.35 + 0.6 * style.richness)
         spine = artwork.book_spine(rng, colour) if printed else materials.plain(rng, colour)
         cover = style.pick(style.covers)
-        book = box((x, 0, 0), (x + width - 0.001, deep, tall), cover, faces={"front": spine, "top": style.paper})
+        faces = {"front": spine, "top": style.paper}
+        book = movable(box)((x, 0, 0), (x + width - 0.001, deep, tall), cover, faces=faces)
         book[0] = replace(book[0], density=1.9)
         patches += book
         x += width
 
 
+@movable
 def book_stack(style: Style, count: int) -> list[Patch]:
     """Books or magazines lying on each other, covers up."""
     rng = style.rng
@@ -52,6 +54,7 @@ def book_stack(style: Style, count: int) -> list[Patch]:
     return patches
 
 
+@movable
 def bottle(style: Style, height: float) -> list[Patch]:
     """Bottle or jar with a label."""
     rng = style.rng
@@ -67,6 +70,7 @@ def bottle(style: Style, height: float) -> list[Patch]:
     return lathe(profile, glass, sides=14) + lathe(label, artwork.package(rng), sides=14, density=2.0)
 
 
+@movable
 def package(style: Style) -> list[Patch]:
     """Cardboard box with a printed front."""
     rng = style.rng
@@ -78,6 +82,7 @@ def package(style: Style) -> list[Patch]:
     return box((-w / 2, -d / 2, 0), (w / 2, d / 2, h), cover, faces=faces, density=1.8)
 
 
+@movable
 def bowl(style: Style, radius: float, fruit: bool) -> list[Patch]:
     """Open bowl, with oranges or apples if asked for."""
     rng = style.rng
@@ -103,6 +108,7 @@ def sphere(centre: tuple[float, float, float], radius: float, material: Material
     return lathe(profile, material, sides=14, centre=centre)
 
 
+@movable
 def vase(style: Style, height: float) -> list[Patch]:
     """Closed vase with a belly."""
     rng = style.rng
@@ -116,6 +122,7 @@ def vase(style: Style, height: float) -> list[Patch]:
     return lathe(profile, glaze, sides=20, density=1.4)
 
 
+@movable
 def plant(style: Style, height: float, leaves: int, reach_m: float) -> list[Patch]:
     """Potted plant: stems with curved, two-sided leaves, none of which reaches further than `reach_m` to the side."""
     rng = style.rng
@@ -155,6 +162,7 @@ def plant(style: Style, height: float, leaves: int, reach_m: float) -> list[Patc
     return patches
 
 
+@movable
 def picture_frame(style: Style, width: float, height: float) -> list[Patch]:
     """Framed picture: back at y = 0, centred on the origin in x and z."""
     depth = 0.025
@@ -192,6 +200,7 @@ def floor_lamp(style: Style, lit: bool) -> list[Patch]:
     return stand + shade(style, 0.22, 0.28, 1.38, lit)
 
 
+@movable
 def pillow(style: Style, material: Material, size: float) -> list[Patch]:
     """Square pillow standing on its edge, front to +y."""
     half = size / 2
@@ -200,6 +209,7 @@ def pillow(style: Style, material: Material, size: float) -> list[Patch]:
     return cushion((-half, 0, 0), (half, thick, size), material, radius_m=0.03, puff=puff, span=6, hidden=())
 
 
+@movable
 def coat(style: Style) -> list[Patch]:
     """A garment hanging from z = 0 downwards, back at y = 0."""
     rng = style.rng

@@ -8,7 +8,7 @@ import numpy as np
 
 from wheretolook_rooms import artwork, decor, materials
 from wheretolook_rooms.materials import Material
-from wheretolook_rooms.patches import Patch, box, cushion, move, slab_between, tilted_back, tube
+from wheretolook_rooms.patches import Patch, box, cushion, movable, move, slab_between, tilted_back, tube
 from wheretolook_rooms.style import Style
 
 WALL_SIDE = ("back", "bottom")
@@ -29,6 +29,7 @@ def legs(
     return patches
 
 
+@movable
 def sofa(style: Style, seats: int) -> list[Patch]:
     """Sofa or armchair: frame, arms, swelling seat and back cushions, a few pillows; 0.9 m deep."""
     rng = style.rng
@@ -71,6 +72,7 @@ def table(style: Style, width: float, depth: float, height: float, material: Mat
     return patches
 
 
+@movable
 def chair(style: Style, wooden: Material, cloth: Material) -> list[Patch]:
     """Dining chair, centred on the origin, its back towards -y."""
     patches = legs(0.36, -0.18, 0.18, 0.43, style.leg, radius=0.018, splay=0.02)

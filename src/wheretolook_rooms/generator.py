@@ -15,7 +15,7 @@ from wheretolook_rooms.building import building
 from wheretolook_rooms.court import court
 from wheretolook_rooms.furnishing import furnish
 from wheretolook_rooms.hall import hall
-from wheretolook_rooms.large import Furnished
+from wheretolook_rooms.large import Furnished, panes
 from wheretolook_rooms.layout import Lamp, Rectangle
 from wheretolook_rooms.materials import NoiseBank
 from wheretolook_rooms.office import office
@@ -23,6 +23,7 @@ from wheretolook_rooms.patches import Patch, join
 from wheretolook_rooms.plan import Plan, draw_plan
 from wheretolook_rooms.shell import build_shell
 from wheretolook_rooms.style import Style
+from wheretolook_rooms.variant import changed
 
 BRIGHTNESS = np.geomspace(0.12, 1.06, atlas.LEVELS)  # factors on the albedo of shared materials
 
@@ -39,31 +40,39 @@ def furnish_apartment(config: ApartmentConfig, seed: int) -> tuple[Plan, list[Pa
     return plan, patches + furniture, lamps, rng
 
 
+def apartment(config: ApartmentConfig, seed: int) -> Furnished:
+    """A furnished apartment, before it is painted and lit."""
+    floor_plan, patches, lamps, rng = furnish_apartment(config, seed)
+    windows = [(pane, floor_plan.rooms[pane.room].curtains_closed) for pane, _ in panes(patches)]
+    return Furnished(patches, lamps, windows, rng)
+
+
 def generate_apartment(config: ApartmentConfig, seed: int, device: str = "cpu") -> TexturedMesh:
     """A furnished apartment in metres, z up, floor at z = 0, centred on the origin; one texture with baked light.
 
     The same configuration and seed give the same bytes on the same device, "cpu" or a CUDA device for the light rays.
     Raises ConfigError if there is no such device, SceneError if the texture is too small for the apartment.
     """
-    config = config.of_seed(seed)
-    floor_plan, patches, lamps, rng = furnish_apartment(config, seed)
-    panes = [p for p in patches if p.material.emissive and p.material.casts_shadow]
-    windows = [(pane, floor_plan.rooms[pane.room].curtains_closed) for pane in panes]
-    return paint(Furnished(patches, lamps, windows, rng), config, seed, device)
+    return generate_scene("apartment", config, seed, device)[0]
 
 
 def generate_scene(
-    kind: SceneKind, config: ApartmentConfig, seed: int, device: str = "cpu"
+    kind: SceneKind, config: ApartmentConfig, seed: int, device: str = "cpu", changes: float = 0.0
 ) -> tuple[TexturedMesh, tuple[Rectangle, ...]]:
     """A scene of a kind, as `generate_apartment` makes them, and the floor that its map is to be made from.
 
+    With `changes`, 0 to 1, the same scene with things moved or removed and in other light; see `variant.changed`.
     The floor is a tuple of rectangles (x0, y0, x1, y1) in metres, empty where the whole scene is to be mapped. All
     kinds but apartments draw their size and difficulty from the seed, as apartments do that `vary`.
     """
     if kind == "apartment":
-        return generate_apartment(config, seed, device), ()
-    config = replace(replace(config, vary=True).of_seed(seed), enlarged=1.0)
-    furnished = {"hall": hall, "court": court, "office": office, "building": building}[kind](config, seed)
+        config = config.of_seed(seed)
+    else:
+        config = replace(replace(config, vary=True).of_seed(seed), enlarged=1.0)
+    make = {"apartment": apartment, "hall": hall, "court": court, "office": office, "building": building}
+    furnished = make[kind](config, seed)
+    if changes:
+        furnished = changed(furnished, changes, seed)
     # Light is computed more coarsely, as these scenes may have ten times the surface of an apartment.
     config = replace(config, light_spacing_m=max(config.light_spacing_m, furnished.light_spacing_m))
     return paint(furnished, config, seed, device), furnished.mapped

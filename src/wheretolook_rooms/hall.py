@@ -16,13 +16,13 @@ from wheretolook_rooms.style import WALLS, Style
 def hall(config: ApartmentConfig, seed: int) -> Furnished:
     """A hall of 14 to 40 m, 4 to 9 m high, drawn from the seed."""
     rng = np.random.default_rng([seed, 3])
-    width = float(rng.uniform(14, 40))
-    height = float(rng.uniform(4, 9))
-    room = large.one_room(width, float(rng.uniform(0.35, 0.8)) * width)
+    width = rng.uniform(14, 40)
+    height = rng.uniform(4, 9)
+    room = large.one_room(width, rng.uniform(0.35, 0.8) * width)
     style = Style(rng, config.texture_richness, config.clutter)
     for side in map(int, rng.permutation(4)[: rng.integers(1, 3)]):
-        bay = float(rng.uniform(3, 5))
-        large.add_windows(room, side, bay, bay * float(rng.uniform(0.4, 0.7)), 0.45 * height, 0.85 * height)
+        bay = rng.uniform(3, 5)
+        large.add_windows(room, side, bay, bay * rng.uniform(0.4, 0.7), 0.45 * height, 0.85 * height)
 
     plain = materials.plain(rng, materials.vary(rng, style.pick(WALLS), 0.03))
     walls = [large.large_pattern(style) if style.bernoulli(0.4 + 0.4 * style.richness) else plain for _ in range(4)]
@@ -44,7 +44,7 @@ def hall(config: ApartmentConfig, seed: int) -> Furnished:
 
 def _pillars(style: Style, layout: Layout, height: float) -> None:
     room = layout.room
-    half = float(style.rng.uniform(0.2, 0.45))
+    half = style.rng.uniform(0.2, 0.45)
     material = style.pick([large.large_pattern(style), style.front])
     nx = round(room.width / 7)
     ny = max(2, round(room.depth / 7))

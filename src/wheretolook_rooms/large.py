@@ -10,9 +10,11 @@ import numpy as np
 from wheretolook_rooms import artwork, decor, fixtures, furniture, materials
 from wheretolook_rooms.layout import Lamp, Layout, Rectangle
 from wheretolook_rooms.materials import Material
-from wheretolook_rooms.patches import Patch, box, move, plane
+from wheretolook_rooms.patches import Patch, box, movable, move, plane
 from wheretolook_rooms.plan import Opening, Room
 from wheretolook_rooms.style import FRONTS, WALLS, Style
+
+SUN_M = 300.0  # distance of the lamp that is the sun
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,13 +65,13 @@ def large_pattern(style: Style) -> Material:
     rng = style.rng
     colour = materials.vary(rng, style.pick(WALLS), 0.06)
     second = materials.vary(rng, style.pick(FRONTS), 0.06)
-    side = float(rng.uniform(0.8, 2.5))
+    side = rng.uniform(0.8, 2.5)
     if style.bernoulli(0.3):
         return materials.wallpaper(rng, colour, second, period_m=side, motif=True)
-    size = (side, side * float(rng.uniform(0.5, 1)))
+    size = (side, side * rng.uniform(0.5, 1))
     every = int(rng.integers(2, 6)) if style.bernoulli(0.5) else 0
     chequered = second if style.bernoulli(0.4) else None
-    veins = style.richness * float(rng.uniform(0.5, 2))
+    veins = style.richness * rng.uniform(0.5, 2)
     brick = style.bernoulli(0.4)
     grout = (0.5, 0.49, 0.47)
     return materials.tiles(
@@ -136,6 +138,7 @@ def hang_doors(style: Style, layout: Layout, count: int) -> None:
             layout.add_door(side, at - 0.475, at + 0.475, 2.1)
 
 
+@movable
 def block(style: Style, width: float, depth: float, height: float) -> list[Patch]:
     """A closed block with pictures on its front and back: a panel of an exhibition, a stall, a container."""
     low = (-width / 2, -depth / 2, 0)
@@ -191,3 +194,15 @@ def sky(width: float, depth: float, height: float) -> Patch:
     d = depth / 2 + 15
     z = height + 12
     return plane((-w, -d, z), (2 * w, 0, 0), (0, 2 * d, 0), artwork.view(np.random.default_rng(0)))
+
+
+def sun(rng: np.random.Generator) -> list[Lamp]:
+    """The sun, or on half of the days none."""
+    azimuth = rng.uniform(0, 2 * np.pi)
+    elevation = rng.uniform(0.6, 1.3)
+    if rng.random() < 0.5:
+        return []
+    x = SUN_M * np.cos(elevation) * np.cos(azimuth)
+    y = SUN_M * np.cos(elevation) * np.sin(azimuth)
+    red, green, blue = (strength * SUN_M**2 for strength in (8.0, 7.4, 6.4))
+    return [Lamp((x, y, SUN_M * np.sin(elevation)), 0, (red, green, blue))]

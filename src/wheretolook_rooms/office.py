@@ -20,11 +20,11 @@ def office(config: ApartmentConfig, seed: int) -> Furnished:
     """An office of 8 to 24 m, 2.6 to 3.3 m high, drawn from the seed."""
     rng = np.random.default_rng([seed, 4])
     config = replace(config, texture_richness=0.3 * config.texture_richness, clutter=0.2 * config.clutter)
-    width, depth, height = (float(rng.uniform(*span)) for span in ((8, 24), (6, 14), (2.6, 3.3)))
+    width, depth, height = (rng.uniform(*span) for span in ((8, 24), (6, 14), (2.6, 3.3)))
     room = large.one_room(width, depth)
     style = Style(rng, config.texture_richness, config.clutter)
     for side in map(int, rng.permutation(4)[: rng.integers(1, 3)]):
-        bay = float(rng.uniform(1.8, 3))
+        bay = rng.uniform(1.8, 3)
         large.add_windows(room, side, bay, bay - 0.4, 0.9, 2.2)
     paint = materials.plain(rng, materials.vary(rng, style.pick(WALLS), 0.02))
     carpet = materials.plain(rng, materials.vary(rng, style.pick(TEXTILES), 0.03), speckle=0.02)

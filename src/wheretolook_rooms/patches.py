@@ -6,9 +6,10 @@ and rows of its texture, and triangles are counter-clockwise. The surface of a s
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import wraps
+from typing import Any, ParamSpec
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook_rooms.materials import Material
 
 Float = NDArray[np.floating[Any]]
+P = ParamSpec("P")
 
 HIDDEN = 0.2  # texel density, relative to other faces, of faces that stand against a wall or on the floor
 
@@ -33,6 +35,7 @@ class Patch:
     density: float = 1.0  # texels per metre relative to the apartment's
     mask: NDArray[np.bool_] | None = None  # (m, n) False for cells that are holes
     offset_m: tuple[float, float] = (0.0, 0.0)  # where the painted pattern starts, right and down
+    piece: object = None  # of what it is a part that can be moved as a whole; None if fixed
 
     def triangles(self) -> tuple[NDArray[np.int64], Float]:
         """Triangles as indices into the flattened grid (T, 3) and the (s, t) of their corners (T, 3, 2)."""
@@ -250,6 +253,17 @@ def move(
     matrix = np.asarray(rotation, float)
     offset = np.asarray(shift, float)
     return [replace(p, positions=p.positions @ matrix.T + offset) for p in patches]
+
+
+def movable(make: Callable[P, list[Patch]]) -> Callable[P, list[Patch]]:
+    """Decorate a function so that the patches it returns are one piece, which `variant.changed` may move."""
+
+    @wraps(make)
+    def made(*args: P.args, **options: P.kwargs) -> list[Patch]:
+        piece = object()
+        return [replace(p, piece=piece) for p in make(*args, **options)]
+
+    return made
 
 
 def tilted_back(patches: Iterable[Patch], angle_rad: float) -> list[Patch]:

@@ -109,13 +109,14 @@ def test_a_compact_table_reads_the_same(many: pd.DataFrame, tmp_path: Path) -> N
     np.testing.assert_allclose(columns[["x_m", "y_m", "z_m"]], centers, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("name", ["appearance", "changes"])
 @pytest.mark.parametrize("compact", [False, True])
-def test_strengths_of_appearances_are_kept(compact: bool, many: pd.DataFrame, tmp_path: Path) -> None:
+def test_strengths_are_kept(compact: bool, name: str, many: pd.DataFrame, tmp_path: Path) -> None:
     strengths = np.random.default_rng(0).random(len(many)).astype(np.float32)
-    write_table(many.assign(appearance=strengths), tmp_path / "a.parquet", compact)
+    write_table(many.assign(**{name: strengths}), tmp_path / "a.parquet", compact)
     back = read_table(tmp_path / "a.parquet")
-    assert [*back] == [*SCHEMA.names, "appearance"]
-    np.testing.assert_array_equal(back["appearance"].to_numpy(), strengths)
+    assert [*back] == [*SCHEMA.names, name]
+    np.testing.assert_array_equal(back[name].to_numpy(), strengths)
 
 
 @pytest.mark.parametrize("compact", [False, True])

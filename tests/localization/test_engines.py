@@ -6,13 +6,18 @@ import multiprocessing
 import os
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from localization.rooms import MappedRoom, label
+from wheretolook.localization.config import LabelConfig
+from wheretolook.localization.labeller import LabelTask, label_scenes
+from wheretolook.scenes.loading import load_mesh, save_glb
 from wheretolook.utils.errors import SceneError
 
 SLOW = pytest.mark.slow
@@ -66,6 +71,19 @@ def test_a_cluster_gives_the_same_table(
     config = {"engine": "ray", "ray_address": cluster.address, "shard_size": 3}
     assert label(views, room, tmp_path / "shards", **config) == expected
     assert not ray.is_initialized()
+
+    mesh = load_mesh(room.mesh)
+    plain = replace(mesh, textures=tuple(np.full_like(texture, 128) for texture in mesh.textures))
+    save_glb(plain, tmp_path / "changed.glb")
+    job = replace(room.job, changes=0.5, changed_mesh=tmp_path / "changed.glb")
+    located = views.assign(location_id=np.arange(len(views), dtype=np.int32))
+    tables = []
+    for engine in (LabelConfig(**config), LabelConfig(workers=1)):
+        task = LabelTask("room", job, located, tmp_path / engine.engine)
+        (scene,) = label_scenes([task], engine, progress=False)
+        tables.append(scene.table)
+    pd.testing.assert_frame_equal(*tables)
+    assert tables[0]["changes"].nunique() == 2
 
     broken = MappedRoom(tmp_path / "broken.glb", room.landmarks)
     broken.mesh.write_bytes(b"no mesh")

@@ -11,6 +11,8 @@ import pytest
 
 from localization.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, file_bytes, label, map_room, times
 from one_scene import label_viewpoints
+from wheretolook.commands.scenes import Scenes
+from wheretolook.commands.scenes_config import MeshSource, ScenesConfig
 from wheretolook.dataset.viewpoint_files import FIRST_FIELDS, SCHEMA, read_table, write_table
 from wheretolook.dataset.viewpoint_table import LOCALIZED, by_first, is_good, poses
 from wheretolook.features.keypoints import Keypoints
@@ -18,12 +20,13 @@ from wheretolook.features.matches import Matches
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import pose_error, transform
 from wheretolook.localization.config import LabelConfig, LocalizerConfig
+from wheretolook.localization.labeller import LabelTask, label_scenes
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.shard import label_rows
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.warp_renderer import WarpRenderer
-from wheretolook.scenes.loading import load_mesh
-from wheretolook.utils.errors import ConfigError
+from wheretolook.scenes.loading import load_mesh, save_glb
+from wheretolook.utils.errors import ConfigError, SceneError
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -179,6 +182,49 @@ def test_appearances_depend_on_the_view_alone(room: MappedRoom, views: pd.DataFr
     clean = label_viewpoints(back, room.mesh, room.landmarks, CAMERA, shards, LabelConfig(workers=1), progress=False)
     assert [*clean] == SCHEMA.names and is_good(clean).all()
     assert back["n_inliers"].sum() < clean["n_inliers"].sum()
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_half_of_the_locations_show_the_changed_mesh(room: MappedRoom, tmp_path: Path) -> None:
+    """Labels are those of each mesh alone, whatever the shards; a location's views all show the same mesh."""
+    table = facing(POSTER, 24, distance_m=1.5).assign(location_id=np.repeat(np.arange(12, dtype=np.int32), 2))
+    mesh = load_mesh(room.mesh)
+    plain = replace(mesh, textures=tuple(np.full_like(texture, 128) for texture in mesh.textures))
+    save_glb(plain, tmp_path / "changed.glb")
+    job = replace(room.job, changes=0.4, changed_mesh=tmp_path / "changed.glb")
+    results = []
+    for size in (5, 24):
+        task = LabelTask("room", job, table, tmp_path / str(size))
+        (scene,) = label_scenes([task], LabelConfig(workers=1, shard_size=size), progress=False)
+        assert scene.manifest["changes"] == 0.4 and "changed_mesh" in scene.manifest
+        results.append(scene.table)
+    pd.testing.assert_frame_equal(*results)
+    labelled = results[0]
+    is_changed = labelled["changes"] > 0
+    assert set(labelled["changes"]) == {np.float32(0), np.float32(0.4)} and 4 <= is_changed.sum() <= 20
+    assert (labelled.groupby("location_id")["changes"].nunique() == 1).all()
+    assert is_good(labelled)[~is_changed].all() and (labelled["n_inliers"][is_changed] == 0).all()
+    localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
+    alone = label_rows(table[~is_changed], WarpRenderer(mesh), localizer, CAMERA)
+    pd.testing.assert_frame_equal(labelled[~is_changed].drop(columns="changes"), alone, check_dtype=False)
+    again = label_rows(labelled, WarpRenderer(mesh), localizer, CAMERA)
+    assert "changes" not in again and is_good(again).all()
+
+
+def test_scenes_from_files_do_not_change(room: MappedRoom, tmp_path: Path) -> None:
+    loaded = ScenesConfig(train=0, test=0, meshes=(MeshSource(room.mesh, name="room"),))
+    scenes = Scenes(name="own", data=tmp_path, device="cpu", scenes=loaded)
+    (files,) = scenes.run(log=lambda line: None).scenes
+    with pytest.raises(SceneError, match=r"label\.changes") as error:
+        scenes.change(files, 0.5)
+    assert error.value.path == files.folder and "label.changes 0" in error.value.fix
+    assert not (files.folder / "changed.glb").exists()
+
+
+@pytest.mark.parametrize("strength", [-0.1, 1.01, np.nan])
+def test_changes_beyond_0_and_1_are_refused(strength: float) -> None:
+    with pytest.raises(ConfigError, match=r"label\.changes"):
+        LabelConfig(changes=strength)
 
 
 @pytest.mark.parametrize("strength", [-0.1, 1.01, 30.0, np.nan, np.inf])

@@ -173,6 +173,37 @@ def test_appearances_replace_the_labels_and_are_removed_again(copy: Path) -> Non
 
 
 @pytest.mark.usefixtures("in_this_process", "no_pictures_here")
+def test_views_of_changed_scenes_are_labelled_and_removed_again(copy: Path) -> None:
+    scenes = Dataset.load(copy / "data" / "tiny").scenes
+    before = {scene: scene.table.read_bytes() for scene in scenes}
+    meshes = [fingerprint(scene.mesh) for scene in scenes]
+    plain = [scene.read_table() for scene in scenes]
+    assert run("label", copy, "--label.changes", "0.8") == 0
+    for scene, old in zip(scenes, plain, strict=True):
+        table = scene.read_table()
+        same = table["changes"] == 0
+        assert set(table["changes"]) == {np.float32(0), np.float32(0.8)}
+        pd.testing.assert_frame_equal(table[same].drop(columns="changes"), old[same])
+        assert not table["n_inliers"][~same].equals(old["n_inliers"][~same])
+        assert read_json_object(scene.label_manifest)["changed_mesh"] == fingerprint(scene.folder / "changed.glb")
+    assert [fingerprint(scene.mesh) for scene in scenes] == meshes
+    written = [path.stat().st_mtime_ns for scene in scenes for path in (scene.table, scene.folder / "changed.glb")]
+    assert run("label", copy, "--label.changes", "0.8", "--label.store_matches", "true") == 0  # the mesh is kept
+    assert run("label", copy, "--label.changes", "0.8") == 0
+    assert [(scene.folder / "changed.glb").stat().st_mtime_ns for scene in scenes] == written[1::2]
+    assert run("label", copy) == 0 and {scene: scene.table.read_bytes() for scene in scenes} == before
+
+
+@pytest.mark.usefixtures("in_this_process", "no_pictures_here")
+def test_only_scenes_that_these_options_generate_can_change(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene, *_ = Dataset.load(copy / "data" / "tiny").scenes
+    before = scene.table.read_bytes()
+    assert run("label", copy, "--label.changes", "0.8", "--scenes.apartment.clutter", "0.3") == 2
+    assert "generated with these options" in capsys.readouterr().err
+    assert scene.table.read_bytes() == before and not (scene.folder / "changed.glb").exists()
+
+
+@pytest.mark.usefixtures("in_this_process", "no_pictures_here")
 def test_labels_by_another_localizer_replace_the_old_ones_when_they_are_finished(
     copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

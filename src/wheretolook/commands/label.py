@@ -11,8 +11,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from wheretolook.commands.options import LabelOptions, Log, MapUseOptions, Progress, ignore_progress
+from wheretolook.commands.options import LabelOptions, Log, MapUseOptions, Progress, ignore_progress, select_options
 from wheretolook.commands.preconditions import existing, extractor_of, load_dataset, naming_file, scene_job
+from wheretolook.commands.scenes import Scenes
+from wheretolook.commands.scenes_config import ScenesConfig
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.thresholds import ALL
@@ -40,12 +42,14 @@ class Label(LabelOptions):
 
     Args:
         mapping: where the weights of the map's extractor are, if they have moved.
+        scenes: the generated scenes that `label.changes` changes, as for the scenes command.
         tracking: where MLflow keeps its runs.
     """
 
     SHORT: ClassVar = {"engine": "label.engine"}
 
     mapping: MapUseOptions = field(default_factory=MapUseOptions)
+    scenes: ScenesConfig = field(default_factory=ScenesConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 
     @changes_dataset("label")
@@ -89,8 +93,7 @@ class Label(LabelOptions):
         settings = [self.label.localizer.record(), extractor.record(), files.camera.record()]
         made_from = [existing(files.mesh, SceneError, "scenes"), existing(files.landmarks, MapError, "map")]
         changes = [name for name in ("store_matches", "store_pixels") if getattr(self.label, name)]
-        if self.label.appearance:
-            changes.append(f"appearance {self.label.appearance}")
+        changes += [f"{name} {value}" for name in ("appearance", "changes") if (value := getattr(self.label, name))]
         return cache_key("label", [*settings, *made_from, files.stage_cache("sample").stored_key, *changes])
 
     def _label(
@@ -106,6 +109,9 @@ class Label(LabelOptions):
         for files in to_label:
             job = scene_job(files, config, extractor_of(files, self.mapping.extractor), self.warp_device)
             job = replace(job, store_matches=config.store_matches, store_pixels=config.store_pixels)
+            if config.changes:
+                changed_mesh = select_options(Scenes, self).change(files, config.changes)
+                job = replace(job, changes=config.changes, changed_mesh=changed_mesh)
             tasks.append(LabelTask(files.name, job, files.read_table(), _shards(files)))
         seconds = Counter[str]()
         start = time.monotonic()

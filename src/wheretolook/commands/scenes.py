@@ -17,13 +17,15 @@ from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, MappedFloor, SceneFolder
 from wheretolook.dataset.sampling_config import Split
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
-from wheretolook.utils.artifact_cache import cache_key
+from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.errors import ConfigError, SceneError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from wheretolook.geometry.mesh import TexturedMesh
 
-    MakeMesh = Callable[[], tuple[TexturedMesh, MappedFloor]]
+    MakeMesh = Callable[..., tuple[TexturedMesh, MappedFloor]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +70,24 @@ class Scenes(DatasetOptions):
         dataset.save()
         return dataset
 
+    def change(self, files: SceneFolder, strength: float) -> Path:
+        """Return the mesh of a generated scene changed by a strength, `<scene>/changed.glb`; made unless it is there.
+
+        Raises SceneError if the scene is not generated with these options.
+        """
+        from wheretolook.scenes.loading import save_glb
+
+        for scene, make, inputs in self._generated():
+            if scene.name == files.name and files.stage_cache("scenes", cache_key("scenes", inputs)).is_current():
+                path = files.folder / "changed.glb"
+                cache = ArtifactCache(files.folder, cache_key(inputs, strength), manifest="changed.json")
+                if not cache.is_current(path):
+                    save_glb(make(changes=strength)[0], path)
+                    cache.store()
+                return path
+        fix = "Set label.changes 0, or give label the scenes options that generated the scene."
+        raise SceneError("label.changes needs a scene generated with these options", path=files.folder, fix=fix)
+
     def _generated(self) -> Iterator[tuple[SceneFolder, MakeMesh, list[Any]]]:
         config = self.scenes
         splits: list[Split] = [*["train"] * config.train, *["val"] * config.val, *["test"] * config.test]  # type: ignore[list-item]
@@ -108,14 +128,16 @@ def save_scene(scene: SceneFolder, make: MakeMesh, key: str, log: Log) -> None:
 
 
 def generate_scene(
-    kind: SceneKind, config: ApartmentConfig, seed: int, device: str
+    kind: SceneKind, config: ApartmentConfig, seed: int, device: str, **changes: float
 ) -> tuple[TexturedMesh, MappedFloor]:
-    """Return a generated scene by the installed generator, `generate(kind, config, seed, device=...)`.
+    """Return a generated scene by the installed generator, `generate(kind, config, seed, device=..., changes=...)`.
+
+    `changes`, 0 to 1, is given only for the mesh of a changed scene.
 
     Raises ConfigError if no package registers one in the entry-point group `wheretolook.scene_generators`.
     """
     for entry in entry_points(group="wheretolook.scene_generators"):
-        made: tuple[TexturedMesh, MappedFloor] = entry.load()(kind, config, seed, device=device)
+        made: tuple[TexturedMesh, MappedFloor] = entry.load()(kind, config, seed, device=device, **changes)
         return made
     raise ConfigError("no generator of scenes is installed", fix="Install wheretolook again, or name scenes.meshes.")
 

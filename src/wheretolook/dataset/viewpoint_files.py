@@ -13,7 +13,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from wheretolook.dataset.viewpoint_table import APPEARANCE, CAMERA_ID, FIRST, LABELS, PIXELS, poses
+from wheretolook.dataset.viewpoint_table import APPEARANCE, CAMERA_ID, CHANGES, FIRST, LABELS, PIXELS, poses
 from wheretolook.geometry.poses import Float, camera_centers, rotation_from_quaternion
 from wheretolook.io.poses import POSE_COLUMNS, QUATERNION_COLUMNS, TRANSLATION_COLUMNS
 from wheretolook.utils.errors import TableError
@@ -55,7 +55,10 @@ exactly as `LocalizerConfig.method` "first" labels."""
 APPEARANCE_FIELD = pa.schema([(APPEARANCE, pa.float32())])
 """An optional column of labels made with `label.appearance`: the strength at which each view's image was changed."""
 
-OPTIONAL_FIELDS = (CAMERA_FIELD, FIRST_FIELDS, APPEARANCE_FIELD)
+CHANGES_FIELD = pa.schema([(CHANGES, pa.float32())])
+"""An optional column of labels made with `label.changes`: the strength at which the scene of each view was changed."""
+
+OPTIONAL_FIELDS = (CAMERA_FIELD, FIRST_FIELDS, APPEARANCE_FIELD, CHANGES_FIELD)
 """Optional columns that compact tables keep, too."""
 
 CENTER_DECIMALS = 12  # of a metre; the centres of a location's viewpoints, each computed from its pose, differ by less

@@ -16,6 +16,7 @@ from wheretolook.utils.errors import TableError
 CAMERA_ID = "camera_id"  # optional column
 PIXELS = "matched_pixels"  # optional column
 APPEARANCE = "appearance"  # optional column
+CHANGES = "changes"  # optional column
 
 UNLABELLED = "unlabelled"
 

@@ -90,6 +90,9 @@ class LabelConfig:
         appearance: 0 to 1, the highest strength at which queries are made to resemble photographs: exposure, white
             balance, vignetting, noise, motion blur, defocus, JPEG, and people in front. Each view's is drawn up to it
             and stored (appearance).
+        changes: 0 to 1, how much generated scenes change after they are mapped: things are moved or removed, lamps are
+            brighter or dimmer. The views of about half of the locations show the changed scene, which is stored
+            (changes). Only the label command uses it.
         store_pixels: store also the pixels of the matches (matched_pixels); needed to localize several looks jointly.
     """
 
@@ -101,6 +104,7 @@ class LabelConfig:
     store_matches: bool = False
     store_pixels: bool = False
     appearance: float = 0.0
+    changes: float = 0.0
 
     def __post_init__(self) -> None:
         check_choice("label.engine", self.engine, ("local", "ray"))
@@ -112,3 +116,4 @@ class LabelConfig:
         if not 0 <= self.appearance <= 1:
             fix = "Give 0 for plain renderings, 0.3 for good photographs, up to 1 for poor ones."
             raise ConfigError("label.appearance must be within 0 and 1", value=self.appearance, fix=fix)
+        check_range("label.changes", self.changes, 0, 1)

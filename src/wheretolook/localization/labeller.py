@@ -121,10 +121,12 @@ class _SceneInProgress:
         }
         if job.localizer.method == "hypotheses":
             settings["first"] = True  # shards of before lack these labels
+        if job.changed_mesh:
+            settings["changed_mesh"] = fingerprint(job.changed_mesh)
         if job.cameras:
             settings["cameras"] = {number: camera.record() for number, camera in job.cameras}
         # only options that are set: the record decides the names of shards
-        options = ("store_matches", "store_pixels", "appearance")
+        options = ("store_matches", "store_pixels", "appearance", "changes")
         settings |= {name: getattr(job, name) for name in options if getattr(job, name)}
         text = json.dumps(settings, sort_keys=True).encode()
         inputs = [name for name in (*SCHEMA.names, CAMERA_ID) if name not in LABELS and name in table]

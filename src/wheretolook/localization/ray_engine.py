@@ -80,7 +80,7 @@ def _run(ray: Any, shards: Sequence[Shard]) -> Iterator[tuple[Shard, LabelledSha
     def start(shard: Shard) -> None:
         if shard.job not in files:  # a scene travels to a machine once
             files.clear()
-            files[shard.job] = ray.put((shard.job.mesh.read_bytes(), shard.job.landmarks.read_bytes()))
+            files[shard.job] = ray.put([path.read_bytes() for path in _files(shard.job).values()])
         gpus = 1 / WORKERS_PER_GPU if shard.job.device != "cpu" else 0
         running[label.options(num_gpus=gpus).remote(shard.job, files[shard.job], shard.rows)] = shard
 
@@ -106,10 +106,16 @@ def _run(ray: Any, shards: Sequence[Shard]) -> Iterator[tuple[Shard, LabelledSha
             ray.cancel(unfinished)
 
 
+def _files(job: SceneJob) -> dict[str, Path]:
+    """Return the files of a scene by the names of their fields."""
+    files = {"mesh": job.mesh, "landmarks": job.landmarks, "changed_mesh": job.changed_mesh}
+    return {name: path for name, path in files.items() if path}
+
+
 _worker: ShardWorker | None = None
 
 
-def _label_shard(job: SceneJob, files: tuple[bytes, bytes], rows: pd.DataFrame) -> LabelledShard:
+def _label_shard(job: SceneJob, files: Sequence[bytes], rows: pd.DataFrame) -> LabelledShard:
     """Label a shard on a machine of the cluster, which caches the scene's files by their checksums."""
     global _worker
     if _worker is None:
@@ -117,12 +123,13 @@ def _label_shard(job: SceneJob, files: tuple[bytes, bytes], rows: pd.DataFrame) 
         _worker = ShardWorker()
     if job.device != "cpu":
         job = replace(job, device="cuda")  # the only GPU that Ray shows to this task
-    mesh = _cached_file(files[0], job.mesh.suffix)
-    landmarks = _cached_file(files[1], job.landmarks.suffix)
+    paths = _files(job)
+    copies = [_cached_file(content, path.suffix) for content, path in zip(files, paths.values(), strict=True)]
+    local: dict[str, Any] = dict(zip(paths, copies, strict=True))
     try:
-        return _worker.label(replace(job, mesh=mesh, landmarks=landmarks), rows)
+        return _worker.label(replace(job, **local), rows)
     except WhereToLookError as error:  # name the user's files, not the copies
-        path = {mesh: job.mesh, landmarks: job.landmarks}.get(Path(error.path or ""), error.path)
+        path = dict(zip(copies, paths.values(), strict=True)).get(Path(error.path or ""), error.path)
         raise type(error)(error.problem, path=path, value=error.value, fix=error.fix) from error
 
 

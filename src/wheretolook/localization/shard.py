@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from wheretolook.dataset.viewpoint_files import FIRST_FIELDS, MATCH_FIELDS
-from wheretolook.dataset.viewpoint_table import APPEARANCE, CAMERA_ID, FIRST, PIXELS, poses
+from wheretolook.dataset.viewpoint_table import APPEARANCE, CAMERA_ID, CHANGES, FIRST, PIXELS, poses
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.poses import Float
@@ -49,6 +49,8 @@ class SceneJob:
     cameras: tuple[tuple[int, Camera], ...] = ()  # by number, if viewpoints have a `camera_id`
     store_pixels: bool = False  # add `viewpoint_files.PIXEL_FIELD`, too
     appearance: float = 0.0  # highest strength of `rendering.appearance`; add `viewpoint_files.APPEARANCE_FIELD`
+    changes: float = 0.0  # strength of the changes in `changed_mesh`; add `viewpoint_files.CHANGES_FIELD`
+    changed_mesh: Path | None = None  # shown by the views of about half of the locations
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +82,7 @@ class ShardWorker:
         use_one_core()
         torch.set_num_threads(1)
         self.number = number
-        self._scene: tuple[SceneJob, Renderer, Localizer] | None = None
+        self._scene: tuple[SceneJob, Renderer, Renderer | None, Localizer] | None = None
 
     def label(self, job: SceneJob, rows: pd.DataFrame) -> LabelledShard:
         """Label viewpoints of a scene.
@@ -89,9 +91,9 @@ class ShardWorker:
         """
         try:
             seconds: dict[str, float] = {}
-            renderer, localizer = self._open(job)
+            renderer, changed, localizer = self._open(job)
             cameras = dict(job.cameras) or job.camera
-            options = job.store_matches, job.store_pixels, job.appearance
+            options = job.store_matches, job.store_pixels, job.appearance, job.changes, changed
             labelled = label_rows(rows, renderer, localizer, cameras, seconds, *options)
             return LabelledShard(labelled, seconds)
         except WhereToLookError:
@@ -102,7 +104,7 @@ class ShardWorker:
             fix = "Fix the cause and run again; finished shards are kept."
             raise WorkerError(problem, path=job.mesh, value=viewpoints, fix=fix) from error
 
-    def _open(self, job: SceneJob) -> tuple[Renderer, Localizer]:
+    def _open(self, job: SceneJob) -> tuple[Renderer, Renderer | None, Localizer]:
         from wheretolook.localization.localizer import Localizer
         from wheretolook.mapping.landmarks import Landmarks
         from wheretolook.rendering.registry import make_renderer
@@ -116,10 +118,11 @@ class ShardWorker:
             if device == "cuda":
                 device = f"cuda:{self.number % max(1, torch.cuda.device_count())}"
             renderer = make_renderer(load_mesh(job.mesh), device)
+            changed = make_renderer(load_mesh(job.changed_mesh), device) if job.changed_mesh else None
             landmarks = Landmarks.load(job.landmarks)
             map_dir = job.landmarks.parent
             localizer = Localizer(landmarks, job.camera, job.localizer, job.extractor, device, map_dir)
-            self._scene = job, renderer, localizer
+            self._scene = job, renderer, changed, localizer
         return self._scene[1:]
 
 
@@ -150,6 +153,8 @@ def label_rows(
     store_matches: bool = False,
     store_pixels: bool = False,
     appearance: float = 0.0,
+    changes: float = 0.0,
+    changed: Renderer | None = None,
 ) -> pd.DataFrame:
     """Render viewpoints, localize the images and measure the errors, in batched steps that overlap.
 
@@ -157,7 +162,8 @@ def label_rows(
     match, pose) are added to `seconds`. A batch that exceeds a GPU's memory is halved. Returns the table with new
     status, error_m, error_deg and n_inliers, with `viewpoint_files.FIRST_FIELDS` by several hypotheses, `MATCH_FIELDS`
     if `store_matches`, and also `PIXEL_FIELD` if `store_pixels`. With `appearance` above 0 images are changed at
-    strengths drawn up to it (`rendering.appearance`), which `APPEARANCE_FIELD` holds.
+    strengths drawn up to it (`rendering.appearance`), which `APPEARANCE_FIELD` holds. With a renderer of the `changed`
+    scene, it renders the views of locations drawn by the localizer's seed, to which `CHANGES_FIELD` assigns `changes`.
     """
     from wheretolook.rendering.appearance import Appearance
 
@@ -167,6 +173,8 @@ def label_rows(
         groups = [(cameras[number], np.flatnonzero(numbers == number)) for number in np.unique(numbers).tolist()]
     else:
         groups = [(cameras, np.arange(len(table)))]
+    is_changed = _is_changed(table, localizer.config.seed) if changed else np.zeros(len(table), dtype=bool)
+    groups = [(camera, rows[is_changed[rows] == which]) for camera, rows in groups for which in (False, True)]
     batch_size = max(BATCH, localizer.extractor.batch_of(640, 480))
     batches = [(camera, rows) for camera, group in groups for rows in _batches(camera, group, batch_size)]
 
@@ -174,7 +182,8 @@ def label_rows(
 
     def render(batch: tuple[Camera, NDArray[np.int64]]) -> tuple[Camera, Sequence[NDArray[np.uint8]]]:
         camera, rows = batch
-        return camera, halving(lambda some: _images(renderer, camera, some, true_poses, drawn))(rows)
+        used = changed if changed and is_changed[rows[0]] else renderer
+        return camera, halving(lambda some: _images(used, camera, some, true_poses, drawn))(rows)
 
     def match(batch: tuple[Camera, list[Keypoints]]) -> tuple[Camera, list[tuple[Keypoints, Matches]]]:
         camera, keypoints = batch
@@ -201,8 +210,16 @@ def label_rows(
         columns |= _matches(results, store_pixels)
     if drawn:
         columns[APPEARANCE] = np.array([one.strength for one in drawn], dtype=np.float32)
-    old = [*FIRST_FIELDS.names, *MATCH_FIELDS.names, PIXELS, APPEARANCE]
+    if changed:
+        columns[CHANGES] = (changes * is_changed).astype(np.float32)
+    old = [*FIRST_FIELDS.names, *MATCH_FIELDS.names, PIXELS, APPEARANCE, CHANGES]
     return table.drop(columns=old, errors="ignore").assign(**columns)
+
+
+def _is_changed(table: pd.DataFrame, seed: int) -> NDArray[np.bool_]:
+    """Draw from a seed whether each viewpoint (B,) shows the changed scene, alike for all of a location."""
+    locations, row = np.unique(table["location_id"], return_inverse=True)
+    return np.array([np.random.default_rng([seed, number]).random() < 0.5 for number in locations.tolist()])[row]
 
 
 def _images(

@@ -121,8 +121,9 @@ def release_settings(options: Experiment) -> dict[str, Any]:
     settings = {"camera": options.camera.camera.record(), **settings}
     settings["scenes"]["meshes"] = meshes
     settings["label"] = {"localizer": options.label.localizer.record()}
-    if options.label.appearance:
-        settings["label"]["appearance"] = options.label.appearance
+    for name in ("appearance", "changes"):
+        if getattr(options.label, name):
+            settings["label"][name] = getattr(options.label, name)
     return dict(json.loads(json.dumps(settings, default=str)))
 
 

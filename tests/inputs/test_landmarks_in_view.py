@@ -64,7 +64,6 @@ def test_each_landmark_by_hand(localization_map: LocalizationMap) -> None:
             "mapped_distance": np.log(m.mapping_distance_m[rows]),
             "distance_spread": m.mapping_distance_spread[rows],
             "mapped_pixel_size": np.log(m.mapping_distance_m[rows] / m.mapping_focal_px[rows]),
-            "map_size": np.full(len(rows), np.log(len(m))),
         }
         assert tuple(expected) == ATTRIBUTES == POSE_ATTRIBUTES + MAP_ATTRIBUTES
         found = described.values[described.starts[view] : described.starts[view + 1]].cpu()

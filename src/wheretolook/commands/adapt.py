@@ -333,6 +333,8 @@ def _save(target: _Target, points: Float, adapted: Adapted, views: LocalizedView
     from wheretolook.training.trained_network import TrainedNetwork
 
     base = TrainedNetwork.load(target.weights, SetNetwork, "set")
+    if (views.photograph >= 0).all():
+        base = base.for_photographs()
     correction = adapted.adaptation
     n_signature = min(_MAX_SIGNATURE, len(points))
     arrays = {

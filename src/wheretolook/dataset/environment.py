@@ -107,6 +107,11 @@ class Environment(ABC):
         """Whether `mesh` is available."""
 
     @property
+    def is_photographed(self) -> bool:
+        """Whether the mapping images are photographs; so are those of an imported model."""
+        return True
+
+    @property
     def has_depth(self) -> bool:
         """Whether `depth_images` are available: by default, rendered from the mesh."""
         return self.has_mesh
@@ -203,7 +208,7 @@ class Environment(ABC):
         from wheretolook.inputs.localization_map import LocalizationMap
 
         of_map = (self.landmarks, self.camera, self.occlusion, self.device, self.mapping_poses)
-        return LocalizationMap(*of_map, self.frame)
+        return LocalizationMap(*of_map, self.frame, self.is_photographed)
 
 
 class SceneEnvironment(Environment):

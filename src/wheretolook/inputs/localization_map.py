@@ -41,6 +41,7 @@ class LocalizationMap:
     device: str = "cpu"  # where kernels run, "cpu" or a CUDA device
     mapping_poses: Float | None = None  # cam_from_world (M, 3, 4) of the images the map was made from, if known
     frame: MapFrame = IDENTITY  # the map's own frame; everything here is in the world: metres, z up
+    photographs: bool = False  # whether the mapping images are photographs: `TrainedNetwork.photograph_offset` applies
 
     @classmethod
     def from_colmap(
@@ -92,7 +93,7 @@ class LocalizationMap:
             space = FreeSpace(load_mesh(Path(mesh), colored=False).transformed(own_frame.world_from_map), device=device)
             occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
             warn_of_mesh(mesh, landmarks.points, space.raycaster)
-        return cls(landmarks, camera, occlusion or NoOcclusion(), device, poses, own_frame)
+        return cls(landmarks, camera, occlusion or NoOcclusion(), device, poses, own_frame, photographs=True)
 
     def of_camera(self, camera: Camera) -> LocalizationMap:
         """Return the same map for another camera."""

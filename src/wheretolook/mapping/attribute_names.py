@@ -9,6 +9,5 @@ MAP_ATTRIBUTES = (
     "mapped_distance",  # logarithm of the mean mapping distance, in metres
     "distance_spread",  # standard deviation of the mapping distances over their mean
     "mapped_pixel_size",  # logarithm of the mean mapping distance over the mapping cameras' focal length in pixels
-    "map_size",  # logarithm of the number of landmarks in the map, the same for all: more matches of a large map are wrong
 )
 """Attributes of a landmark that scorers use; NaN where a value is unknown."""

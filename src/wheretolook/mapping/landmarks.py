@@ -86,7 +86,6 @@ class Landmarks:
             "mapped_distance": distance,
             "distance_spread": self.mapping_distance_spread,
             "mapped_pixel_size": distance - np.log(np.full(len(self), np.nan) if focal_px is None else focal_px),
-            "map_size": np.full(len(self), np.log(max(len(self), 1))),
         }
         return np.stack([values[name] for name in MAP_ATTRIBUTES], axis=1).astype(np.float32)
 

@@ -13,7 +13,6 @@ from tqdm.auto import tqdm
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
-from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.planning.config import MAX_DIRECTIONS
 from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
@@ -112,9 +111,7 @@ def update_viewpoint_map(
 
 def landmark_digests(landmarks: Landmarks) -> NDArray[np.uint64]:
     """Compute digests (N, 2) of each landmark's position and of its attributes: BLAKE2b of 8 bytes, little-endian."""
-    # scorers that use the map's size, which every landmark changes for all others, are not `local`
-    of_each = landmarks.attributes()[:, [name != "map_size" for name in MAP_ATTRIBUTES]]
-    attributes = np.concatenate([landmarks.mapping_direction, of_each], axis=1)
+    attributes = np.concatenate([landmarks.mapping_direction, landmarks.attributes()], axis=1)
     return np.stack([_digests(landmarks.points), _digests(attributes)], axis=1)
 
 

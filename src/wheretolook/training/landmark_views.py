@@ -33,8 +33,6 @@ DISTANCES = [ATTRIBUTES.index(name) for name in OF_SIZE]
 CORRECT_WITHIN = 0.5, 5.0
 """Largest errors in metres and degrees of a localized pose whose inliers count as correct matches."""
 
-MANY_MAPS = 20  # from which the size of a map is an input: among few, it identifies the map
-
 BLOCK = 2048  # views described at a time: some million landmarks
 
 
@@ -204,13 +202,6 @@ class LandmarkDataModule(ViewsDataModule):
     """
 
     views: LandmarkViews
-
-    @property
-    def hidden(self) -> tuple[str, ...]:
-        """Attributes that are no inputs: those of the options, and the size of the map if there are few training maps."""
-        n_maps = len(np.unique(self.views.scene[self.train_rows.numpy()]))
-        few = n_maps < MANY_MAPS and "map_size" not in self.options.hidden
-        return (*self.options.hidden, "map_size") if few else self.options.hidden
 
     def __init__(self, task: TrainingJob, max_landmarks: int, matches: bool = False) -> None:
         super().__init__()

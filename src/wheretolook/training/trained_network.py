@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
@@ -42,7 +42,11 @@ NetworkT = TypeVar("NetworkT", bound=StoredNetwork)
 
 @dataclass(frozen=True, eq=False)
 class TrainedNetwork(Generic[NetworkT]):
-    """A network and the calibration scale * logit + offset of its logits."""
+    """A network and the calibration scale * logit + offset of its logits.
+
+    Trained on rendered views, a network predicts too low probabilities for photographs: `photograph_offset` is added to
+    the log-odds of their maps (`for_photographs`).
+    """
 
     method: str
     network: NetworkT
@@ -51,6 +55,7 @@ class TrainedNetwork(Generic[NetworkT]):
     offset: float = 0.0
     training_range: TrainingRange | None = None  # of its training views; None if the weights do not store it
     accuracy: Accuracy = ACCURACY  # limits of its training views' errors, in metres and degrees
+    photograph_offset: float = 0.0
 
     def __post_init__(self) -> None:
         self.network.eval()
@@ -58,6 +63,10 @@ class TrainedNetwork(Generic[NetworkT]):
     def calibrated(self, logits: Tensor) -> Tensor:
         """Return calibrated log-odds of the network's logits, in the same shape and precision."""
         return self.scale * logits + self.offset
+
+    def for_photographs(self) -> Self:
+        """Return the same network, calibrated for maps of photographs."""
+        return replace(self, offset=self.offset + self.photograph_offset, photograph_offset=0.0)
 
     def range_at(self, accuracy: Accuracy) -> TrainingRange:
         """Return the range of scores at an accuracy; without a stored one, that of the training camera."""
@@ -71,6 +80,8 @@ class TrainedNetwork(Generic[NetworkT]):
         if self.training_range is not None:
             header["range"] = self.training_range.record()
         header |= {"offset": self.offset, "training": dict(training or {})}
+        if self.photograph_offset:
+            header["photograph_offset"] = self.photograph_offset
         write_weights(path, self.method, self.network.stored.state_dict(), header)
 
     @classmethod
@@ -93,7 +104,7 @@ class TrainedNetwork(Generic[NetworkT]):
             scale = finite(header.get("scale", 1.0))
             if scale <= 0:
                 raise ValueError(f"the scale of the logits is {scale:g}")
-            offset = finite(header.get("offset", 0.0))
+            offset, photograph_offset = (finite(header.get(name, 0.0)) for name in ("offset", "photograph_offset"))
             training_range = TrainingRange.of_record(header["range"]) if "range" in header else None
             options = header.get("training", {}).get("config", {})
             names = ("max_error_m", "max_error_deg")
@@ -104,7 +115,8 @@ class TrainedNetwork(Generic[NetworkT]):
             fix = "Use the version that wrote them, or train again."
             raise WeightsError(problem, path=path, fix=fix) from error
         network.to(device).requires_grad_(False)
-        return TrainedNetwork(header["method"], network, camera, scale, offset, training_range, accuracy)
+        calibration = scale, offset, training_range, accuracy, photograph_offset
+        return TrainedNetwork(header["method"], network, camera, *calibration)
 
 
 def finite(value: Any) -> float:

@@ -131,10 +131,9 @@ class ViewedMap:
 
     @lru_cache(MAX_SCORERS)  # noqa: B019
     def _localization_map(self, occlusion: str) -> LocalizationMap:
-        from wheretolook.inputs.localization_map import LocalizationMap
 
-        model = self.environment.occlusion_model(occlusion)
-        return LocalizationMap(self.landmarks, self.camera, model, self.environment.device, self.mapping_poses)
+        of_map = self.environment.localization_map
+        return replace(of_map, camera=self.camera, occlusion=self.environment.occlusion_model(occlusion))
 
     @lru_cache(MAX_FLOORS)  # noqa: B019
     def floor(self, method: str, occlusion: str, height_m: float) -> Floor:

@@ -98,7 +98,7 @@ class ExpectedScorer(LandmarkScorer):
         self.kind = kind
         self.name = f"fisher-{kind}-expected" if kind in METRICS else f"expected-{kind}"
         # every added landmark lowers the share of inliers, and changes the map's size for all
-        self.local = kind != "inliers" and not trained.network.uses("map_size")
+        self.local = kind != "inliers"
 
     def score(self, cam_from_world: Float) -> Float:
         """Return (B,) in [0, 1]; metrics of information are not bounded by 1."""

@@ -69,4 +69,4 @@ def learn_matchability(task: TrainingJob) -> TrainingResult:
     Raises a TableError if there is no train scene, no labels, or no stored matches.
     """
     data = MatchabilityDataModule(task)
-    return train_network(MatchabilityNetwork(data.statistics, task.options.width, data.hidden), data, task)
+    return train_network(MatchabilityNetwork(data.statistics, task.options.width, task.options.hidden), data, task)

@@ -29,10 +29,6 @@ class LandmarkNetwork(StoredNetwork):
         self.attributes = statistics.names
         self.options = options
 
-    def uses(self, attribute: str) -> bool:
-        """Return whether an attribute is an input."""
-        return attribute in self.attributes and attribute not in self.options["hidden"]
-
     def description(self) -> dict[str, Any]:
         """Return the attributes, their statistics, and the options."""
         stored = {"attributes": list(self.attributes), "statistics": self.statistics.record()}

@@ -39,8 +39,6 @@ SERVED = {
     "log_orientation_variance",
     "log_det_information",
     "axis_height",
-    "mean_ambiguity",
-    "mean_map_size",
     "log_expected_cells",
 }
 """Statistics of a view that do not depend on the camera's axes."""
@@ -101,9 +99,7 @@ class BatchedDirections:
                     values[:, column] = self._pixel_angle
             # the kernels give `across` and `down` as they are: their means are subtracted here
             means_of_image = _columns(mean[None], names, IMAGE)[:, 0] @ self._of_image
-            standard = matchability.input(values)
-            self._first = first(standard) - means_of_image
-            self._averaged = standard[:, trained.network.averaged]
+            self._first = first(matchability.input(values)) - means_of_image
             mapped = [MAP_ATTRIBUTES.index(name) for name in ("mapped_distance", "mapped_pixel_size")]
             mapped_from = torch.from_numpy(landmarks.mapping_direction[self.points.order]).to(self.device)
             self._mapped = torch.cat([mapped_from, of_map[:, mapped]], 1)
@@ -192,8 +188,7 @@ class BatchedDirections:
         place = used.cumsum(0, dtype=torch.int32) - 1
         seen = used.nonzero()[:, 0]
         base, terms = self._described(wp.to_torch(nearby.offsets).index_select(0, seen), rows[seen] * stride)
-        n_sums = self.trained.network.n_sums
-        sums = torch.zeros((len(n_visible), n_sums), device=self.device)
+        sums = torch.zeros((len(n_visible), N_EXPECTED), device=self.device)
         cells = torch.zeros(len(n_visible), device=self.device)
         visible = torch.from_numpy(n_visible).to(sums)
         each = visible / torch.from_numpy(np.diff(starts)).to(self.device).clamp(min=1)
@@ -206,16 +201,14 @@ class BatchedDirections:
             log_odds = torch.mv(hidden, self._last.weight[0]).add_(self._last.bias)
             ends = torch.from_numpy((part - part[0]).astype(np.int32)).to(self.device)
             p_detect = torch.sparse_csr_tensor(ends, here, log_odds.sigmoid(), size=(len(part) - 1, len(terms)))
-            of_terms = p_detect @ terms
-            sums[views, :16] = of_terms[:, :16]
-            sums[views, N_EXPECTED:n_sums] = of_terms[:, 16:]
+            sums[views, :16] = p_detect @ terms
             of_view = torch.arange(len(part) - 1, device=self.device).repeat_interleave(ends.diff())
             cells[views] = expected_cells(image[span], log_odds, of_view, each[views], IMAGE)
         height = torch.from_numpy(heights).to(sums)
         return probabilities(self.trained, self.accuracy, sums * each[:, None], visible, height, cells)
 
     def _described(self, offsets: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the first layer (M, W) of landmarks without their position in the image, and their terms of sums (M, T).
+        """Return the first layer (M, W) of landmarks without their position in the image, and their terms of sums (M, 16).
 
         The landmarks are at offsets (M, 3) m from the location, and at rows (M,) of the points.
         """
@@ -230,10 +223,9 @@ class BatchedDirections:
         pixels = torch.stack([torch.full_like(size_ratio, self._pixel_angle), size_ratio], 1)
         weight = bearing_precision(pixels, ("pixel_angle", "pixel_size_ratio"))
         x, y, z = bearing.unbind(1)
-        terms = torch.empty((len(x), 16 + self._averaged.shape[1]), device=self.device)
+        terms = torch.empty((len(x), 16), device=self.device)
         terms[:, 0] = 1
-        terms[:, 16:] = self._averaged.index_select(0, rows)
-        plane = terms[:, 10:16]
+        plane = terms[:, 10:]
         for column, number in enumerate((1 - x * x, -x * y, -x * z, 1 - y * y, -y * z, 1 - z * z)):
             torch.mul(number, weight, out=plane[:, column])
         inverse = distance.reciprocal()

@@ -10,7 +10,7 @@ from torch import Tensor
 from wheretolook.dataset.viewpoint_files import has_matches
 from wheretolook.scorers.matchability.network import MatchabilityNetwork
 from wheretolook.scorers.set.config import SetConfig
-from wheretolook.scorers.set.network import DEFAULT_STATISTICS, OF_MANY_MAPS, SetNetwork
+from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.data import check_classes
 from wheretolook.training.landmark_views import LandmarkBatches, LandmarkDataModule
 from wheretolook.training.learner import TrainingJob, TrainingResult, train_network
@@ -67,8 +67,7 @@ def learn_set(task: TrainingJob, data: SetDataModule | None = None) -> TrainingR
     if options.starts_from and path.is_file():
         start = TrainedNetwork.load(path, MatchabilityNetwork, options.starts_from).network
         statistics = start.statistics if start.attributes == statistics.names else statistics
-    inputs = DEFAULT_STATISTICS if "map_size" in data.hidden else OF_MANY_MAPS
-    network = SetNetwork(statistics, options.width, options.pooled, options.head, options.dropout, data.hidden, inputs)
+    network = SetNetwork(statistics, options.width, options.pooled, options.head, options.dropout, options.hidden)
     if start is not None and (start.statistics, start.options) == (statistics, network.matchability.options):
         network.matchability.load_state_dict(start.state_dict())
     return train_network(network, data, replace(task, options=options))

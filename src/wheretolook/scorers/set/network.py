@@ -49,13 +49,8 @@ EXPECTED = (
 )
 """Outputs of `expected_statistics`."""
 
-AVERAGED = ("ambiguity", "map_size")
-"""Attributes averaged over the landmarks expected to be detected: from ambiguous matches of a large map, RANSAC finds
-wrong poses with as many inliers as right ones have in a small map."""
-
-ALL_STATISTICS = (*EXPECTED, "axis_height", *(f"mean_{name}" for name in AVERAGED), "log_expected_cells")
-"""All statistics of a view. Means are of standardized attributes, 0 if they are no inputs; the last is log(1 + cells of the sphere expected to hold
-a detected landmark)."""
+ALL_STATISTICS = (*EXPECTED, "axis_height", "log_expected_cells")
+"""All statistics of a view; the last is log(1 + cells of the sphere expected to hold a detected landmark)."""
 
 DEFAULT_STATISTICS = (
     "log_expected_inliers",
@@ -65,9 +60,6 @@ DEFAULT_STATISTICS = (
     "log_expected_cells",
 )
 """Inputs of the head by default: chosen by cross-validation over the scenes of configs/cameras.yaml."""
-
-OF_MANY_MAPS = (*DEFAULT_STATISTICS, *(f"mean_{name}" for name in AVERAGED))
-"""Inputs of the head if it is trained on many maps (docs/research/cameras.md)."""
 
 CELLS = 30
 """Cells that 180 degrees are cut into, across and down: 6 degrees each, the same for every camera."""
@@ -103,10 +95,6 @@ class SetNetwork(LandmarkNetwork):
         self._inputs = [ALL_STATISTICS.index(name) for name in view_statistics]
         self.needs_cells = "log_expected_cells" in view_statistics
         self.matchability = MatchabilityNetwork(statistics, width, hidden)
-        self.averaged = []  # columns of the attributes; none if their means are no inputs
-        if not {f"mean_{name}" for name in AVERAGED}.isdisjoint(view_statistics):
-            self.averaged = [self.attributes.index(name) for name in AVERAGED]
-        self.n_sums = N_EXPECTED + len(self.averaged)  # over the landmarks of a view, before those of attention
         self.attention = None
         if pooled:
             layers = nn.Linear(len(self.attributes), width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
@@ -173,9 +161,6 @@ class SetNetwork(LandmarkNetwork):
     def parts(self, values: Tensor, log_odds: Tensor) -> Tensor:
         """Return what landmarks (..., A) with log-odds of detection (...) add to their view's sums, (..., D)."""
         expected = expected_parts(values, log_odds, self.attributes)
-        if self.averaged:
-            averaged = self.matchability.input(values)[..., self.averaged]
-            expected = torch.cat([expected, expected[..., :1] * averaged], -1)
         if self.attention is None:
             return expected
         attended = self.attention(values)
@@ -186,7 +171,7 @@ class SetNetwork(LandmarkNetwork):
         """Return logits (B,) from sums (B, D) over each view's landmarks, and `expected_cells` (B,) if they are an input."""
         features = [self.statistics_of(sums, n_visible, axis_height, cells)[:, self._inputs]]
         if self.attention is not None:
-            features.append(sums[:, self.n_sums + 1 :] / (sums[:, self.n_sums : self.n_sums + 1] + 1e-6))
+            features.append(sums[:, N_EXPECTED + 1 :] / (sums[:, N_EXPECTED : N_EXPECTED + 1] + 1e-6))
         joined = torch.cat(features, 1).float()
         if self.training and len(joined) < 2:  # one view has no spread of its own; a process's share may be empty
             standard = self.standard
@@ -200,8 +185,6 @@ class SetNetwork(LandmarkNetwork):
     ) -> Tensor:
         """Return `ALL_STATISTICS` (B, S) from what `logits` takes, without the last if `cells` are not given."""
         known = [expected_statistics(sums[:, :N_EXPECTED], n_visible, self.pose_variances), axis_height[:, None]]
-        means = sums[:, N_EXPECTED : self.n_sums] / (sums[:, :1] + 1e-6)
-        known.append((means if self.averaged else torch.zeros_like(sums[:, : len(AVERAGED)])).float())
         if cells is not None:
             known.append(cells.log1p()[:, None])
         return torch.cat(known, 1)

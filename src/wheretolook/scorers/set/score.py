@@ -43,8 +43,8 @@ class SetScorer(LandmarkScorer):
     def __init__(self, localization_map: LocalizationMap, trained: TrainedNetwork[SetNetwork]) -> None:
         super().__init__(localization_map, trained.network.attributes, trained.training_range, trained.camera)
         self.name = trained.method
-        self.local = not trained.network.uses("map_size")
-        self.trained = trained
+        self.local = True
+        self.trained = trained.for_photographs() if localization_map.photographs else trained
         self.network = trained.network.to(localization_map.device)
         self.accuracy = trained.accuracy
         signs = [NARROW.get(name, 0.0) for name in self.network.attributes]

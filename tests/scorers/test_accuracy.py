@@ -29,11 +29,14 @@ from wheretolook.scorers.set.accuracy import STATISTICS, AccuracyModel, LogError
 from wheretolook.scorers.set.network import ALL_STATISTICS
 from wheretolook.scorers.set.score import SetScorer
 from wheretolook.select.where_to_look import WhereToLook
+from wheretolook.training.weights import read_header
 from wheretolook.utils.errors import ConfigError, MapWarning, OutOfRangeWarning, WeightsError
+from wheretolook.utils.shipped import WEIGHTS, shipped
 from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.studies import fit_accuracy
 
 ACCURACIES = ((1e-9, 1e-9), (0.01, 0.1), ACCURACY, (0.1, 1.0), (0.25, 2.0), (math.inf, math.inf))
+DISTANCE_M = read_header(shipped(WEIGHTS) / "set.safetensors")["range"]["distance_m"]  # of the training views
 MODEL = AccuracyModel((1.0, 0.5), 0.2, (LogError((0.1, 0.2, -0.3), -4.0, 0.9), LogError((0.0, 0.4, -0.1), -2.0, 0.8)))
 
 
@@ -166,7 +169,7 @@ def test_views_have_an_accuracy_and_expected_errors(scorer: SetScorer) -> None:
     coarse = look.best(place, accuracy=(0.25, 2))
     assert coarse.score[0] >= own.score[0] and coarse.method == "set 0.25m_2deg"
     assert coarse.expected_error_m is not None and coarse.expected_error_deg is not None
-    assert np.array_equal(look.at_accuracy((0.25, 2)).score(coarse.cam_from_world), coarse.score)
+    assert look.at_accuracy((0.25, 2)).score(coarse.cam_from_world) == pytest.approx(coarse.score, abs=1e-6)
     with pytest.raises(ConfigError, match="joint scores"):
         look.best(place, accuracy=(0.25, 2), looks=2)
     for limits in ((0, 1), (0.1, -1), (math.nan, 1), (1,)):
@@ -194,12 +197,12 @@ def sphere(radius_m: float) -> SetScorer:
 
 @pytest.mark.parametrize("radius_m", [6.0, 35.0])
 def test_the_depth_that_is_in_range_depends_on_the_accuracy(radius_m: float) -> None:
-    """The weights store a mean distance of 0.3726 to 15.2239 m, at 5 cm."""
     scorer = sphere(radius_m)
+    farthest = DISTANCE_M[1]
     views = poses_looking_along(np.zeros((8, 3)), direction_lattice(8))
-    for accuracy_m in (0.005, 0.0196, 0.0198, 0.05, 0.25, 1.0):
+    for accuracy_m in (0.005, *(6 / DISTANCE_M[1] * 0.05 + np.array([-1e-4, 1e-4])), 0.05, 0.25, 1.0):
         at = scorer.at_accuracy((accuracy_m, 0.4))
-        is_inside = radius_m < 15.2239 and radius_m / accuracy_m < 15.2239 / 0.05
+        is_inside = radius_m < farthest and radius_m / accuracy_m < farthest / 0.05
         assert (at.in_range(views) == is_inside).all() and (at.report(views).in_range == is_inside).all()
         assert (at.at_accuracy(ACCURACY).in_range(views) == scorer.in_range(views)).all()
 
@@ -210,10 +213,11 @@ def test_it_warns_once_of_depth_relative_to_the_accuracy() -> None:
     for accuracy in (ACCURACY, (0.02, 0.2), (0.25, 2.0)):
         assert not warnings_of(scorer.at_accuracy(accuracy), views)
     (warned,) = warnings_of(scorer.at_accuracy((0.01, 0.1)), views)
-    assert warned.startswith("set 0.01m_0.1deg: 8 of 8 views") and "6 m (in range: 0.373 to 3.04)" in warned
+    assert warned.startswith("set 0.01m_0.1deg: 8 of 8 views")
+    assert f"6 m (in range: {DISTANCE_M[0]:.3g} to {DISTANCE_M[1] / 5:.3g})" in warned
     assert not warnings_of(scorer.at_accuracy((0.01, 0.1)), views)
     (warned,) = warnings_of(sphere(35.0), views)
-    assert "35 m (in range: 0.373 to 15.2)" in warned
+    assert f"35 m (in range: {DISTANCE_M[0]:.3g} to {DISTANCE_M[1]:.3g})" in warned
 
 
 def test_depth_over_accuracy_does_not_depend_on_an_unknown_unit(tmp_path: Path) -> None:

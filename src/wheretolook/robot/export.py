@@ -63,6 +63,8 @@ def export_robot(
     out = Path(out)
     weights = Path(weights)
     trained = TrainedNetwork.load(weights, SetNetwork, "set")
+    if localization_map.photographs:
+        trained = trained.for_photographs()
     landmarks = localization_map.landmarks
     places = np.empty((0, 3)) if places is None else np.asarray(places, dtype=np.float64).reshape(-1, 3)
     accuracy = trained.accuracy if accuracy is None else checked_accuracy(accuracy)

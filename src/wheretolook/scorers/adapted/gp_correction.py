@@ -15,6 +15,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import minimize
 from scipy.special import expit
 
 from wheretolook.geometry.poses import Float
@@ -150,16 +151,14 @@ def _most_likely(mean: Float, covariance: Float, y: Float) -> Float:
 def _calibration(fixed: Float, y: Float) -> tuple[float, float]:
     """Return scale and offset of log-odds (Platt scaling) with a prior."""
     prior = np.array([1.0, 0.0])
-    at = prior
-    for _ in range(STEPS):
-        p = expit(fixed @ at)
-        gradient = fixed.T @ (p - y) + PRIOR * (at - prior)
-        step = np.linalg.solve(fixed.T @ (fixed * (p * (1 - p))[:, None]) + np.diag(PRIOR), gradient)
-        largest = float(np.abs(step).max())
-        at = at - step * min(1.0, 2.0 / max(1e-12, largest))
-        if largest < 1e-8:
-            break
-    return float(at[0]), float(at[1])
+
+    def loss(at: Float) -> tuple[float, Float]:
+        log_odds = fixed @ at
+        value = np.logaddexp(0, log_odds).sum() - y @ log_odds + PRIOR @ (at - prior) ** 2 / 2
+        return float(value), fixed.T @ (expit(log_odds) - y) + PRIOR * (at - prior)
+
+    scale, offset = minimize(loss, prior, jac=True).x
+    return float(scale), float(offset)
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,7 +40,7 @@ def fitted_offset(places: Sequence[Views]) -> float:
     return float(minimize_scalar(loss, bounds=(-5, 5), method="bounded").x)
 
 
-def main(weights: Path, checks: list[Path], share: float = 0.6, write: bool = False) -> None:
+def main(weights: Path, checks: list[Path], share: float = 0.3, write: bool = False) -> None:
     """Print the calibration error of each place; with `write`, store the offset in the weights.
 
     Args:

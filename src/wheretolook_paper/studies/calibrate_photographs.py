@@ -23,10 +23,9 @@ from scipy.special import expit
 from wheretolook.evaluation.calibration import expected_calibration_error
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.trained_network import TrainedNetwork
-from wheretolook.training.weights import read_weights
+from wheretolook.training.weights import read_record, read_training
 from wheretolook.utils.files import sha256, write_json
 from wheretolook.utils.probability import finite_log_odds
-from wheretolook.utils.reading import read_json_object
 
 Views = tuple[np.ndarray, np.ndarray]  # log-odds and labels (B,) of the views of a place
 
@@ -65,12 +64,10 @@ def main(weights: Path, checks: list[Path], share: float = 0.3, write: bool = Fa
     print(f"offset {offset}")
     if write:
         trained = TrainedNetwork.load(weights, SetNetwork, "set")
-        about = read_weights(weights)[1]["training"]
-        replace(trained, photograph_offset=offset).save(
-            weights, {**about, "calibrated_on": [path.name for path in checks]}
-        )
-        record = weights.with_suffix(".json")
-        write_json(record, read_json_object(record) | {"weights_sha256": sha256(weights)})
+        about = {**read_training(weights), "calibrated_on": [path.name for path in checks]}
+        replace(trained, photograph_offset=offset).save(weights, about)
+        record = read_record(weights) | {"about": about, "weights_sha256": sha256(weights)}
+        write_json(weights.with_suffix(".json"), record)
 
 
 if __name__ == "__main__":

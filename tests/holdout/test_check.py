@@ -143,7 +143,7 @@ def test_the_part_that_nothing_else_shows_is_named(checked: Path) -> None:
 def test_adapted_weights_are_checked_on_their_own_map_alone(
     checked: Path, corridor: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    base = TrainedNetwork.load(WEIGHTS / "set.safetensors", SetNetwork, "set")
+    base = TrainedNetwork.load(WEIGHTS / "set.safetensors", SetNetwork, "set").for_photographs()
     network = AdaptedNetwork(base.network, base.scale, base.offset, 1.0, 4.0, 0, 256)  # changes no score
     points = np.array([point.xyz for _, point in sorted(read_model(corridor[0]).points3D.items())])
     path = tmp_path / "adapted.safetensors"

@@ -87,6 +87,7 @@ def test_weights_without_a_gain_are_not_kept(dataset: Dataset, capsys: pytest.Ca
         ("--scene", "scene-1", "--weights", "x.safetensors", "--out", "x.safetensors"),
         ("--scene", "scene-1", "--weights", "nowhere.safetensors"),
         ("--map", "dataset", "--label.appearance", "0.5"),
+        ("--scene", "scene-1", "--label.changes", "0.5"),
     ],
 )
 def test_bad_input_is_named(

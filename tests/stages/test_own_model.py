@@ -23,6 +23,7 @@ from wheretolook.commands.preconditions import extractor_of
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.scenes_config import ScenesConfig
 from wheretolook.commands.viewpoint_map import BuildViewpointMap
+from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.features.config import ExtractorConfig
@@ -110,6 +111,7 @@ def test_from_a_model_to_a_planned_path(tmp_path, with_mesh):
     (scene,) = Dataset.load(tmp_path / "data" / "mine").scenes
     assert scene.name == "flat" and scene.camera == LOOKS and scene.own_camera
     assert scene.is_photographed is not with_mesh and len(scene.read_landmarks()) == n_points
+    assert SceneEnvironment(scene).has_photographs  # of the model, whose mesh is not what was mapped
     np.testing.assert_allclose(scene.mapping_poses(), colmap_poses(folder), atol=1e-6)
 
     run(Sample, experiment)

@@ -10,6 +10,7 @@ import pytest
 from selection.room import POINTS, WEIGHTS, write_room
 from synthetic_dataset import CAMERA, make_dataset
 from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.mapping.config import FrameOptions
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import TableError
 from wheretolook.view import drawing
@@ -48,6 +49,17 @@ def test_the_best_views_of_a_location_are_those_of_select(room: ViewedMap) -> No
     np.testing.assert_allclose(location.scores, selector.scorer.score_directions(POINTS[:1], selector.directions)[0])
     with pytest.raises(TableError):
         score_location(selector, np.array([80.0, 0.0, 1.0]), 1)
+
+
+def test_locations_are_in_the_world_whatever_the_unit_of_the_map(tmp_path: Path) -> None:
+    halved = open_map(
+        write_room(tmp_path / "sparse", metric=False), weights=WEIGHTS, frame=FrameOptions(scale=0.5, up="z")
+    )
+    assert halved.frame.world_from_map.scale == 0.5
+    selector = halved.selector("set", "none")
+    best = score_location(selector, 0.5 * POINTS[0], 4).best
+    np.testing.assert_allclose(best.positions, np.tile(0.5 * POINTS[0], (4, 1)), atol=1e-9)
+    np.testing.assert_allclose(best.score, selector.scorer.score(best.cam_from_world), atol=1e-6)
 
 
 def test_probabilities_of_visible_landmarks_sum_to_the_expected_inliers(room: ViewedMap) -> None:

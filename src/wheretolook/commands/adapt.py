@@ -6,7 +6,7 @@ import shutil
 import time
 import warnings
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -53,6 +53,7 @@ class _Target:
     dataset: str  # its name; empty for a COLMAP model
     weights: Path
     path: Path
+    photographs: bool  # whether the map's images are photographs, for which log-odds have an offset
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,9 +100,11 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         config = self.adapt
         frame = self.frame_options()
         appearance = config.map and self.label.appearance
+        changes = self.label.changes
         reject(
             (config.map is None and frame != FrameOptions(), "the map's scale and up belong to --map", vars(frame)),
             (bool(appearance), "label.appearance is for renders, not for the photographs of --map", appearance),
+            (bool(changes), "label.changes is for the label command, whose labels are then adapted to", changes),
         )
         if config.map is not None:
             return self._adapt_map(config.map, log, progress)
@@ -109,8 +112,9 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         with reading(self.root, "adapt", FOLDER):
             dataset = Dataset.load(self.root)
             files = _scene(dataset, config.scene)
-            target = self._target(files.name, dataset.root / FOLDER / f"{files.name}.safetensors", dataset)
             scene = open_scene(self, files)
+            path = dataset.root / FOLDER / f"{files.name}.safetensors"
+            target = self._target(files.name, path, scene.has_photographs, dataset)
             has_photographs = knows_photographs(files, config.images, config.database)
             table = self._labelled(files, scene, has_photographs, log)
             views = None if table is None else labelled_views(files, scene, table, target.weights)
@@ -131,10 +135,10 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         """Adapt to a COLMAP map by its photographs only."""
         from wheretolook.holdout.photo_map import folder_of_check
         from wheretolook.mapping.colmap_model import model_arrays, read_model
-        from wheretolook.mapping.map_frame import find_frame
+        from wheretolook.mapping.map_frame import find_frame, has_photographs
 
         name = place_name(model)
-        target = self._target(name, folder_of_check(self.data, name) / "adapted.safetensors")
+        target = self._target(name, folder_of_check(self.data, name) / "adapted.safetensors", has_photographs(model))
         occlusion = "none" if self.occlusion.model == "none" else "hidden-points"
         reconstruction = read_model(model)
         arrays = model_arrays(reconstruction)
@@ -146,7 +150,7 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         with hold(target.path.with_name(f".{target.path.name}.lock"), "adapt"):
             return self._fit(target, views, frame.of_arrays(arrays).points, log, progress)
 
-    def _target(self, name: str, path: Path, dataset: Dataset | None = None) -> _Target:
+    def _target(self, name: str, path: Path, photographs: bool, dataset: Dataset | None = None) -> _Target:
         """Return what is adapted, after checks that fail before the work; `path` is the default of `adapt.out`."""
         features = "" if dataset is None else dataset.features
         weights = resolve_weights("set", self.adapt.weights, features)
@@ -160,7 +164,7 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
             path.parent.mkdir(parents=True, exist_ok=True)
         remove_if_empty(created)
         check_store(self.tracking)
-        return _Target(name, "" if dataset is None else dataset.name, weights, path)
+        return _Target(name, "" if dataset is None else dataset.name, weights, path, photographs)
 
     def _held_out(self, model: Path, name: str, occlusion: OcclusionModel, weights: Path, log: Log) -> LocalizedViews:
         """Return a map's photographs, held out in blocks that `wheretolook check` shares."""
@@ -298,7 +302,8 @@ def labelled_views(files: SceneFolder, scene: SceneEnvironment, table: pd.DataFr
     cam_from_world = poses(table)
     log_odds = np.empty(len(table))
     for camera, rows in views_by_camera(files, table):
-        scorer = load_scorer(weights, files.localization_map(camera, scene.device))
+        localization_map = files.localization_map(camera, scene.device)
+        scorer = load_scorer(weights, replace(localization_map, photographs=scene.has_photographs))
         with warnings.catch_warnings():  # how accurate the weights are here is what is measured
             warnings.simplefilter("ignore", OutOfRangeWarning)
             log_odds[rows] = log_odds_of(scorer.score(cam_from_world[rows]))
@@ -333,7 +338,7 @@ def _save(target: _Target, points: Float, adapted: Adapted, views: LocalizedView
     from wheretolook.training.trained_network import TrainedNetwork
 
     base = TrainedNetwork.load(target.weights, SetNetwork, "set")
-    if (views.photograph >= 0).all():
+    if target.photographs:
         base = base.for_photographs()
     correction = adapted.adaptation
     n_signature = min(_MAX_SIGNATURE, len(points))

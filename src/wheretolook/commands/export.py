@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from wheretolook.commands.options import CameraOptions
+from wheretolook.dataset.thresholds import checked_accuracy
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.shipped import or_shipped
@@ -56,6 +57,8 @@ class Export(CameraOptions, FrameOptions):
 
     def __post_init__(self) -> None:
         check_positive("spacing", self.spacing)
+        if self.accuracy is not None:
+            checked_accuracy(self.accuracy)
         self.frame_options()
         self.named_camera()
 

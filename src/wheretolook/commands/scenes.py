@@ -82,7 +82,9 @@ class Scenes(DatasetOptions):
                 path = files.folder / "changed.glb"
                 cache = ArtifactCache(files.folder, cache_key(inputs, strength), manifest="changed.json")
                 if not cache.is_current(path):
-                    save_glb(make(changes=strength)[0], path)
+                    mesh, _ = make(changes=strength)
+                    cache.clear()  # so that no key describes a mesh of other changes
+                    save_glb(mesh, path)
                     cache.store()
                 return path
         fix = "Set label.changes 0, or give label the scenes options that generated the scene."

@@ -16,7 +16,8 @@ from wheretolook.geometry.camera import Camera, cameras_by_id, only_camera
 from wheretolook.geometry.lattices import ViewLattice, VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.mapping.config import FrameOptions, place_name
-from wheretolook.mapping.map_frame import IDENTITY, MapFrame, read_frame
+from wheretolook.mapping.georeference import read_scale
+from wheretolook.mapping.map_frame import IDENTITY, MapFrame, has_photographs, read_frame
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError
@@ -107,9 +108,9 @@ class Environment(ABC):
         """Whether `mesh` is available."""
 
     @property
-    def is_photographed(self) -> bool:
-        """Whether the mapping images are photographs; so are those of an imported model."""
-        return True
+    @abstractmethod
+    def has_photographs(self) -> bool:
+        """Whether the mapping images are photographs, as those of an imported model; else they are rendered."""
 
     @property
     def has_depth(self) -> bool:
@@ -208,7 +209,7 @@ class Environment(ABC):
         from wheretolook.inputs.localization_map import LocalizationMap
 
         of_map = (self.landmarks, self.camera, self.occlusion, self.device, self.mapping_poses)
-        return LocalizationMap(*of_map, self.frame, self.is_photographed)
+        return LocalizationMap(*of_map, self.frame, self.has_photographs)
 
 
 class SceneEnvironment(Environment):
@@ -237,6 +238,11 @@ class SceneEnvironment(Environment):
     def is_photographed(self) -> bool:
         """Whether the scene is known from photographs alone."""
         return self.files.is_photographed
+
+    @cached_property
+    def has_photographs(self) -> bool:  # type: ignore[override]
+        """Whether the map is of photographs or an imported model, with or without a mesh."""
+        return read_scale(self.files.map) is not None
 
     @cached_property
     def frame(self) -> MapFrame:
@@ -408,6 +414,11 @@ class ColmapEnvironment(Environment):
     def has_mesh(self) -> bool:
         """Whether a mesh was given."""
         return self.files.mesh is not None
+
+    @property
+    def has_photographs(self) -> bool:
+        """Whether the model's images are photographs, see `wheretolook.mapping.map_frame.has_photographs`."""
+        return has_photographs(self.files.model)
 
     @property
     def has_depth(self) -> bool:

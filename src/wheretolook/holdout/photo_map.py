@@ -22,7 +22,7 @@ from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_ar
 from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, PhotographsConfig, place_name
 from wheretolook.mapping.feature_files import DATABASE_FILE, read_descriptors
 from wheretolook.mapping.georeference import DEPTH_M, median_depths
-from wheretolook.mapping.map_frame import IDENTITY, MapFrame, find_frame
+from wheretolook.mapping.map_frame import IDENTITY, MapFrame, find_frame, has_photographs
 from wheretolook.mapping.sources import find_features, find_photographs
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.confine import safe_child
@@ -62,6 +62,7 @@ class PhotographedMap:
         depth_m: (I,) median depth of the landmarks that each observes, NaN where it observes none.
         key: changes with the model and the features.
         fov_deg: horizontal field of view of narrower views that are simulated from each photograph; None for itself.
+        photographs: False for a map of renders, see `wheretolook.mapping.map_frame.has_photographs`.
     """
 
     name: str
@@ -77,6 +78,7 @@ class PhotographedMap:
     depth_m: Float
     key: str
     fov_deg: float | None = None
+    photographs: bool = True
 
     @property
     def n_crops(self) -> int:
@@ -191,6 +193,7 @@ def open_map(
         own_centers=own_centers,
         depth_m=median_depths(arrays, poses),
         key=cache_key(_fingerprints(model_dir), size_and_time([features.resolve()]), own_frame.record()),
+        photographs=has_photographs(source or model_dir),
     )
 
 

@@ -83,7 +83,7 @@ def check_place(source: PhotographedMap, scoring: Scoring, device: str) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MapWarning)
             landmarks = load_colmap_landmarks(source.path, reconstruction=source.model, progress=False)
-        scoring.scorer(LocalizationMap(landmarks, source.cameras[0], device=device, photographs=True))
+        scoring.scorer(LocalizationMap(landmarks, source.cameras[0], device=device, photographs=source.photographs))
 
 
 def score_views(
@@ -118,7 +118,9 @@ def maps_without(
     cached = occlusion if occlusion.name == "none" else CachedOcclusion(occlusion)
     cameras = [camera for camera, _ in _views(source, result.views)]
     poses = compact_poses(source.poses[remaining])
-    localization_map = LocalizationMap(result.landmarks, cameras[0], cached, device, poses, photographs=True)
+    localization_map = LocalizationMap(
+        result.landmarks, cameras[0], cached, device, poses, photographs=source.photographs
+    )
     for camera in dict.fromkeys(cameras):
         rows = np.array([row for row, other in enumerate(cameras) if other == camera])
         yield rows, localization_map.of_camera(camera)

@@ -15,7 +15,7 @@ from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.landmarks import Landmarks, open_colmap
-from wheretolook.mapping.map_frame import IDENTITY, MapFrame
+from wheretolook.mapping.map_frame import IDENTITY, MapFrame, has_photographs
 from wheretolook.mapping.sanity import warn_of_mesh
 from wheretolook.utils.validation import check_positive
 from wheretolook.visibility import frustum
@@ -93,7 +93,9 @@ class LocalizationMap:
             space = FreeSpace(load_mesh(Path(mesh), colored=False).transformed(own_frame.world_from_map), device=device)
             occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
             warn_of_mesh(mesh, landmarks.points, space.raycaster)
-        return cls(landmarks, camera, occlusion or NoOcclusion(), device, poses, own_frame, photographs=True)
+        return cls(
+            landmarks, camera, occlusion or NoOcclusion(), device, poses, own_frame, has_photographs(Path(model))
+        )
 
     def of_camera(self, camera: Camera) -> LocalizationMap:
         """Return the same map for another camera."""

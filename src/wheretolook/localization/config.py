@@ -92,7 +92,7 @@ class LabelConfig:
             and stored (appearance).
         changes: 0 to 1, how much generated scenes change after they are mapped: things are moved or removed, lamps are
             brighter or dimmer. The views of about half of the locations show the changed scene, which is stored
-            (changes). Only the label command uses it.
+            (changes). Only the label command takes it.
         store_pixels: store also the pixels of the matches (matched_pixels); needed to localize several looks jointly.
     """
 

@@ -146,6 +146,12 @@ def reported_scale(model_dir: Path) -> MapScale | None:
     return MapScale("rendered") if path.is_file() and "n_landmarks" in read_json_object(path) else None
 
 
+def has_photographs(model_dir: Path) -> bool:
+    """Return whether the images of a model are photographs: all but those that the report of its map states as rendered."""
+    scale = reported_scale(model_dir)
+    return scale is None or scale.source != "rendered"
+
+
 def read_frame(map_dir: Path) -> MapFrame:
     """Read the own frame of the model that a map was imported from, from its report; of other maps, their own.
 

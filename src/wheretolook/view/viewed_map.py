@@ -131,9 +131,12 @@ class ViewedMap:
 
     @lru_cache(MAX_SCORERS)  # noqa: B019
     def _localization_map(self, occlusion: str) -> LocalizationMap:
+        from wheretolook.inputs.localization_map import LocalizationMap
 
-        of_map = self.environment.localization_map
-        return replace(of_map, camera=self.camera, occlusion=self.environment.occlusion_model(occlusion))
+        model = self.environment.occlusion_model(occlusion)
+        of_map = self.landmarks, self.camera, model, self.environment.device, self.mapping_poses
+        # without the map's own frame: the viewer selects in the world
+        return LocalizationMap(*of_map, photographs=self.environment.has_photographs)
 
     @lru_cache(MAX_FLOORS)  # noqa: B019
     def floor(self, method: str, occlusion: str, height_m: float) -> Floor:

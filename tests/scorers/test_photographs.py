@@ -1,0 +1,41 @@
+"""Log-odds of maps of photographs have the offset of the weights once; those of maps of renders have none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import logit
+
+from selection.room import write_room
+from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.scorers.set.network import SetNetwork
+from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.weights.resolve import load_scorer
+
+
+@pytest.mark.parametrize("rendered", [True, False])
+def test_the_offset_is_added_once_and_only_for_photographs(rendered: bool, tmp_path: Path) -> None:
+    folder = write_room(tmp_path / "sparse", metric=rendered)  # whose report then states that it is rendered
+    trained = replace(
+        TrainedNetwork.load(shipped(WEIGHTS) / "set.safetensors", SetNetwork, "set"), photograph_offset=0.7
+    )
+    trained.save(tmp_path / "with.safetensors")
+    replace(trained, photograph_offset=0.0).save(tmp_path / "without.safetensors")
+    TrainedNetwork.load(tmp_path / "with.safetensors", SetNetwork, "set").save(tmp_path / "again.safetensors")
+    expected = 0.0 if rendered else 0.7
+    for localization_map in (
+        LocalizationMap.from_colmap(folder),
+        ColmapEnvironment(ColmapFiles(folder)).localization_map,
+    ):
+        views = localization_map.mapping_poses
+        assert views is not None
+        plain, *others = (
+            load_scorer(tmp_path / f"{name}.safetensors", localization_map) for name in ("without", "with", "again")
+        )
+        for scorer in others:
+            np.testing.assert_allclose(logit(scorer.score(views)) - logit(plain.score(views)), expected, atol=1e-6)

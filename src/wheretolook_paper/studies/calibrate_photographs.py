@@ -1,7 +1,8 @@
 """Fit the offset of a network's log-odds on maps of photographs, and write it to its weights.
 
-    wheretolook check --map places/entry-P10/sparse --fov 40 --weights set.safetensors --out checks/entry-P10    (and others)
-    python -m wheretolook_paper.studies.calibrate_photographs --weights set.safetensors --checks '[checks/entry-P10, ...]'
+    wheretolook check --map entry-P10/sparse --fov 40 --weights set.safetensors --out checks/entry-P10    (and others)
+    python -m wheretolook_paper.studies.calibrate_photographs --weights set.safetensors \\
+        --checks '[checks/entry-P10, ...]'
 
 Reads the scores and labels of the checks, made with weights without an offset. Every place counts the same. Prints the
 calibration error of each place without an offset, with the one fitted to the other places, and with the one that is
@@ -24,6 +25,7 @@ from wheretolook.evaluation.calibration import expected_calibration_error
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.weights import read_record, read_training
+from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import sha256, write_json
 from wheretolook.utils.probability import finite_log_odds
 
@@ -64,6 +66,11 @@ def main(weights: Path, checks: list[Path], share: float = 0.3, write: bool = Fa
     print(f"offset {offset}")
     if write:
         trained = TrainedNetwork.load(weights, SetNetwork, "set")
+        if trained.photograph_offset:
+            fix = "Check with weights that have none, and give these."
+            raise ConfigError(
+                "the weights have an offset already", path=weights, value=trained.photograph_offset, fix=fix
+            )
         about = {**read_training(weights), "calibrated_on": [path.name for path in checks]}
         replace(trained, photograph_offset=offset).save(weights, about)
         record = read_record(weights) | {"about": about, "weights_sha256": sha256(weights)}

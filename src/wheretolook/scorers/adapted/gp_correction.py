@@ -30,6 +30,7 @@ PRIOR = np.array([5.0, 0.1])  # precision of scale (about 1) and offset (about 0
 MAX_SUPPORT = 2000  # views that support g, finally and while kernels are tried; evenly spread
 TRIED_SUPPORT = 800
 FOLDS = 5
+MIN_SCALE = 1e-3  # of log-odds: 0 or less would reverse the order of the views
 STEPS = 30  # of Newton's method at most
 TOLERANCE = 1e-4  # smallest gain in log-likelihood of a step
 
@@ -114,7 +115,7 @@ def fit(
     kernel = amplitude * nearness(*poses, *poses, length_m, sharpness)
     residual = _most_likely(fixed @ (1.0, 0.0), kernel + (fixed / PRIOR) @ fixed.T, y)
     scale, offset = (1.0, 0.0) + fixed.T @ residual / PRIOR
-    return Adaptation(float(scale), float(offset), length_m, sharpness, *poses, amplitude * residual)
+    return Adaptation(max(float(scale), MIN_SCALE), float(offset), length_m, sharpness, *poses, amplitude * residual)
 
 
 def _most_likely(mean: Float, covariance: Float, y: Float) -> Float:
@@ -157,7 +158,7 @@ def _calibration(fixed: Float, y: Float) -> tuple[float, float]:
         value = np.logaddexp(0, log_odds).sum() - y @ log_odds + PRIOR @ (at - prior) ** 2 / 2
         return float(value), fixed.T @ (expit(log_odds) - y) + PRIOR * (at - prior)
 
-    scale, offset = minimize(loss, prior, jac=True).x
+    scale, offset = minimize(loss, prior, jac=True, bounds=((MIN_SCALE, None), (None, None))).x
     return float(scale), float(offset)
 
 

@@ -27,6 +27,7 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.localization.localizer import Localizer
 from wheretolook.mapping.colmap_model import load_mapping_poses, save_mapping_poses
 from wheretolook.mapping.config import MapConfig
+from wheretolook.mapping.georeference import REPORT_FILE
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.rendered_map import build_map
 from wheretolook.planning.map_building import build_viewpoint_map
@@ -182,8 +183,9 @@ def test_a_colmap_model_gives_the_same_views(tmp_path: Path) -> None:
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(np.eye(3)), SHIFT))
     (tmp_path / "far").mkdir()
     model.write_binary(str(tmp_path / "far"))
+    (folder / REPORT_FILE).unlink()  # which states that the images are rendered, and not copied with the model
     for hides in ("none", "hidden-points"):
-        near = WhereToLook.from_colmap(folder, occlusion=hides, directions=100)
+        near = WhereToLook.from_colmap(folder, occlusion=hides, directions=100, scale=1)
         far = WhereToLook.from_colmap(tmp_path / "far", occlusion=hides, directions=100, scale=1)
         views = near.best(POINTS)
         there = far.best(POINTS + SHIFT)

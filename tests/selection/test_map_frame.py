@@ -36,7 +36,9 @@ def frame_of(folder: Path, **options: object) -> MapFrame:
 
 @pytest.mark.filterwarnings("ignore")
 def test_scores_do_not_depend_on_unit_and_axes(sparse: Path, tmp_path: Path) -> None:
-    reference = WhereToLook.from_colmap(sparse, weights=WEIGHTS, directions=60, device="cpu").best(POINTS, 3)
+    moved = in_other_units(sparse, tmp_path / "metric", 1.0, np.eye(3)).apply(POINTS)
+    of_map = {"weights": WEIGHTS, "directions": 60, "device": "cpu", "scale": 1}
+    reference = WhereToLook.from_colmap(tmp_path / "metric", **of_map).best(moved, 3)
     unknown = []
     for number, unit in enumerate((0.01, 0.1, 1.0, 10.0, 270.0)):
         folder = tmp_path / str(number)

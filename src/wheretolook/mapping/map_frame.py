@@ -147,7 +147,7 @@ def reported_scale(model_dir: Path) -> MapScale | None:
 
 
 def has_photographs(model_dir: Path) -> bool:
-    """Return whether the images of a model are photographs: all but those that the report of its map states as rendered."""
+    """Return whether the images of a model are photographs: all but those that its report states as rendered."""
     scale = reported_scale(model_dir)
     return scale is None or scale.source != "rendered"
 

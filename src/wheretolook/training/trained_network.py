@@ -44,8 +44,8 @@ NetworkT = TypeVar("NetworkT", bound=StoredNetwork)
 class TrainedNetwork(Generic[NetworkT]):
     """A network and the calibration scale * logit + offset of its logits.
 
-    Trained on rendered views, a network predicts too low probabilities for photographs: `photograph_offset` is added to
-    the log-odds of their maps (`for_photographs`).
+    A network trained on rendered views predicts probabilities that are too low for most photographs:
+    `for_photographs` adds `photograph_offset` to the log-odds (docs/research/cameras.md).
     """
 
     method: str

@@ -38,12 +38,12 @@ training, small triangulation angles occur at landmarks that are hard to match, 
 class SetScorer(LandmarkScorer):
     """Network over the set of visible landmarks: their probabilities of detection and their information on the pose."""
 
+    local = True
     max_landmarks = MAX_LANDMARKS
 
     def __init__(self, localization_map: LocalizationMap, trained: TrainedNetwork[SetNetwork]) -> None:
         super().__init__(localization_map, trained.network.attributes, trained.training_range, trained.camera)
         self.name = trained.method
-        self.local = True
         self.trained = trained.for_photographs() if localization_map.photographs else trained
         self.network = trained.network.to(localization_map.device)
         self.accuracy = trained.accuracy

@@ -41,6 +41,7 @@ SETTINGS = {
 JOINTS = ["pan", "tilt"]
 CAMERA = PinholeCamera()
 TIMEOUT_S = 60.0  # of a machine that does other work
+RESEND_S = 5.0
 
 
 def environment() -> dict[str, str]:
@@ -132,6 +133,24 @@ class Robot(Node):
         message.header.stamp.nanosec = round(now % 1 * 1e9)
         self.senders[topic].publish(message)
 
+    def ask(self, topic: str, message: Any, *answers: str) -> list[Any]:
+        """Publish a message until a node answers on other topics; returns the last answer on each.
+
+        The first answers can be lost: a node may discover this one's subscription after its own is discovered.
+        """
+        self.received.clear()
+        sent = 0.0
+
+        def answered() -> Any:
+            nonlocal sent
+            if time.monotonic() - sent > RESEND_S:
+                self.send(topic, message)
+                sent = time.monotonic()
+            found = [self.last(answer) for answer in answers]
+            return None if None in found else found
+
+        return self.wait(answered, f"{answers}")
+
     def rgb(self, base: Array, pan: float = 0.0, tilt: float = 0.0, camera: PinholeCamera = CAMERA) -> Array:
         """Render what the camera sees."""
         assert self.renderer is not None
@@ -162,7 +181,7 @@ class Robot(Node):
 
         def answered() -> DiagnosticStatus | None:
             nonlocal sent
-            if time.monotonic() - sent > 5:  # sensor QoS may drop it
+            if time.monotonic() - sent > RESEND_S:  # sensor QoS may drop it
                 self.send("image/compressed" if isinstance(message, CompressedImage) else "image", message)
                 sent = time.monotonic()
             return next(

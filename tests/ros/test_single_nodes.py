@@ -189,9 +189,7 @@ def test_the_gaze(node: Robot, folder: Path) -> None:
             message = PoseWithCovarianceStamped()
             message.header.frame_id = "map"
             message.pose.pose = pose_message(base)
-            node.received.clear()
-            node.send("pose", message)
-            trajectory = node.wait(lambda: node.last("joint_trajectory"), "a trajectory")
+            (trajectory,) = node.ask("pose", message, "joint_trajectory")
             assert trajectory.joint_names == ["pan", "tilt"]
             pan, tilt = trajectory.points[0].positions
             assert abs(pan) <= np.radians(60) + 1e-9 and abs(tilt) <= np.radians(20) + 1e-9
@@ -206,9 +204,7 @@ def test_the_gaze(node: Robot, folder: Path) -> None:
         look.header.frame_id = "base_link"
         look.vector.x = np.cos(0.5)
         look.vector.y = np.sin(0.5)
-        node.received.clear()
-        node.send("look", look)
-        found = node.wait(lambda: node.last("joint_trajectory"), "a trajectory")
+        (found,) = node.ask("look", look, "joint_trajectory")
         np.testing.assert_allclose(found.points[0].positions, (0.5, 0.0), atol=1e-9)
         look.vector.x = np.nan
         node.send("look", look)
@@ -229,9 +225,7 @@ def test_the_gaze(node: Robot, folder: Path) -> None:
         stops = np.column_stack([np.linspace(1.5, 4.5, 31), np.full(31, 2.5)])
         for x, y in stops:
             path.poses.append(PoseStamped(pose=pose_message(base_at(x, y, 0.0))))
-        node.received.clear()
-        node.send("plan", path)
-        views = node.wait(lambda: node.last("gaze/views"), "views along the path")
+        (views,) = node.ask("plan", path, "gaze/views")
         cameras = np.array([pose_matrix(view.pose) for view in views.poses])
         assert views.header.frame_id == "map" and len(cameras) == 7
         np.testing.assert_allclose(
@@ -271,9 +265,7 @@ def test_the_gaze_of_a_head_with_one_joint(node: Robot, folder: Path, missing: s
         message.header.frame_id = "map"
         for base in (BASE, base_at(2.0, 3.0, -100.0)):
             message.pose.pose = pose_message(base)
-            node.received.clear()
-            node.send("pose", message)
-            trajectory = node.wait(lambda: node.last("joint_trajectory"), "a trajectory")
+            trajectory, looked = node.ask("pose", message, "joint_trajectory", "gaze/direction")
             moved = {"tilt": "pan", "pan": "tilt"}[missing]
             assert trajectory.joint_names == [moved] and len(trajectory.points[0].positions) == 1
             angle = trajectory.points[0].positions[0]
@@ -284,7 +276,7 @@ def test_the_gaze_of_a_head_with_one_joint(node: Robot, folder: Path, missing: s
                 grid = [(0.0, tilt) for tilt in np.radians(np.linspace(-45, 45, 10))]
                 joints = (0.0, angle)
             axis = HEAD.base_from_camera(*joints)[:, 2]
-            direction = node.wait(lambda: node.last("gaze/direction"), "a direction").vector
+            direction = looked.vector
             np.testing.assert_allclose((direction.x, direction.y, direction.z), axis, atol=1e-9)
             scores = [scorer.score(invert_poses(compose_poses(base, HEAD.base_from_camera(*at))))[0] for at in grid]
             chosen = scorer.score(invert_poses(compose_poses(base, HEAD.base_from_camera(*joints))))[0]
@@ -293,8 +285,7 @@ def test_the_gaze_of_a_head_with_one_joint(node: Robot, folder: Path, missing: s
         path.header.frame_id = "map"
         for x in np.linspace(1.5, 4.5, 31):
             path.poses.append(PoseStamped(pose=pose_message(base_at(x, 2.5, 0.0))))
-        node.send("plan", path)
-        views = node.wait(lambda: node.last("gaze/views"), "views along the path")
+        (views,) = node.ask("plan", path, "gaze/views")
         axes = np.array([pose_matrix(view.pose)[:, 2] for view in views.poses])
         fixed = -np.arcsin(axes[:, 2]) if missing == "tilt" else np.arctan2(axes[:, 1], axes[:, 0])
         np.testing.assert_allclose(np.degrees(fixed), 10 if missing == "tilt" else 0, atol=1e-6)

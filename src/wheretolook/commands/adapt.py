@@ -6,7 +6,7 @@ import shutil
 import time
 import warnings
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -302,8 +302,8 @@ def labelled_views(files: SceneFolder, scene: SceneEnvironment, table: pd.DataFr
     cam_from_world = poses(table)
     log_odds = np.empty(len(table))
     for camera, rows in views_by_camera(files, table):
-        localization_map = files.localization_map(camera, scene.device)
-        scorer = load_scorer(weights, replace(localization_map, photographs=scene.has_photographs))
+        own = scene.localization_map.of_camera(camera) if scene.has_photographs else None
+        scorer = load_scorer(weights, own or files.localization_map(camera, scene.device))
         with warnings.catch_warnings():  # how accurate the weights are here is what is measured
             warnings.simplefilter("ignore", OutOfRangeWarning)
             log_odds[rows] = log_odds_of(scorer.score(cam_from_world[rows]))

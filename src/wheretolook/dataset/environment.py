@@ -30,6 +30,7 @@ if TYPE_CHECKING:  # pandas and Warp are imported when first needed
     from wheretolook.geometry.tsdf import DepthImage, DepthImages, TsdfVolume
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.mapping.landmarks import ColmapSource, Landmarks
+    from wheretolook.mapping.mapped_images import MappedImages
     from wheretolook.rendering.raycasting import MeshRaycaster
     from wheretolook.rendering.types import Renderer
     from wheretolook.space.free_space import FreeSpace
@@ -86,6 +87,11 @@ class Environment(ABC):
     @abstractmethod
     def mapping_poses(self) -> Float | None:
         """Poses cam_from_world (M, 3, 4) of the mapping images; None if unknown."""
+
+    @property
+    @abstractmethod
+    def images(self) -> MappedImages | None:
+        """The mapping images with their observations; None if they are unknown or rendered."""
 
     @property
     def frame(self) -> MapFrame:
@@ -209,7 +215,7 @@ class Environment(ABC):
         from wheretolook.inputs.localization_map import LocalizationMap
 
         of_map = (self.landmarks, self.camera, self.occlusion, self.device, self.mapping_poses)
-        return LocalizationMap(*of_map, self.frame, self.has_photographs)
+        return LocalizationMap(*of_map, self.frame, self.has_photographs, self.images)
 
 
 class SceneEnvironment(Environment):
@@ -275,6 +281,18 @@ class SceneEnvironment(Environment):
     def mapping_poses(self) -> Float | None:  # type: ignore[override]
         """Poses cam_from_world (M, 3, 4) of the mapping images; None if unknown."""
         return self.files.mapping_poses()
+
+    @cached_property
+    def images(self) -> MappedImages | None:  # type: ignore[override]
+        """The photographs with their observations; None if images are rendered or there is no COLMAP model."""
+        from wheretolook.mapping.colmap_model import holds_model
+        from wheretolook.mapping.mapped_images import read_images
+
+        return (
+            read_images(self.files.map, self.landmarks)
+            if self.has_photographs and holds_model(self.files.map)
+            else None
+        )
 
     @cached_property
     def depth_images(self) -> DepthImages:  # type: ignore[override]
@@ -409,6 +427,11 @@ class ColmapEnvironment(Environment):
     def mapping_poses(self) -> Float:
         """Poses cam_from_world (M, 3, 4) of the mapping images."""
         return self._map.mapping_poses
+
+    @property
+    def images(self) -> MappedImages:
+        """The mapping images with their observations."""
+        return self._map.images
 
     @property
     def has_mesh(self) -> bool:

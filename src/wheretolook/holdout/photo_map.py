@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,9 @@ from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_ar
 from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, PhotographsConfig, place_name
 from wheretolook.mapping.feature_files import DATABASE_FILE, read_descriptors
 from wheretolook.mapping.georeference import DEPTH_M, median_depths
+from wheretolook.mapping.landmarks import load_colmap_landmarks
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame, find_frame, has_photographs
+from wheretolook.mapping.mapped_images import MappedImages
 from wheretolook.mapping.sources import find_features, find_photographs
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.confine import safe_child
@@ -97,6 +100,15 @@ class PhotographedMap:
         if self.fov_deg is None:
             return pixels, np.ones(len(pixels), dtype=bool)
         return crop_pixels(self.cameras[row], pixels, self.fov_deg, crop)
+
+    @cached_property
+    def images(self) -> MappedImages:
+        """The photographs with what they observe of the whole map."""
+        of_map = self.path, self.features, None, "cpu", self.model
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MapWarning)
+            landmarks = load_colmap_landmarks(*of_map, arrays=self.arrays)
+        return MappedImages(landmarks, self.arrays, self.poses, self.cameras)
 
     @property
     def is_metric(self) -> bool:

@@ -21,6 +21,7 @@ from wheretolook.holdout.photo_map import PhotographedMap
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import compact_poses
 from wheretolook.mapping.landmarks import load_colmap_landmarks
+from wheretolook.mapping.map_frame import IDENTITY
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import find, make_scorer
 from wheretolook.training.weights import method_of_weights
@@ -118,9 +119,8 @@ def maps_without(
     cached = occlusion if occlusion.name == "none" else CachedOcclusion(occlusion)
     cameras = [camera for camera, _ in _views(source, result.views)]
     poses = compact_poses(source.poses[remaining])
-    localization_map = LocalizationMap(
-        result.landmarks, cameras[0], cached, device, poses, photographs=source.photographs
-    )
+    of_images = poses, IDENTITY, source.photographs, source.images if source.photographs else None
+    localization_map = LocalizationMap(result.landmarks, cameras[0], cached, device, *of_images)
     for camera in dict.fromkeys(cameras):
         rows = np.array([row for row, other in enumerate(cameras) if other == camera])
         yield rows, localization_map.of_camera(camera)

@@ -16,6 +16,7 @@ from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.landmarks import Landmarks, open_colmap
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame, has_photographs
+from wheretolook.mapping.mapped_images import MappedImages
 from wheretolook.mapping.sanity import warn_of_mesh
 from wheretolook.utils.validation import check_positive
 from wheretolook.visibility import frustum
@@ -41,7 +42,8 @@ class LocalizationMap:
     device: str = "cpu"  # where kernels run, "cpu" or a CUDA device
     mapping_poses: Float | None = None  # cam_from_world (M, 3, 4) of the images the map was made from, if known
     frame: MapFrame = IDENTITY  # the map's own frame; everything here is in the world: metres, z up
-    photographs: bool = False  # whether the mapping images are photographs: `TrainedNetwork.photograph_offset` applies
+    photographs: bool = False  # whether the mapping images are photographs, see `scorers.set.own_images.for_map`
+    images: MappedImages | None = None  # the mapping images with their observations, if known
 
     @classmethod
     def from_colmap(
@@ -84,7 +86,7 @@ class LocalizationMap:
         if max_reprojection_error_px is not None:
             check_positive("max_reprojection_error_px", max_reprojection_error_px)
         opened = (model, camera, database, max_reprojection_error_px, device, FrameOptions(**frame))
-        landmarks, camera, poses, own_frame = open_colmap(*opened)
+        landmarks, camera, poses, own_frame, images = open_colmap(*opened)
         if mesh is not None:
             from wheretolook.scenes.loading import load_mesh
             from wheretolook.space.free_space import FreeSpace
@@ -93,9 +95,8 @@ class LocalizationMap:
             space = FreeSpace(load_mesh(Path(mesh), colored=False).transformed(own_frame.world_from_map), device=device)
             occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
             warn_of_mesh(mesh, landmarks.points, space.raycaster)
-        return cls(
-            landmarks, camera, occlusion or NoOcclusion(), device, poses, own_frame, has_photographs(Path(model))
-        )
+        of_images = poses, own_frame, has_photographs(Path(model)), images
+        return cls(landmarks, camera, occlusion or NoOcclusion(), device, *of_images)
 
     def of_camera(self, camera: Camera) -> LocalizationMap:
         """Return the same map for another camera."""

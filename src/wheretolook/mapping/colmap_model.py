@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -160,6 +160,21 @@ def model_arrays(reconstruction: Any) -> ModelArrays:
     )
 
 
+def select_points(model: ModelArrays, keep: NDArray[np.bool_]) -> ModelArrays:
+    """Select the points (P,) of a model for which `keep` is true, with their observations."""
+    lengths = np.diff(model.observation_start)
+    rows = np.repeat(keep, lengths)
+    return replace(
+        model,
+        point_ids=model.point_ids[keep],
+        points=model.points[keep],
+        errors_px=model.errors_px[keep],
+        observation_start=np.concatenate([[0], np.cumsum(lengths[keep])]),
+        observation_image=model.observation_image[rows],
+        observation_keypoint=model.observation_keypoint[rows],
+    )
+
+
 def observation_matrix(model: ModelArrays, group: NDArray[np.integer[Any]] | None = None) -> csr_array:
     """Which images, or groups (I,) of images, observe which points: a sparse matrix (I or number of groups, P) of ones.
 
@@ -219,6 +234,12 @@ def holds_model(folder: Path) -> bool:
 def save_mapping_poses(cam_from_world: Float, path: str | Path) -> None:
     """Write poses (M, 3, 4) as an NPZ file, see `compact_poses`, atomically. The same poses give the same bytes."""
     save_npz(Path(path), {"cam_from_world": compact_poses(cam_from_world)})
+
+
+def cameras_of_images(model_dir: Path, reconstruction: Any) -> tuple[Camera, ...]:
+    """Cameras (M,) of the images whose poses `colmap_poses` returns."""
+    cameras = cameras_by_id(reconstruction.cameras, model_dir)
+    return tuple(cameras[image.camera_id] for _, image in sorted(reconstruction.images.items()) if image.has_pose)
 
 
 def compact_poses(cam_from_world: Float) -> Float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,14 +21,17 @@ from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.mapping.colmap_model import (
     ModelArrays,
     camera_of_model,
+    cameras_of_images,
     colmap_poses,
     compact_poses,
     model_arrays,
     read_model,
+    select_points,
 )
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.feature_files import read_descriptors
 from wheretolook.mapping.map_frame import MapFrame, find_frame
+from wheretolook.mapping.mapped_images import MappedImages
 from wheretolook.mapping.sources import choose_features
 from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.npz_files import load_npz, save_npz
@@ -142,6 +145,7 @@ class ColmapSource(NamedTuple):
     camera: Camera  # the query camera
     mapping_poses: Float  # cam_from_world (M, 3, 4) of its images
     frame: MapFrame  # of the model
+    images: MappedImages  # the same images, with their cameras and observations
 
 
 def open_colmap(
@@ -169,7 +173,8 @@ def open_colmap(
     found.warn(model, landmarks.mapping_distance_m, poses)
     if camera is None or isinstance(camera, int):
         camera = camera_of_model(reconstruction, model, camera)
-    return ColmapSource(landmarks, camera, compact_poses(poses), found)
+    images = MappedImages(landmarks, arrays, poses, cameras_of_images(model, reconstruction))
+    return ColmapSource(landmarks, camera, compact_poses(poses), found, images)
 
 
 def load_colmap_landmarks(
@@ -208,7 +213,7 @@ def load_colmap_landmarks(
         )
         text += f"observes are omitted, and {(observed & ~keep).sum():,} with a mean error of more than {worst_px:g} px"
         warnings.warn(text, MapWarning, stacklevel=2)
-    model = _select_points(model, keep)
+    model = select_points(model, keep)
     kind = SIFT
     descriptors = None
     cosine = np.full(len(model.points), np.nan, dtype=np.float32)
@@ -228,6 +233,19 @@ def load_colmap_landmarks(
         ambiguity=cosine,
         described_by=None if kind is SIFT else kind.name,
     )
+
+
+def landmarks_of(landmarks: Landmarks, arrays: ModelArrays) -> Landmarks:
+    """Return the landmarks that are points of a model (P, all of them landmarks), with the attributes of its tracks.
+
+    Their errors, ambiguities and descriptors stay as they are.
+    """
+    rows = np.searchsorted(landmarks.ids, arrays.point_ids)
+    values: dict[str, Any] = {
+        name: value[rows] if isinstance(value, np.ndarray) else value for name, value in vars(landmarks).items()
+    }
+    values["track_length"] = np.diff(arrays.observation_start).astype(np.int32)
+    return Landmarks(**{**values, **_viewing_geometry(arrays)})
 
 
 def max_cosine_to_other(descriptors: NDArray[Any], device: str = "cpu", progress: bool = True) -> NDArray[np.float32]:
@@ -257,21 +275,6 @@ def max_cosine_to_other(descriptors: NDArray[Any], device: str = "cpu", progress
                 best[rows] = torch.maximum(best[rows], cosine.amax(1))
                 best[columns] = torch.maximum(best[columns], cosine.amax(0))
     return torch.where(best.isinf(), torch.nan, best).cpu().numpy()
-
-
-def _select_points(model: ModelArrays, keep: NDArray[np.bool_]) -> ModelArrays:
-    """Select the points (P,) of a model for which `keep` is true, with their observations."""
-    lengths = np.diff(model.observation_start)
-    rows = np.repeat(keep, lengths)
-    return replace(
-        model,
-        point_ids=model.point_ids[keep],
-        points=model.points[keep],
-        errors_px=model.errors_px[keep],
-        observation_start=np.concatenate([[0], np.cumsum(lengths[keep])]),
-        observation_image=model.observation_image[rows],
-        observation_keypoint=model.observation_keypoint[rows],
-    )
 
 
 def _viewing_geometry(model: ModelArrays) -> dict[str, NDArray[np.float32]]:

@@ -15,6 +15,7 @@ from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
 from wheretolook.scorers.set.network import SetNetwork
+from wheretolook.scorers.set.own_images import for_map
 from wheretolook.scorers.set.score import MAX_LANDMARKS
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.training_range import camera_quantities
@@ -63,8 +64,8 @@ def export_robot(
     out = Path(out)
     weights = Path(weights)
     trained = TrainedNetwork.load(weights, SetNetwork, "set")
-    if localization_map.photographs:
-        trained = trained.for_photographs()
+    trained.network.to(localization_map.device)
+    trained = for_map(trained, localization_map)
     landmarks = localization_map.landmarks
     places = np.empty((0, 3)) if places is None else np.asarray(places, dtype=np.float64).reshape(-1, 3)
     accuracy = trained.accuracy if accuracy is None else checked_accuracy(accuracy)

@@ -136,7 +136,8 @@ class ViewedMap:
         model = self.environment.occlusion_model(occlusion)
         of_map = self.landmarks, self.camera, model, self.environment.device, self.mapping_poses
         # without the map's own frame: the viewer selects in the world
-        return LocalizationMap(*of_map, photographs=self.environment.has_photographs)
+        photographs = self.environment.has_photographs
+        return LocalizationMap(*of_map, photographs=photographs, images=self.environment.images)
 
     @lru_cache(MAX_FLOORS)  # noqa: B019
     def floor(self, method: str, occlusion: str, height_m: float) -> Floor:

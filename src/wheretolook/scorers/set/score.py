@@ -19,6 +19,7 @@ from wheretolook.scorers.landmark_scorer import LandmarkScorer
 from wheretolook.scorers.set.accuracy import AccuracyModel, probabilities, statistics_of
 from wheretolook.scorers.set.batched_directions import BatchedDirections
 from wheretolook.scorers.set.network import SetNetwork
+from wheretolook.scorers.set.own_images import for_map
 from wheretolook.training.trained_network import TrainedNetwork
 
 MAX_LANDMARKS = 1024
@@ -44,8 +45,11 @@ class SetScorer(LandmarkScorer):
     def __init__(self, localization_map: LocalizationMap, trained: TrainedNetwork[SetNetwork]) -> None:
         super().__init__(localization_map, trained.network.attributes, trained.training_range, trained.camera)
         self.name = trained.method
-        self.trained = trained.for_photographs() if localization_map.photographs else trained
-        self.network = trained.network.to(localization_map.device)
+        trained.network.to(localization_map.device)
+        self.trained = for_map(trained, localization_map)
+        self.network = self.trained.network
+        if self.trained is not trained:
+            self.local = False  # calibrated by images all over the map
         self.accuracy = trained.accuracy
         signs = [NARROW.get(name, 0.0) for name in self.network.attributes]
         self._signs = torch.tensor(signs, device=localization_map.device)

@@ -1,0 +1,68 @@
+"""The images of a map with what they observe, and what is left of it without some of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.poses import Float
+from wheretolook.mapping.colmap_model import ModelArrays, cameras_of_images, colmap_poses, model_arrays, read_model
+
+if TYPE_CHECKING:
+    from wheretolook.mapping.landmarks import Landmarks
+
+
+@dataclass(frozen=True, eq=False)
+class MappedImages:
+    """Images of a map, in the order of their ids in its model, and what they observe.
+
+    Attributes:
+        landmarks: of the map.
+        arrays: its model in the world, in metres with z up.
+        poses: (M, 3, 4) cam_from_world.
+        cameras: (M,)
+    """
+
+    landmarks: Landmarks
+    arrays: ModelArrays
+    poses: Float
+    cameras: tuple[Camera, ...]
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def without(self, held_out: NDArray[np.int64]) -> Landmarks:
+        """Return the landmarks that two of the other images observe, with the attributes of their tracks in those.
+
+        `held_out` are rows of images. Coordinates, errors and ambiguities stay as they are.
+        """
+        arrays = self.arrays
+        observations = ~np.isin(arrays.observation_image, held_out)
+        point = np.repeat(np.arange(len(arrays.points)), np.diff(arrays.observation_start))
+        counts = np.bincount(point[observations], minlength=len(arrays.points))
+        kept = counts >= 2
+        observations &= kept[point]
+        left = replace(
+            arrays,
+            point_ids=arrays.point_ids[kept],
+            points=arrays.points[kept],
+            errors_px=arrays.errors_px[kept],
+            observation_start=np.concatenate([[0], np.cumsum(counts[kept])]),
+            observation_image=arrays.observation_image[observations],
+            observation_keypoint=arrays.observation_keypoint[observations],
+        )
+        from wheretolook.mapping.landmarks import landmarks_of  # which imports this module
+
+        return landmarks_of(self.landmarks, left)
+
+
+def read_images(model_dir: Path, landmarks: Landmarks) -> MappedImages:
+    """Read the images of a map's COLMAP model, which is in metres with z up. Raises MapError as `read_model`."""
+    model = read_model(model_dir)
+    of_images = colmap_poses(model_dir, model), cameras_of_images(model_dir, model)
+    return MappedImages(landmarks, model_arrays(model), *of_images)

@@ -1,0 +1,143 @@
+"""The offset of the log-odds of detection that a map's own images determine."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from scipy.special import logit
+
+from selection.room import WEIGHTS, write_room
+from synthetic_dataset import make_landmarks
+from wheretolook.geometry.camera import Camera, PinholeCamera
+from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.colmap_model import ModelArrays
+from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
+from wheretolook.mapping.mapped_images import MappedImages
+from wheretolook.robot.export import export_robot
+from wheretolook.robot.wheretolook_robot import RobotScorer
+from wheretolook.scorers.set.network import SetNetwork
+from wheretolook.scorers.set.own_images import OFFSETS, detection_offset, for_map
+from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook.weights.resolve import load_scorer
+
+WIDE = PinholeCamera(640, 480, 320.0)
+NARROW = PinholeCamera(640, 480, 640.0)
+PREDICTED = 0.3
+
+
+def bundled() -> TrainedNetwork[SetNetwork]:
+    return TrainedNetwork.load(WEIGHTS / "set.safetensors", SetNetwork, "set")
+
+
+def constant_network() -> SetNetwork:
+    """Return a network that predicts the same probability of detection for every landmark."""
+    network = deepcopy(bundled().network)
+    last = network.matchability.layers[-1]
+    assert isinstance(last, torch.nn.Linear)
+    with torch.no_grad():
+        last.weight.zero_()
+        last.bias.fill_(logit(PREDICTED))
+    return network
+
+
+def observed_map(p_detect: float, n_images: int = 40, n: int = 2000, photographs: bool = True) -> LocalizationMap:
+    """Return a map whose images, of two cameras, observe each landmark in view with a probability."""
+    rng = np.random.default_rng(0)
+    landmarks = make_landmarks(rng, n)
+    poses = poses_looking_along(rng.uniform((-2, -2, 1), (1, 1, 2), (n_images, 3)), rng.normal(size=(n_images, 3)))
+    cameras: list[Camera] = [WIDE if row % 3 else NARROW for row in range(n_images)]
+    seen = np.zeros((n, n_images), dtype=bool)
+    for row, camera in enumerate(cameras):
+        local = landmarks.points @ poses[row, :, :3].T + poses[row, :, 3]
+        pixels = camera.focal_px * local[:, :2] / local[:, 2:] + (320, 240)
+        inside = (local[:, 2] > 0.1) & (pixels > 0).all(1) & (pixels < (640, 480)).all(1)
+        seen[:, row] = inside & (rng.random(n) < p_detect)
+    mapped = seen.sum(1) >= 2
+    point, image = np.nonzero(seen[mapped])
+    values = {name: v[mapped] if isinstance(v, np.ndarray) else v for name, v in vars(landmarks).items()}
+    values["track_length"] = np.bincount(point).astype(np.int32)
+    landmarks = Landmarks(**values)
+    arrays = ModelArrays(
+        point_ids=landmarks.ids,
+        points=landmarks.points,
+        errors_px=landmarks.reprojection_error_px.astype(np.float64),
+        image_ids=np.arange(n_images),
+        image_names=[f"{row}.jpg" for row in range(n_images)],
+        image_centers=camera_centers(poses),
+        image_focal_px=np.array([camera.mean_focal_px for camera in cameras]),
+        observation_start=np.concatenate([[0], np.cumsum(landmarks.track_length)]),
+        observation_image=image,
+        observation_keypoint=np.zeros(len(image), dtype=np.int64),
+    )
+    images = MappedImages(landmarks, arrays, poses, tuple(cameras))
+    return LocalizationMap(landmarks, WIDE, mapping_poses=poses, photographs=photographs, images=images)
+
+
+@pytest.mark.parametrize("p_detect", [0.2, 0.3, 0.6])
+def test_the_offset_is_that_of_the_rate_of_detection(p_detect: float) -> None:
+    """Whether a held-out image observes a landmark is independent of the others, so that the rate is known."""
+    expected = logit(p_detect) - logit(PREDICTED)
+    assert detection_offset(constant_network(), observed_map(p_detect)) == pytest.approx(expected, abs=0.12)
+
+
+def test_the_offset_is_bounded() -> None:
+    assert detection_offset(constant_network(), observed_map(0.06, n=10_000)) == OFFSETS[0]
+    assert detection_offset(constant_network(), observed_map(0.97)) == OFFSETS[-1]
+
+
+def test_few_images_do_not_determine_it() -> None:
+    assert detection_offset(constant_network(), observed_map(0.6, n_images=4)) == 0
+    assert detection_offset(constant_network(), observed_map(0.6, n=3)) == 0
+    assert detection_offset(constant_network(), replace(observed_map(0.6), images=None)) == 0
+
+
+def test_it_is_added_for_photographs_only_and_to_a_copy() -> None:
+    trained = replace(bundled(), network=constant_network())
+    assert for_map(trained, observed_map(0.6, photographs=False)) is trained
+    calibrated = for_map(trained, observed_map(0.6))
+    assert calibrated.offset == trained.offset + trained.photograph_offset and calibrated.photograph_offset == 0
+    values = torch.zeros(5, len(trained.network.attributes))
+    before, after = (one.network.matchability(values).sigmoid().numpy() for one in (trained, calibrated))
+    np.testing.assert_allclose(before, PREDICTED, rtol=1e-5)
+    np.testing.assert_allclose(after, 0.6, atol=0.03)
+
+
+def test_all_scorers_of_a_map_use_it(tmp_path: Path) -> None:
+    """Of single poses, of directions, and on the robot."""
+    localization_map = observed_map(0.6)
+    views = localization_map.mapping_poses
+    assert views is not None
+    scorer = load_scorer(WEIGHTS / "set.safetensors", localization_map)
+    plain = load_scorer(WEIGHTS / "set.safetensors", replace(localization_map, images=None))
+    assert not scorer.local  # an image that is added changes the offset of all views
+    before, after = (one.report(views).expected_inliers for one in (plain, scorer))
+    assert (after[before > 1] > 1.1 * before[before > 1]).all()
+    axes = views[:1, 2, :3]
+    center = camera_centers(views[:1])
+    expected = scorer.score(poses_looking_along(center, axes))
+    np.testing.assert_allclose(scorer.score_directions(center, axes)[0], expected, atol=0.02)
+    folder = export_robot(localization_map, WEIGHTS / "set.safetensors", tmp_path, progress=False)
+    np.testing.assert_allclose(RobotScorer(folder).score(views), scorer.score(views), atol=1e-5)
+
+
+def test_landmarks_without_an_image_are_those_of_the_smaller_model(tmp_path: Path) -> None:
+    folder = write_room(tmp_path / "sparse", metric=False)
+    images = LocalizationMap.from_colmap(folder, scale=1.0, up="z").images
+    assert images is not None and len(images) == 12
+    model = pycolmap.Reconstruction(str(folder))
+    for number in (2, 3, 7, 8, 12):
+        model.deregister_frame(model.images[number].frame_id)
+    expected = load_colmap_landmarks(folder, reconstruction=model)
+    found = images.without(np.array([1, 2, 6, 7, 11]))
+    assert len(expected) < len(images.landmarks)
+    np.testing.assert_array_equal(found.ids, expected.ids)
+    np.testing.assert_array_equal(found.track_length, expected.track_length)
+    for name in ("triangulation_angle_deg", "mapping_direction", "mapping_distance_m", "mapping_distance_spread"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-4)

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from box_scenes import ROOM, furnished_room
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
+from wheretolook.visibility.cached_occlusion import CachedOcclusion
 from wheretolook.visibility.hidden_points import HiddenPointRemoval, on_hull, on_hull_plain
 from wheretolook.visibility.hull import LEAST_POINTS, hull_length, may_be_near_hull
 
@@ -152,3 +153,14 @@ def test_invalid_input(
 ) -> None:
     with pytest.raises(error):
         HiddenPointRemoval(**options).unoccluded(np.array([location], dtype=float), points)  # type: ignore[arg-type]
+
+
+def test_cached_results_are_those_of_the_same_landmarks() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(300, 3)) * 3
+    location = np.zeros((1, 3))
+    cached = CachedOcclusion(HiddenPointRemoval())
+    for some in (points, points[::2], points[1::2], points):
+        expected = HiddenPointRemoval().unoccluded(location, some)
+        for _ in range(2):
+            np.testing.assert_array_equal(cached.unoccluded(location, some), expected)

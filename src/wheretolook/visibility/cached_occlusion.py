@@ -14,7 +14,7 @@ DECIMALS = 5  # locations that agree to this many decimals of a metre are one
 
 
 class CachedOcclusion(OcclusionModel):
-    """Caches the masks of another model for the landmarks of one map, one bit for each line of sight.
+    """Caches the masks of another model, one bit for each line of sight.
 
     Hidden-point removal takes a tenth of a second for a location, and is evaluated several times: for the scores of all
     directions, for those of the best views, and for their visible landmarks. When `max_bytes` are exceeded the cache is
@@ -32,7 +32,8 @@ class CachedOcclusion(OcclusionModel):
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
         """Mask (L, N) of the model, from the cache where possible."""
         at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
-        keys = [tuple(key) for key in (np.round(at, DECIMALS) + 0.0).tolist()]
+        of_points = len(points), float(np.sum(points))  # differ between sets of landmarks
+        keys = [(*of_points, *key) for key in (np.round(at, DECIMALS) + 0.0).tolist()]
         new = [row for row, key in enumerate(keys) if key not in self._known]
         mask = np.empty((len(at), len(points)), dtype=bool)
         if new:

@@ -84,7 +84,7 @@ def observed_map(p_detect: float, n_images: int = 40, n: int = 2000, photographs
 def test_the_offset_is_that_of_the_rate_of_detection(p_detect: float) -> None:
     """Whether a held-out image observes a landmark is independent of the others, so that the rate is known."""
     expected = logit(p_detect) - logit(PREDICTED)
-    assert detection_offset(constant_network(), observed_map(p_detect)) == pytest.approx(expected, abs=0.12)
+    assert detection_offset(constant_network(), observed_map(p_detect, n=8000)) == pytest.approx(expected, abs=0.12)
 
 
 def test_the_offset_is_bounded() -> None:

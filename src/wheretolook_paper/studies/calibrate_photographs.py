@@ -5,8 +5,8 @@
         --checks '[checks/entry-P10, ...]'
 
 Reads the scores and labels of the checks, made with weights without an offset. Every place counts the same. Prints the
-calibration error of each place without an offset, with the one fitted to the other places, and with the one that is
-written: `share` of the fit to all, as places differ and more of them are less off than those at hand.
+calibration error of each place without an offset, with the one fitted to the other places, and with the fit to all,
+which is written.
 """
 
 from __future__ import annotations
@@ -41,20 +41,19 @@ def fitted_offset(places: Sequence[Views]) -> float:
     return float(minimize_scalar(loss, bounds=(-5, 5), method="bounded").x)
 
 
-def main(weights: Path, checks: list[Path], share: float = 0.3, write: bool = False) -> None:
+def main(weights: Path, checks: list[Path], write: bool = False) -> None:
     """Print the calibration error of each place; with `write`, store the offset in the weights.
 
     Args:
         weights: of a set network.
         checks: folders written by `wheretolook check`.
-        share: of the fitted offset that is written.
         write: replace the weights.
     """
     places = {}
     for folder in checks:
         views = pd.read_csv(folder / "views.csv")
         places[folder.name] = finite_log_odds(views["score"].to_numpy(), 1e-4), views["good"].to_numpy(bool)
-    offset = round(share * fitted_offset(list(places.values())), 2)
+    offset = round(fitted_offset(list(places.values())), 2)
     rows = []
     for name, (log_odds, good) in places.items():
         others = fitted_offset([views for other, views in places.items() if other != name])

@@ -18,7 +18,7 @@ from wheretolook.training.trained_network import TrainedNetwork
 MIN_IMAGES = 5  # of a map whose tracks show how often landmarks are detected
 BLOCKS = 8  # of images that are held out one after the other
 SHARE = 8  # part of the images that a block takes, one over
-TESTED = 4  # images of a block, at most
+TESTED = 2  # images of a block, at most
 MAX_POINTS = 20_000  # of the map that are examined, evenly spread
 MIN_SAMPLE = 200  # landmarks in view of the held-out images, with repetitions
 MAX_LANDMARKS = 512  # of an image that are described

@@ -120,6 +120,8 @@ def test_all_scorers_of_a_map_use_it(tmp_path: Path) -> None:
     assert not scorer.local  # an image that is added changes the offset of all views
     before, after = (one.report(views).expected_inliers for one in (plain, scorer))
     assert (after[before > 1] > 1.1 * before[before > 1]).all()
+    load_scorer(WEIGHTS / "set.safetensors", localization_map.of_camera(NARROW))
+    assert localization_map.images is not None and len(localization_map.images.offsets) == 1  # estimated once
     axes = views[:1, 2, :3]
     center = camera_centers(views[:1])
     expected = scorer.score(poses_looking_along(center, axes))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,12 +26,14 @@ class MappedImages:
         arrays: its model in the world, in metres with z up.
         poses: (M, 3, 4) cam_from_world.
         cameras: (M,)
+        offsets: of the log-odds of detection, once estimated, by network and occlusion.
     """
 
     landmarks: Landmarks
     arrays: ModelArrays
     poses: Float
     cameras: tuple[Camera, ...]
+    offsets: dict[tuple[object, ...], float] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.cameras)

@@ -36,8 +36,19 @@ def for_map(trained: TrainedNetwork[SetNetwork], localization_map: LocalizationM
     last = network.matchability.layers[-1]
     assert isinstance(last, torch.nn.Linear)
     with torch.no_grad():
-        last.bias.add_(detection_offset(network, localization_map))
+        last.bias.add_(_known_offset(network, localization_map))
     return replace(trained.for_photographs(), network=network)
+
+
+def _known_offset(network: SetNetwork, localization_map: LocalizationMap) -> float:
+    """Return `detection_offset`, estimated once for all cameras and parts of a map."""
+    if localization_map.images is None:
+        return 0.0
+    known = localization_map.images.offsets
+    key = (localization_map.occlusion.name, *(float(values.sum()) for values in network.parameters()))
+    if key not in known:
+        known[key] = detection_offset(network, localization_map)
+    return known[key]
 
 
 def detection_offset(network: SetNetwork, localization_map: LocalizationMap) -> float:

@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
-from wheretolook.mapping.colmap_model import ModelArrays, cameras_of_images, colmap_poses, model_arrays, read_model
+from wheretolook.mapping.colmap_model import (
+    ModelArrays,
+    cameras_of_images,
+    colmap_poses,
+    model_arrays,
+    read_model,
+    select_points,
+)
 
 if TYPE_CHECKING:
     from wheretolook.mapping.landmarks import Landmarks
@@ -47,20 +54,15 @@ class MappedImages:
         observations = ~np.isin(arrays.observation_image, held_out)
         point = np.repeat(np.arange(len(arrays.points)), np.diff(arrays.observation_start))
         counts = np.bincount(point[observations], minlength=len(arrays.points))
-        kept = counts >= 2
-        observations &= kept[point]
         left = replace(
             arrays,
-            point_ids=arrays.point_ids[kept],
-            points=arrays.points[kept],
-            errors_px=arrays.errors_px[kept],
-            observation_start=np.concatenate([[0], np.cumsum(counts[kept])]),
+            observation_start=np.concatenate([[0], np.cumsum(counts)]),
             observation_image=arrays.observation_image[observations],
             observation_keypoint=arrays.observation_keypoint[observations],
         )
         from wheretolook.mapping.landmarks import landmarks_of  # which imports this module
 
-        return landmarks_of(self.landmarks, left)
+        return landmarks_of(self.landmarks, select_points(left, counts >= 2))
 
 
 def read_images(model_dir: Path, landmarks: Landmarks) -> MappedImages:

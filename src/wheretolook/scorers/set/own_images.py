@@ -78,13 +78,12 @@ def detection_offset(network: SetNetwork, localization_map: LocalizationMap) -> 
         describer = LandmarkDescriber(replace(localization_map, landmarks=remaining), network.attributes)
         tested = block[_spread(len(block), TESTED)]
         n_observed += observes[tested][:, np.isin(images.arrays.point_ids, remaining.ids)].sum()
-        for camera in dict.fromkeys(images.cameras[row] for row in tested):
-            poses = images.poses[[row for row in tested if images.cameras[row] == camera]].astype(np.float64)
-            for _, described, n_visible in describer.of_camera(camera).in_blocks(poses, MAX_LANDMARKS):
+        for row in tested:
+            views = describer.of_camera(images.cameras[row]).in_blocks(images.poses[[row]], MAX_LANDMARKS)
+            for _, described, n_visible in views:
                 with torch.inference_mode():
                     log_odds = network.matchability(described.values).double()
-                each = (n_visible / described.counts.clamp(min=1)).repeat_interleave(described.counts)
-                parts.append((log_odds, each.double()))
+                parts.append((log_odds, (n_visible / max(1, len(log_odds))).expand(len(log_odds))))
     if sum(len(part[0]) for part in parts) < MIN_SAMPLE:
         return 0.0
     log_odds, weights = (torch.cat(part) for part in zip(*parts, strict=True))

@@ -23,12 +23,15 @@ from wheretolook.holdout.holdout import without
 from wheretolook.holdout.holdout_blocks import KEPT, MIN_REST, choose_blocks, landmarks_kept
 from wheretolook.holdout.photo_map import open_map
 from wheretolook.holdout.report import CheckReport
+from wheretolook.holdout.scores import whole_map
 from wheretolook.mapping.colmap_model import model_arrays, observation_matrix, read_model
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.scorers.adapted.network import AdaptedNetwork
 from wheretolook.scorers.set.network import SetNetwork
+from wheretolook.scorers.set.own_images import for_map
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import ConfigError, MapError, WeightsError
+from wheretolook.visibility.hidden_points import HiddenPointRemoval
 
 
 def run(arguments: list[str]) -> None:
@@ -143,7 +146,9 @@ def test_the_part_that_nothing_else_shows_is_named(checked: Path) -> None:
 def test_adapted_weights_are_checked_on_their_own_map_alone(
     checked: Path, corridor: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    base = TrainedNetwork.load(WEIGHTS / "set.safetensors", SetNetwork, "set").for_photographs()
+    source = open_map(*corridor, frame=FrameOptions(scale=1))
+    base = TrainedNetwork.load(WEIGHTS / "set.safetensors", SetNetwork, "set")
+    base = for_map(base, whole_map(source, HiddenPointRemoval(), "cpu"))  # as `adapt` writes it
     network = AdaptedNetwork(base.network, base.scale, base.offset, 1.0, 4.0, 0, 256)  # changes no score
     points = np.array([point.xyz for _, point in sorted(read_model(corridor[0]).points3D.items())])
     path = tmp_path / "adapted.safetensors"

@@ -10,12 +10,13 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from numpy.typing import NDArray
 from scipy.special import logit
 
 from selection.room import WEIGHTS, write_room
 from synthetic_dataset import make_landmarks
 from wheretolook.geometry.camera import Camera, PinholeCamera
-from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import ModelArrays
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
@@ -25,11 +26,20 @@ from wheretolook.robot.wheretolook_robot import RobotScorer
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.set.own_images import OFFSETS, detection_offset, for_map
 from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook.visibility.cached_occlusion import CachedOcclusion
+from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
 from wheretolook.weights.resolve import load_scorer
 
 WIDE = PinholeCamera(640, 480, 320.0)
 NARROW = PinholeCamera(640, 480, 640.0)
 PREDICTED = 0.3
+
+
+class SeesHalf(OcclusionModel):
+    """Hides every second landmark."""
+
+    def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
+        return np.tile(np.arange(len(points)) % 2 == 0, (len(locations), 1))
 
 
 def bundled() -> TrainedNetwork[SetNetwork]:
@@ -45,6 +55,12 @@ def constant_network() -> SetNetwork:
         last.weight.zero_()
         last.bias.fill_(logit(PREDICTED))
     return network
+
+
+def first_of(landmarks: Landmarks, n: int) -> Landmarks:
+    """Return the first landmarks."""
+    values = {name: v[:n] if isinstance(v, np.ndarray) else v for name, v in vars(landmarks).items()}
+    return Landmarks(**values)
 
 
 def observed_map(p_detect: float, n_images: int = 40, n: int = 2000, photographs: bool = True) -> LocalizationMap:
@@ -99,6 +115,30 @@ def test_few_images_do_not_determine_it() -> None:
     assert detection_offset(constant_network(), replace(observed_map(0.6), images=None)) == 0
 
 
+def test_maps_that_do_not_show_it() -> None:
+    """Stored occlusion is of all landmarks at other locations; no third image observes what two do."""
+    localization_map = observed_map(0.6)
+    images = localization_map.images
+    assert images is not None
+    stored = StoredOcclusion.from_mask(np.zeros((1, 3)), np.ones((1, len(images.landmarks)), dtype=bool))
+    trained = replace(bundled(), network=constant_network())
+    for occlusion in (stored, CachedOcclusion(stored)):
+        unknown = for_map(trained, replace(localization_map, occlusion=occlusion)).network
+        torch.testing.assert_close(unknown.state_dict(), trained.network.state_dict())
+    n = len(images.landmarks)
+    arrays = replace(images.arrays, observation_start=2 * np.arange(n + 1), observation_image=np.tile([0, 1], n))
+    pairs = replace(images, arrays=replace(arrays, observation_keypoint=np.zeros(2 * n, dtype=np.int64)))
+    assert detection_offset(constant_network(), replace(localization_map, images=pairs)) == 0
+
+
+def test_every_occlusion_model_has_its_own() -> None:
+    localization_map = observed_map(0.6)
+    half = replace(localization_map, occlusion=SeesHalf())
+    offsets = [for_map(bundled(), one).network.matchability.layers[-1].bias.item() for one in (localization_map, half)]
+    assert offsets[1] > offsets[0] + 0.5  # as many detections of half of the landmarks
+    assert for_map(bundled(), half).network.matchability.layers[-1].bias.item() == offsets[1]
+
+
 def test_it_is_added_for_photographs_only_and_to_a_copy() -> None:
     trained = replace(bundled(), network=constant_network())
     assert for_map(trained, observed_map(0.6, photographs=False)) is trained
@@ -139,6 +179,10 @@ def test_landmarks_without_an_image_are_those_of_the_smaller_model(tmp_path: Pat
         model.deregister_frame(model.images[number].frame_id)
     expected = load_colmap_landmarks(folder, reconstruction=model)
     found = images.without(np.array([1, 2, 6, 7, 11]))
+    few = MappedImages.of(first_of(images.landmarks, 100), images.arrays, images.poses, images.cameras)
+    np.testing.assert_array_equal(
+        few.without(np.array([1, 2, 6, 7, 11])).ids, expected.ids[expected.ids <= few.landmarks.ids[-1]]
+    )
     assert len(expected) < len(images.landmarks)
     np.testing.assert_array_equal(found.ids, expected.ids)
     np.testing.assert_array_equal(found.track_length, expected.track_length)

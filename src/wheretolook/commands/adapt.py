@@ -19,7 +19,6 @@ from wheretolook.commands.preconditions import extractor_of, open_scene, refuse_
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
-from wheretolook.geometry.poses import Float
 from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.scorers.adapted.config import AdaptConfig
 from wheretolook.tracking.config import TrackingConfig
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from wheretolook.evaluation.adaptation import Gain
+    from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.scorers.adapted.gp_correction import Adapted, LocalizedViews
     from wheretolook.visibility.occlusion import OcclusionModel
 
@@ -53,7 +53,6 @@ class _Target:
     dataset: str  # its name; empty for a COLMAP model
     weights: Path
     path: Path
-    photographs: bool  # whether the map's images are photographs, for which log-odds have an offset
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,14 +113,14 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
             files = _scene(dataset, config.scene)
             scene = open_scene(self, files)
             path = dataset.root / FOLDER / f"{files.name}.safetensors"
-            target = self._target(files.name, path, scene.has_photographs, dataset)
+            target = self._target(files.name, path, dataset)
             has_photographs = knows_photographs(files, config.images, config.database)
             table = self._labelled(files, scene, has_photographs, log)
             views = None if table is None else labelled_views(files, scene, table, target.weights)
             if has_photographs:
                 try:
                     name = check_name(self, files)
-                    held_out = self._held_out(files.map, name, scene.occlusion, target.weights, log)
+                    held_out, _ = self._held_out(files.map, name, scene.occlusion, target.weights, log)
                     views = held_out if views is None else views.joined(held_out)
                 except MapError as error:
                     if views is None:
@@ -129,28 +128,28 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
                     log(f"{files.name}: its photographs are not used: {error}")
             assert views is not None
             _check_enough(views, files.map if table is None else files.table)
-            return self._fit(target, views, files.read_landmarks().points, log, progress)
+            whole = scene.localization_map if scene.has_photographs else files.localization_map(device=scene.device)
+            return self._fit(target, views, whole, log, progress)
 
     def _adapt_map(self, model: Path, log: Log, progress: Progress) -> Path | None:
         """Adapt to a COLMAP map by its photographs only."""
         from wheretolook.holdout.photo_map import folder_of_check
-        from wheretolook.mapping.colmap_model import model_arrays, read_model
-        from wheretolook.mapping.map_frame import find_frame, has_photographs
+        from wheretolook.mapping.colmap_model import read_model
+        from wheretolook.mapping.map_frame import find_frame
 
         name = place_name(model)
-        target = self._target(name, folder_of_check(self.data, name) / "adapted.safetensors", has_photographs(model))
+        target = self._target(name, folder_of_check(self.data, name) / "adapted.safetensors")
         occlusion = "none" if self.occlusion.model == "none" else "hidden-points"
         reconstruction = read_model(model)
-        arrays = model_arrays(reconstruction)
-        frame = find_frame(model, reconstruction, self.frame_options(), arrays=arrays)
+        frame = find_frame(model, reconstruction, self.frame_options())
         log(f"{name}: {'; '.join((frame.describe(), *frame.doubts))}")
         environment = ColmapEnvironment(ColmapFiles(model), occlusion=occlusion, device=self.warp_device)
-        views = self._held_out(model, name, environment.occlusion, target.weights, log)
+        views, whole = self._held_out(model, name, environment.occlusion, target.weights, log)
         _check_enough(views, model)
         with hold(target.path.with_name(f".{target.path.name}.lock"), "adapt"):
-            return self._fit(target, views, frame.of_arrays(arrays).points, log, progress)
+            return self._fit(target, views, whole, log, progress)
 
-    def _target(self, name: str, path: Path, photographs: bool, dataset: Dataset | None = None) -> _Target:
+    def _target(self, name: str, path: Path, dataset: Dataset | None = None) -> _Target:
         """Return what is adapted, after checks that fail before the work; `path` is the default of `adapt.out`."""
         features = "" if dataset is None else dataset.features
         weights = resolve_weights("set", self.adapt.weights, features)
@@ -164,18 +163,24 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
             path.parent.mkdir(parents=True, exist_ok=True)
         remove_if_empty(created)
         check_store(self.tracking)
-        return _Target(name, "" if dataset is None else dataset.name, weights, path, photographs)
+        return _Target(name, "" if dataset is None else dataset.name, weights, path)
 
-    def _held_out(self, model: Path, name: str, occlusion: OcclusionModel, weights: Path, log: Log) -> LocalizedViews:
-        """Return a map's photographs, held out in blocks that `wheretolook check` shares."""
+    def _held_out(
+        self, model: Path, name: str, occlusion: OcclusionModel, weights: Path, log: Log
+    ) -> tuple[LocalizedViews, LocalizationMap]:
+        """Return a map's photographs, held out in blocks that `wheretolook check` shares, and the whole map."""
         from wheretolook.holdout.holdout_views import photographed_views
+        from wheretolook.holdout.scores import whole_map
 
         log(f"{name}: holding out blocks of photographs")
         given = (self.adapt.images, self.adapt.database)
         photographs, held_out = hold_out_photographs(self, "adapt", model, name, self.frame_options(), given)
-        return photographed_views(photographs, held_out, weights, occlusion, self.warp_device)
+        views = photographed_views(photographs, held_out, weights, occlusion, self.warp_device)
+        return views, whole_map(photographs, occlusion, self.warp_device)
 
-    def _fit(self, target: _Target, views: LocalizedViews, points: Float, log: Log, progress: Progress) -> Path | None:
+    def _fit(
+        self, target: _Target, views: LocalizedViews, whole: LocalizationMap, log: Log, progress: Progress
+    ) -> Path | None:
         """Adapt to localized views; keep the weights if they are better, report and log the gain."""
         from wheretolook.evaluation.adaptation import compare_log_odds, gain_markdown
         from wheretolook.scorers.adapted.gp_correction import adapt as fit
@@ -203,7 +208,7 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
             text += f"\nPhotographs only:\n\n{gain_markdown(of_photographs)}"
         write_text(path.with_suffix(".md"), f"# {name}: adapted by {counts}\n\n{text}")
         if is_better:
-            _save(target, points, adapted, views, gain)
+            _save(target, whole, adapted, views, gain)
             log(f"{text}\n{name}: the adapted weights are better -> {path}")
         else:
             log(f"{text}\n{name}: adapting does not make the weights better here: use {target.weights}")
@@ -330,16 +335,16 @@ def _counts(views: LocalizedViews) -> dict[str, object]:
     return {"views": len(views), "photographs": int((views.photograph >= 0).sum())}
 
 
-def _save(target: _Target, points: Float, adapted: Adapted, views: LocalizedViews, gain: Gain) -> None:
+def _save(target: _Target, whole: LocalizationMap, adapted: Adapted, views: LocalizedViews, gain: Gain) -> None:
     import torch
 
     from wheretolook.scorers.adapted.network import AdaptedNetwork
     from wheretolook.scorers.set.network import SetNetwork
+    from wheretolook.scorers.set.own_images import for_map
     from wheretolook.training.trained_network import TrainedNetwork
 
-    base = TrainedNetwork.load(target.weights, SetNetwork, "set")
-    if target.photographs:
-        base = base.for_photographs()
+    base = for_map(TrainedNetwork.load(target.weights, SetNetwork, "set", device=whole.device), whole)
+    points = whole.landmarks.points
     correction = adapted.adaptation
     n_signature = min(_MAX_SIGNATURE, len(points))
     arrays = {

@@ -108,7 +108,7 @@ class PhotographedMap:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MapWarning)
             landmarks = load_colmap_landmarks(*of_map, arrays=self.arrays)
-        return MappedImages(landmarks, self.arrays, self.poses, self.cameras)
+        return MappedImages.of(landmarks, self.arrays, self.poses, self.cameras)
 
     @property
     def is_metric(self) -> bool:

@@ -87,6 +87,12 @@ def check_place(source: PhotographedMap, scoring: Scoring, device: str) -> None:
         scoring.scorer(LocalizationMap(landmarks, source.cameras[0], device=device, photographs=source.photographs))
 
 
+def whole_map(source: PhotographedMap, occlusion: OcclusionModel, device: str) -> LocalizationMap:
+    """Return the map with all photographs, for the camera of the first."""
+    of_images = compact_poses(source.poses), IDENTITY, source.photographs, source.images
+    return LocalizationMap(source.images.landmarks, source.cameras[0], occlusion, device, *of_images)
+
+
 def score_views(
     source: PhotographedMap, results: Sequence[HoldoutResult], scoring: Scoring, occlusion: OcclusionModel, device: str
 ) -> tuple[str, pd.DataFrame]:

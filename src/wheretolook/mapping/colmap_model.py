@@ -237,7 +237,7 @@ def save_mapping_poses(cam_from_world: Float, path: str | Path) -> None:
 
 
 def cameras_of_images(model_dir: Path, reconstruction: Any) -> tuple[Camera, ...]:
-    """Cameras (M,) of the images whose poses `colmap_poses` returns."""
+    """Return the cameras (M,) of the images whose poses `colmap_poses` returns."""
     cameras = cameras_by_id(reconstruction.cameras, model_dir)
     return tuple(cameras[image.camera_id] for _, image in sorted(reconstruction.images.items()) if image.has_pose)
 

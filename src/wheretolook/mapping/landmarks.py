@@ -173,7 +173,7 @@ def open_colmap(
     found.warn(model, landmarks.mapping_distance_m, poses)
     if camera is None or isinstance(camera, int):
         camera = camera_of_model(reconstruction, model, camera)
-    images = MappedImages(landmarks, arrays, poses, cameras_of_images(model, reconstruction))
+    images = MappedImages.of(landmarks, arrays, poses, cameras_of_images(model, reconstruction))
     return ColmapSource(landmarks, camera, compact_poses(poses), found, images)
 
 

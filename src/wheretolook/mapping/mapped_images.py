@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ class MappedImages:
 
     Attributes:
         landmarks: of the map.
-        arrays: its model in the world, in metres with z up.
+        arrays: its model in the world, in metres with z up; all points are landmarks.
         poses: (M, 3, 4) cam_from_world.
         cameras: (M,)
         offsets: of the log-odds of detection, once estimated, by network and occlusion.
@@ -45,8 +45,13 @@ class MappedImages:
     def __len__(self) -> int:
         return len(self.cameras)
 
+    @classmethod
+    def of(cls, landmarks: Landmarks, arrays: ModelArrays, poses: Float, cameras: tuple[Camera, ...]) -> Self:
+        """Return the images of a model, of which only the points that are landmarks count."""
+        return cls(landmarks, select_points(arrays, np.isin(arrays.point_ids, landmarks.ids)), poses, cameras)
+
     def without(self, held_out: NDArray[np.int64]) -> Landmarks:
-        """Return the landmarks that two of the other images observe, with the attributes of their tracks in those.
+        """Return the landmarks with at least two observations in the other images, with the attributes of those tracks.
 
         `held_out` are rows of images. Coordinates, errors and ambiguities stay as they are.
         """
@@ -69,4 +74,4 @@ def read_images(model_dir: Path, landmarks: Landmarks) -> MappedImages:
     """Read the images of a map's COLMAP model, which is in metres with z up. Raises MapError as `read_model`."""
     model = read_model(model_dir)
     of_images = colmap_poses(model_dir, model), cameras_of_images(model_dir, model)
-    return MappedImages(landmarks, model_arrays(model), *of_images)
+    return MappedImages.of(landmarks, model_arrays(model), *of_images)

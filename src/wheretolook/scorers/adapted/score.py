@@ -49,7 +49,8 @@ class AdaptedScorer(Scorer):
         network = trained.network
         self.trained = trained
         of_base = network.network, trained.camera, network.base_scale, network.base_offset, trained.training_range
-        self.base = SetScorer(localization_map, TrainedNetwork("set", *of_base))
+        known = replace(localization_map, photographs=False)  # the base is calibrated for this map already
+        self.base = SetScorer(known, TrainedNetwork("set", *of_base))
         poses = network.support_centers.numpy(), network.support_axes.numpy()
         kernel = network.length_m, network.sharpness
         self.correction = Correction(*poses, network.support_weights.numpy(), *kernel)

@@ -14,19 +14,21 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import observation_matrix, select_points
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook.visibility.cached_occlusion import CachedOcclusion
+from wheretolook.visibility.occlusion import StoredOcclusion
 
 MIN_IMAGES = 5  # of a map whose tracks show how often landmarks are detected
 BLOCKS = 8  # of images that are held out one after the other
-SHARE = 8  # part of the images that a block takes, one over
+SHARE = 1 / 8  # of the images that a block takes
 TESTED = 2  # images of a block, at most
 MAX_POINTS = 20_000  # of the map that are examined, evenly spread
-MIN_SAMPLE = 200  # landmarks in view of the held-out images, with repetitions
+MIN_OBSERVED = 50  # observations of remaining landmarks in the held-out images
 MAX_LANDMARKS = 512  # of an image that are described
 OFFSETS = np.linspace(-1, 2, 61).tolist()
 
 
 def for_map(trained: TrainedNetwork[SetNetwork], localization_map: LocalizationMap) -> TrainedNetwork[SetNetwork]:
-    """Return a network calibrated for a map of photographs; for a map of renders, as those it was trained on, the same.
+    """Return a network calibrated for a map of photographs; the same network for a map of renders.
 
     The log-odds of detection get `detection_offset`, those of the view `TrainedNetwork.photograph_offset`.
     """
@@ -45,7 +47,12 @@ def _known_offset(network: SetNetwork, localization_map: LocalizationMap) -> flo
     if localization_map.images is None:
         return 0.0
     known = localization_map.images.offsets
-    key = (localization_map.occlusion.name, *(float(values.sum()) for values in network.parameters()))
+    occlusion = localization_map.occlusion
+    if isinstance(occlusion, CachedOcclusion):
+        occlusion = occlusion.model
+    if isinstance(occlusion, StoredOcclusion):  # of all landmarks at some locations only
+        return 0.0
+    key = (occlusion, *(float(values.sum()) for values in network.parameters()))
     if key not in known:
         known[key] = detection_offset(network, localization_map)
     return known[key]
@@ -55,22 +62,22 @@ def detection_offset(network: SetNetwork, localization_map: LocalizationMap) -> 
     """Estimate the offset of a network's log-odds of detection on a map from the tracks of its landmarks.
 
     Blocks of images that share landmarks are held out. With the offset, the network predicts as many detections of the
-    remaining landmarks as there are observations of them in the held-out images. 0 if the images are unknown or fewer
-    than `MIN_IMAGES`, or see hardly any of these landmarks. Measured in docs/research/cameras.md.
+    remaining landmarks as there are observations of them in the held-out images. 0 if the images are unknown, fewer
+    than `MIN_IMAGES`, or observe hardly any of these landmarks. Measured in docs/research/cameras.md.
     """
     images = localization_map.images
     if images is None or len(images) < MIN_IMAGES:
         return 0.0
-    known = np.flatnonzero(np.isin(images.arrays.point_ids, images.landmarks.ids))
     kept = np.zeros(len(images.arrays.points), dtype=bool)
-    kept[known[:: max(1, -(-len(known) // MAX_POINTS))]] = True
+    kept[:: max(1, -(-len(kept) // MAX_POINTS))] = True
     images = replace(images, arrays=select_points(images.arrays, kept))
     observes = observation_matrix(images.arrays)
     n_observed = 0.0
     parts: list[tuple[torch.Tensor, torch.Tensor]] = []
-    for first in _spread(len(images), BLOCKS):
+    seeing = np.flatnonzero(np.asarray(observes.sum(1)).reshape(-1))
+    for first in seeing[_spread(len(seeing), BLOCKS)]:
         common = (observes @ observes[[first]].T).toarray().reshape(-1)
-        block = np.argsort(-common, kind="stable")[: max(1, round(len(images) / SHARE))]
+        block = np.argsort(-common, kind="stable")[: max(1, round(len(images) * SHARE))]
         block = block[common[block] > 0]
         remaining = images.without(block)
         if len(remaining) == 0:
@@ -84,7 +91,7 @@ def detection_offset(network: SetNetwork, localization_map: LocalizationMap) -> 
                 with torch.inference_mode():
                     log_odds = network.matchability(described.values).double()
                 parts.append((log_odds, (n_visible / max(1, len(log_odds))).expand(len(log_odds))))
-    if sum(len(part[0]) for part in parts) < MIN_SAMPLE:
+    if n_observed < MIN_OBSERVED:
         return 0.0
     log_odds, weights = (torch.cat(part) for part in zip(*parts, strict=True))
 

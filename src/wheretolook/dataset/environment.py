@@ -29,8 +29,8 @@ if TYPE_CHECKING:  # pandas and Warp are imported when first needed
     from wheretolook.geometry.mesh import TexturedMesh
     from wheretolook.geometry.tsdf import DepthImage, DepthImages, TsdfVolume
     from wheretolook.inputs.localization_map import LocalizationMap
-    from wheretolook.mapping.landmarks import ColmapSource, Landmarks
-    from wheretolook.mapping.mapped_images import MappedImages
+    from wheretolook.mapping.landmarks import Landmarks
+    from wheretolook.mapping.mapped_images import ColmapSource, MappedImages
     from wheretolook.rendering.raycasting import MeshRaycaster
     from wheretolook.rendering.types import Renderer
     from wheretolook.space.free_space import FreeSpace
@@ -396,7 +396,7 @@ class ColmapEnvironment(Environment):
 
     @cached_property
     def _map(self) -> ColmapSource:
-        from wheretolook.mapping.landmarks import open_colmap
+        from wheretolook.mapping.mapped_images import open_colmap
 
         files = self.files
         depth_scale = None

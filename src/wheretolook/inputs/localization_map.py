@@ -14,9 +14,9 @@ from wheretolook.geometry.camera import Camera, ColmapCamera
 from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
 from wheretolook.mapping.config import FrameOptions
-from wheretolook.mapping.landmarks import Landmarks, open_colmap
+from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame, has_photographs
-from wheretolook.mapping.mapped_images import MappedImages
+from wheretolook.mapping.mapped_images import MappedImages, open_colmap
 from wheretolook.mapping.sanity import warn_of_mesh
 from wheretolook.utils.validation import check_positive
 from wheretolook.visibility import frustum

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -14,25 +14,11 @@ from tqdm.auto import tqdm
 from wheretolook.features.descriptors import DescriptorKind, unit_descriptors
 from wheretolook.features.registry import all_kinds
 from wheretolook.features.sift import SIFT
-from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.local_origin import local_origin
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
-from wheretolook.mapping.colmap_model import (
-    ModelArrays,
-    camera_of_model,
-    cameras_of_images,
-    colmap_poses,
-    compact_poses,
-    model_arrays,
-    read_model,
-    select_points,
-)
-from wheretolook.mapping.config import FrameOptions
+from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, read_model, select_points
 from wheretolook.mapping.feature_files import read_descriptors
-from wheretolook.mapping.map_frame import MapFrame, find_frame
-from wheretolook.mapping.mapped_images import MappedImages
-from wheretolook.mapping.sources import choose_features
 from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.npz_files import load_npz, save_npz
 
@@ -136,45 +122,6 @@ def _cast_floats(values: dict[str, NDArray[Any]], points: DTypeLike, others: DTy
     """Cast the points and all other arrays of floats to the given types; arrays of integers stay as they are."""
     types = {name: points if name == "points" else others for name, value in values.items() if value.dtype.kind == "f"}
     return {name: value.astype(types.get(name, value.dtype), copy=False) for name, value in values.items()}
-
-
-class ColmapSource(NamedTuple):
-    """Parts of a COLMAP model in the world: metres, z up."""
-
-    landmarks: Landmarks
-    camera: Camera  # the query camera
-    mapping_poses: Float  # cam_from_world (M, 3, 4) of its images
-    frame: MapFrame  # of the model
-    images: MappedImages  # the same images, with their cameras and observations
-
-
-def open_colmap(
-    model: str | Path,
-    camera: Camera | int | None = None,
-    database: str | Path | None = None,
-    max_reprojection_error_px: float | None = None,
-    device: str = "cpu",
-    frame: FrameOptions = FrameOptions(),
-    depth_scale: float | None = None,
-) -> ColmapSource:
-    """Read a COLMAP model; arguments, errors and warnings are those of `LocalizationMap.from_colmap`.
-
-    `depth_scale` is that of `find_frame`. Without a database torch and Warp are not imported: importing them takes
-    longer than reading 200,000 landmarks.
-    """
-    model = Path(model)
-    reconstruction = read_model(model)
-    database = choose_features(model, reconstruction, None if database is None else Path(database))
-    arrays = model_arrays(reconstruction)
-    found = find_frame(model, reconstruction, frame, depth_scale, arrays)
-    arrays = found.of_arrays(arrays)
-    landmarks = load_colmap_landmarks(model, database, max_reprojection_error_px, device, reconstruction, arrays=arrays)
-    poses = found.world_from_map.apply_to_poses(colmap_poses(model, reconstruction))
-    found.warn(model, landmarks.mapping_distance_m, poses)
-    if camera is None or isinstance(camera, int):
-        camera = camera_of_model(reconstruction, model, camera)
-    images = MappedImages.of(landmarks, arrays, poses, cameras_of_images(model, reconstruction))
-    return ColmapSource(landmarks, camera, compact_poses(poses), found, images)
 
 
 def load_colmap_landmarks(

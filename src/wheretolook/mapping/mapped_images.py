@@ -1,10 +1,10 @@
-"""The images of a map with what they observe, and what is left of it without some of them."""
+"""Opens a map: its landmarks, and its images with what they observe."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,15 +13,18 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import (
     ModelArrays,
+    camera_of_model,
     cameras_of_images,
     colmap_poses,
+    compact_poses,
     model_arrays,
     read_model,
     select_points,
 )
-
-if TYPE_CHECKING:
-    from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.config import FrameOptions
+from wheretolook.mapping.landmarks import Landmarks, landmarks_of, load_colmap_landmarks
+from wheretolook.mapping.map_frame import MapFrame, find_frame
+from wheretolook.mapping.sources import choose_features
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,8 +68,6 @@ class MappedImages:
             observation_image=arrays.observation_image[observations],
             observation_keypoint=arrays.observation_keypoint[observations],
         )
-        from wheretolook.mapping.landmarks import landmarks_of  # which imports this module
-
         return landmarks_of(self.landmarks, select_points(left, counts >= 2))
 
 
@@ -75,3 +76,42 @@ def read_images(model_dir: Path, landmarks: Landmarks) -> MappedImages:
     model = read_model(model_dir)
     of_images = colmap_poses(model_dir, model), cameras_of_images(model_dir, model)
     return MappedImages.of(landmarks, model_arrays(model), *of_images)
+
+
+class ColmapSource(NamedTuple):
+    """Parts of a COLMAP model in the world: metres, z up."""
+
+    landmarks: Landmarks
+    camera: Camera  # the query camera
+    mapping_poses: Float  # cam_from_world (M, 3, 4) of its images
+    frame: MapFrame  # of the model
+    images: MappedImages  # the same images, with their cameras and observations
+
+
+def open_colmap(
+    model: str | Path,
+    camera: Camera | int | None = None,
+    database: str | Path | None = None,
+    max_reprojection_error_px: float | None = None,
+    device: str = "cpu",
+    frame: FrameOptions = FrameOptions(),
+    depth_scale: float | None = None,
+) -> ColmapSource:
+    """Read a COLMAP model; arguments, errors and warnings are those of `LocalizationMap.from_colmap`.
+
+    `depth_scale` is that of `find_frame`. Without a database torch and Warp are not imported: importing them takes
+    longer than reading 200,000 landmarks.
+    """
+    model = Path(model)
+    reconstruction = read_model(model)
+    database = choose_features(model, reconstruction, None if database is None else Path(database))
+    arrays = model_arrays(reconstruction)
+    found = find_frame(model, reconstruction, frame, depth_scale, arrays)
+    arrays = found.of_arrays(arrays)
+    landmarks = load_colmap_landmarks(model, database, max_reprojection_error_px, device, reconstruction, arrays=arrays)
+    poses = found.world_from_map.apply_to_poses(colmap_poses(model, reconstruction))
+    found.warn(model, landmarks.mapping_distance_m, poses)
+    if camera is None or isinstance(camera, int):
+        camera = camera_of_model(reconstruction, model, camera)
+    images = MappedImages.of(landmarks, arrays, poses, cameras_of_images(model, reconstruction))
+    return ColmapSource(landmarks, camera, compact_poses(poses), found, images)

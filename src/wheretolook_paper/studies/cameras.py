@@ -139,7 +139,7 @@ def main(
         split: the scenes that are scored.
         weights: folder of weights.
         methods: what is compared; differences are to the first.
-        out: CSV file of the table.
+        out: CSV file of the table; rows of other datasets in it are kept.
     """
     paths = [path for path in sorted(weights.glob("*.safetensors")) if not path.stem.startswith("mlp")]
     tables = []
@@ -151,7 +151,9 @@ def main(
         shown = table[(table["group"] == "mean") | table["group"].str.startswith("all ")]
         print(shown.drop(columns=["dataset"]).to_string(index=False, float_format=lambda x: f"{x:.3f}"))
         if out is not None:
-            pd.concat(tables).round(4).to_csv(out, index=False)
+            others = pd.read_csv(out) if out.is_file() else pd.DataFrame({"dataset": []})
+            others = others[~others["dataset"].isin([path.name for path in datasets])]
+            pd.concat([others, *tables]).round(4).to_csv(out, index=False)
 
 
 if __name__ == "__main__":

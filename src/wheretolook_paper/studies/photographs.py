@@ -145,7 +145,7 @@ def rows_of(scene: str, numbers: Mapping[str, Any], method: str) -> list[dict[st
             row |= _ends(column, found[column])
         if name == method:
             ratios = numbers["inliers_found_over_expected"] or {}
-            row |= _ends("ece", numbers["ece"] or {})
+            row |= _ends("ece", numbers["ece"] or {}) | {"predicted": numbers["mean_probability"]}
             row |= {f"real_over_expected_{which}": ratio["value"] for which, ratio in ratios.items()}
             row["in_range"] = numbers["share_in_range"]
         rows.append(row)

@@ -1,0 +1,275 @@
+"""Numbers of the pages that a release's results hold: for each place in a page, the file and cell that it is of.
+
+A table of a page is found by its header line, its rows by their first cells; a number in prose by a pattern whose groups
+are the numbers. `updated` returns a page with today's numbers, so that a test compares it with the page and
+`wheretolook_paper.studies.results` writes it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache
+from pathlib import Path
+
+import pandas as pd
+
+STRICT = "0.05m_0.4deg"
+
+Cells = Callable[[str], list[str] | None]
+"""Returns the cells of a row beside its first, given this one without emphasis and remarks; None if it is no method."""
+
+METHODS = {
+    "set of landmarks": "set",
+    "expected inliers": "expected-inliers",
+    "expected bins": "expected-bins",
+    "Fisher, trace, expected": "fisher-trace-expected",
+    "random": "random",
+    "a random direction": "random",
+    "forward, headings drawn": "forward",
+    "most visible landmarks": "visible",
+    "most visible": "visible",
+    "reprojections with bins": "bins",
+    "Fisher, min. eigenvalue, exact": "fisher-mineig-exact",
+    "Fisher, log det, exact": "fisher-logdet-exact",
+    "Fisher, trace, exact": "fisher-trace-exact",
+    "Fisher information, trace": "fisher-trace-exact",
+    "Fisher, trace, GP": "fisher-trace-gp",
+    "MLP, 2d": "mlp-2d",
+    "MLP, 2d + z": "mlp-2d+z",
+    "MLP, 2d + 3d": "mlp-2d+3d",
+    "the paper's network": "mlp-2d+z",
+}
+"""Methods by their names in tables."""
+
+RANKED = ("set", "expected-inliers", "bins", "visible")
+LOOKS = {
+    "selected as a set, joint": "together",
+    "added one after another, joint": "in-turn",
+    "by single scores, 40° apart, joint": "one-by-one",
+    "evenly spaced, joint": "even",
+    "most visible, joint": "visible",
+    "exact Fisher information, joint": "fisher",
+    "random, joint": "random",
+}
+POLICIES = {
+    "random": "random",
+    "even spread": "even",
+    "expected score": "expected",
+    "blended by confidence": "blended",
+    "expected gain": "gain",
+    "score at the true pose": "known",
+}
+
+
+class Numbers:
+    """Tables and pages of a checkout.
+
+    Args:
+        root: folder of README.md, docs/ and data/release.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.table = cache(lambda name: pd.read_csv(root / "data" / "release" / "results" / name))
+
+    def row(self, file: str, **values: object) -> pd.Series | None:
+        """Return the only row of a table with these values in its columns, None if there is none."""
+        table = self.table(file)
+        for column, value in values.items():
+            table = table[table[column].astype(str) == str(value)]
+        if len(table) > 1:
+            raise ValueError(f"{file}: {len(table)} rows of {values}")
+        return table.iloc[0] if len(table) else None
+
+    def scores(self, file: str, method: str, occlusion: str = "mesh", scene: str = "all") -> pd.Series | None:
+        """Return the row of the best view of each location among all labelled ones."""
+        return self.row(file, method=method, occlusion=occlusion, candidates="all", top_n=1, scene=scene)
+
+    # --- cells of tables
+
+    def readme_scores(self, label: str) -> list[str] | None:
+        method = METHODS.get(label)
+        return method and [*self._best(method, "scores.csv")[::2], *self._best(method, "generalization.csv")[::2]]
+
+    def all_scores(self, label: str) -> list[str] | None:
+        method = METHODS.get(label)
+        return method and [*self._best(method, "scores.csv"), *self._best(method, "generalization.csv")]
+
+    def _best(self, method: str, file: str) -> list[str]:
+        """Return share with interval, share through walls, AUC; from `variants.csv` what does not ship."""
+        found = self.scores(file, method)
+        if found is None and file == "scores.csv":
+            file = "variants.csv"
+            found = self.scores(file, method)
+        if found is None:
+            return ["–"] * 3
+        through = self.scores(file, method, "none")
+        return [
+            interval(100 * found[[f"normalized_{end}{STRICT}" for end in ("", "low_", "high_")]]),
+            "–" if through is None else f"{100 * through[f'normalized_{STRICT}']:.1f}",
+            f"{found['roc_auc']:.3f}",
+        ]
+
+    def angles(self, label: str) -> list[str] | None:
+        """Return regret and AUC of four methods on the six scenes, then on the apartments."""
+        groups = ("all others'", "all apartment")
+        cells = [self._ranked(f"test-{label.rstrip('°')}", group, method) for group in groups for method in RANKED]
+        return [f"{row['regret']:.1f}; {row['auc']:.3f}" for row in cells]
+
+    def fisheye(self, label: str) -> list[str] | None:
+        group = {"two apartments": "all apartment", "six other scenes": "all others'"}[label]
+        cells = []
+        for method in RANKED:
+            row = self._ranked("fisheye", group, method)
+            regret = f"{row['regret']:.1f}"
+            if method == RANKED[0]:
+                regret = interval(row[["regret", "regret_low", "regret_high"]])
+            cells.append(f"{regret}; {row['auc']:.3f}" + ("" if pd.isna(row["ece"]) else f"; {row['ece']:.2f}"))
+        return cells
+
+    def _ranked(self, dataset: str, group: str, method: str) -> pd.Series:
+        found = self.row("cameras.csv", dataset=dataset, group=group, method=method)
+        assert found is not None
+        return found
+
+    def photographs(self, scene: str) -> Cells:
+        def cells(label: str) -> list[str] | None:
+            found = self.row("photographs.csv", scene=scene, method=METHODS.get(label, ""))
+            if found is None:
+                return None
+            ends = ("", "_low", "_high")
+            auc, within, regret, ece = (
+                found[[name + end for end in ends]].astype(float)
+                for name in ("auc", "auc_within_blocks", "regret", "ece")
+            )
+            regrets = interval(regret) if regret.any() else "0"
+            calibrated = ["", ""]
+            if not ece.isna().any():
+                calibrated = [interval(ece, 3), f"{found['real_over_expected_localized']:.2f}"]
+            return [interval(auc, 3), interval(within, 3), regrets, *calibrated]
+
+        return cells
+
+    def looks(self, label: str) -> list[str] | None:
+        rows = [self.row("looks.csv", split="test", strategy=LOOKS[label], n_looks=n) for n in (1, 2, 3, 5)]
+        assert all(row is not None for row in rows)
+        return [*(f"{100 * row['good']:.1f}" for row in rows), f"{100 * rows[-1]['any_good']:.1f}"]  # type: ignore[index]
+
+
+def interval(values: Iterable[float], digits: int = 1) -> str:
+    """Format a value and the ends of its interval."""
+    value, low, high = (f"{number:.{digits}f}" for number in values)
+    return f"{value} [{low}, {high}]"
+
+
+def tables(numbers: Numbers) -> Mapping[tuple[str, str], Cells]:
+    """Return the cells of each table of the pages, by page and header line."""
+    held_out = "| AUC | AUC within groups | regret in points | calibration error | inliers / expected |"
+    four = "set | expected inliers | bins | most visible |"
+    return {
+        ("README.md", "| method | two test apartments | AUC | six other scenes | AUC |"): numbers.readme_scores,
+        (
+            "docs/results.md",
+            "| method | two test apartments | through walls | AUC | six other scenes | through walls | AUC |",
+        ): numbers.all_scores,
+        ("docs/results.md", f"| field of view | six other scenes: {four} two apartments: {four}"): numbers.angles,
+        ("docs/results.md", f"| | {four}"): numbers.fisheye,
+        ("docs/results.md", f"| kitchen {held_out}"): numbers.photographs("kitchen"),
+        ("docs/results.md", f"| fox {held_out}"): numbers.photographs("fox"),
+        ("docs/looks.md", "| views | one | two | three | five | any of five alone |"): numbers.looks,
+    }
+
+
+def prose(numbers: Numbers) -> Mapping[tuple[str, str], list[str]]:
+    """Return the numbers of each pattern, by page and pattern, in the order of its groups."""
+    two, single = (numbers.row("looks.csv", split="test", strategy="together", n_looks=n)["good"] for n in (2, 1))
+    gain, even = (numbers.row("relocalize.csv", policy=policy)["right_4"] for policy in ("gain", "even"))
+    looks = [f"{100 * share:.0f}" for share in (two, single)]
+    turned = [f"{100 * share:.0f}" for share in (gain, even)]
+    ours, other = "scores.csv", "generalization.csv"
+    paired = []
+    for method in ("bins", "mlp-2d+z"):
+        for file in (ours, other):
+            row = numbers.scores(file, method)
+            mean, high, low = (-100 * row[f"difference_{end}{STRICT}"] for end in ("", "low_", "high_"))
+            paired += [f"{mean:+.1f}", f"{low:.1f}", f"{high:.1f}"]
+    levels = numbers.table("cameras.csv")
+    levels = levels[(levels["dataset"] == "test-90") & levels["group"].str.startswith("nexuiz")]
+    by_set, by_bins = (levels[levels["method"] == method] for method in ("set", "bins"))
+    house = numbers._ranked("test-90", "aws_house", "set")
+    tested = numbers.table("cameras.csv")
+    tested = tested[tested["dataset"].str.startswith("test-") & (tested["method"] == "set")]
+    errors = [tested[tested["group"] == group]["ece"] for group in ("all apartment", "all others'")]
+    kitchen, fox = (numbers.row("photographs.csv", scene=scene, method="set") for scene in ("kitchen", "fox"))
+    held_out = [str(int(row[name])) for row in (kitchen, fox) for name in ("good", "views", "blocks")]
+    shares = [f"{100 * row['good'] / row['views']:.0f}" for row in (fox, kitchen)]
+    predicted = [f"{100 * row['predicted']:.0f}" for row in (fox, kitchen)]
+    number = r"(-?[+\d.]+)"
+    pair = rf"{number} points on the apartments \[{number}, {number}\] and {number} on the six scenes"
+    return {
+        ("README.md", r"two localize at (\d+) of 100 .* single view localizes at (\d+)"): looks,
+        ("README.md", r"after four views (\d+) of 100 poses are correct, (\d+) by even"): turned,
+        (
+            "docs/results.md",
+            rf"against bins {pair} \[{number}, {number}\]; against the paper's network {number} \[{number}, {number}\] "
+            rf"and {number} \[{number}, {number}\]",
+        ): paired,
+        ("docs/results.md", r"ECE ([\d.]+) to ([\d.]+); ([\d.]+) in the simulator's house"): [
+            *_range(by_set["ece"]),
+            f"{house['ece']:.2f}",
+        ],
+        ("docs/results.md", r"AUC ([\d.]+) to ([\d.]+), bins ([\d.]+) to ([\d.]+)"): [
+            *_range(by_set["auc"]),
+            *_range(by_bins["auc"]),
+        ],
+        ("docs/results.md", r"error is ([\d.]+) to ([\d.]+) on the apartments and ([\d.]+) to ([\d.]+) on"): [
+            end for values in errors for end in _range(values)
+        ],
+        (
+            "docs/results.md",
+            r"(\d+) of (\d+) views in (\d+) groups localize\) and .* (\d+) of (\d+) views in (\d+) groups",
+        ): held_out,
+        ("docs/results.md", r"\((\d+) % localize where (\d+) % were predicted\)"): [shares[0], predicted[0]],
+        ("docs/results.md", r"In the kitchen (\d+) % localize where (\d+) %"): [shares[1], predicted[1]],
+    }
+
+
+def _range(values: pd.Series) -> list[str]:
+    return [f"{values.min():.2f}", f"{values.max():.2f}"]
+
+
+def updated(page: str, numbers: Numbers) -> str:
+    """Return a page's text with the numbers that the results hold now.
+
+    Raises ValueError if a table or a pattern is not in the page, so that a rewritten page is noticed.
+    """
+    lines = (numbers.root / page).read_text(encoding="utf-8").splitlines()
+    for (where, header), cells in tables(numbers).items():
+        if where != page:
+            continue
+        start = lines.index(header) + 2
+        for index in range(start, len(lines)):
+            if not lines[index].startswith("|"):
+                break
+            first = lines[index].strip("|").split("|")[0].strip()
+            found = cells(re.sub(r" \((ships|MLP|\[).*\)$", "", first.replace("**", "")))
+            if found is not None:
+                lines[index] = re.sub(r"\|  (?=\|)", "| ", f"| {' | '.join([first, *found])} |")
+    text = "\n".join(lines) + "\n"
+    for (where, pattern), values in prose(numbers).items():
+        if where != page:
+            continue
+        matches = [*re.finditer(pattern, text)]
+        if len(matches) != 1:
+            raise ValueError(f"{page}: {len(matches)} places match {pattern}")
+        match = matches[0]
+        for group in range(len(values), 0, -1):
+            start, end = match.span(group)
+            text = text[:start] + values[group - 1] + text[end:]
+    return text
+
+
+def pages(numbers: Numbers) -> list[str]:
+    """Return the pages that have numbers of the results."""
+    return sorted({page for page, _ in [*tables(numbers), *prose(numbers)]})

@@ -19,7 +19,7 @@ from wheretolook_paper.studies.compare_hloc import main, render_set, summarize
 def test_a_mesh_becomes_a_set_and_its_queries_localize(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     mesh = tmp_path / "room.glb"
     save_glb(furnished_room(), mesh)
-    sizes = {"locations": 3, "images": 24, "work": tmp_path / "work"}
+    sizes = {"locations": 2, "images": 16, "work": tmp_path / "work"}
     table = main([str(mesh)], tmp_path / "poses.csv", partners=8, retrieved=4, **sizes)
 
     folder = render_set(str(mesh), **sizes)  # made before
@@ -27,7 +27,7 @@ def test_a_mesh_becomes_a_set_and_its_queries_localize(tmp_path: Path, capsys: p
     model = read_model(folder)
     assert len(model.points3D) == 0
     names = [*registered_names(model).values()]
-    assert len(names) == 24 + len(queries) and {*queries} < {*names}
+    assert len(names) == 16 + len(queries) and {*queries} < {*names}
     assert {path.name for path in (folder / "images").iterdir()} == {*names}
     assert np.isfinite(colmap_poses(folder, model)).all()
 

@@ -345,7 +345,8 @@ def _triangulate(
     names = [*mapping]
     _, stored = read_features(features, names)
     (camera,) = read_model(folder).cameras.values()
-    posed = posed_model(camera, names, dict(enumerate(mapping.values())), stored)
+    empty = [(np.empty((0, 2), np.float32), descriptors) for _, descriptors in stored]  # keypoints are added below
+    posed = posed_model(camera, names, dict(enumerate(mapping.values())), empty)
     colors = [np.zeros((len(pixels), 3), np.uint8) for pixels, _ in stored]
     # tracks as long as hloc asks for
     config = MapConfig(extractor=extractor, two_view_landmarks=False)

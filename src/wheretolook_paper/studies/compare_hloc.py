@@ -1,15 +1,21 @@
 """Compare localization with hloc (Sarlin et al., CVPR 2019) on the same features, maps and queries.
 
-    python -m wheretolook_paper.studies.compare_hloc compare --sets work/kitchen work/fox --features aliked \\
-        --weights aliked-n16rot.pth --lightglue aliked_lightglue.pth --out hloc.csv
-    python -m wheretolook_paper.studies.compare_hloc draw --tables hloc.csv --figure hloc.png
+    python -m wheretolook_paper.studies.compare_hloc compare --sets '[building-700, scan.glb]' --out hloc.csv
+    python -m wheretolook_paper.studies.compare_hloc compare --sets '[work/kitchen]' --features aliked \\
+        --weights aliked-n16rot.pth --lightglue aliked_lightglue.pth --out aliked.csv
+    python -m wheretolook_paper.studies.compare_hloc draw --tables '[hloc.csv, aliked.csv]' --figure hloc.png
 
-Needs hloc (https://github.com/cvg/Hierarchical-Localization) and h5py. A set is a folder with images/, cameras.txt of one
-camera and images.txt with all poses (COLMAP's text), and queries.txt: lines "image fold". The queries of a fold are
-localized in a map of all images but those of the fold, which hloc triangulates at the known poses. Each of these is
-matched with the `partners` nearest ones. hloc then matches each query with the `retrieved` mapping images that observe
-most of the landmarks that the query matches, since weights of global descriptors are not assumed; its confidence is the
-number of inliers.
+Needs h5py, and hloc (https://github.com/cvg/Hierarchical-Localization) in the same environment; without hloc only this
+project's methods are compared. A set is
+
+- a generated scene, `<kind>-<seed>`, or a mesh in metres: it is mapped by rendered images, and the views that the scorer
+  that ships, bins, most visible landmarks and a random draw select at `locations` locations are rendered as queries; or
+- a folder with images/, cameras.txt of one camera, images.txt with all poses and an empty points3D.txt (COLMAP's text),
+  and queries.txt: lines "image fold". The queries of a fold are localized in a map of all images but those of the fold.
+
+hloc triangulates the map at the known poses (without hloc, the map stage does); each image is matched with the `partners`
+nearest ones. hloc then matches each query with the `retrieved` mapping images that observe most of the landmarks that the
+query matches, since weights of global descriptors are not assumed; its confidence is the number of inliers.
 
 Methods: `hloc`; `first` (the paper's: landmarks, one RANSAC), `hypotheses` (landmarks, several hypotheses), `lightglue`
 (the same after LightGlue with five mapping images). Times are those of matching and pose estimation, without features.
@@ -17,10 +23,13 @@ Methods: `hloc`; `first` (the paper's: landmarks, one RANSAC), `hypotheses` (lan
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pandas as pd
@@ -28,25 +37,43 @@ import pycolmap
 from jsonargparse import auto_cli
 from tqdm.auto import tqdm
 
+from wheretolook.commands.map import Map
+from wheretolook.commands.sample import Sample
+from wheretolook.commands.scenes import Scenes
+from wheretolook.commands.scenes_config import MeshSource, ScenesConfig
+from wheretolook.dataset.environment import SceneEnvironment
+from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.thresholds import Accuracy
+from wheretolook.dataset.viewpoint_table import poses as poses_of_table
 from wheretolook.evaluation.calibration import precision_area, precision_over_coverage
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.evaluation.scoring import score_scenes
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.features.extraction import KeypointExtractor
 from wheretolook.features.keypoints import Keypoints
 from wheretolook.features.registry import all_kinds, kind_of
-from wheretolook.geometry.camera import Camera, camera_of
+from wheretolook.geometry.camera import Camera, camera_of, write_cameras
 from wheretolook.geometry.poses import Float, camera_centers, pose_error
 from wheretolook.io.poses import images_text
 from wheretolook.localization.confidence import probabilities
-from wheretolook.localization.config import LocalizerConfig
+from wheretolook.localization.config import LabelConfig, LocalizerConfig
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.rig import Look
 from wheretolook.localization.rig_localization import POSES_OF_AN_IMAGE
-from wheretolook.mapping.colmap_model import colmap_poses, read_model, registered_names
+from wheretolook.mapping.colmap_model import colmap_poses, holds_model, read_model, registered_names
+from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
+from wheretolook.mapping.map_folder import DATABASE_FILE, IMAGES_FOLDER, MapRun
 from wheretolook.mapping.photographs import read_photograph
-from wheretolook.utils.files import atomic_write, write_text
+from wheretolook.mapping.triangulation import triangulate_model
+from wheretolook.scenes.config import SceneKind
+from wheretolook.utils.devices import usable_device
+from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.files import atomic_write, write_bytes, write_text
+from wheretolook.utils.processes import WorkerPool
+from wheretolook.weights.resolve import resolve_weights
+from wheretolook_paper.studies.photographs import posed_model
 
 MATCHERS = {"aliked": "aliked+lightglue", "disk": "disk+lightglue", "opencv": "NN-ratio"}  # of hloc, by extractor
 LABELS = {"aliked": "ALIKED", "disk": "DISK", "opencv": "SIFT"}
@@ -55,6 +82,12 @@ ACCURACIES: Mapping[str, Accuracy] = {"5 cm, 0.4 deg": (0.05, 0.4), "25 cm, 2 de
 AHEAD_M = 3.0  # of a camera, of the point that decides which images are matched
 MIN_TIMED = 10  # queries of a fold of which hloc's time is stated
 HLOC_ERROR_PX = 12.0  # hloc's default limit of an inlier
+SELECTING = ("set", "bins", "visible", "random")  # methods whose views are the queries in a rendered scene
+DIRECTIONS = 24  # of a location, that they select from
+NO_HLOC = (
+    "hloc is not installed, so only this project's methods are compared. To install it:\n"
+    "    git clone --recursive https://github.com/cvg/Hierarchical-Localization && pip install ./Hierarchical-Localization"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,21 +112,45 @@ class Pose:
 
 
 def main(
-    sets: list[Path],
+    sets: list[str],
     out: Path,
-    features: str = "aliked",
+    features: str = "opencv",
     weights: str = "",
     lightglue: str = "",
     retrieved: int = 10,
     partners: int = 20,
+    locations: int = 40,
+    images: int = 100,
     work: Path = Path("hloc-work"),
+    workers: int = 1,
     device: str = "cpu",
 ) -> pd.DataFrame:
-    """Localize the queries of all sets by all methods, write every pose's errors to `out`, and print a summary."""
+    """Localize the queries of all sets by all methods, write every pose's errors to `out`, and print a summary.
+
+    Args:
+        sets: generated scenes such as building-700, mesh files, or folders.
+        out: CSV file.
+        features: opencv (SIFT), aliked or disk.
+        weights: weights of learned features.
+        lightglue: weights of LightGlue, for one more method.
+        retrieved: mapping images that hloc matches a query with.
+        partners: images that each mapping image is matched with.
+        locations: locations in a mesh or generated scene, with up to four queries each.
+        images: images that a mesh or generated scene is mapped from.
+        work: folder of scenes, maps and features, which are reused.
+        workers: worker processes that map.
+        device: where to compute.
+    """
+    if find_spec("hloc") is None:
+        print(NO_HLOC)
     rows = []
-    for folder in sets:
-        extractor = KeypointExtractor(ExtractorConfig(features, weights=weights), device)
-        for fold in _folds(folder, extractor, partners, work / folder.name / features):
+    device = usable_device(device)
+    extractor = KeypointExtractor(ExtractorConfig(features, weights=weights), device)
+    for name in sets:
+        folder = Path(name)
+        if not folder.is_dir():
+            folder = render_set(name, locations, images, work, workers, device)
+        for fold in _folds(folder, extractor, partners, work / folder.name / features, workers):
             for method, poses in _methods(fold, features, lightglue, retrieved, device).items():
                 for name, pose in poses.items():
                     estimated = np.full((3, 4), np.nan) if pose.cam_from_world is None else pose.cam_from_world
@@ -106,6 +163,52 @@ def main(
     write_text(out, table.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
     print(summarize(table).to_string(index=False))
     return table
+
+
+def render_set(source: str, locations: int, images: int, work: Path, workers: int = 1, device: str = "cpu") -> Path:
+    """Map a mesh or a generated scene, render the queries, and return the folder of the set, which is reused.
+
+    Raises ConfigError if the source is neither.
+    """
+    import cv2
+
+    kind, _, seed = source.rpartition("-")
+    if Path(source).is_file():
+        scenes = ScenesConfig(train=0, test=0, meshes=(MeshSource(Path(source)),))
+    elif kind in get_args(SceneKind) and seed.isdecimal():
+        scenes = ScenesConfig(train=0, test=1, seed=int(seed), kinds=(kind,))  # type: ignore[arg-type]
+    else:
+        fix = f"Name a folder, a mesh file, or one of {', '.join(get_args(SceneKind))} with a seed: building-700."
+        raise ConfigError("there is no such set", value=source, fix=fix)
+    out = work / f"{Path(source).stem}-{images}-{locations}"
+    if (out / "queries.txt").is_file():
+        return out
+    dataset = {"data": work, "name": f"scene-{Path(source).stem}", "device": device}
+    Scenes(**dataset, scenes=scenes).run()
+    Map(**dataset, mapping=MapConfig(n_images=images, keep_images=True), label=LabelConfig(workers=workers)).run()
+    sample = SampleConfig(keep=0, max_locations=locations, max_directions=DIRECTIONS)
+    (scene,) = Sample(**dataset, sample=sample).run().scenes
+    table = scene.read_table()
+    weights = resolve_weights()
+    assert weights is not None
+    config = EvaluateConfig(methods=SELECTING)
+    scores, _ = score_scenes([scene], [table], config, {weights: "set"}, device, True, None)
+    places = table["location_id"].to_numpy()
+    rows = np.unique([pd.Series(values).groupby(places).idxmax() for values in scores.values()])
+    model = read_model(scene.map)
+    names = [*registered_names(model).values()]
+    shutil.copytree(scene.map / IMAGES_FOLDER, out / "images", dirs_exist_ok=True)
+    queries = {f"query-{row:05d}.png": pose for row, pose in zip(rows, poses_of_table(table)[rows], strict=True)}
+    renderer = SceneEnvironment(scene, device=device).renderer
+    for name, pose in tqdm(queries.items(), desc="render queries"):
+        (rgb,) = renderer.render(scene.camera, pose[None]).rgb
+        write_bytes(out / "images" / name, cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1].tobytes())
+    write_cameras({1: scene.camera}, out / "cameras.txt")
+    poses = [*colmap_poses(scene.map, model), *queries.values()]
+    write_text(out / "images.txt", images_text([*names, *queries], np.stack(poses)))
+    write_text(out / "points3D.txt", "")
+    write_text(out / "queries.txt", "".join(f"{name} views\n" for name in queries))
+    return out
 
 
 def summarize(table: pd.DataFrame) -> pd.DataFrame:
@@ -173,10 +276,8 @@ def _nearest(cam_from_world: Sequence[Float], count: int) -> list[tuple[int, int
     return sorted({(min(a, int(b)), max(a, int(b))) for a, row in enumerate(order) for b in row})
 
 
-def _folds(folder: Path, extractor: KeypointExtractor, partners: int, work: Path) -> Iterator[Fold]:
-    """Map the images outside each fold by hloc, and yield the map with the fold's queries."""
-    from hloc import match_features, triangulation
-
+def _folds(folder: Path, extractor: KeypointExtractor, partners: int, work: Path, workers: int) -> Iterator[Fold]:
+    """Map the images outside each fold, and yield the map with the fold's queries."""
     reference = read_model(folder)
     names = [*registered_names(reference).values()]
     true = dict(zip(names, colmap_poses(folder, reference), strict=True))
@@ -185,29 +286,75 @@ def _folds(folder: Path, extractor: KeypointExtractor, partners: int, work: Path
     method = extractor.config.method
     stored = work / f"feats-{kind_of(method).name}.h5"
     _store_features({name: folder / "images" / name for name in names}, extractor, stored)
-    matcher = match_features.confs[MATCHERS[method]]
+    has_hloc = find_spec("hloc") is not None
     for fold in dict.fromkeys(fold_of.values()):
         out = work / f"fold-{fold}"
-        mapping = [name for name in names if fold_of.get(name) != fold]
-        write_text(out / "reference" / "cameras.txt", (folder / "cameras.txt").read_text(encoding="utf-8"))
-        write_text(out / "reference" / "images.txt", images_text(mapping, [true[name] for name in mapping]))
-        write_text(out / "reference" / "points3D.txt", "")
-        pairs_file = out / "pairs.txt"
-        pairs = _nearest([true[name] for name in mapping], partners)
-        write_text(pairs_file, "\n".join(f"{mapping[a]} {mapping[b]}" for a, b in pairs))
-        matches = work / "mapping-matches.h5"  # shared by all folds
-        match_features.main(matcher, pairs_file, stored, matches=matches)
-        model = out / "model"
-        if not model.is_dir():
-            reference_dir = out / "reference"
-            # pycolmap 4 ignores the pairs that hloc verifies by the known poses, since it leaves their configuration open
-            triangulation.main(
-                model, reference_dir, folder / "images", pairs_file, stored, matches, estimate_two_view_geometries=True
-            )
+        mapping = {name: pose for name, pose in true.items() if fold_of.get(name) != fold}
+        pairs = _nearest([*mapping.values()], partners)
+        model = out / ("model" if has_hloc else "model-without-hloc")
+        if not holds_model(model):
+            own = folder, mapping, pairs, stored, out
+            if has_hloc:
+                _triangulate_by_hloc(*own, model, MATCHERS[method])
+            else:
+                _triangulate(*own, model, extractor.config, workers)
         landmarks = load_colmap_landmarks(model, stored, ambiguity=False)
         queries = {name: true[name] for name in names if fold_of.get(name) == fold}
-        own = camera_of(camera.model_name, camera.width, camera.height, camera.params)
-        yield Fold(out, model, stored, landmarks, own, queries)
+        seen_by = camera_of(camera.model_name, camera.width, camera.height, camera.params)
+        yield Fold(out, model, stored, landmarks, seen_by, queries)
+
+
+def _triangulate_by_hloc(
+    folder: Path,
+    mapping: Mapping[str, Float],
+    pairs: Sequence[tuple[int, int]],
+    features: Path,
+    out: Path,
+    model: Path,
+    matcher: str,
+) -> None:
+    """Match pairs of images of a set and triangulate at their known poses, all by hloc."""
+    from hloc import match_features, triangulation
+
+    reference = out / "reference"
+    write_text(reference / "cameras.txt", (folder / "cameras.txt").read_text(encoding="utf-8"))
+    write_text(reference / "images.txt", images_text(mapping, [*mapping.values()]))
+    write_text(reference / "points3D.txt", "")
+    pairs_file = out / "pairs.txt"
+    names = [*mapping]
+    write_text(pairs_file, "\n".join(f"{names[a]} {names[b]}" for a, b in pairs))
+    matches = out.parent / "mapping-matches.h5"  # shared by all folds
+    match_features.main(match_features.confs[matcher], pairs_file, features, matches=matches)
+    # pycolmap 4 ignores the pairs that hloc verifies by the known poses, since it leaves their configuration open
+    triangulation.main(
+        model, reference, folder / "images", pairs_file, features, matches, estimate_two_view_geometries=True
+    )
+
+
+def _triangulate(
+    folder: Path,
+    mapping: Mapping[str, Float],
+    pairs: Sequence[tuple[int, int]],
+    features: Path,
+    out: Path,
+    model: Path,
+    extractor: ExtractorConfig,
+    workers: int,
+) -> None:
+    """Match pairs of images of a set and triangulate at their known poses, as the map stage does."""
+    names = [*mapping]
+    _, stored = read_features(features, names)
+    (camera,) = read_model(folder).cameras.values()
+    empty = [(np.empty((0, 2), np.float32), descriptors) for _, descriptors in stored]  # keypoints are added below
+    posed = posed_model(camera, names, dict(enumerate(mapping.values())), empty)
+    colors = [np.zeros((len(pixels), 3), np.uint8) for pixels, _ in stored]
+    # tracks as long as hloc asks for
+    config = MapConfig(extractor=extractor, two_view_landmarks=False)
+    with WorkerPool(workers) as processes:
+        run = MapRun(config, processes)
+        triangulated = triangulate_model(out / DATABASE_FILE, posed, stored, colors, np.array(pairs), run)
+    model.mkdir(parents=True, exist_ok=True)
+    triangulated.write_binary(str(model))
 
 
 def _methods(fold: Fold, features: str, lightglue: str, retrieved: int, device: str) -> dict[str, dict[str, Pose]]:
@@ -226,7 +373,8 @@ def _methods(fold: Fold, features: str, lightglue: str, retrieved: int, device: 
         localizer = Localizer(fold.landmarks, fold.camera, config, None, device, fold.model, fold.features)
         localizer.match([next(iter(queries.values()))])  # what is read or compiled once is not timed
         results[method] = {name: _localize(localizer, query) for name, query in tqdm(queries.items(), desc=method)}
-    results["hloc"] = _by_hloc(fold, features, _retrieve(fold, queries, retrieved, device))
+    if find_spec("hloc") is not None:
+        results["hloc"] = _by_hloc(fold, features, _retrieve(fold, queries, retrieved, device))
     return results
 
 

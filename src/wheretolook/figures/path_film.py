@@ -110,7 +110,7 @@ def draw_path(
     axes.plot(*stops.T, markersize=7, zorder=3.5, **_STOP)
     along = lengths_along(positions)
     arrows = np.unique(np.searchsorted(along, np.linspace(0, along[-1], N_ARROWS) - 1e-9)).tolist()
-    length = 0.07 * float(np.max(high - low))
+    length = margin = 0.07 * float(np.max(high - low))
     if number is not None:
         arrows = [number]
         length *= 2
@@ -118,7 +118,7 @@ def draw_path(
         axes.annotate("", xy[at] + views[at].axis[:2] * length, xy[at], arrowprops=_ARROW, zorder=4)
     for label, at in enumerate(shown, 1):
         axes.annotate(str(label), xy[at], fontsize=9, color="white", ha="center", va="center", bbox=_NUMBER, zorder=5)
-    axes.set(xlim=(low[0] - 0.3, high[0] + 0.3), ylim=(low[1] - 0.3, high[1] + 0.3), aspect="equal")
+    axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), aspect="equal")
     axes.set(xlabel="x (m)", ylabel="y (m)")
 
 

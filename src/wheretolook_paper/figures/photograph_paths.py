@@ -54,7 +54,7 @@ def photograph_paths_figure(table: pd.DataFrame, landmarks: pd.DataFrame, pictur
     scenes = list(dict.fromkeys(table["scene"]))
     n_methods = table.groupby("scene")["method"].nunique().max()
     with context(RC):
-        figure = new_figure(4.3 * n_methods, 6.6 * len(scenes))
+        figure = new_figure(4.3 * n_methods, (7.2 if pictures else 5.8) * len(scenes))
         for part, scene in zip(figure.subfigures(len(scenes), squeeze=False)[:, 0], scenes, strict=True):
             rows = table[table["scene"] == scene]
             points = landmarks.loc[landmarks["scene"] == scene, ["x", "y"]].to_numpy()
@@ -66,7 +66,7 @@ def _draw_scene(figure: Any, table: pd.DataFrame, landmarks: Float, pictures: Pi
     unit = table["unit"].iloc[0]
     methods = dict(iter(table.groupby("method", sort=False)))
     figure.suptitle(f"{scene_label(table['scene'].iloc[0])}, {table['photographs'].iloc[0]} photographs")
-    grid = figure.add_gridspec(3, len(methods), height_ratios=(2.3, 1.1, 1.2))
+    grid = figure.add_gridspec(3, len(methods), height_ratios=(2.0, 0.9, 1.5 if pictures else 0.5))
     most = 1.1 * max(1, table["visible"].max())
     for column, (method, rows) in enumerate(methods.items()):
         axes = figure.add_subplot(grid[0, column])
@@ -96,7 +96,7 @@ def _draw_photograph(axes: Axes, number: int, view: pd.Series, pictures: Picture
         result, color = ("localized", BLUE) if view["localized"] else ("not localized", VERMILION)
     unit = "m" if view["unit"] == "m" else "depths"
     name = view["image"].partition(".")[0]
-    text = f"{name}\n{view['distance']:.2f} {unit}, {view['angle_deg']:.0f}° away\n"
+    text = f"{name}\n{view['distance']:.2f} {unit}, {view['angle_deg']:.0f}°\n"
     text += result if view["shown"] else "not of this view"
     rgb = pictures.get(view["image"])
     if rgb is not None:
@@ -104,7 +104,7 @@ def _draw_photograph(axes: Axes, number: int, view: pd.Series, pictures: Picture
         axes.set_title(f"{number}: {text}", fontsize=7.5)
         axes.set_anchor("N")
     else:
-        axes.text(0.5, 0.5, f"{number}: {text}", ha="center", va="center", fontsize=8, transform=axes.transAxes)
+        axes.text(0.5, 0.5, f"{number}: {text}", ha="center", va="center", fontsize=7.5, transform=axes.transAxes)
     frame(axes, color if view["shown"] else GREY, linewidth=2.0)
 
 
@@ -127,7 +127,7 @@ def photograph_paths_markdown(table: pd.DataFrame) -> str:
         lines.append([
             scene_label(scene), method_style(method).label, f"{rows['visible'].mean():,.0f}",
             f"{rows['visible'].min():,}", f"{rows['probability'].mean():.2f}", f"{len(of_views)} of {len(rows)}",
-            f"{int((of_views['localized'] == 1).sum())} of {len(of_views)}",
+            f"{int((of_views['localized'] == 1).sum())} of {len(of_views)}" if len(of_views) else "–",
         ])  # fmt: skip
     names = ["map", "path by", "landmarks visible, mean", "least", "mean probability (set)"]
     return markdown_table([*names, "views that a photograph shows", "these localize"], lines)

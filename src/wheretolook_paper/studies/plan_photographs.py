@@ -181,7 +181,7 @@ def main(
     print(photograph_paths_markdown(table))
     if out is not None:
         write_rows(table, out, 4)
-        write_rows(landmarks, out.with_name(LANDMARKS_CSV), 2)
+        write_rows(landmarks, out.with_name(LANDMARKS_CSV), 3)
     if figure is not None:
         shown = table["image"].unique() if images is not None else ()
         pictures = {image: read_photograph(images / image)[::2, ::2] for image in shown}

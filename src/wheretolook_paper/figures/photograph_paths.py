@@ -72,9 +72,9 @@ def _draw_scene(figure: Any, table: pd.DataFrame, landmarks: Float, pictures: Pi
         axes = figure.add_subplot(grid[0, column])
         shown = np.unique(np.linspace(0, len(rows) - 1, N_SHOWN).round().astype(int)).tolist()
         at = rows[POSITION].to_numpy()
-        nothing = {"pixels": np.empty((0, 2)), "size_px": (0, 0), "rgb": None}
         of_rows = zip(at, rows[AXIS].to_numpy(), strict=True)
-        draw_path(axes, [PathView(place, axis, np.nan, **nothing) for place, axis in of_rows], landmarks, shown=shown)
+        views = [PathView(place, axis, np.nan, np.empty((0, 2)), (0, 0), None) for place, axis in of_rows]
+        draw_path(axes, views, landmarks, shown=shown)
         axes.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})")
         axes.set_title(f"{method_style(str(method)).label}\n{_summary(rows)}", fontsize=10)
         curve = figure.add_subplot(grid[1, column])
@@ -122,12 +122,13 @@ def _summary(rows: pd.DataFrame) -> str:
 def photograph_paths_markdown(table: pd.DataFrame) -> str:
     """Format means along the paths: landmarks visible, probability, views that photographs show and that localize."""
     lines = []
-    for (scene, method), rows in table.groupby(["scene", "method"], sort=False):
+    for names, rows in table.groupby(["scene", "method"], sort=False):
+        scene, method = map(str, names)
         of_views = rows[rows["shown"]]
         lines.append([
             scene_label(scene), method_style(method).label, f"{rows['visible'].mean():,.0f}",
             f"{rows['visible'].min():,}", f"{rows['probability'].mean():.2f}", f"{len(of_views)} of {len(rows)}",
             f"{int((of_views['localized'] == 1).sum())} of {len(of_views)}" if len(of_views) else "–",
         ])  # fmt: skip
-    names = ["map", "path by", "landmarks visible, mean", "least", "mean probability (set)"]
-    return markdown_table([*names, "views that a photograph shows", "these localize"], lines)
+    header = ["map", "path by", "landmarks visible, mean", "least", "mean probability (set)"]
+    return markdown_table([*header, "views that a photograph shows", "these localize"], lines)

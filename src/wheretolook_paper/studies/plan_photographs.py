@@ -168,7 +168,7 @@ def main(
         reach_m = 2 * scene.config.mapped_space.max_camera_distance_m
         rows = farthest_ends(scene.space, camera_centers(source.poses), reach_m)
     else:
-        rows = tuple(source.names.index(end) for end in ends)
+        rows = source.names.index(ends[0]), source.names.index(ends[1])
     print(f"from {source.names[rows[0]]} to {source.names[rows[1]]}")
     start, goal = (tuple(source.own_centers[row].tolist()) for row in rows)
     planner = PathConfig(time_s=time_s, spacing_m=SPACING_M)

@@ -65,14 +65,17 @@ def test_paths_through_a_rendered_room(tmp_path: Path) -> None:
     # ends are photographs' places, and the nearest photograph by either measure is no nearer than the one found
     centers = camera_centers(source.poses)
     for _, path in table.groupby("method"):
-        assert np.linalg.norm(path[POSITION].to_numpy()[[0, -1], None] - centers, axis=2).min(1) == pytest.approx(0, abs=1e-3)
+        assert np.linalg.norm(path[POSITION].to_numpy()[[0, -1], None] - centers, axis=2).min(1) == pytest.approx(
+            0, abs=1e-3
+        )
     for view in table.itertuples():
         at, axis = (np.array([getattr(view, name) for name in names]) for names in (POSITION, AXIS))
         distance_m = np.linalg.norm(centers - at, axis=1)
         angle_deg = np.degrees(np.arccos(np.clip(source.poses[:, 2, :3] @ axis, -1, 1)))
         row = source.names.index(view.image)
-        assert (view.distance, view.angle_deg) == pytest.approx((distance_m[row], angle_deg[row]), abs=0.02)
-        assert not ((distance_m < view.distance - 0.01) & (angle_deg < view.angle_deg - 0.1)).any()
+        assert view.distance == pytest.approx(distance_m[row], abs=1e-3)
+        assert view.angle_deg == pytest.approx(angle_deg[row], abs=0.5)  # stored axes are rounded
+        assert not ((distance_m < view.distance - 1e-3) & (angle_deg < view.angle_deg - 0.5)).any()
 
     means = table.groupby("method")[["visible", "probability"]].mean()
     assert means.loc["set", "visible"] >= means.loc["forward", "visible"] > 0

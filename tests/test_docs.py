@@ -230,7 +230,10 @@ def test_tables_hold_the_numbers_of_the_release(page: str, columns: list[str], h
 
 def test_the_table_of_paths_on_photographs_is_that_of_the_release() -> None:
     table, landmarks = read_photograph_paths(Dataset.load(ROOT / "data" / "release"))
-    page = (ROOT / "docs" / "results.md").read_text()
-    for line in photograph_paths_markdown(table).splitlines():
-        assert "|".join(map(str.strip, line.split("|"))) in page.replace(" |", "|").replace("| ", "|")
+    page, made = (
+        [[cell.strip() for cell in line.split("|")] for line in text.splitlines() if line[:2] == "| "]
+        for text in ((ROOT / "docs" / "results.md").read_text(), photograph_paths_markdown(table))
+    )
+    missing = [cells for cells in made if cells not in page and set(cells[1]) != {"-"}]
+    assert len(made) == 8 and not missing
     assert set(landmarks["scene"]) == set(table["scene"])

@@ -1,12 +1,15 @@
 """Plan paths on a map of photographs by several methods, and localize the photographs nearest to their views.
 
     python -m wheretolook_paper.studies.photographs --poses kitchen --work work/kitchen
-    python -m wheretolook_paper.studies.plan_photographs --map work/kitchen/map --name kitchen --frame.scale 1 \\
-      --images kitchen --work work/kitchen/check --out plan_photographs.csv --figure kitchen.png
-    wheretolook map --name door --images lund_door/images --keep-database true
-    python -m wheretolook_paper.studies.plan_photographs --map data/door/door/map --name lund_door \\
-      --images lund_door/images --work work/door --out plan_photographs.csv --figure door.png
+    python -m wheretolook_paper.studies.plan_photographs --map work/kitchen/map --name kitchen \
+      --frame.scale 1 --frame.up 0.0089,-0.9044,-0.4265 --images kitchen --work work/kitchen/check \
+      --out data/release/results/plan_photographs.csv --figure kitchen.png
+    python -m wheretolook_paper.studies.photographs --images lund_door/images --work work/door
+    python -m wheretolook_paper.studies.plan_photographs --map work/door/map --name lund_door \
+      --images lund_door/images --work work/door/check \
+      --out data/release/results/plan_photographs.csv --figure door.png
 
+The first and third command make the maps; any COLMAP model with its features serves (`wheretolook map --images`).
 Paths lead through the space near the map's cameras. The nearest photograph minimizes the angle between the optical axes
 plus, in radians, the distance over the median depth of the map, by which nearby views differ; it shows the view if this
 is below half the field of view. It is localized with its block of neighbours held out of the map (`wheretolook check`).

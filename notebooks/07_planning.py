@@ -31,6 +31,11 @@ from wheretolook.planning.config import PathConfig, PlanConfig
 from wheretolook.planning.method_paths import path_views, plan_by_methods
 from wheretolook.tracking.runs import newest_artifact
 from wheretolook_paper.figures.paths import paths_figure
+from wheretolook_paper.figures.photograph_paths import (
+    photograph_paths_figure,
+    photograph_paths_markdown,
+    read_photograph_paths,
+)
 from wheretolook_paper.paths.config import PathsConfig
 from wheretolook_paper.paths.path_report import path_markdown
 from wheretolook_paper.release.notebook import open_release, open_store
@@ -74,6 +79,23 @@ display(methods_figure(views, localization_map.landmarks.points))
 
 # %%
 display(still_figure(views["set"], localization_map.landmarks.points, "apartment 210, set of landmarks"))
+
+# %% [markdown]
+# ## Photographs
+#
+# As in the paper, paths on maps of photographs, which no method is trained on: a kitchen (200 photographs of 7-Scenes,
+# metric) and a church door (12 photographs of unknown scale; lengths are in median depths of its landmarks). Paths lead
+# from one of the two photographs that are farthest apart to the other, near the cameras of the map. Below each: the
+# landmarks visible along it, occluded ones excluded, and the photographs nearest to three views, framed by whether
+# they localize when they and their neighbours are held out of the map.
+#
+# The photographs are not part of the release, only their names. `python -m wheretolook_paper.studies.plan_photographs
+# --help` names the command that shows them, given their folder.
+
+# %%
+table, landmarks = read_photograph_paths(release)
+display(photograph_paths_figure(table, landmarks))
+display(Markdown(photograph_paths_markdown(table)))
 
 # %% [markdown]
 # ## Results

@@ -18,10 +18,12 @@ import pytest
 from box_scenes import furnished_room
 from selection.room import write_room
 from wheretolook.cli import main, parse_command
+from wheretolook.dataset.layout import Dataset
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.mapping.colmap_model import colmap_poses
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import save_glb
+from wheretolook_paper.figures.photograph_paths import photograph_paths_markdown, read_photograph_paths
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -224,3 +226,14 @@ def test_tables_hold_the_numbers_of_the_release(page: str, columns: list[str], h
     checked = {label: method for label, method in METHODS.items() if label in rows}
     wanted = {label: [known[method][column] for column in columns] for label, method in checked.items()}
     assert len(wanted) >= 6 and {label: rows[label] for label in wanted} == wanted
+
+
+def test_the_table_of_paths_on_photographs_is_that_of_the_release() -> None:
+    table, landmarks = read_photograph_paths(Dataset.load(ROOT / "data" / "release"))
+    page, made = (
+        [[cell.strip() for cell in line.split("|")] for line in text.splitlines() if line[:2] == "| "]
+        for text in ((ROOT / "docs" / "results.md").read_text(), photograph_paths_markdown(table))
+    )
+    missing = [cells for cells in made if cells not in page and set(cells[1]) != {"-"}]
+    assert len(made) == 8 and not missing
+    assert set(landmarks["scene"]) == set(table["scene"])

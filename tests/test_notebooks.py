@@ -23,7 +23,7 @@ OF_THE_RELEASE = {
     "02_sampling": 3,
     "03_inputs": 4,
     "04_training": 6,
-    "07_planning": 3,
+    "07_planning": 4,
     "09_your_own_map": 2,
     "10_looks": 2,
 }

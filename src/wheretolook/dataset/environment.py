@@ -174,6 +174,18 @@ class Environment(ABC):
         tsdf = TsdfConfig(voxel_size_m=occlusion.voxel_m, max_depth_m=occlusion.max_depth_m)
         return TsdfVolume.from_images(self.depth_images, tsdf, self.progress)
 
+    def free_voxels(self, views: ViewLattice, space: FreeSpace | MappedSpace) -> tuple[VoxelGrid, NDArray[np.int64]]:
+        """The voxels of a lattice over a space, and the ids of the free ones, ascending.
+
+        Raises SceneError if no voxel is free.
+        """
+        from wheretolook.dataset.sampling import free_locations
+
+        grid = views.voxels(space.bounds)
+        free = free_locations(grid, space)
+        # depth images that have not seen all of the scene may put free space behind surfaces
+        return grid, free[~self.occlusion.inside_geometry(grid.centers()[free])]
+
     @property
     def available_occlusion(self) -> tuple[str, ...]:
         """Names of the occlusion models that can be made here, the most accurate first."""
@@ -330,18 +342,6 @@ class SceneEnvironment(Environment):
         """Where a camera can be: with occlusion "tsdf" according to depth images, else `sampled_space`."""
         tsdf = self.config.occlusion.model == "tsdf" and not self.is_photographed
         return self.tsdf_space if tsdf else self.sampled_space
-
-    def free_voxels(self, views: ViewLattice, space: FreeSpace | MappedSpace) -> tuple[VoxelGrid, NDArray[np.int64]]:
-        """The voxels of a lattice over `space` or `sampled_space`, and the ids of the free ones, ascending.
-
-        Raises SceneError if no voxel is free.
-        """
-        from wheretolook.dataset.sampling import free_locations
-
-        grid = views.voxels(space.bounds)
-        free = free_locations(grid, space)
-        # depth images that have not seen all of the scene may put free space behind surfaces
-        return grid, free[~self.occlusion.inside_geometry(grid.centers()[free])]
 
     @property
     def occlusion_config(self) -> OcclusionConfig:

@@ -38,7 +38,7 @@ def film_frames(views: Sequence[PathView], landmarks: Float) -> Iterator[Pixels]
             figure = new_figure(9.6, 4.4)
             grid = figure.add_gridspec(2, 2, width_ratios=(1.5, 1.0), height_ratios=(1.7, 1.0))
             _draw_view(figure.add_subplot(grid[:, 0]), view)
-            _draw_map(figure.add_subplot(grid[0, 1]), views, landmarks, number)
+            draw_path(figure.add_subplot(grid[0, 1]), views, landmarks, number)
             _draw_scores(figure.add_subplot(grid[1, 1]), views, number)
             yield pixels_of(figure)
 
@@ -55,7 +55,7 @@ def still_figure(views: Sequence[PathView], landmarks: Float, title: str = "") -
         grid = figure.add_gridspec(2, 1, height_ratios=(1.6, 1.0))
         above = grid[0].subgridspec(1, 2, width_ratios=(1.1, 1.0))
         axes = figure.add_subplot(above[0])
-        _draw_map(axes, views, landmarks, None, shown)
+        draw_path(axes, views, landmarks, None, shown)
         axes.set_title(title)
         _draw_scores(figure.add_subplot(above[1]), views, None, shown)
         cells = grid[1].subgridspec(1, len(shown))
@@ -72,7 +72,7 @@ def methods_figure(paths: Mapping[str, Sequence[PathView]], landmarks: Float) ->
     with context(RC):
         figure = new_figure(3.9 * len(paths), 4.2)
         for axes, (name, views) in zip(figure.subplots(1, len(paths), squeeze=False)[0], paths.items(), strict=True):
-            _draw_map(axes, views, landmarks)
+            draw_path(axes, views, landmarks)
             n_visible = np.mean([len(view.pixels) for view in views])
             axes.set_title(f"{method_style(name).label}\n{n_visible:,.0f} landmarks in view on average", fontsize=10)
         return figure
@@ -95,10 +95,10 @@ def _draw_view(axes: Axes, view: PathView, prefix: str = "") -> None:
     axes.set_title(f"{prefix}{stop}{counted(len(view.pixels), 'landmark')}{score}", fontsize=9)
 
 
-def _draw_map(
+def draw_path(
     axes: Axes, views: Sequence[PathView], landmarks: Float, number: int | None = None, shown: Sequence[int] = ()
 ) -> None:
-    """Draw landmarks and path from above, arrows along all views or at view `number`, and numbers at views `shown`."""
+    """Draw landmarks (N, 2 or 3) and path from above, arrows along it or at view `number`, numbers at views `shown`."""
     positions = np.array([view.position for view in views])
     xy = positions[:, :2]
     low, high = np.percentile(landmarks[:, :2], (1, 99), axis=0)
@@ -110,7 +110,7 @@ def _draw_map(
     axes.plot(*stops.T, markersize=7, zorder=3.5, **_STOP)
     along = lengths_along(positions)
     arrows = np.unique(np.searchsorted(along, np.linspace(0, along[-1], N_ARROWS) - 1e-9)).tolist()
-    length = 0.07 * float(np.max(high - low))
+    length = margin = 0.07 * float(np.max(high - low))
     if number is not None:
         arrows = [number]
         length *= 2
@@ -118,7 +118,7 @@ def _draw_map(
         axes.annotate("", xy[at] + views[at].axis[:2] * length, xy[at], arrowprops=_ARROW, zorder=4)
     for label, at in enumerate(shown, 1):
         axes.annotate(str(label), xy[at], fontsize=9, color="white", ha="center", va="center", bbox=_NUMBER, zorder=5)
-    axes.set(xlim=(low[0] - 0.3, high[0] + 0.3), ylim=(low[1] - 0.3, high[1] + 0.3), aspect="equal")
+    axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), aspect="equal")
     axes.set(xlabel="x (m)", ylabel="y (m)")
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wheretolook.dataset.environment import SceneEnvironment
+from wheretolook.dataset.environment import Environment
 from wheretolook.dataset.layout import Dataset
 from wheretolook.geometry.poses import poses_looking_along, transform
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -24,8 +24,8 @@ from wheretolook.weights.resolve import resolve_weights
 
 
 def plan_by_methods(
-    scene: SceneEnvironment,
-    dataset: Dataset,
+    scene: Environment,
+    dataset: Dataset | None,
     methods: Iterable[str],
     start: ArrayLike,
     goal: ArrayLike,
@@ -39,7 +39,8 @@ def plan_by_methods(
     method's must be.
 
     Methods are "forward", or names of scorers; empty for that of the weights, or bins without. `config` has weights for
-    learned methods, if they are of their kind (`resolve_weights`). Returns paths by the names of their methods, in
+    learned methods, if they are of their kind (`resolve_weights`); without them they are the dataset's or the bundled
+    ones. Returns paths by the names of their methods, in
     the order given. Raises ConfigError if a method needs weights or there is none of that name, or the last cannot
     stop; PlanningError if no path can be found.
     """

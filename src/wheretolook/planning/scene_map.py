@@ -1,4 +1,4 @@
-"""Build the viewpoint map of a scene of a dataset, and its variant for planners."""
+"""Build the viewpoint map of a scene or COLMAP model, and its variant for planners."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wheretolook.dataset.environment import SceneEnvironment
+from wheretolook.dataset.environment import Environment
 from wheretolook.dataset.thresholds import Accuracy
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.planning.map_building import build_viewpoint_map
@@ -25,7 +25,7 @@ INSIDE = np.stack(np.meshgrid(*[(-1 / 3, 0.0, 1 / 3)] * 3, indexing="ij"), -1).r
 
 
 def scene_scorer(
-    scene: SceneEnvironment,
+    scene: Environment,
     method: str = "",
     weights: Path | None = None,
     anywhere: bool = False,
@@ -46,7 +46,7 @@ def scene_scorer(
     return scorer if accuracy is None else scorer.at_accuracy(accuracy)
 
 
-def scene_viewpoint_map(scene: SceneEnvironment, views: ViewLattice, scorer: Scorer) -> ViewpointMap:
+def scene_viewpoint_map(scene: Environment, views: ViewLattice, scorer: Scorer) -> ViewpointMap:
     """Build the viewpoint map of a scene by a scorer of its views, with progress bars.
 
     Raises SceneError if no voxel is free, MapError if there are no landmarks.
@@ -55,7 +55,7 @@ def scene_viewpoint_map(scene: SceneEnvironment, views: ViewLattice, scorer: Sco
     return build_viewpoint_map(scorer, grid, free, views.axes(), views.lattice, f"viewpoint map {scene.name}")
 
 
-def planner_map(scene: SceneEnvironment, views: ViewLattice, scorer: Scorer) -> ViewpointMap:
+def planner_map(scene: Environment, views: ViewLattice, scorer: Scorer) -> ViewpointMap:
     """Build the map for planners: scores in [0, 1], and views wherever a camera can be.
 
     Scores that are no probabilities are replaced by ranks, and partially free voxels are filled. Raises as

@@ -43,6 +43,7 @@ from wheretolook_paper.figures.network_walkthrough import learning_figure
 from wheretolook_paper.figures.occlusion import occlusion_figure
 from wheretolook_paper.figures.paths import paths_figure
 from wheretolook_paper.figures.peaks import peaks_figure
+from wheretolook_paper.figures.photograph_paths import COMMAND, photograph_paths_figure, read_photograph_paths
 from wheretolook_paper.figures.pipeline import pipeline_figure
 from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
 from wheretolook_paper.figures.sampling import sampling_figure
@@ -251,6 +252,19 @@ item("table_vs_others", "Table 2", "all methods", "05_tables", file="table_vs_ot
 def _planning(source: Source) -> Figure:
     showcase = _open(source.dataset)
     return methods_figure(planned_views(showcase, source.dataset), showcase.localization_map.landmarks.points)
+
+
+@item(
+    "planning_photographs",
+    "Fig. 5",
+    "planning on maps of photographs",
+    "07_planning",
+    **_NO_RUN,
+    command=COMMAND,
+    of_release=True,
+)
+def _planning_photographs(source: Source) -> Figure:
+    return photograph_paths_figure(*read_photograph_paths(source.dataset))
 
 
 item(

@@ -44,6 +44,9 @@ SCENES = ("aws_house", "nexuiz_aggressor", "nexuiz_aggressor_b", "nexuiz_desertf
 FEW = ("--sample.max_locations", "60", "--sample.max_directions", "14")
 
 
+Words = Sequence[str]
+
+
 @dataclass(frozen=True)
 class Step:
     """A part of the results.
@@ -54,7 +57,7 @@ class Step:
         needs: folder that the user must give: "meshes", "photographs" or none.
     """
 
-    commands: Sequence[Sequence[str]]
+    commands: Sequence[Words]
     collect: Callable[[], None] = lambda: None
     needs: str = ""
 
@@ -64,14 +67,6 @@ def steps(meshes: Path = Path("MESHES"), photographs: Path = Path("PHOTOGRAPHS")
     scenes = ", ".join(f"{{path: {meshes / name}.glb, split: test}}" for name in SCENES)
     others = ("--scenes.meshes", f"[{scenes}]")
     bundled = ("--evaluate.weights", f"[{', '.join(map(str, WEIGHTS))}]")
-    of_any_camera = ("--evaluate.weights", f"[{', '.join(map(str, WEIGHTS[:1]))}]")
-    ranked = (
-        *of_any_camera,
-        "--evaluate.methods",
-        "[set, expected-inliers, bins, visible]",
-        "--evaluate.reference",
-        "set",
-    )
 
     def demo(name: str, *options: str) -> tuple[str, ...]:
         return ("wheretolook", "demo", "--config", "configs/others.yaml", "--name", name, *others, *options)
@@ -79,21 +74,24 @@ def steps(meshes: Path = Path("MESHES"), photographs: Path = Path("PHOTOGRAPHS")
     def on_looks(command: str, *options: str) -> tuple[str, ...]:
         return ("wheretolook", command, "--config", "configs/others.yaml", "--name", "looks", *options)
 
-    views = {
-        name: demo(name, "--mapping.camera", "{fov_deg: 90}", *camera, *ranked, *(FEW if name == "fisheye" else ()))
-        for name, camera in CAMERAS.items()
-    }
+    def labelled(name: str, *options: str, sample: Words = (), label: Words = ()) -> list[Words]:
+        words = ("--config", "configs/others.yaml", "--name", name, *options)
+        stages = {"scenes": others, "map": ("--mapping.camera", "{fov_deg: 90}"), "sample": sample, "label": label}
+        return [("wheretolook", stage, *words, *of_stage) for stage, of_stage in stages.items()]
+
+    views = {name: labelled(name, *camera, sample=FEW if name == "fisheye" else ()) for name, camera in CAMERAS.items()}
     tested = ("--datasets", f"[{', '.join(f'data/{name}' for name in CAMERAS)}]", "--split", "test")
     cameras = ("wheretolook_paper.studies.cameras", *tested, "--out", str(RESULTS / "cameras.csv"))
-    looks = demo("looks", *ranked, "--sample.max_locations", "30", "--sample.max_directions", "50",
-                 "--label.store_pixels", "true")  # fmt: skip
+    looks = labelled("looks", sample=("--sample.max_locations", "30", "--sample.max_directions", "50"),
+                     label=("--label.store_pixels", "true"))  # fmt: skip
+    ranked = on_looks("evaluate", "--evaluate.weights", f"[{WEIGHTS[0]}]", "--evaluate.methods", "[set, visible]")
     study = "wheretolook_paper.studies.photographs"
     photographed = ("--out", str(RESULTS / "photographs.csv"))
     return {
         "interiors": Step([demo("interiors", "--scenes.test", "0", *bundled)], _generalization, "meshes"),
-        **{name: Step([command], needs="meshes") for name, command in views.items()},
+        **{name: Step(commands, needs="meshes") for name, commands in views.items()},
         "cameras": Step([cameras], needs="meshes"),
-        "looks": Step([looks], _looks, "meshes"),
+        "looks": Step([*looks, ranked], _looks, "meshes"),
         "relocalize": Step([on_looks("relocalize")], lambda: _copy("looks", "relocalize.csv"), "meshes"),
         "paths": Step(
             [("wheretolook", "compare-paths", "--config", "configs/others.yaml", "--name", "test-90")],

@@ -26,8 +26,8 @@ from wheretolook_paper.release.showcase import open_showcase
 from wheretolook_paper.release.showcase_figures import planned_views
 
 RELEASE = Path(__file__).parents[3] / "data" / "release"
-OF_SCENES = {"pipeline", "learning", "viewpoint_generation", "planning", "inputs", "peaks"}
-"""Items that need a scene generated from a seed, which the tiny release lacks."""
+OF_SCENES = {"pipeline", "learning", "viewpoint_generation", "planning", "planning_photographs", "inputs", "peaks"}
+"""Items that need a scene generated from a seed, or results on photographs, which the tiny release lacks."""
 
 NOT_THERE = {"training", "visibility_scaling"} | OF_SCENES
 
@@ -78,7 +78,7 @@ def test_scenes_of_the_release_are_drawn_with_the_runs_of_their_weights(tmp_path
     assert notes == {
         "pipeline": f"runs: {runs['train set']} (train)", "peaks": f"runs: {runs['train set']} (train)",
         "learning": f"runs: {runs['train mlp-2d+z']} (train)", "inputs": f"runs: {runs['train mlp-2d+z']} (train)",
-        "viewpoint_generation": "",
+        "viewpoint_generation": "", "planning_photographs": "",
     }  # fmt: skip
     config = PlanConfig(grid=(4, 4, 2), directions=40, planner=PathConfig(time_s=4.0))
     views = planned_views(open_showcase(release), release, ("forward", "bins"), config)

@@ -342,6 +342,8 @@ def _triangulate(
     workers: int,
 ) -> None:
     """Match pairs of images of a set and triangulate at their known poses, as the map stage does."""
+    out.mkdir(parents=True, exist_ok=True)
+    (out / DATABASE_FILE).unlink(missing_ok=True)  # of an interrupted run
     names = [*mapping]
     _, stored = read_features(features, names)
     (camera,) = read_model(folder).cameras.values()

@@ -146,10 +146,10 @@ def main(
     rows = []
     device = usable_device(device)
     extractor = KeypointExtractor(ExtractorConfig(features, weights=weights), device)
-    for name in sets:
-        folder = Path(name)
+    for source in sets:
+        folder = Path(source)
         if not folder.is_dir():
-            folder = render_set(name, locations, images, work, workers, device)
+            folder = render_set(source, locations, images, work, workers, device)
         for fold in _folds(folder, extractor, partners, work / folder.name / features, workers):
             for method, poses in _methods(fold, features, lightglue, retrieved, device).items():
                 for name, pose in poses.items():
@@ -159,8 +159,8 @@ def main(
                     confidences = {f"confidence at {at}": value for at, value in pose.confidence.items()}
                     errors = {"error_m": float(error_m), "error_deg": float(error_deg)}
                     rows.append({**row, **errors, **confidences, "seconds": pose.seconds})
-    table = pd.DataFrame(rows)
-    write_text(out, table.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
+        table = pd.DataFrame(rows)
+        write_text(out, table.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
     print(summarize(table).to_string(index=False))
     return table
 
@@ -342,6 +342,8 @@ def _triangulate(
     workers: int,
 ) -> None:
     """Match pairs of images of a set and triangulate at their known poses, as the map stage does."""
+    out.mkdir(parents=True, exist_ok=True)
+    (out / DATABASE_FILE).unlink(missing_ok=True)  # of an interrupted run
     names = [*mapping]
     _, stored = read_features(features, names)
     (camera,) = read_model(folder).cameras.values()

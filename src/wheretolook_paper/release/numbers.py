@@ -62,6 +62,9 @@ POLICIES = {
 }
 
 
+PATHS = "| two test apartments | six other scenes | all | × forward | length / forward's | turning | no path |"
+
+
 class Numbers:
     """Tables and pages of a checkout.
 
@@ -151,6 +154,36 @@ class Numbers:
 
         return cells
 
+    def paths(self, task: str) -> Cells:
+        """Return shares by group of scenes (weighted by views), that of all with interval and ratio, and the rest."""
+
+        def cells(label: str) -> list[str] | None:
+            method = {"forward": "forward"}.get(label) or METHODS[label.removesuffix(", greedy")]
+            table = self.table("paths.csv")
+            table = table[table["task"] == task]
+            table = table[table["method"] == method + (" greedy" if label.endswith("greedy") else "")]
+            everywhere = table[table["scene"] == "all"].iloc[0]
+            apartments = table["scene"].str.startswith("apartment")
+            parts = (table[apartments], table[~apartments & (table["scene"] != "all")])
+            shares = [100 * (part["localized"] * part["views"]).sum() / part["views"].sum() for part in parts]
+            ends = 100 * everywhere[["localized", "localized_low", "localized_high"]]
+            row = [*(f"{share:.1f}" for share in shares), interval(ends), f"{everywhere['times_forward']:.2f}"]
+            row += [f"{everywhere['times_forward_length']:.2f}", f"{everywhere['turn_deg_per_m']:.0f}°/m"]
+            return [*row, f"{everywhere['failures']:.0f} of {everywhere['pairs']:.0f}"]
+
+        return cells
+
+    def relocalized(self, label: str) -> list[str] | None:
+        row = self.row("relocalize.csv", policy=POLICIES[label])
+        assert row is not None
+        joint = [
+            f"{100 * row[f'right_{n}']:.1f} [{100 * row[f'right_{n}_low']:.0f}, {100 * row[f'right_{n}_high']:.0f}]"
+            for n in (2, 3, 4)
+        ]
+        stopped = [f"{100 * row['right']:.1f}", f"{row['views']:.2f}"]
+        confident = f"{100 * row['confident']:.1f}, {100 * row['precision']:.1f}"
+        return [f"{100 * row['right_1']:.1f}", *joint, *stopped, confident]
+
     def looks(self, label: str) -> list[str] | None:
         rows = [self.row("looks.csv", split="test", strategy=LOOKS[label], n_looks=n) for n in (1, 2, 3, 5)]
         assert all(row is not None for row in rows)
@@ -177,6 +210,13 @@ def tables(numbers: Numbers) -> Mapping[tuple[str, str], Cells]:
         ("docs/results.md", f"| | {four}"): numbers.fisheye,
         ("docs/results.md", f"| kitchen {held_out}"): numbers.photographs("kitchen"),
         ("docs/results.md", f"| fox {held_out}"): numbers.photographs("fox"),
+        ("docs/results.md", f"| places and views planned {PATHS}"): numbers.paths("planned"),
+        ("docs/results.md", f"| views along given paths {PATHS}"): numbers.paths("given"),
+        (
+            "docs/lost.md",
+            "| next view | first | two views | three | four | right at stop | views until stop | confident, right of "
+            "these |",
+        ): numbers.relocalized,
         ("docs/looks.md", "| views | one | two | three | five | any of five alone |"): numbers.looks,
     }
 

@@ -10,7 +10,7 @@ bundle adjustment then refines them and the focal length, and the result is alig
 
 The table has, for each method, the AUC over all held-out photographs and within blocks, and the regret, with 95 %
 intervals by resampling blocks; for the first method also the calibration error and real over expected inliers. `--out`
-keeps the rows of other scenes. `--work` caches maps and blocks. `wheretolook adapt` measures adapted weights.
+keeps the rows of other scenes, and those of adapted weights. `--work` caches maps and blocks. `wheretolook adapt` measures adapted weights.
 """
 
 from __future__ import annotations
@@ -202,8 +202,9 @@ def main(
     rows = pd.DataFrame(rows_of(scene, result.numbers, result.method))
     print(rows.to_string(index=False, float_format="{:.3f}".format))
     if out is not None:
-        others = pd.read_csv(out) if out.is_file() else pd.DataFrame({"scene": []})
-        rows = pd.concat([others[others["scene"] != scene], rows], ignore_index=True)
+        others = pd.read_csv(out) if out.is_file() else pd.DataFrame({"scene": [], "method": []})
+        others = others[(others["scene"] != scene) | (others["method"] == "adapted")]
+        rows = pd.concat([others, rows], ignore_index=True)
         out.parent.mkdir(parents=True, exist_ok=True)
         rows.sort_values("scene", kind="stable").to_csv(out, index=False, float_format="%.4g")
 

@@ -2,6 +2,7 @@
 # make test   sets everything up and runs linter, type checker and the tests: three minutes on two cores
 # make test-all   the same and the slow tests too, in a quarter of an hour
 # make bench   measures what must not become slower, in a minute, and compares with tests/benchmarks/ledger.csv
+# make results   regenerates tables, pages and pictures of weights that changed: MESHES=folder, PHOTOGRAPHS=folder
 # make ui     opens MLflow at the comparison of methods; make lab opens Jupyter on the notebooks
 # make html   runs all notebooks and writes them as pages, notebooks/html; make docs builds the documentation, site/
 # Options: TORCH=cuda for the CUDA build of PyTorch, PYTHON=python3.12, PORT=5001 for make ui. See environment.md.
@@ -16,10 +17,10 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --progre
 CONSTRAINTS := configs/constraints.txt
 READY := $(VENV)/ready-$(TORCH)
 
-.PHONY: demo test test-all bench setup ui lab html docs clean help
+.PHONY: demo test test-all bench results setup ui lab html docs clean help
 
 help:
-	@sed -n '1,7s/^# //p' Makefile
+	@sed -n '1,8s/^# //p' Makefile
 
 demo: $(READY)
 	@$(BIN)/wheretolook demo
@@ -50,6 +51,10 @@ lab: $(READY)
 html: $(READY)
 	@$(BIN)/wheretolook log-release >/dev/null
 	OMP_WAIT_POLICY=PASSIVE $(BIN)/python notebooks/pages.py notebooks notebooks/html
+
+results: $(READY)
+	@$(BIN)/python -m wheretolook_paper.studies.results $(if $(MESHES),--meshes $(MESHES)) \
+	  $(if $(PHOTOGRAPHS),--photographs $(PHOTOGRAPHS))
 
 docs: $(READY)
 	$(BIN)/mkdocs build --strict

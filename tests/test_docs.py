@@ -24,6 +24,7 @@ from wheretolook.mapping.colmap_model import colmap_poses
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import save_glb
 from wheretolook_paper.figures.photograph_paths import photograph_paths_markdown, read_photograph_paths
+from wheretolook_paper.release.numbers import Numbers, pages, updated
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -156,76 +157,23 @@ def test_shell_blocks_name_real_commands(page: Path, monkeypatch: pytest.MonkeyP
 # --- numbers: those of the release's tables
 
 
-def number_rows() -> dict[str, dict[str, str]]:
-    """By label of a method: cells of both tables, as the release's results have them."""
-    results = ROOT / "data" / "release" / "results"
-    columns = {"a": results / "scores.csv", "b": results / "generalization.csv"}
-    cells: dict[str, dict[str, str]] = {}
-    for column, path in columns.items():
-        table = pd.read_csv(path, keep_default_na=False, na_values=[""])
-        table = table[(table["scene"] == "all") & (table["top_n"] == 1) & (table["candidates"].astype(str) == "all")]
-        for row in table.to_dict("records"):
-            found = cells.setdefault(str(row["method"]), {})
-            share, low, high = (100 * row[f"normalized_{name}0.05m_0.4deg"] for name in ("", "low_", "high_"))
-            if row["occlusion"] == "mesh":
-                found[column] = f"{share:.1f} [{low:.1f}, {high:.1f}]"
-                found[f"{column} AUC"] = f"{row['roc_auc']:.3f}"
-            elif row["occlusion"] == "none":
-                found[f"{column} through"] = f"{share:.1f}"
-    return cells
+NUMBERS = Numbers(ROOT)
 
 
-METHODS = {
-    "set of landmarks": "set",
-    "expected inliers": "expected-inliers",
-    "expected bins": "expected-bins",
-    "Fisher, trace, expected": "fisher-trace-expected",
-    "random": "random",
-    "a random direction": "random",
-    "forward, headings drawn": "forward",
-    "most visible landmarks": "visible",
-    "reprojections with bins": "bins",
-    "Fisher, min. eigenvalue, exact": "fisher-mineig-exact",
-    "Fisher, log det, exact": "fisher-logdet-exact",
-    "Fisher, trace, exact": "fisher-trace-exact",
-    "Fisher information, trace": "fisher-trace-exact",
-    "Fisher, trace, GP": "fisher-trace-gp",
-    "MLP, 2d + z": "mlp-2d+z",
-    "the paper's network": "mlp-2d+z",
-}
+@pytest.mark.parametrize("page", pages(NUMBERS))
+def test_numbers_are_those_of_the_results(page: str) -> None:
+    assert (ROOT / page).read_text() == updated(page, NUMBERS), "python -m wheretolook_paper.studies.results --only pages"
 
 
-def rows_of(page: Path, header: str) -> dict[str, list[str]]:
-    """A table's rows by their first cells, without emphasis and what stands in brackets there."""
-    lines = page.read_text().splitlines()
-    start = lines.index(header) + 2
-    rows = {}
-    for line in lines[start:]:
-        if not line.startswith("|"):
-            break
-        first, *cells = (cell.strip().replace("**", "") for cell in line.strip("|").split("|"))
-        rows[re.sub(r" \((ships|MLP).*\)$", "", first)] = cells
-    return rows
-
-
-@pytest.mark.parametrize(
-    ("page", "columns", "header"),
-    [
-        ("README.md", ["a", "a AUC", "b", "b AUC"], "| method | two test apartments | AUC | six other scenes | AUC |"),
-        (
-            "docs/results.md",
-            ["a", "a through", "a AUC", "b", "b through", "b AUC"],
-            "| method | two test apartments | through walls | AUC | six other scenes | through walls | AUC |",
-        ),
-    ],
-)
-def test_tables_hold_the_numbers_of_the_release(page: str, columns: list[str], header: str) -> None:
-    known = number_rows()
-    rows = rows_of(ROOT / page, header)
-    assert len(rows) == (6 if page == "README.md" else 16)
-    checked = {label: method for label, method in METHODS.items() if label in rows}
-    wanted = {label: [known[method][column] for column in columns] for label, method in checked.items()}
-    assert len(wanted) >= 6 and {label: rows[label] for label in wanted} == wanted
+def test_a_changed_result_changes_the_page(tmp_path: Path) -> None:
+    shutil.copytree(ROOT / "data" / "release" / "results", tmp_path / "data" / "release" / "results")
+    shutil.copytree(ROOT / "docs", tmp_path / "docs")
+    path = tmp_path / "data" / "release" / "results" / "looks.csv"
+    table = pd.read_csv(path)
+    table.loc[(table["split"] == "test") & (table["n_looks"] == 2), "good"] = 0.123
+    table.to_csv(path, index=False)
+    text = updated("docs/looks.md", Numbers(tmp_path))
+    assert text.count("| 12.3 |") == 7 and text != (ROOT / "docs" / "looks.md").read_text()
 
 
 def test_the_table_of_paths_on_photographs_is_that_of_the_release() -> None:

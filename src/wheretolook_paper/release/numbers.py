@@ -234,10 +234,10 @@ def prose(numbers: Numbers) -> Mapping[tuple[str, str], list[str]]:
             row = numbers.scores(file, method)
             mean, high, low = (-100 * row[f"difference_{end}{STRICT}"] for end in ("", "low_", "high_"))
             paired += [f"{mean:+.1f}", f"{low:.1f}", f"{high:.1f}"]
-    levels = numbers.table("cameras.csv")
-    levels = levels[(levels["dataset"] == "test-90") & levels["group"].str.startswith("nexuiz")]
+    levels = numbers.table(other)
+    levels = levels[(levels["occlusion"] == "mesh") & (levels["top_n"] == 1) & levels["scene"].str.startswith("nexuiz")]
     by_set, by_bins = (levels[levels["method"] == method] for method in ("set", "bins"))
-    house = numbers._ranked("test-90", "aws_house", "set")
+    house = numbers.scores(other, "set", scene="aws_house")
     tested = numbers.table("cameras.csv")
     tested = tested[tested["dataset"].str.startswith("test-") & (tested["method"] == "set")]
     errors = [tested[tested["group"] == group]["ece"] for group in ("all apartment", "all others'")]
@@ -260,8 +260,8 @@ def prose(numbers: Numbers) -> Mapping[tuple[str, str], list[str]]:
             f"{house['ece']:.2f}",
         ],
         ("docs/results.md", r"AUC ([\d.]+) to ([\d.]+), bins ([\d.]+) to ([\d.]+)"): [
-            *_range(by_set["auc"]),
-            *_range(by_bins["auc"]),
+            *_range(by_set["roc_auc"]),
+            *_range(by_bins["roc_auc"]),
         ],
         ("docs/results.md", r"error is ([\d.]+) to ([\d.]+) on the apartments and ([\d.]+) to ([\d.]+) on"): [
             end for values in errors for end in _range(values)

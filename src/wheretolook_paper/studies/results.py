@@ -29,6 +29,7 @@ from wheretolook.utils.version import VERSION
 from wheretolook_paper.evaluation.looks import LOOKS_CSV
 from wheretolook_paper.paths.path_report import PATHS_CSV
 from wheretolook_paper.release.card import GENERALIZATION_CSV
+from wheretolook_paper.release.numbers import Numbers, pages, updated
 
 RELEASE = Path("data/release")
 RESULTS = RELEASE / "results"
@@ -107,6 +108,7 @@ def steps(meshes: Path = Path("MESHES"), photographs: Path = Path("PHOTOGRAPHS")
             needs="photographs",
         ),
         "release": Step([("wheretolook", "release", "--config", "configs/release.yaml")]),
+        "pages": Step([], _pages),
     }
 
 
@@ -131,12 +133,19 @@ def _looks() -> None:
     write_text(RESULTS / LOOKS_CSV, table.to_csv(index=False, float_format="%.4g", lineterminator="\n"))
 
 
+def _pages() -> None:
+    """Fill in the numbers of README.md and docs/."""
+    numbers = Numbers(Path())
+    for page in pages(numbers):
+        write_text(Path(page), updated(page, numbers))
+
+
 def outdated(only: Sequence[str] = ()) -> Iterator[str]:
     """Yield the steps whose tables are not of the shipped weights or of other commands."""
     made = read_json_object(MADE) if MADE.is_file() else {}
     for name, step in steps().items():
         record = made.get(name, {})
-        if not only and (record.get("weights"), record.get("commands")) == (_weights(), _texts(step)):
+        if not only and step.commands and (record.get("weights"), record.get("commands")) == (_weights(), _texts(step)):
             continue
         if not only or name in only:
             yield name
@@ -175,6 +184,8 @@ def main(
             print(f"{name}: {' '.join(words)}", flush=True)
             subprocess.run([sys.executable, "-m", *words, *chosen], check=True)
         step.collect()
+        if not step.commands:
+            continue
         made = read_json_object(MADE) if MADE.is_file() else {}
         record = {"weights": _weights(), "version": VERSION, "device": usable_device(device), "commands": _texts(named)}
         write_json(MADE, made | {name: record})

@@ -6,7 +6,7 @@ NAME = "wheretolook_ros"
 
 setup(
     name=NAME,
-    version="0.2.0",
+    version="0.3.0",
     packages=[NAME],
     package_data={NAME: ["wheretolook.yaml"]},
     data_files=[

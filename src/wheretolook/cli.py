@@ -110,7 +110,8 @@ def run_command(arguments: list[str]) -> None:
             if error.name not in EXTRAS:
                 raise
             raise missing_package(error.name) from error
-        if hasattr(command, "root") and command.root.is_dir():
+        listed = getattr(command, command.LISTING, False)
+        if hasattr(command, "root") and not listed and command.root.is_dir():
             print(f"done in {time.monotonic() - start:.0f} s: {command.root}")
 
 

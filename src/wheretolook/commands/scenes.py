@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import entry_points
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from wheretolook.commands.options import DatasetOptions, Log, Progress, ignore_progress
@@ -19,6 +20,7 @@ from wheretolook.dataset.sampling_config import Split
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.files import storage_errors
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -50,7 +52,7 @@ class Scenes(DatasetOptions):
 
         With `scenes.rgbd.folder`, one scene is fused from the RGB-D recording and joins the dataset's others. Raises
         SceneError if a mesh or the recording cannot be used or two scenes have the same name, ConfigError if the
-        dataset's folder holds a release.
+        dataset's folder holds a release, StorageError, before any work, if it cannot be written.
         """
         refuse_release(self.root)
         if self.scenes.rgbd.folder is not None:
@@ -60,6 +62,9 @@ class Scenes(DatasetOptions):
             if scene.name in {other.name for other in sources}:
                 raise SceneError("two scenes have the same name", path=self.root, value=scene.name, fix="Give a name.")
             sources[scene] = make, cache_key("scenes", cache_inputs)
+        with storage_errors(self.root):  # before minutes of work
+            self.root.mkdir(parents=True, exist_ok=True)
+            TemporaryFile(dir=self.root).close()
         for scene, (make, key) in sources.items():
             if scene.stage_cache("scenes", key).is_current(scene.mesh):
                 log(f"{scene.name}: reusing {scene.mesh}")

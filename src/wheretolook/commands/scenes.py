@@ -19,7 +19,7 @@ from wheretolook.dataset.layout import Dataset, MappedFloor, SceneFolder
 from wheretolook.dataset.sampling_config import Split
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
-from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.errors import ConfigError, SceneError, TableError
 from wheretolook.utils.files import storage_errors
 
 if TYPE_CHECKING:
@@ -110,12 +110,18 @@ class Scenes(DatasetOptions):
             yield scene, partial(_load, mesh), [mesh_fingerprint(mesh.path), mesh.up]
 
     def _with_scans(self, made: tuple[SceneFolder, ...]) -> Dataset:
-        """Return the dataset of the scenes made and of the scans that it had; clear the sample cache of scenes whose camera changed."""
-        before = Dataset.load(self.root).scenes if (self.root / "dataset.json").is_file() else ()
+        """Return the dataset of the scenes made and of the scans that it had; clear the sample cache of scenes whose camera changed.
+
+        A description that cannot be read, such as one of another version, is replaced.
+        """
+        try:
+            before = {scene.name: scene for scene in Dataset.load(self.root).scenes}
+        except TableError:
+            before = {}
         names = {scene.name for scene in made}
-        scans = [scene for scene in before if scene.is_scanned and scene.name not in names]
-        for scene in before:
-            if scene.camera != self.camera.camera and (scene in scans or scene.name in names):
+        scans = [scene for scene in before.values() if scene.is_scanned and scene.name not in names]
+        for scene in (*made, *scans):
+            if scene.name not in before or before[scene.name].camera != self.camera.camera:
                 scene.stage_cache("sample").clear()
         return Dataset(self.root, (*made, *scans))
 

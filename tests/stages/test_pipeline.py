@@ -101,15 +101,6 @@ def test_run_again_it_reuses_what_is_there(demo: Path, capsys: pytest.CaptureFix
     assert "[evaluate] reusing" in capsys.readouterr().out
 
 
-def test_a_description_of_another_version_is_replaced(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = copy / "data" / "tiny" / "dataset.json"
-    before = path.read_bytes()
-    path.write_text('{"scenes": ["apartment-000"]}')  # scenes once were names
-    assert run("map", copy) == 2 and "Run the scenes stage" in capsys.readouterr().err
-    assert run("scenes", copy) == 0 and path.read_bytes() == before
-    assert capsys.readouterr().out.count("reusing") == 2
-
-
 def test_all_methods_are_trained_and_compared(copy: Path) -> None:
     methods = EvaluateConfig().methods
     learned = TrainConfig().methods

@@ -296,7 +296,7 @@ def read_settings(path: Path, types: Mapping[str, Any]) -> list[tuple[str, str]]
         content = read_yaml(path) or {}
     except FileNotFoundError as error:
         known = shipped_configs()
-        fix = did_you_mean(str(path), known) or f"Bundled configurations: {', '.join(known)}."
+        fix = did_you_mean("/".join(path.parts[-2:]), known) or f"Bundled configurations: {', '.join(known)}."
         raise ConfigError("there is no such file", path=path, fix=fix) from error
     except (OSError, ValueError) as error:
         raise ConfigError(f"not a YAML file: {error}", path=path) from error

@@ -29,11 +29,12 @@ demo: $(READY)
 # beside the tests, which wait for nothing, and speaks after them if it found something; their status is the target's.
 test: TESTS := -m 'not slow'
 test test-all: $(READY)
-	$(BIN)/ruff check . && $(BIN)/ruff format --check .
-	@echo "mypy runs beside the tests"; $(BIN)/mypy >$(VENV)/mypy.log 2>&1 & types=$$!; \
+	$(BIN)/ruff check --no-cache . && $(BIN)/ruff format --no-cache --check .
+	@echo "mypy runs beside the tests"; log=$$(mktemp); $(BIN)/mypy >$$log 2>&1 & types=$$!; \
 	OMP_WAIT_POLICY=PASSIVE OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile \
 	  --no-loadscope-reorder $(TESTS); tests=$$?; \
-	wait $$types || { cat $(VENV)/mypy.log; test $$tests -ne 0 || tests=1; }; \
+	wait $$types || { cat $$log; test $$tests -ne 0 || tests=1; }; \
+	rm -f $$log; \
 	exit $$tests
 
 bench: $(READY)

@@ -22,6 +22,7 @@ from wheretolook.scorers.registry import describe_methods
 from wheretolook.utils import devices
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.nearest import nearest
+from wheretolook_paper.release.catalog import ITEMS
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = ROOT / "configs"
@@ -32,6 +33,8 @@ CONFIGS = ROOT / "configs"
 )
 @pytest.mark.parametrize("command", ["train", "release"])
 def test_a_shipped_configuration_serves_every_command(path: Path, command: str) -> None:
+    Path("data").mkdir()
+    Path("data", "release").symlink_to(ROOT / "data" / "release")
     assert parse_command(command, ["--config", str(path)]).name == path.stem
 
 
@@ -265,9 +268,14 @@ def test_debug_shows_the_traceback(capsys: pytest.CaptureFixture[str]) -> None:
     assert "Traceback" in capsys.readouterr().err
 
 
-def test_methods_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_listings_hold_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("demo", "release"):
+        Path("data", name).mkdir(parents=True)
     assert main(["evaluate", "--list-methods"]) == 0
     assert dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()) == describe_methods()
+    assert main(["figures", "--list"]) == 0
+    names = [line.split("|")[1].strip() for line in capsys.readouterr().out.splitlines()]
+    assert names[0] == "name" and names[2:] == [item.name for item in ITEMS]
 
 
 @pytest.mark.parametrize("command", cli.command_targets())

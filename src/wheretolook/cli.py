@@ -110,7 +110,8 @@ def run_command(arguments: list[str]) -> None:
             if error.name not in EXTRAS:
                 raise
             raise missing_package(error.name) from error
-        if hasattr(command, "root") and command.root.is_dir():
+        listed = getattr(command, command.LISTING, False)
+        if hasattr(command, "root") and not listed and command.root.is_dir():
             print(f"done in {time.monotonic() - start:.0f} s: {command.root}")
 
 
@@ -295,7 +296,7 @@ def read_settings(path: Path, types: Mapping[str, Any]) -> list[tuple[str, str]]
         content = read_yaml(path) or {}
     except FileNotFoundError as error:
         known = shipped_configs()
-        fix = did_you_mean(str(path), known) or f"Bundled configurations: {', '.join(known)}."
+        fix = did_you_mean("/".join(path.parts[-2:]), known) or f"Bundled configurations: {', '.join(known)}."
         raise ConfigError("there is no such file", path=path, fix=fix) from error
     except (OSError, ValueError) as error:
         raise ConfigError(f"not a YAML file: {error}", path=path) from error

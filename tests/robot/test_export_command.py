@@ -22,9 +22,10 @@ from wheretolook.robot.wheretolook_robot import RobotScorer
 from wheretolook.scenes.loading import save_glb
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import MapWarning
+from wheretolook.utils.shipped import shipped
 from wheretolook.weights.resolve import load_scorer
 
-WEIGHTS = Path("data/release/weights/set.safetensors").absolute()
+WEIGHTS = shipped("data/release/weights/set.safetensors")
 
 
 @pytest.fixture

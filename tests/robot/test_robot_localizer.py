@@ -40,8 +40,9 @@ from wheretolook.robot.localizer_export import export_localizer
 from wheretolook.robot.wheretolook_robot import RobotScorer
 from wheretolook.scorers.base import Scorer
 from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.shipped import shipped
 
-BUNDLED = Path("data/release/weights/set.safetensors")
+BUNDLED = shipped("data/release/weights/set.safetensors")
 POSES = poses_looking_along([(-0.5, 0.3, 1.2)] * 2, [(1, 0.2, 0), (0.3, 1, 0)])
 PLACES = [(-0.5, 0.3, 1.2), (0.4, -0.6, 1.5), (0.8, 0.8, 1.0)]
 RUN = """

@@ -34,12 +34,13 @@ from wheretolook.space.free_space import FreeSpace
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.training_range import TrainingRange
 from wheretolook.utils.errors import CameraError, WeightsError
+from wheretolook.utils.shipped import shipped
 from wheretolook.visibility.occlusion import MeshOcclusion
 from wheretolook.weights.resolve import load_scorer
 
 pytestmark = pytest.mark.filterwarnings("ignore::wheretolook.utils.errors.OutOfRangeWarning")
 
-BUNDLED = Path("data/release/weights/set.safetensors")
+BUNDLED = shipped("data/release/weights/set.safetensors")
 TOLERANCE = 1e-5  # of scores
 PLACES = np.array([[1.0, 1.0, 1.5], [3.0, 4.0, 1.2], [5.0, 3.0, 1.0]])
 CAMERAS = {

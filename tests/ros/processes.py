@@ -49,7 +49,7 @@ def environment() -> dict[str, str]:
     path = os.pathsep.join([str(ROOT / "src"), str(ROOT / "src" / "wheretolook_ros"), str(ROOT / "tests")])
     domain = {"ROS_DOMAIN_ID": str(os.getpid() % 100 + 1), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     domain["FASTDDS_DEFAULT_PROFILES_FILE"] = str(Path(__file__).with_name("fastdds.xml"))
-    return domain | {"PYTHONPATH": path, "ROS_LOG_DIR": str(ROOT / ".pytest_cache" / "ros")}
+    return domain | {"PYTHONPATH": path}
 
 
 @contextmanager

@@ -7,8 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tests.disks import read_only, small_disk
 
 from wheretolook.cli import main
+from wheretolook.commands import scenes
 from wheretolook.commands.export import Export
 from wheretolook.commands.plan import Plan
 from wheretolook.commands.select import Select
@@ -18,7 +20,7 @@ from wheretolook.dataset.dataset_lock import changing
 from wheretolook.planning.config import PlanConfig, ViewpointMapConfig
 from wheretolook.select.waypoints import read_waypoints
 from wheretolook.utils.confine import check_folder_name
-from wheretolook.utils.errors import ConfigError, MapError, TableError
+from wheretolook.utils.errors import ConfigError, MapError, StorageError, TableError
 from wheretolook.utils.files import check_output, write_text
 from wheretolook.utils.reading import read_text
 
@@ -148,9 +150,30 @@ def test_links_of_the_user_are_kept(tmp_path: Path) -> None:
     assert (tmp_path / "elsewhere" / "a.partial").exists()
 
 
-def test_an_unwritable_home_names_the_variable_to_set() -> None:
-    code = "from wheretolook.utils.warp import start_warp; start_warp()"
+START_WARP = "from wheretolook.utils.warp import start_warp; start_warp()"
+
+
+def _started_warp(home: str) -> subprocess.CompletedProcess[str]:
     environment = {k: v for k, v in os.environ.items() if k not in ("WARP_CACHE_PATH", "XDG_CACHE_HOME")}
-    run = [sys.executable, "-c", code]
-    done = subprocess.run(run, env=environment | {"HOME": "/dev/null/x"}, capture_output=True, text=True)
+    run = [sys.executable, "-c", START_WARP]
+    return subprocess.run(run, env=environment | {"HOME": home}, capture_output=True, text=True)
+
+
+def test_an_unwritable_home_names_the_variable_to_set(tmp_path: Path) -> None:
+    done = _started_warp("/dev/null/x")
     assert "ConfigError" in done.stderr and "WARP_CACHE_PATH" in done.stderr
+    with small_disk(tmp_path / "disk", 8 * 2**20) as disk:
+        assert _started_warp(str(disk)).returncode == 0
+        with read_only(disk):
+            done = _started_warp(str(disk))
+    assert "ConfigError" in done.stderr and "WARP_CACHE_PATH" in done.stderr
+
+
+def test_a_read_only_folder_is_found_before_scenes_are_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_work(*arguments: object) -> None:
+        raise AssertionError("a scene is made that cannot be written")
+
+    monkeypatch.setattr(scenes, "save_scene", no_work)
+    with small_disk(tmp_path / "disk", 8 * 2**20) as disk, read_only(disk), pytest.raises(StorageError) as raised:
+        scenes.Scenes(data=disk).run()
+    assert raised.value.path == disk / "demo" and raised.value.fix

@@ -49,6 +49,7 @@ class Evaluate(SceneOptions, LabelOptions):
     """
 
     SHORT: ClassVar = {"engine": "label.engine"}
+    LISTING: ClassVar = "list_methods"
 
     evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)

@@ -77,6 +77,8 @@ class Command:
     """Option of the values before the first option."""
     WRITES: ClassVar[str] = ""
     """If `out` is a folder: a file in it, by which the command knows a folder that it wrote."""
+    LISTING: ClassVar[str] = ""
+    """Option with which the command prints a list and does nothing else."""
 
     def __init_subclass__(cls) -> None:
         """Let the command's `run` check its outputs first."""

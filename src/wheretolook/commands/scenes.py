@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import entry_points
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from wheretolook.commands.options import DatasetOptions, Log, Progress, ignore_progress
@@ -18,7 +19,8 @@ from wheretolook.dataset.layout import Dataset, MappedFloor, SceneFolder
 from wheretolook.dataset.sampling_config import Split
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
-from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.errors import ConfigError, SceneError, TableError
+from wheretolook.utils.files import storage_errors
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -50,7 +52,7 @@ class Scenes(DatasetOptions):
 
         With `scenes.rgbd.folder`, one scene is fused from the RGB-D recording and joins the dataset's others. Raises
         SceneError if a mesh or the recording cannot be used or two scenes have the same name, ConfigError if the
-        dataset's folder holds a release.
+        dataset's folder holds a release, StorageError, before any work, if it cannot be written.
         """
         refuse_release(self.root)
         if self.scenes.rgbd.folder is not None:
@@ -60,6 +62,9 @@ class Scenes(DatasetOptions):
             if scene.name in {other.name for other in sources}:
                 raise SceneError("two scenes have the same name", path=self.root, value=scene.name, fix="Give a name.")
             sources[scene] = make, cache_key("scenes", cache_inputs)
+        with storage_errors(self.root):  # before minutes of work
+            self.root.mkdir(parents=True, exist_ok=True)
+            TemporaryFile(dir=self.root).close()
         for scene, (make, key) in sources.items():
             if scene.stage_cache("scenes", key).is_current(scene.mesh):
                 log(f"{scene.name}: reusing {scene.mesh}")
@@ -105,12 +110,18 @@ class Scenes(DatasetOptions):
             yield scene, partial(_load, mesh), [mesh_fingerprint(mesh.path), mesh.up]
 
     def _with_scans(self, made: tuple[SceneFolder, ...]) -> Dataset:
-        """Return the dataset of the scenes made and of the scans that it had; clear the sample cache of scenes whose camera changed."""
-        before = Dataset.load(self.root).scenes if (self.root / "dataset.json").is_file() else ()
+        """Return the dataset of the scenes made and of the scans that it had; clear the sample cache of scenes whose camera changed.
+
+        A description that cannot be read, such as one of another version, is replaced.
+        """
+        try:
+            before = {scene.name: scene for scene in Dataset.load(self.root).scenes}
+        except TableError:
+            before = {}
         names = {scene.name for scene in made}
-        scans = [scene for scene in before if scene.is_scanned and scene.name not in names]
-        for scene in before:
-            if scene.camera != self.camera.camera and (scene in scans or scene.name in names):
+        scans = [scene for scene in before.values() if scene.is_scanned and scene.name not in names]
+        for scene in (*made, *scans):
+            if scene.name not in before or before[scene.name].camera != self.camera.camera:
                 scene.stage_cache("sample").clear()
         return Dataset(self.root, (*made, *scans))
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from wheretolook.utils.errors import ConfigError, StorageError
 
-STORAGE_FIX = "Free disk space or fix permissions, then run again; finished work is kept."
+STORAGE_FIX = "Free disk space, fix permissions or name another folder, then run again; finished work is kept."
 MAP_FILES = ("cameras", "images", "points3D", "rigs", "frames", "landmarks")  # without endings
 
 

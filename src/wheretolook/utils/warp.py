@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from ctypes.util import find_library
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,6 +32,9 @@ def start_warp(device: str = "cpu") -> str:
     try:
         with _without_driver_warning():
             wp.init()
+        kernels = Path(wp.config.kernel_cache_dir)
+        if not os.access(kernels, os.W_OK) and not any(kernels.glob("wp_wheretolook*")):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(kernels))
         found = wp.get_device(device)
         if found.is_cuda and found.is_mempool_supported:
             wp.set_mempool_release_threshold(found, KEPT_BYTES)

@@ -35,6 +35,7 @@ class Figures(DatasetOptions):
 
     CONFIG: ClassVar = "release"
     SHORT: ClassVar = {name: f"figures.{name}" for name in ("out", "only", "kinds")}
+    LISTING: ClassVar = "list"
 
     figures: FiguresConfig = field(default_factory=FiguresConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)

@@ -104,6 +104,25 @@ def runtime_table(sizes: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(columns).sort_values(["work", "median (s)"], ignore_index=True)
 
 
+def step_table(sizes: pd.DataFrame) -> pd.DataFrame:
+    """Return the median and quartiles (ms) of one inference step of each scorer, the paper's first.
+
+    `sizes` is that of `runtime_figure`; the steps are its rows of one location, which also have `q1_s` and `q3_s`.
+    """
+    rows = [{"machine": "the paper's", "scorer": "the paper's network", "median (ms)": 20.0}]
+    for row in sizes[sizes["locations"] == 1].sort_values(["name", "what"]).to_dict("records"):
+        machine = machine_label(row["name"]) + ("" if _is_gpu(row) else f", {_threads(row)}")
+        size = {"views": row["directions"], "landmarks": row["landmarks"]}
+        times = {f"{name} (ms)": 1e3 * row[key] for name, key in _QUARTILES.items()}
+        rows.append({"machine": machine, "scorer": row["what"].rpartition(", ")[0], **size, **times})
+    return pd.DataFrame(
+        rows, columns=["machine", "scorer", "views", "landmarks", *(f"{name} (ms)" for name in _QUARTILES)]
+    )
+
+
+_QUARTILES = {"25 %": "q1_s", "median": "median_s", "75 %": "q3_s"}
+
+
 def _draw_bars(axes: Axes, bars: list[_Bar], start: float) -> None:
     plate: Style = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
     for y, bar in enumerate(bars):

@@ -81,7 +81,9 @@ def _picture(content: bytes, shown_px: int) -> tuple[NotebookNode, NotebookNode]
             (WIDEST_PX, round(picture.height * WIDEST_PX / picture.width)), Image.Resampling.LANCZOS
         )
     written = io.BytesIO()
-    palette = picture.quantize(COLORS, Image.Quantize.MAXCOVERAGE)  # also has the colours of small areas, as of scales
+    palette = Image.new("P", (1, 1), 0)
+    covered = picture.quantize(COLORS - 1, Image.Quantize.MAXCOVERAGE)  # also the colours of small areas, as of scales
+    palette.putpalette([255, 255, 255, *(covered.getpalette() or ())])
     picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG).save(written, "png", optimize=True)
     width = min(shown_px, picture.width)
     size = {"width": width, "height": round(picture.height * width / picture.width)}

@@ -4,7 +4,7 @@
 # make bench   measures what must not become slower, in a minute, and compares with tests/benchmarks/ledger.csv
 # make results   regenerates tables, pages and pictures of weights that changed: MESHES=folder, PHOTOGRAPHS=folder
 # make ui     opens MLflow at the comparison of methods; make lab opens Jupyter on the notebooks
-# make html   runs all notebooks and writes them as pages, notebooks/html; make docs builds the documentation, site/
+# make notebooks   executes all notebooks and stores their outputs; make docs builds the documentation, site/
 # Options: TORCH=cuda for the CUDA build of PyTorch, PYTHON=python3.12, PORT=5001 for make ui. See environment.md.
 
 TORCH ?= cpu
@@ -17,7 +17,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --progre
 CONSTRAINTS := configs/constraints.txt
 READY := $(VENV)/ready-$(TORCH)
 
-.PHONY: demo test test-all bench results setup ui lab html docs clean help
+.PHONY: demo test test-all bench results setup ui lab notebooks docs clean help
 
 help:
 	@sed -n '1,8s/^# //p' Makefile
@@ -49,9 +49,8 @@ lab: $(READY)
 	@test -x $(BIN)/jupyter-lab || $(PIP) -c $(CONSTRAINTS) -e '.[notebooks]'
 	$(BIN)/jupyter lab notebooks
 
-html: $(READY)
-	@$(BIN)/wheretolook log-release >/dev/null
-	OMP_WAIT_POLICY=PASSIVE $(BIN)/python notebooks/pages.py notebooks notebooks/html
+notebooks: $(READY)
+	OMP_WAIT_POLICY=PASSIVE $(BIN)/python notebooks/execute.py $(NOTEBOOKS)
 
 results: $(READY)
 	@$(BIN)/python -m wheretolook_paper.studies.results $(if $(MESHES),--meshes $(MESHES)) \

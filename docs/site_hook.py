@@ -11,6 +11,7 @@ import re
 from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
@@ -23,25 +24,31 @@ def _place(uri: str) -> str:
     return "index.md" if uri == "README.md" else uri.removeprefix("docs/")
 
 
+def _taken(uri: str, config: MkDocsConfig) -> File:
+    """A file of the repository outside docs/ as a file of the site."""
+    return File(uri, str(ROOT), config.site_dir, config.use_directory_urls)
+
+
 def _target(file: File, link: str) -> str:
     """The file of the repository that a page's link names."""
     page = Path(str(file.abs_src_path)).relative_to(ROOT).as_posix()
     return posixpath.normpath(posixpath.join(posixpath.dirname(page), link))
 
 
+@event_priority(50)  # before the plugin that makes pages of notebooks
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Take along what is linked to outside docs/."""
     pages, named = list(files.documentation_pages()), _in_nav(config.nav)
     for uri in sorted(named - {file.src_uri for file in files}):
         if (ROOT / uri).is_file():
-            pages.append(File.generated(config, uri, abs_src_path=str(ROOT / uri)))
+            pages.append(_taken(uri, config))
             files.append(pages[-1])
     while pages:
         page = pages.pop()
         for link in LINK.findall(Path(str(page.abs_src_path)).read_text(encoding="utf-8")):
             uri = _target(page, link)
             if files.get_file_from_path(_place(uri)) is None and (ROOT / uri).is_file():
-                found = File.generated(config, uri, abs_src_path=str(ROOT / uri))
+                found = _taken(uri, config)
                 files.append(found)
                 if found.is_documentation_page():
                     pages.append(found)

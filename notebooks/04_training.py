@@ -72,9 +72,9 @@ display(training_figure(curves) if curves else Markdown(f"No run has a history y
 # ## Calibration
 #
 # Of all test viewpoints with about the same predicted probability, the fraction that localizes; the dashed line is
-# perfect calibration. The paper's network is overconfident here, the set network slightly underconfident. Temperature
-# scaling, fitted on the validation scene, gives T near 1: the offset is between scenes, which one parameter cannot fix;
-# on your map `wheretolook adapt` calibrates with its photographs. Below, the number of viewpoints.
+# perfect calibration, a network below it is overconfident. Below, the number of viewpoints. Temperature scaling, fitted
+# on the validation scene, changes little: the offset is between scenes, which one parameter cannot fix; on your map
+# `wheretolook adapt` calibrates with its photographs.
 
 # %%
 from wheretolook.evaluation.calibration import read_calibration
@@ -83,6 +83,18 @@ from wheretolook.tracking.runs import newest_artifact
 
 calibration = read_calibration(newest_artifact(tracking, "evaluate", "calibration.csv", release.name))
 display(calibration_figure(calibration))
+
+# %% [markdown]
+# In how many bins more views are predicted to localize than do, and the calibration error before and after scaling:
+
+# %%
+import pandas as pd
+
+calibration["overconfident"] = calibration["mean_predicted"] > calibration["share_good"]
+before, after = (calibration[calibration["when"] == when].groupby("method") for when in ("before", "after"))
+columns = {"bins": before.size(), "bins above what happens": before["overconfident"].sum()}
+columns |= {"error": before["ece"].first(), "error, scaled": after["ece"].first(), "T": after["temperature"].first()}
+pd.DataFrame(columns).style.format(precision=3)
 
 # %% [markdown]
 # ## What the network responds to

@@ -86,7 +86,7 @@ display(regret_figure(latest_scores(tracking, "interiors")))
 # ## Without occlusion
 #
 # Discs with true occlusion, squares as if every method saw through walls, as in the paper's released code. Without
-# occlusion bins and networks are above all Fisher information rows, as in the paper, but bins above the paper's
+# occlusion bins and networks are above the paper's Fisher information rows, as in the paper, but bins above its
 # network. Counting methods and summed information lose most.
 
 # %%

@@ -1,6 +1,8 @@
 """Measure learned scorers: viewpoints per second from landmarks to scores, and the time of a single pose.
 
     python tests/benchmarks/bench_scorers.py [--device cuda] [--weights data/release/weights/set.safetensors ...]
+    python tests/benchmarks/bench_scorers.py --step --out step.json
+    python tests/benchmarks/bench_visibility.py --draw data/release/results/runtimes.csv step.json --figures FOLDER
 
 The map has 25,000 landmarks on the walls of a room; a random half is occluded from each location. A batch holds every
 direction at many locations. The time runs from poses and unoccluded landmarks to scores in host memory. Single poses
@@ -10,10 +12,14 @@ are each at another location. Prints the median and the range over repeats.
 from __future__ import annotations
 
 import argparse
+import itertools
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from bench_visibility import machine, seconds_of
 from common import ROOM_M, room_map, timed
 
 from wheretolook.geometry.lattices import fibonacci_sphere
@@ -35,7 +41,9 @@ def main() -> None:
     parser.add_argument("--locations", type=int, default=200)
     parser.add_argument("--directions", type=int, default=500)
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--poses", type=int, default=200, help="single poses to time")
+    parser.add_argument("--poses", type=int, default=200, help="single poses to time, or inference steps")
+    parser.add_argument("--step", action="store_true", help="measure one inference step")
+    parser.add_argument("--out", type=Path, help="write the inference steps to this JSON file")
     args = parser.parse_args()
     rng = np.random.default_rng(1)
     low, high = np.array(ROOM_M)
@@ -53,11 +61,36 @@ def main() -> None:
             scorers[path.stem] = load_scorer(path, localization_map)
         except WhereToLookError as error:  # matchability is no scorer by itself
             print(f"{path.stem}: {error}")
+    if args.step:
+        rows = inference_steps(scorers, views.reshape(len(locations), len(axes), 3, 4), args.landmarks, args.poses)
+        if args.out:
+            args.out.write_text(json.dumps({"machine": machine(args.device), "paper_size": rows}, indent=1))
+        return
     for name, scorer in scorers.items():
         median = timed(f"{name}: all views", lambda s=scorer: s.score(views), args.repeats)
         print(f"{'':62} {len(views) / median:,.0f} views a second")
         poses = iter(views[rng.permutation(len(views))[: args.poses + 1]])
         timed(f"{name}: one pose", lambda s=scorer, p=poses: s.score(next(p)[None]), args.poses, 1e3, "ms")
+
+
+def inference_steps(
+    scorers: dict[str, Scorer], views: np.ndarray, landmarks: int, repeats: int
+) -> list[dict[str, Any]]:
+    """Return rows of `runtimes.csv`: the time to score all directions of one location, and one pose.
+
+    `views` (L, D, 3, 4) are poses by location; each repeat is at the next location.
+    """
+    rows = []
+    for name, scorer in scorers.items():
+        for what, directions, times_each in (("one location", views.shape[1], 1), ("one pose", 1, 20)):
+            steps = itertools.cycle(views[:, :directions])
+            # Single poses are so short that few of them measure what else the machine does at that moment.
+            times = seconds_of(lambda s=scorer, p=steps: s.score(next(p)), times_each * repeats)
+            size = {"locations": 1, "directions": directions, "landmarks": landmarks}
+            rows.append({"what": f"{name}, {what}", "threads": torch.get_num_threads(), **size, **times})
+            low, median, high = (1e3 * times[key] for key in ("q1_s", "median_s", "q3_s"))
+            print(f"{name}, {what}".ljust(32), f"{median:9.3f} ms [{low:.3f}, {high:.3f}]", flush=True)
+    return rows
 
 
 if __name__ == "__main__":

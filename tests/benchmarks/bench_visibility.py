@@ -19,7 +19,6 @@ import json
 import os
 import platform
 import resource
-import statistics
 import sys
 import threading
 import time
@@ -125,14 +124,16 @@ class PeakMemory:
 
 
 def seconds_of(work: Callable[[], object], repeats: int) -> dict[str, float]:
-    """Return median, minimum and maximum seconds over repeats, after one warm-up run."""
+    """Return median, quartiles, minimum and maximum seconds over repeats, after one warm-up run."""
     work()
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter()
         work()
         seconds.append(time.perf_counter() - start)
-    return {"median_s": statistics.median(seconds), "min_s": min(seconds), "max_s": max(seconds), "repeats": repeats}
+    low, median, high = np.percentile(seconds, (25, 50, 75)).tolist()
+    ends = {"min_s": min(seconds), "max_s": max(seconds)}
+    return {"median_s": median, "q1_s": low, "q3_s": high, **ends, "repeats": repeats}
 
 
 def machine(device: str) -> dict[str, Any]:
@@ -160,7 +161,7 @@ def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
 
     def add(what: str, threads: int, work: Callable[[], object], repeats: int = args.repeats, scale: float = 1) -> None:
         times = seconds_of(work, repeats)
-        times |= {name: scale * times[name] for name in ("median_s", "min_s", "max_s")}
+        times |= {name: scale * value for name, value in times.items() if name != "repeats"}
         row = {"what": what, "threads": threads, **size, **times, "scale": scale}
         row["projections_per_s"] = n / row["median_s"]
         rows.append(row)
@@ -253,11 +254,14 @@ def draw(args: argparse.Namespace) -> None:
     from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
     from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
 
-    results = [json.loads(Path(file).read_text()) for file in args.draw]
+    tables = [pd.read_csv(file) for file in args.draw if file.endswith(".csv")]
+    results = [json.loads(Path(file).read_text()) for file in args.draw if not file.endswith(".csv")]
     sizes, growth = (
         pd.DataFrame([{**row, **result["machine"]} for result in results for row in result.get(part, [])])
         for part in ("paper_size", "scaling")
     )
+    about = ["what", "threads", "name"]
+    sizes = pd.concat([*tables, sizes], ignore_index=True).drop_duplicates(about, keep="last", ignore_index=True)
     folder = Path(args.figures)
     folder.mkdir(parents=True, exist_ok=True)
     save_figure(runtime_figure(sizes), folder / "runtimes.png")
@@ -287,7 +291,7 @@ def main() -> None:
     parser.add_argument("--bounded", action="store_true", help="also run 2 million landmarks x 5,000 locations")
     parser.add_argument("--memory-gb", type=float, default=2.0, help="memory bound of the blocks in work")
     parser.add_argument("--out", help="write the results to this JSON file")
-    parser.add_argument("--draw", nargs="+", metavar="JSON", help="draw earlier results")
+    parser.add_argument("--draw", nargs="+", metavar="FILE", help="draw earlier results: JSON files, and runtimes.csv")
     parser.add_argument("--figures", default=".", help="folder for figures and tables")
     parser.add_argument("--log", action="store_true", help="log tables and figures to MLflow")
     args = parser.parse_args()

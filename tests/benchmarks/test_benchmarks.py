@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 FOLDER = Path(__file__).parent
@@ -50,6 +51,15 @@ def test_visibility_is_measured_and_drawn(tmp_path: Path) -> None:
     assert {"paper_size", "scaling"} < json.loads(out.read_text()).keys()
     run("visibility", "--draw", str(out), "--figures", str(tmp_path))
     assert {"runtimes.csv", "runtimes.png", "scaling.csv"} < {path.name for path in tmp_path.iterdir()}
+    steps = tmp_path / "step.json"
+    run("scorers", *SMALL["scorers"].split(), "--step", "--out", str(steps))
+    for _ in range(2):  # a second measurement on the same machine replaces the first
+        run("visibility", "--draw", str(tmp_path / "runtimes.csv"), str(steps), "--figures", str(tmp_path))
+    times = pd.read_csv(tmp_path / "runtimes.csv").set_index("what")
+    assert times.index.is_unique and "counts alone" in times.index
+    pose, location = times.loc["set, one pose"], times.loc["set, one location"]
+    assert (pose["directions"], location["directions"], pose["landmarks"]) == (1, 20, 500)
+    assert 0 < pose["q1_s"] <= pose["median_s"] <= pose["q3_s"] <= pose["max_s"]
 
 
 def test_features_and_labelling(tmp_path: Path) -> None:

@@ -40,6 +40,10 @@ _PANELS = {COUNTS: "counts alone: the work that the paper times"}
 _PANELS[EVERYTHING] = "occlusion, counts and best 100 directions:\nmore than the paper times"
 
 
+_STEP_TIMES = {"median": "median_s", "25 %": "q1_s", "75 %": "q3_s", "least": "min_s"}
+"""Columns of the times of an inference step."""
+
+
 @dataclass(frozen=True)
 class _Bar:
     """One bar: label, median seconds, source of the number, text at its end, minimum and maximum seconds."""
@@ -102,6 +106,21 @@ def runtime_table(sizes: pd.DataFrame) -> pd.DataFrame:
     columns |= {"median (s)": rows["median_s"], "least (s)": rows["min_s"], "most (s)": rows["max_s"]}
     columns |= {"projections (10⁹/s)": rows["projections_per_s"] / 1e9}
     return pd.DataFrame(columns).sort_values(["work", "median (s)"], ignore_index=True)
+
+
+def step_table(sizes: pd.DataFrame) -> pd.DataFrame:
+    """Return median, quartiles and minimum (ms) of one inference step of each scorer, the paper's first.
+
+    `sizes` is that of `runtime_figure`; the steps are its rows of one location, which also have `q1_s` and `q3_s`.
+    """
+    rows: list[dict[str, Any]] = [{"machine": "the paper's", "scorer": "the paper's network", "median (ms)": 20.0}]
+    for row in sizes[sizes["locations"] == 1].sort_values(["name", "what"]).to_dict("records"):
+        machine = machine_label(row["name"]) + ("" if _is_gpu(row) else f", {_threads(row)}")
+        size = {"views": row["directions"], "landmarks": row["landmarks"]}
+        times = {f"{name} (ms)": 1e3 * row[key] for name, key in _STEP_TIMES.items()}
+        rows.append({"machine": machine, "scorer": row["what"].rpartition(", ")[0], **size, **times})
+    columns = ["machine", "scorer", "views", "landmarks", *(f"{name} (ms)" for name in _STEP_TIMES)]
+    return pd.DataFrame(rows, columns=columns)
 
 
 def _draw_bars(axes: Axes, bars: list[_Bar], start: float) -> None:

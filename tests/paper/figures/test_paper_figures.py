@@ -18,7 +18,7 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook_paper.figures.lattices import covering_radius_deg, fibonacci_figure, nearest_angles_deg
 from wheretolook_paper.figures.look_story import Estimate, LookStory, film_frames, story_figure
 from wheretolook_paper.figures.peaks import spread_extrema
-from wheretolook_paper.figures.runtimes import scaling_figure
+from wheretolook_paper.figures.runtimes import scaling_figure, step_table
 from wheretolook_paper.figures.training import training_figure
 
 RNG = np.random.default_rng(0)
@@ -92,3 +92,16 @@ def test_a_story_of_views_is_a_figure_and_a_film() -> None:
     house = dollhouse(furnished_room(), width_px=100)
     assert len(story_figure(story, house).axes) == 3 + 4
     assert len([*film_frames(story, house)]) == 3
+
+
+def test_inference_steps_are_listed_below_the_papers() -> None:
+    about = {"threads": 2, "cores": 2, "device": "cpu", "name": "AMD EPYC", "landmarks": 24_919}
+    step = {"what": "mlp-2d+z, one pose", "locations": 1, "directions": 1, "median_s": 3e-3}
+    step |= {"q1_s": 2e-3, "q3_s": 5e-3, "min_s": 1e-3}
+    check = {"what": "counts alone", "locations": 648, "directions": 500, "median_s": 1.5}
+    table = step_table(pd.DataFrame([check, step]).assign(**about))
+    assert table["median (ms)"].tolist() == [20, 3]  # Sec. "Runtimes": one inference step takes around 0.02 s
+    row = table.iloc[1]
+    assert (row["machine"], row["scorer"], row["views"]) == ("AMD EPYC, all 2 cores", "mlp-2d+z", 1)
+    assert (row["25 % (ms)"], row["75 % (ms)"], row["least (ms)"]) == (2, 5, 1)
+    assert len(step_table(pd.DataFrame([check]).assign(**about))) == 1

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+
+from wheretolook.utils.system import cores
 
 
 def run_in_parts(n_rows: int, rows_at_once: int, work: Callable[[slice], None], device: str = "cpu") -> None:
@@ -14,7 +15,7 @@ def run_in_parts(n_rows: int, rows_at_once: int, work: Callable[[slice], None], 
     PyTorch and Warp release Python's lock while they compute, so that the threads use several cores.
     """
     parts = [slice(start, min(start + rows_at_once, n_rows)) for start in range(0, n_rows, rows_at_once)]
-    threads = min(len(parts), len(os.sched_getaffinity(0))) if device == "cpu" else 1
+    threads = min(len(parts), cores()) if device == "cpu" else 1
     if threads < 2:
         for part in parts:
             work(part)

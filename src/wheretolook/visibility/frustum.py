@@ -9,7 +9,6 @@ Rounding the normals moves the border of the view by less than 1e-4 pixels.
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
@@ -22,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.system import cores
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility import frustum_kernel
 
@@ -238,7 +238,7 @@ def _collected_on_cpu(
     if len(blocks) == 1:  # without the cost of threads
         numbers, indices = collect(blocks[0])
     else:
-        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        with ThreadPoolExecutor(cores()) as pool:
             numbers, indices = (np.concatenate(parts) for parts in zip(*pool.map(collect, blocks), strict=True))
     return _starts(numbers), wp.array(indices, dtype=wp.int32, device="cpu")
 

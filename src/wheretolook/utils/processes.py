@@ -20,7 +20,7 @@ from types import FrameType, TracebackType
 from typing import Any, TypeVar
 
 from wheretolook.utils.errors import WorkerError
-from wheretolook.utils.system import end_with_starting_thread, hold_back, keep_freed_memory, signal_main_thread
+from wheretolook.utils.system import end_with_starting_thread, hold_back, signal_main_thread
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -190,7 +190,9 @@ def _start_worker(numbers: Any, stopped: Connection, started_by_main_thread: boo
     threading.Thread(target=_exit_when_stopped, args=(stopped,), daemon=True).start()
     _number = numbers.get()
     on_sigterm(signal.SIG_DFL)
-    use_one_core()
+    import cv2
+
+    cv2.setNumThreads(1)
     collect_less_garbage()
 
 
@@ -203,15 +205,3 @@ def _exit_when_stopped(stopped: Connection) -> None:
     with suppress(EOFError, OSError):
         stopped.recv()  # returns at the end of the pipe: the parent has closed it or has ended
     os._exit(1)
-
-
-def use_one_core() -> None:
-    """Let OpenCV use one thread and the C library keep freed memory, for workers that run SIFT, one per core.
-
-    SIFT allocates about 70 MB for each 640 x 480 image; requesting it from the system each time took a third of its
-    time.
-    """
-    import cv2
-
-    cv2.setNumThreads(1)
-    keep_freed_memory()

@@ -8,14 +8,10 @@ import os
 import signal
 import threading
 from contextlib import suppress
-from importlib import import_module
-from typing import Any
 
 READERS = 64  # that can share a lock on Windows
 _LOCKED = 2**20  # offset of the locked bytes, beyond the content of any lock file
 _PR_SET_PDEATHSIG = 1  # sys/prctl.h
-_M_TRIM_THRESHOLD = -1  # malloc.h
-_M_MMAP_THRESHOLD = -3
 
 OPEN_LOCK = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 """Flags for opening a lock file: not through a link, and without waiting for the other end of a pipe."""
@@ -41,11 +37,12 @@ def lock_file(file: int, shared: bool) -> None:
 
 def _lock_bytes(file: int, shared: bool) -> None:
     """Lock on Windows, where each byte has one holder: a reader locks one of `READERS` bytes, a writer all."""
-    msvcrt: Any = import_module("msvcrt")
+    import msvcrt
+
     for reader in range(READERS if shared else 1):
         os.lseek(file, _LOCKED + reader, os.SEEK_SET)
         with suppress(PermissionError):
-            msvcrt.locking(file, msvcrt.LK_NBLCK, 1 if shared else READERS)
+            msvcrt.locking(file, msvcrt.LK_NBLCK, 1 if shared else READERS)  # type: ignore[attr-defined]
             return
     raise BlockingIOError
 
@@ -68,11 +65,3 @@ def end_with_starting_thread() -> None:
     """Let Linux kill this process when the thread that started it ends, whatever this process does (prctl(2))."""
     with suppress(OSError, AttributeError, TypeError):  # TypeError: Windows has no library without a name
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-
-
-def keep_freed_memory() -> None:
-    """Let the GNU C library keep freed memory for further allocations of up to 32 MB."""
-    with suppress(OSError, AttributeError):  # another C library
-        library = ctypes.CDLL("libc.so.6")
-        library.mallopt(_M_MMAP_THRESHOLD, 32 * 2**20)  # the largest value that glibc allows
-        library.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)

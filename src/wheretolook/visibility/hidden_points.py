@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from threading import Lock
 
@@ -12,6 +11,7 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import MapError, SceneError
+from wheretolook.utils.parts import in_threads
 from wheretolook.utils.system import cores
 from wheretolook.utils.validation import check_range
 from wheretolook.visibility.config import DEFAULT_RADIUS
@@ -88,8 +88,7 @@ class HiddenPointRemoval(OcclusionModel):
         def fill(row: int) -> None:
             free[row] = self._free_from(at[row], places.distinct)[places.place]
 
-        with ThreadPoolExecutor(self.threads or cores()) as pool:
-            list(pool.map(fill, range(len(at))))  # raises what a thread raised
+        list(in_threads(fill, range(len(at)), self.threads or cores()))
         return free
 
     def check(self, locations: Float, points: Float) -> None:

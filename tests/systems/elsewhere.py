@@ -61,14 +61,18 @@ def leave_posix() -> None:
         delattr(signal, name)
     for name in OF_OS:
         delattr(os, name)
+    signal.valid_signals = lambda: {getattr(signal, name) for name in KEEP}
     sys.addaudithook(without_proc)
 
 
 leave_posix()
 
 if __name__ == "__main__":
+    from lightning.fabric.utilities import imports
+
     from wheretolook.cli import main
 
+    imports._IS_WINDOWS = True  # or Lightning asks for SIGKILL
     for command in json.loads(sys.argv[1]):
         if main(command):
             sys.exit(f"failed: {command}")

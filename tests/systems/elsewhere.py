@@ -68,11 +68,12 @@ def leave_posix() -> None:
 leave_posix()
 
 if __name__ == "__main__":
-    from lightning.fabric.utilities import imports
-
     from wheretolook.cli import main
 
-    imports._IS_WINDOWS = True  # or Lightning asks for SIGKILL
     for command in json.loads(sys.argv[1]):
+        if command[0] == "train":
+            from lightning.pytorch.trainer.connectors import signal_connector
+
+            signal_connector._IS_WINDOWS = True  # or Lightning uses SIGKILL
         if main(command):
             sys.exit(f"failed: {command}")

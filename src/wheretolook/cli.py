@@ -76,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         quiet_libraries()
     try:
         if in_main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM):
+            for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, interrupt)
         run_command([argument for argument in given if argument != "--debug"])
         return 0

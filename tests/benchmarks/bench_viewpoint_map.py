@@ -10,7 +10,6 @@ repeats.
 from __future__ import annotations
 
 import argparse
-import os
 import tempfile
 from dataclasses import replace
 from itertools import cycle
@@ -31,6 +30,7 @@ from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.space.free_space import FreeSpace
+from wheretolook.utils.system import cores
 from wheretolook.visibility.occlusion import MeshOcclusion
 from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.paths.greedy import greedy_sequence
@@ -113,7 +113,7 @@ def main() -> None:
     scorer = scorer_on(landmarks)
     print(f"{len(free)} voxels x {len(directions)} directions, {len(landmarks):,} landmarks, "
           f"{len(mesh.triangles):,} triangles, {scorer.name}, on {args.device}, "
-          f"{len(os.sched_getaffinity(0))} cores")  # fmt: skip
+          f"{cores()} cores")  # fmt: skip
     timed("build", lambda: build_viewpoint_map(scorer, grid, free, directions), args.builds)
     before = build_viewpoint_map(scorer_on(rows_of(landmarks, slice(0, -10))), grid, free, directions)
     viewpoint_map, changed = update_viewpoint_map(before, scorer)

@@ -16,7 +16,6 @@ import contextlib
 import ctypes
 import gc
 import json
-import os
 import platform
 import resource
 import sys
@@ -41,6 +40,7 @@ from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.space.free_space import FreeSpace
+from wheretolook.utils.system import cores
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.counting import FrustumCounter
 from wheretolook.visibility.occlusion import DevicePoints, MeshOcclusion, NoOcclusion
@@ -89,7 +89,7 @@ class Setup:
         self.occlusion = MeshOcclusion(MeshRaycaster(self.mesh, device))
         self.device = device
         self.on_gpu = wp.get_device(device).is_cuda
-        self.threads = 1 if self.on_gpu else len(os.sched_getaffinity(0))
+        self.threads = 1 if self.on_gpu else cores()
 
 
 class PeakMemory:
@@ -144,7 +144,7 @@ def machine(device: str) -> dict[str, Any]:
         host = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), host)
     name = wp.get_device(device).name if wp.get_device(device).is_cuda else host
     versions = {"warp": wp.__version__, "numpy": np.__version__}
-    return {"device": device, "name": name, "host": host, "cores": len(os.sched_getaffinity(0)), **versions}
+    return {"device": device, "name": name, "host": host, "cores": cores(), **versions}
 
 
 def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -16,6 +15,7 @@ from wheretolook.features.config import ExtractorConfig
 from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.locks import hold
+from wheretolook.utils.system import cores
 from wheretolook.utils.validation import check_range, reject
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
         from wheretolook.utils.devices import usable_device
 
         device = usable_device(self.device)
-        workers = self.workers or len(os.sched_getaffinity(0))
+        workers = self.workers or cores()
         scoring = Scoring(self.method, self.weights, self.also, self.anywhere, self.accuracy)
         scoring.check()
         out = self.out or folder_of_check(self.data, name)

@@ -19,6 +19,7 @@ from wheretolook.utils.confine import safe_child
 from wheretolook.utils.devices import check_device_name, usable_device
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import check_output, check_output_folder
+from wheretolook.utils.system import cores
 from wheretolook.visibility.config import OcclusionConfig
 
 T = TypeVar("T")
@@ -175,7 +176,7 @@ class LabelOptions(DatasetOptions):
     @property
     def n_workers(self) -> int:
         """Worker processes: `label.workers`, by default one for each CPU core that this process may use."""
-        return self.label.workers or len(os.sched_getaffinity(0))
+        return self.label.workers or cores()
 
     @property
     def warp_device(self) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -22,6 +21,7 @@ from wheretolook.localization.shard import LabelledShard, SceneJob, Shard, run_l
 from wheretolook.localization.versions import versions
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import fingerprint, sha256, write_json
+from wheretolook.utils.system import cores
 
 MANIFEST = "manifest.json"
 """File in the folder of shards with the settings of the labels; later `labels.json` next to the table."""
@@ -163,7 +163,7 @@ def _run(shards: Sequence[Shard], config: LabelConfig) -> Generator[tuple[Shard,
 
         yield from run_ray(shards, config.ray_address)
     elif shards:
-        yield from run_local(shards, config.workers or len(os.sched_getaffinity(0)))
+        yield from run_local(shards, config.workers or cores())
 
 
 def _read(shard: Shard) -> pd.DataFrame:

@@ -6,6 +6,7 @@ the driver, which writes them. Ray restarts the shards of a lost machine on anot
 
 from __future__ import annotations
 
+import getpass
 import hashlib
 import os
 import socket
@@ -135,7 +136,7 @@ def _label_shard(job: SceneJob, files: Sequence[bytes], rows: pd.DataFrame) -> L
 
 def _cached_file(content: bytes, suffix: str) -> Path:
     """Write content to a temporary file named by its checksum, unless it exists."""
-    folder = Path(tempfile.gettempdir()) / f"wheretolook-{os.getuid()}"
+    folder = Path(tempfile.gettempdir()) / f"wheretolook-{getattr(os, 'getuid', getpass.getuser)()}"
     path = folder / f"{hashlib.sha256(content).hexdigest()[:32]}{suffix}"
     if not path.is_file():
         partial = path.with_name(f"{path.name}.{os.getpid()}.partial")  # other workers may write the same file

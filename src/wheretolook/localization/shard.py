@@ -20,7 +20,7 @@ from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.pipeline import Step, run_pipeline
 from wheretolook.utils.errors import WhereToLookError, WorkerError
 from wheretolook.utils.memory import halving
-from wheretolook.utils.processes import WorkerPool, use_one_core, worker_number
+from wheretolook.utils.processes import WorkerPool, worker_number
 
 if TYPE_CHECKING:
     from wheretolook.features.keypoints import Keypoints
@@ -77,9 +77,10 @@ class ShardWorker:
     """
 
     def __init__(self, number: int = 0) -> None:
+        import cv2
         import torch
 
-        use_one_core()
+        cv2.setNumThreads(1)
         torch.set_num_threads(1)
         self.number = number
         self._scene: tuple[SceneJob, Renderer, Renderer | None, Localizer] | None = None

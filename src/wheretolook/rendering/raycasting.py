@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.rendering import ray_kernels
 from wheretolook.rendering.ray_kernels import cast_kernel, clear_kernel, distance_kernel, unoccluded_kernel
+from wheretolook.utils.parts import in_threads
+from wheretolook.utils.system import cores
 from wheretolook.utils.warp import start_warp, vec3_array
 
 BLOCK_DIM = 64  # threads of a block on a GPU: rays of a block wait for its longest
@@ -51,7 +51,7 @@ class MeshRaycaster:
         points_on_device = self.upload(points)
         n_points = points_on_device.shape[0]
         occluded = np.zeros((len(origins_at), n_points), dtype=np.bool_)
-        threads = len(os.sched_getaffinity(0)) if self.device == "cpu" else 1
+        threads = cores() if self.device == "cpu" else 1
         block = max(1, min(BLOCK_RAYS // max(n_points, 1), -(-len(origins_at) // threads)))
 
         def work(start: int) -> None:
@@ -59,8 +59,7 @@ class MeshRaycaster:
             unoccluded = self.unoccluded_on_device(origins_at[rows], points_on_device, margin_m)
             occluded[rows] = ~unoccluded.numpy().astype(np.bool_)
 
-        with ThreadPoolExecutor(threads) as pool:  # Warp lets go of Python's lock while a kernel runs
-            list(pool.map(work, range(0, len(origins_at), block)))
+        list(in_threads(work, range(0, len(origins_at), block), threads))
         return occluded
 
     def unoccluded_on_device(self, origins: ArrayLike, points: Any, margin_m: float = 0.02) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from importlib.util import find_spec
 
 from wheretolook.utils.errors import ConfigError
@@ -27,6 +28,8 @@ EXTRAS = {
 def missing_package(module: str) -> ConfigError:
     """Return the error for an optional module that is not installed."""
     fix = f"pip install 'wheretolook[{EXTRAS[module]}]'."
+    if module == "ompl" and sys.platform == "win32":
+        fix = "It has no wheels for Windows: plan on Linux or macOS, or install OMPL with its Python bindings."
     return ConfigError(f"this needs the package {module}, which is not installed", fix=fix)
 
 

@@ -1,11 +1,11 @@
-"""Locks on folders and stores, held by one process or shared by readers. The kernel releases those of dead processes."""
+"""Locks on folders and stores, held by one process or shared by readers. The system releases those of ended processes."""
 
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import socket
+import sys
 import time
 import warnings
 from collections.abc import Iterator
@@ -14,6 +14,7 @@ from pathlib import Path
 
 from wheretolook.utils.errors import InUseError, LockWarning
 from wheretolook.utils.files import missing_folders, remove_if_empty
+from wheretolook.utils.system import OPEN_LOCK, lock_file
 
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)
 _NOT_WRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOSPC)
@@ -21,7 +22,7 @@ _NOT_WRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENO
 
 @contextmanager
 def hold(lock: Path, what: str, *, shared: bool = False, wait_s: float = 0.0) -> Iterator[None]:
-    """Hold a lock (flock(2)) on a file within this block; the file is created if missing and removed at the end,
+    """Hold a lock on a file within this block; the file is created if missing and removed at the end,
     as are folders that were created for it and are empty then.
 
     Where nothing can be written, as in a read-only folder, the block runs without a lock; where the file system has no
@@ -54,15 +55,20 @@ def hold(lock: Path, what: str, *, shared: bool = False, wait_s: float = 0.0) ->
     try:
         with suppress(OSError):  # such as a full disk
             os.ftruncate(file, 0)
-            os.pwrite(file, f"{what}, process {os.getpid()} on {socket.gethostname()}".encode(), 0)
+            os.lseek(file, 0, os.SEEK_SET)
+            os.write(file, f"{what}, process {os.getpid()} on {socket.gethostname()}".encode())
         yield
     finally:
         with suppress(OSError):
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # only the last reader can and removes the file
+            lock_file(file, shared=False)  # only the last reader can and removes the file
             if _is_current(lock, file):
                 lock.unlink()
                 remove_if_empty(created)
         os.close(file)
+        if sys.platform == "win32":  # which removes no open file, so that the last to close it can
+            with suppress(OSError):
+                lock.unlink()
+                remove_if_empty(created)
 
 
 _HELD = -1
@@ -73,17 +79,18 @@ def _try_lock(lock: Path, shared: bool) -> int | None:
     try:
         if not shared:
             lock.parent.mkdir(parents=True, exist_ok=True)
-        file = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+        file = os.open(lock, OPEN_LOCK, 0o666)
     except OSError as error:
         if error.errno in _NOT_WRITABLE:
             return None
         raise
     try:
-        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+        lock_file(file, shared)
+    except BlockingIOError:
+        os.close(file)
+        return _HELD
     except OSError as error:
         os.close(file)
-        if error.errno == errno.EWOULDBLOCK:
-            return _HELD
         if error.errno not in _NO_LOCKS:
             raise
         text = f"{lock.parent}: this file system has no locks; make sure that only one process writes at a time"

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
+
+import psutil
 
 from wheretolook.utils.logs import LOG
 
 
 def available_bytes() -> int:
-    """Return the memory available without swapping, in bytes; all of it where the system does not report it."""
-    try:
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) * 1024
-    except OSError:
-        pass
-    return int(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    """Return the memory available without swapping, in bytes."""
+    return int(psutil.virtual_memory().available)
 
 
 def fitting(bytes_each: int) -> int:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import ctypes
+import _thread
 import gc
 import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -19,14 +20,12 @@ from types import FrameType, TracebackType
 from typing import Any, TypeVar
 
 from wheretolook.utils.errors import WorkerError
+from wheretolook.utils.system import end_with_starting_thread, hold_back, signal_main_thread
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-RETRY_S = 0.05  # until an interrupt is handled that came during an import
-_PR_SET_PDEATHSIG = 1  # sys/prctl.h
-_M_TRIM_THRESHOLD = -1  # malloc.h
-_M_MMAP_THRESHOLD = -3
+RETRY_S = 0.05  # until a signal that came during an import is sent again
 
 
 class WorkerPool:
@@ -143,21 +142,26 @@ def ignoring_sigint() -> Iterator[None]:
 def on_sigterm(handler: Any) -> None:
     """Set the handler of SIGTERM in the main thread, in place of COLMAP's own, which prints a native stack."""
     if in_main_thread():
-        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
+        hold_back(signal.SIGTERM, True)
         import pycolmap  # noqa: F401
 
         signal.signal(signal.SIGTERM, handler)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGTERM])
+        hold_back(signal.SIGTERM, False)
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
-    """Handle a signal by KeyboardInterrupt; during an import, which might swallow it, after that, by SIGALRM."""
+    """Handle a signal by KeyboardInterrupt; during an import, which might swallow it, send it again a little later."""
     while frame is not None:
         if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
-            signal.setitimer(signal.ITIMER_REAL, RETRY_S)
+            _thread.start_new_thread(_send_later, (number,))  # without locks that the main thread may hold
             return
         frame = frame.f_back
     raise KeyboardInterrupt
+
+
+def _send_later(number: int) -> None:
+    time.sleep(RETRY_S)
+    signal_main_thread(number)
 
 
 def in_main_thread() -> bool:
@@ -182,12 +186,13 @@ def _start_worker(numbers: Any, stopped: Connection, started_by_main_thread: boo
     """
     global _number
     if started_by_main_thread:
-        with suppress(OSError, AttributeError):
-            ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        end_with_starting_thread()
     threading.Thread(target=_exit_when_stopped, args=(stopped,), daemon=True).start()
     _number = numbers.get()
     on_sigterm(signal.SIG_DFL)
-    use_one_core()
+    import cv2
+
+    cv2.setNumThreads(1)
     collect_less_garbage()
 
 
@@ -200,20 +205,3 @@ def _exit_when_stopped(stopped: Connection) -> None:
     with suppress(EOFError, OSError):
         stopped.recv()  # returns at the end of the pipe: the parent has closed it or has ended
     os._exit(1)
-
-
-def use_one_core() -> None:
-    """Let OpenCV use one thread and the C library keep freed memory, for workers that run SIFT, one per core.
-
-    SIFT allocates about 70 MB for each 640 x 480 image; requesting it from the system each time took a third of its
-    time.
-    """
-    import cv2
-
-    cv2.setNumThreads(1)
-    try:
-        library = ctypes.CDLL("libc.so.6")
-        library.mallopt(_M_MMAP_THRESHOLD, 32 * 2**20)  # the largest value that glibc allows
-        library.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
-    except (OSError, AttributeError):  # another C library
-        pass

@@ -9,8 +9,6 @@ Rounding the normals moves the border of the view by less than 1e-4 pixels.
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -22,6 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.parts import in_threads
+from wheretolook.utils.system import cores
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility import frustum_kernel
 
@@ -235,11 +235,7 @@ def _collected_on_cpu(
         return numbers, np.concatenate([np.empty(0, np.int32), *parts])
 
     blocks = [slice(begin, end) for begin, end in pairwise(bounds)]
-    if len(blocks) == 1:  # without the cost of threads
-        numbers, indices = collect(blocks[0])
-    else:
-        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-            numbers, indices = (np.concatenate(parts) for parts in zip(*pool.map(collect, blocks), strict=True))
+    numbers, indices = map(np.concatenate, zip(*in_threads(collect, blocks, cores()), strict=True))
     return _starts(numbers), wp.array(indices, dtype=wp.int32, device="cpu")
 
 

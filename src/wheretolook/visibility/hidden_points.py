@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from threading import Lock
 
@@ -13,6 +11,8 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import MapError, SceneError
+from wheretolook.utils.parts import in_threads
+from wheretolook.utils.system import cores
 from wheretolook.utils.validation import check_range
 from wheretolook.visibility.config import DEFAULT_RADIUS
 from wheretolook.visibility.hull import hull_length, may_be_near_hull
@@ -88,8 +88,7 @@ class HiddenPointRemoval(OcclusionModel):
         def fill(row: int) -> None:
             free[row] = self._free_from(at[row], places.distinct)[places.place]
 
-        with ThreadPoolExecutor(self.threads or len(os.sched_getaffinity(0))) as pool:
-            list(pool.map(fill, range(len(at))))  # raises what a thread raised
+        list(in_threads(fill, range(len(at)), self.threads or cores()))
         return free
 
     def check(self, locations: Float, points: Float) -> None:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -17,6 +14,8 @@ from tqdm.auto import tqdm
 from wheretolook.geometry.camera import Camera
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.memory import fitting
+from wheretolook.utils.parts import in_threads
+from wheretolook.utils.system import cores
 from wheretolook.visibility.counting import FrustumCounter
 from wheretolook.visibility.counting_kernel import best_kernel, pack_kernel
 from wheretolook.visibility.occlusion import DevicePoints, OcclusionModel, StoredOcclusion
@@ -74,7 +73,7 @@ def survey(
     landmarks = points if isinstance(points, DevicePoints) else DevicePoints(positions, options.device)
     n_points = len(landmarks)
     on_gpu = wp.get_device(landmarks.device).is_cuda
-    workers = 1 if on_gpu or occlusion.uses_all_cores else (options.threads or len(os.sched_getaffinity(0)))
+    workers = 1 if on_gpu or occlusion.uses_all_cores else (options.threads or cores())
     scratch = max(1, options.memory_bytes // (4 * workers))
     directions = np.asarray(rotations, dtype=np.float64).tobytes()
     counter = _counter(options.counter, camera, directions, n_points, landmarks.device, scratch)  # type: ignore[arg-type]
@@ -103,7 +102,7 @@ def survey(
 
     blocks = [slice(start, min(start + block, len(at))) for start in range(0, len(at), block)]
     with tqdm(total=len(at), desc=options.progress, unit="location", disable=options.progress is None) as bar:
-        for done in _each(work, blocks, workers):
+        for done in in_threads(work, blocks, workers):
             bar.update(done)
     stored = StoredOcclusion(at, packed, n_points, occlusion.name) if options.keep_occlusion else None
     return Survey(counts, best, stored)
@@ -142,17 +141,8 @@ def _workers_and_block(
         share = min(share, CPU_BLOCK_BYTES)
     block = min(max(1, share // per_location), counter.max_locations(n_points), -(-n_locations // workers))
     if occlusion.uses_all_cores:
-        block = min(block, 16 * len(os.sched_getaffinity(0)))  # enough for all cores, and the progress bar moves
+        block = min(block, 16 * cores())  # enough for all cores, and the progress bar moves
     return workers, block
-
-
-def _each(work: Callable[[slice], int], blocks: list[slice], workers: int) -> Iterator[int]:
-    """Results of all blocks. Warp releases Python's lock while a kernel runs, so that threads use several cores."""
-    if workers == 1:
-        yield from map(work, blocks)
-        return
-    with ThreadPoolExecutor(workers) as pool:
-        yield from pool.map(work, blocks)
 
 
 def _best(counts: Any, keep: int) -> Any:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from wheretolook.commands.options import Command
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.system import cores
 from wheretolook.utils.validation import check_range
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ class Benchmark(Command):
             self.lattice,
             self.max_turn,
             localize=self.localizer == "sift",
-            workers=self.workers or len(os.sched_getaffinity(0)),
+            workers=self.workers or cores(),
             device=usable_device(self.device),
         )
         rounds = [SceneRound(scene, self.out / scene.name, config) for scene in scenes]

@@ -7,7 +7,6 @@ axes, which leaves the variances that the network uses unchanged.
 
 from __future__ import annotations
 
-import os
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from math import log
@@ -27,6 +26,7 @@ from wheretolook.scorers.matchability.network import N_EXPECTED, bearing_precisi
 from wheretolook.scorers.set.accuracy import probabilities
 from wheretolook.scorers.set.network import SetNetwork, expected_cells
 from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook.utils.system import cores
 from wheretolook.visibility.listing import FrustumLister, ListedViews, Surroundings
 from wheretolook.visibility.occlusion import DevicePoints
 from wheretolook.visibility.sphere_cells import choose_size
@@ -130,7 +130,7 @@ class BatchedDirections:
                 work(rows)
             return scores
         threads = torch.get_num_threads()
-        pool = ThreadPoolExecutor(len(os.sched_getaffinity(0)), initializer=torch.set_num_threads, initargs=(1,))
+        pool = ThreadPoolExecutor(cores(), initializer=torch.set_num_threads, initargs=(1,))
         try:
             with pool:  # blocks are small: each thread has its own
                 list(pool.map(work, blocks))

@@ -163,7 +163,9 @@ NUMBERS = Numbers(ROOT)
 
 @pytest.mark.parametrize("page", pages(NUMBERS))
 def test_numbers_are_those_of_the_results(page: str) -> None:
-    assert (ROOT / page).read_text() == updated(page, NUMBERS), "python -m wheretolook_paper.studies.results --only pages"
+    assert (ROOT / page).read_text() == updated(page, NUMBERS), (
+        "python -m wheretolook_paper.studies.results --only pages"
+    )
 
 
 def test_a_changed_result_changes_the_page(tmp_path: Path) -> None:

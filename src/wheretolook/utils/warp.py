@@ -32,7 +32,7 @@ def start_warp(device: str = "cpu") -> str:
     try:
         with _without_driver_warning():
             wp.init()
-        kernels = Path(wp.config.kernel_cache_dir)
+        kernels = Path(str(wp.config.kernel_cache_dir))
         if not os.access(kernels, os.W_OK) and not any(kernels.glob("wp_wheretolook*")):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(kernels))
         found = wp.get_device(device)

@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -76,8 +77,8 @@ class Numbers:
         self.root = root
         self.table = cache(lambda name: pd.read_csv(root / "data" / "release" / "results" / name))
 
-    def row(self, file: str, **values: object) -> pd.Series | None:
-        """Return the only row of a table with these values in its columns, None if there is none."""
+    def row(self, file: str, **values: object) -> Any:
+        """Return the only row of a table with these values in its columns (a Series), None if there is none."""
         table = self.table(file)
         for column, value in values.items():
             table = table[table[column].astype(str) == str(value)]
@@ -85,7 +86,7 @@ class Numbers:
             raise ValueError(f"{file}: {len(table)} rows of {values}")
         return table.iloc[0] if len(table) else None
 
-    def scores(self, file: str, method: str, occlusion: str = "mesh", scene: str = "all") -> pd.Series | None:
+    def scores(self, file: str, method: str, occlusion: str = "mesh", scene: str = "all") -> Any:
         """Return the row of the best view of each location among all labelled ones."""
         return self.row(file, method=method, occlusion=occlusion, candidates="all", top_n=1, scene=scene)
 
@@ -93,11 +94,15 @@ class Numbers:
 
     def readme_scores(self, label: str) -> list[str] | None:
         method = METHODS.get(label)
-        return method and [*self._best(method, "scores.csv")[::2], *self._best(method, "generalization.csv")[::2]]
+        if method is None:
+            return None
+        return [cell for file in ("scores.csv", "generalization.csv") for cell in self._best(method, file)[::2]]
 
     def all_scores(self, label: str) -> list[str] | None:
         method = METHODS.get(label)
-        return method and [*self._best(method, "scores.csv"), *self._best(method, "generalization.csv")]
+        if method is None:
+            return None
+        return [cell for file in ("scores.csv", "generalization.csv") for cell in self._best(method, file)]
 
     def _best(self, method: str, file: str) -> list[str]:
         """Return share with interval, share through walls, AUC; from `variants.csv` what does not ship."""
@@ -131,10 +136,8 @@ class Numbers:
             cells.append(f"{regret}; {row['auc']:.3f}" + ("" if pd.isna(row["ece"]) else f"; {row['ece']:.2f}"))
         return cells
 
-    def _ranked(self, dataset: str, group: str, method: str) -> pd.Series:
-        found = self.row("cameras.csv", dataset=dataset, group=group, method=method)
-        assert found is not None
-        return found
+    def _ranked(self, dataset: str, group: str, method: str) -> Any:
+        return self.row("cameras.csv", dataset=dataset, group=group, method=method)
 
     def photographs(self, scene: str) -> Cells:
         def cells(label: str) -> list[str] | None:
@@ -175,7 +178,6 @@ class Numbers:
 
     def relocalized(self, label: str) -> list[str] | None:
         row = self.row("relocalize.csv", policy=POLICIES[label])
-        assert row is not None
         joint = [
             f"{100 * row[f'right_{n}']:.1f} [{100 * row[f'right_{n}_low']:.0f}, {100 * row[f'right_{n}_high']:.0f}]"
             for n in (2, 3, 4)
@@ -186,8 +188,7 @@ class Numbers:
 
     def looks(self, label: str) -> list[str] | None:
         rows = [self.row("looks.csv", split="test", strategy=LOOKS[label], n_looks=n) for n in (1, 2, 3, 5)]
-        assert all(row is not None for row in rows)
-        return [*(f"{100 * row['good']:.1f}" for row in rows), f"{100 * rows[-1]['any_good']:.1f}"]  # type: ignore[index]
+        return [*(f"{100 * row['good']:.1f}" for row in rows), f"{100 * rows[-1]['any_good']:.1f}"]
 
 
 def interval(values: Iterable[float], digits: int = 1) -> str:
@@ -224,9 +225,13 @@ def tables(numbers: Numbers) -> Mapping[tuple[str, str], Cells]:
 def prose(numbers: Numbers) -> Mapping[tuple[str, str], list[str]]:
     """Return the numbers of each pattern, by page and pattern, in the order of its groups."""
     two, single = (numbers.row("looks.csv", split="test", strategy="together", n_looks=n)["good"] for n in (2, 1))
-    gain, even = (numbers.row("relocalize.csv", policy=policy)["right_4"] for policy in ("gain", "even"))
+    rates = {policy: numbers.row("relocalize.csv", policy=policy) for policy in ("gain", "even", "known")}
+    closed = [
+        f"{100 * (rates['gain'][name] - rates['even'][name]) / (rates['known'][name] - rates['even'][name]):.0f}"
+        for name in ("right_2", "right_3", "right_4")
+    ]
     looks = [f"{100 * share:.0f}" for share in (two, single)]
-    turned = [f"{100 * share:.0f}" for share in (gain, even)]
+    turned = [f"{100 * rates[policy]['right_4']:.0f}" for policy in ("gain", "even")]
     ours, other = "scores.csv", "generalization.csv"
     paired = []
     for method in ("bins", "mlp-2d+z"):
@@ -250,6 +255,7 @@ def prose(numbers: Numbers) -> Mapping[tuple[str, str], list[str]]:
     return {
         ("README.md", r"two localize at (\d+) of 100 .* single view localizes at (\d+)"): looks,
         ("README.md", r"after four views (\d+) of 100 poses are correct, (\d+) by even"): turned,
+        ("docs/lost.md", r"close (\d+) % after two views, (\d+) % after three and (\d+) % after four"): closed,
         (
             "docs/results.md",
             rf"against bins {pair} \[{number}, {number}\]; against the paper's network {number} \[{number}, {number}\] "

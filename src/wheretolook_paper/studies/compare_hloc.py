@@ -29,7 +29,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pandas as pd
@@ -183,7 +183,7 @@ def render_set(source: str, locations: int, images: int, work: Path, workers: in
     out = work / f"{Path(source).stem}-{images}-{locations}"
     if (out / "queries.txt").is_file():
         return out
-    dataset = {"data": work, "name": f"scene-{Path(source).stem}", "device": device}
+    dataset: dict[str, Any] = {"data": work, "name": f"scene-{Path(source).stem}", "device": device}
     Scenes(**dataset, scenes=scenes).run()
     Map(**dataset, mapping=MapConfig(n_images=images, keep_images=True), label=LabelConfig(workers=workers)).run()
     sample = SampleConfig(keep=0, max_locations=locations, max_directions=DIRECTIONS)

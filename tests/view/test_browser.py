@@ -13,7 +13,7 @@ from PIL import Image
 pytest.importorskip("viser")
 
 from selection.room import POINTS, WEIGHTS, write_room
-from view.browser import Browser, chromium
+from wheretolook_paper.studies.browser import Browser, chromium
 from wheretolook.geometry.poses import poses_looking_along, rotation_from_quaternion
 from wheretolook.view.paths import FORWARD, RecordedPath, looking_ahead
 from wheretolook.view.server import Viewer

@@ -7,6 +7,8 @@ import subprocess
 import sys
 import time
 import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.client import HTTPConnection
 
@@ -58,17 +60,25 @@ class Ui(Command):
         check_port(ADDRESS, self.port)
         links = comparisons(self.tracking, f"http://{NAME}:{self.port}")
         print("starting MLflow's server, half a minute", flush=True)
-        with subprocess.Popen(_server_command(self.tracking, self.port), env=os.environ | SETTINGS) as server:
-            try:
-                _wait_for(server, self.port)
+        try:
+            with serving(self.tracking, self.port) as server:
                 print(*(f"{name:<24}{link}" for name, link in links.items()), "Ctrl-C ends it", sep="\n", flush=True)
                 if sys.platform == "darwin" or {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
                     webbrowser.open(next(iter(links.values())))
                 server.wait()
-            except KeyboardInterrupt:
-                print("ended")
-            finally:
-                server.terminate()
+        except KeyboardInterrupt:
+            print("ended")
+
+
+@contextmanager
+def serving(tracking: TrackingConfig, port: int) -> Iterator[subprocess.Popen[bytes]]:
+    """Run MLflow's server while the context is open. Raises ConfigError if it does not start."""
+    with subprocess.Popen(_server_command(tracking, port), env=os.environ | SETTINGS) as server:
+        try:
+            _wait_for(server, port)
+            yield server
+        finally:
+            server.terminate()
 
 
 def comparisons(tracking: TrackingConfig, server: str) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import shutil
 import subprocess
@@ -75,6 +76,28 @@ class Tab:
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
             button = {} if kind == "mouseMoved" else {"button": "left", "clickCount": 1}
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **button)
+
+    def click_on(self, selector: str, index: int = 0) -> None:
+        """Click an element by its CSS selector, once it exists."""
+        script = (
+            f"(() => {{ const e = document.querySelectorAll({json.dumps(selector)})[{index}]; if (!e) return null;"
+            " const r = e.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; })()"
+        )
+        self.wait(lambda tab: tab.evaluate(script) is not None, 20)
+        self.click(*self.evaluate(script))
+
+    def enter(self, text: str) -> None:
+        """Type a text and press Enter."""
+        self.call("Input.insertText", text=text)
+        time.sleep(0.5)  # lists are filtered after a delay
+        for kind in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, key="Enter", code="Enter", windowsVirtualKeyCode=13)
+
+    def save(self, path: Path, left: int, top: int, width: int, height: int) -> None:
+        """Write a rectangle of the page as a WebP file."""
+        clip = {"x": left, "y": top, "width": width, "height": height, "scale": 1}
+        image = self.call("Page.captureScreenshot", format="webp", quality=85, clip=clip)
+        path.write_bytes(base64.b64decode(image["data"]))
 
     def press(self, label: str) -> None:
         """Click the last element with exactly this text, once it exists."""

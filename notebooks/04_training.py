@@ -77,7 +77,7 @@ display(training_figure(curves) if curves else Markdown(f"No run has a history y
 # `wheretolook adapt` calibrates with its photographs.
 
 # %%
-from wheretolook.evaluation.calibration import read_calibration
+from wheretolook.evaluation.statistics import read_calibration
 from wheretolook.figures.calibration import calibration_figure
 from wheretolook.tracking.runs import newest_artifact
 

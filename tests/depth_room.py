@@ -10,7 +10,7 @@ from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.geometry.tsdf import DepthImage
 from wheretolook.rendering.raycasting import MeshRaycaster
-from wheretolook.rendering.types import camera_rays
+from wheretolook.rendering.warp_renderer import camera_rays
 
 ROOM = np.array([4.0, 3.0, 2.5])
 CUPBOARD = np.array([[0.0, 2.2, 0.0], [1.2, 3.0, 1.6]])

@@ -9,8 +9,8 @@ import pandas as pd
 
 from synthetic_dataset import make_dataset
 from synthetic_scores import make_scores
+from wheretolook.dataset.config import RELEASE_FILE
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.names import RELEASE_FILE
 from wheretolook_paper.evaluation.paper_tables import write_paper_tables
 
 METHODS: tuple[str, ...] = ("random", "bins", "fisher-trace-exact", "mlp-2d+z", "mlp-2d+3d")

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from wheretolook.dataset.thresholds import THRESHOLDS, threshold_key
-from wheretolook.evaluation.scores import RELEASED_DIVISOR
+from wheretolook.dataset.config import THRESHOLDS, threshold_key
+from wheretolook.evaluation.results import RELEASED_DIVISOR
 
 KEYS = tuple(map(threshold_key, THRESHOLDS))
 FISHER: tuple[str, ...] = tuple(

@@ -15,13 +15,12 @@ import pytest
 
 from wheretolook import cli
 from wheretolook.cli import main, parse_command
-from wheretolook.commands.options import Experiment
-from wheretolook.commands.scenes_config import MeshSource
+from wheretolook.commands.options import Experiment, MeshSource
 from wheretolook.mapping.config import MapConfig
 from wheretolook.scorers.registry import describe_methods
 from wheretolook.utils import devices
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.nearest import nearest
+from wheretolook.utils.validation import nearest
 from wheretolook_paper.release.catalog import ITEMS
 
 ROOT = Path(__file__).parents[1]

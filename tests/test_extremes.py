@@ -14,19 +14,19 @@ from selection.room import WEIGHTS
 from synthetic_dataset import make_landmarks
 from twins.open3d_renderer import Open3DRenderer
 from twins.visibility import count_plain
+from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.sampling import sample_viewpoints
-from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.planning.config import ViewpointMapConfig
-from wheretolook.planning.map_building import build_viewpoint_map
+from wheretolook.planning.scene_map import build_viewpoint_map
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scorers.registry import make_scorer, scorers
 from wheretolook.space.mapped_space import MappedSpace
-from wheretolook.utils import memory
+from wheretolook.utils import devices as memory
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import NoOcclusion

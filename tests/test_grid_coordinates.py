@@ -16,12 +16,12 @@ from planning.rooms import CAMERA, DIRECTIONS, GRID, free_voxels, room_landmarks
 from selection.room import POINTS, WEIGHTS, write_room
 from twins.open3d_renderer import Open3DRenderer
 from wheretolook import WhereToLook
-from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.extractor import Keypoints
 from wheretolook.features.matches import Matches
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid
-from wheretolook.geometry.local_origin import local_origin, poses_from
 from wheretolook.geometry.poses import Float, camera_centers, pose_error, poses_looking_along, transform
+from wheretolook.geometry.similarity import local_origin, poses_from
 from wheretolook.geometry.tsdf import DepthImage, TsdfVolume
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.localization.localizer import Localizer
@@ -30,7 +30,7 @@ from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.georeference import REPORT_FILE
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.rendered_map import build_map
-from wheretolook.planning.map_building import build_viewpoint_map
+from wheretolook.planning.scene_map import build_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.rendering.warp_renderer import WarpRenderer
@@ -38,8 +38,7 @@ from wheretolook.robot.export import export_robot
 from wheretolook.robot.wheretolook_robot import RobotScorer
 from wheretolook.scenes.loading import load_mesh, save_glb
 from wheretolook.scorers.registry import make_scorer, scorers
-from wheretolook.space.free_space import FreeSpace
-from wheretolook.space.tsdf_space import TsdfSpace
+from wheretolook.space.free_space import FreeSpace, TsdfSpace
 from wheretolook.utils.errors import OutOfRangeWarning
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import MeshOcclusion

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from wheretolook.geometry.poses import poses_looking_along
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.planning.viewpoint_map import ViewpointMap
+    from wheretolook.scorers.weights import load_scorer
     from wheretolook.select.where_to_look import WhereToLook
-    from wheretolook.weights.resolve import load_scorer
 
 __all__ = [
     "LocalizationMap",
@@ -31,7 +31,7 @@ __all__ = [
 _HOMES = {
     "LocalizationMap": "wheretolook.inputs.localization_map",
     "PinholeCamera": "wheretolook.geometry.camera",
-    "load_scorer": "wheretolook.weights.resolve",
+    "load_scorer": "wheretolook.scorers.weights",
     "ViewpointMap": "wheretolook.planning.viewpoint_map",
     "WhereToLook": "wheretolook.select.where_to_look",
     "poses_looking_along": "wheretolook.geometry.poses",

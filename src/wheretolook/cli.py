@@ -22,10 +22,10 @@ from typing import Any, get_type_hints
 from wheretolook.utils.errors import ConfigError, WhereToLookError
 from wheretolook.utils.extras import EXTRAS, missing_package
 from wheretolook.utils.images import MAX_PIXELS
-from wheretolook.utils.logs import quiet_libraries
-from wheretolook.utils.nearest import did_you_mean
 from wheretolook.utils.processes import collect_less_garbage, in_main_thread, interrupt, on_sigterm
 from wheretolook.utils.shipped import or_shipped, shipped, shipped_configs
+from wheretolook.utils.texts import quiet_libraries
+from wheretolook.utils.validation import did_you_mean
 from wheretolook.utils.version import VERSION
 
 COMMANDS = {
@@ -290,7 +290,7 @@ def read_settings(path: Path, types: Mapping[str, Any]) -> list[tuple[str, str]]
 
     Raises ConfigError, naming the file, if it cannot be read or sets an option that no command has.
     """
-    from wheretolook.utils.reading import read_yaml
+    from wheretolook.utils.files import read_yaml
 
     try:
         content = read_yaml(path) or {}

@@ -25,9 +25,8 @@ from sklearn.metrics import roc_auc_score
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.viewpoint_table import LOCALIZED
-from wheretolook.features.config import ExtractorConfig
-from wheretolook.features.extraction import KeypointExtractor
-from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.config import ExtractorConfig, KeypointExtractor
+from wheretolook.features.extractor import Keypoints
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -37,9 +36,9 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.rendered_map import build_map
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scorers.registry import make_scorer
+from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.npz_files import load_npz, save_npz
 from wheretolook.visibility.occlusion import MeshOcclusion
-from wheretolook.weights.resolve import load_scorer
 
 CAMERA = PinholeCamera()
 

@@ -28,8 +28,7 @@ import warp as wp
 from bench_visibility import CAMERA, COUNTS, EVERYTHING, Setup, machine, seconds_of
 from common import SIDE_M, room_map, use_one_thread, write_model
 
-from wheretolook.features.descriptors import quantize_descriptors
-from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.extractor import Keypoints, quantize_descriptors
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import poses_looking_along, rotation_looking_along, transform
 from wheretolook.localization.config import LocalizerConfig

@@ -22,8 +22,8 @@ from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.looks.selection import best_views
+from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.shipped import WEIGHTS, shipped
-from wheretolook.weights.resolve import load_scorer
 
 
 def main() -> None:

@@ -25,8 +25,8 @@ from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.robot.export import export_robot
 from wheretolook.robot.wheretolook_robot import RobotScorer
+from wheretolook.scorers.weights import load_scorer
 from wheretolook.visibility.occlusion import NoOcclusion
-from wheretolook.weights.resolve import load_scorer
 
 
 def timed(label: str, work: Callable[[int], object], repeats: int) -> None:

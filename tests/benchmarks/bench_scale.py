@@ -21,19 +21,18 @@ import numpy as np
 import pandas as pd
 from common import ROOM_M, room_map, use_one_thread
 
-from wheretolook.features.descriptor_index import DescriptorIndex, has_index
-from wheretolook.features.descriptors import quantize_descriptors
+from wheretolook.features.extractor import quantize_descriptors
 from wheretolook.features.matches import match
-from wheretolook.features.matching import DescriptorMatcher
+from wheretolook.features.matching import DescriptorIndex, DescriptorMatcher, has_index
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.occlusion import DevicePoints, NoOcclusion, StoredOcclusion
 from wheretolook.visibility.survey import SurveyOptions, survey
-from wheretolook.weights.resolve import load_scorer
 
 IN_ROOM = 2_500  # landmarks
 PITCH_M = 12.0  # between rooms

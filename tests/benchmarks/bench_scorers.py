@@ -26,8 +26,8 @@ from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
+from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.errors import WhereToLookError
-from wheretolook.weights.resolve import load_scorer
 
 
 def main() -> None:

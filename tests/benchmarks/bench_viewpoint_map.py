@@ -21,18 +21,18 @@ from common import points_on_surface, room_map, timed
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.planning.map_building import build_viewpoint_map, update_viewpoint_map
-from wheretolook.planning.refine import refine_directions
-from wheretolook.planning.view_sequence import TurnLimit, best_sequence
+from wheretolook.planning.routes import TurnLimit, best_sequence
+from wheretolook.planning.scene_map import build_viewpoint_map, update_viewpoint_map
+from wheretolook.planning.stops import refine_directions
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
+from wheretolook.scorers.weights import load_scorer
 from wheretolook.space.free_space import FreeSpace
-from wheretolook.utils.system import cores
+from wheretolook.utils.processes import cores
 from wheretolook.visibility.occlusion import MeshOcclusion
-from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.paths.greedy import greedy_sequence
 from wheretolook_rooms.generator import generate_apartment
 

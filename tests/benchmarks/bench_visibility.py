@@ -40,7 +40,7 @@ from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.space.free_space import FreeSpace
-from wheretolook.utils.system import cores
+from wheretolook.utils.processes import cores
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.counting import FrustumCounter
 from wheretolook.visibility.occlusion import DevicePoints, MeshOcclusion, NoOcclusion
@@ -250,7 +250,7 @@ def bounded(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
 def draw(args: argparse.Namespace) -> None:
     """Write tables and figures of earlier results, and log them to MLflow if asked to."""
     from wheretolook.figures.style import save_figure
-    from wheretolook.tracking.config import TrackingConfig
+    from wheretolook.tracking.store import TrackingConfig
     from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
     from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
 

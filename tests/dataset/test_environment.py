@@ -15,9 +15,9 @@ from wheretolook.rendering import raycasting
 from wheretolook.scenes.loading import save_glb
 from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.files import write_json
-from wheretolook.visibility.cached_occlusion import CachedOcclusion
 from wheretolook.visibility.config import OcclusionConfig
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
+from wheretolook.visibility.occlusion import CachedOcclusion
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from wheretolook.evaluation.bootstrap import ClusterBootstrap
+from wheretolook.evaluation.statistics import ClusterBootstrap
 
 
 def test_interval_of_independent_observations_is_binomial() -> None:

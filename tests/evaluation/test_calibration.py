@@ -8,7 +8,7 @@ from scipy.special import expit
 from sklearn.calibration import calibration_curve
 from sklearn.metrics import log_loss, precision_recall_curve
 
-from wheretolook.evaluation.calibration import (
+from wheretolook.evaluation.statistics import (
     BINS,
     calibration_rows,
     expected_calibration_error,

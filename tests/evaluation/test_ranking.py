@@ -9,7 +9,7 @@ import pytest
 
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.ranking import CandidateViews, choose_at_random, choose_best, choose_oracle, rank_views
-from wheretolook.evaluation.scores import reference_method, score_table, threshold_keys
+from wheretolook.evaluation.results import reference_method, score_table, threshold_keys
 from wheretolook.utils.errors import ConfigError
 
 HAND = CandidateViews(

@@ -10,7 +10,7 @@ import pytest
 
 from synthetic_scores import KEYS, make_scores
 from wheretolook.evaluation.report import best_in_words, score_markdown
-from wheretolook.evaluation.scores import main_rows
+from wheretolook.evaluation.results import main_rows
 from wheretolook_paper.evaluation.comparisons import comparisons_markdown
 
 FINEST = KEYS[0]

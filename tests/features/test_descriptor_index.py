@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wheretolook.features import descriptor_index
-from wheretolook.features.descriptor_index import DescriptorIndex, has_index
+from wheretolook.features import matching as descriptor_index
 from wheretolook.features.matches import match
-from wheretolook.features.matching import MAX_NEAREST, DescriptorMatcher
+from wheretolook.features.matching import MAX_NEAREST, DescriptorIndex, DescriptorMatcher, has_index
 
 
 def stored(values: np.ndarray) -> np.ndarray:

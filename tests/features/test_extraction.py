@@ -7,9 +7,8 @@ import pycolmap
 import pytest
 
 from features.textures import color_texture
-from wheretolook.features.config import ExtractorConfig
-from wheretolook.features.descriptors import quantize_descriptors, unit_descriptors
-from wheretolook.features.extraction import KeypointExtractor
+from wheretolook.features.config import ExtractorConfig, KeypointExtractor
+from wheretolook.features.extractor import quantize_descriptors, unit_descriptors
 from wheretolook.utils.processes import WorkerPool
 
 METHODS = ("colmap", "opencv")

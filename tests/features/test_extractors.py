@@ -9,11 +9,10 @@ import pytest
 
 from twins.features import mutual_matches
 from wheretolook.features.aliked_batch import detect_and_describe
-from wheretolook.features.config import ExtractorConfig
-from wheretolook.features.descriptors import unit_descriptors
-from wheretolook.features.extraction import KeypointExtractor
+from wheretolook.features.config import ExtractorConfig, KeypointExtractor
+from wheretolook.features.extractor import unit_descriptors
+from wheretolook.features.matching import SimilarityMatcher
 from wheretolook.features.registry import all_kinds, kind_of
-from wheretolook.features.similarity import SimilarityMatcher
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.utils.errors import WeightsError
 
@@ -46,7 +45,7 @@ def test_the_records_of_older_maps_and_labels_stay_valid():
 
 @pytest.mark.parametrize("n", [0, 1, 2, 700, 2000])
 def test_mutual_nearest_neighbours_are_those_of_all_products(n, monkeypatch):
-    monkeypatch.setattr("wheretolook.features.similarity._PRODUCTS", {"cpu": 60_000})  # several blocks
+    monkeypatch.setattr("wheretolook.features.matching._PRODUCTS", {"cpu": 60_000})  # several blocks
     landmarks = unit(n, 64).astype(np.float16)
     noisy = unit_descriptors(
         np.concatenate([landmarks[: n // 2], landmarks[: n // 4]]) + 0.05 * unit(n // 2 + n // 4, 64, 1)

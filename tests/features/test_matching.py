@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from twins.features import nearest
 from wheretolook.features import matching
-from wheretolook.features.descriptors import quantize_descriptors, unit_descriptors
+from wheretolook.features.extractor import quantize_descriptors, unit_descriptors
 from wheretolook.features.matches import match
 from wheretolook.features.matching import DescriptorMatcher
 

@@ -8,9 +8,8 @@ import warp as wp
 from scipy.spatial import KDTree
 
 from features.textures import texture
-from wheretolook.features.config import ExtractorConfig
-from wheretolook.features.extraction import KeypointExtractor
-from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.config import ExtractorConfig, KeypointExtractor
+from wheretolook.features.extractor import Keypoints
 from wheretolook.features.warp_sift import WarpSift
 
 EVERYTHING = ExtractorConfig(max_keypoints=100_000)

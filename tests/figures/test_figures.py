@@ -13,7 +13,7 @@ from matplotlib.colors import to_hex
 from box_scenes import furnished_room
 from synthetic_dataset import make_dataset
 from synthetic_scores import EVERY_METHOD, FISHER, KEYS, make_scores
-from wheretolook.evaluation.calibration import calibration_rows
+from wheretolook.evaluation.statistics import calibration_rows
 from wheretolook.figures.calibration import calibration_figure
 from wheretolook.figures.dollhouse import dollhouse
 from wheretolook.figures.labels import SHADES, label_figure

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from wheretolook.features.descriptors import DescriptorKind
+from wheretolook.features.extractor import DescriptorKind
 from wheretolook.features.sift import SIFT
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.mapping.triangulation import fill_database

@@ -19,8 +19,7 @@ from holdout.rendered_room import write_rendered_room
 from selection.room import WEIGHTS
 from wheretolook.cli import parse_command
 from wheretolook.geometry.poses import camera_centers
-from wheretolook.holdout.holdout import without
-from wheretolook.holdout.holdout_blocks import KEPT, MIN_REST, choose_blocks, landmarks_kept
+from wheretolook.holdout.holdout import KEPT, MIN_REST, choose_blocks, landmarks_kept, without
 from wheretolook.holdout.photo_map import open_map
 from wheretolook.holdout.report import CheckReport
 from wheretolook.holdout.scores import whole_map
@@ -28,7 +27,7 @@ from wheretolook.mapping.colmap_model import model_arrays, observation_matrix, r
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.scorers.adapted.network import AdaptedNetwork
 from wheretolook.scorers.set.network import SetNetwork
-from wheretolook.scorers.set.own_images import for_map
+from wheretolook.scorers.set.score import for_map
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import ConfigError, MapError, WeightsError
 from wheretolook.visibility.hidden_points import HiddenPointRemoval

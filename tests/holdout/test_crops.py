@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera, field_of_view_deg
 from wheretolook.geometry.poses import transform
-from wheretolook.holdout.crops import PANS, crop_pixels, crops_of
+from wheretolook.holdout.photo_map import PANS, crop_pixels, crops_of
 from wheretolook.utils.errors import ConfigError
 
 CAMERAS = [PinholeCamera(640, 480, 320.0), ColmapCamera("SIMPLE_RADIAL", 800, 600, (500.0, 390.0, 310.0, -0.05))]

@@ -21,8 +21,8 @@ from wheretolook.holdout.holdout_views import evaluated_photographs
 from wheretolook.holdout.photo_map import WORK, open_map
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.scorers.set.network import SetNetwork
-from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import finished_runs
+from wheretolook.tracking.store import TrackingConfig
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.weights import read_training
 from wheretolook.utils.shipped import WEIGHTS, shipped

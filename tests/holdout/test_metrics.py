@@ -7,8 +7,7 @@ import pandas as pd
 import pytest
 from sklearn.metrics import roc_auc_score
 
-from wheretolook.evaluation.bootstrap import ClusterBootstrap
-from wheretolook.evaluation.calibration import expected_calibration_error
+from wheretolook.evaluation.statistics import ClusterBootstrap, expected_calibration_error
 from wheretolook.holdout.metrics import (
     RESAMPLES,
     measure,

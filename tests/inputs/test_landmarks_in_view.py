@@ -12,7 +12,7 @@ from wheretolook.geometry.poses import Float, poses_looking_along, transform
 from wheretolook.inputs.channels import ATTRIBUTES, POSE_ATTRIBUTES
 from wheretolook.inputs.landmark_features import LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
-from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
+from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
 from wheretolook.visibility.occlusion import StoredOcclusion
 
 COLMAP = ColmapCamera("OPENCV", 160, 120, (80.0, 80.0, 80.0, 60.0, -0.1, 0.01, 1e-3, -1e-3))

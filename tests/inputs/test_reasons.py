@@ -11,8 +11,8 @@ from box_scenes import furnished_room
 from selection.room import POINTS, write_room
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.inputs.landmark_features import ReasonCounter
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.inputs.reasons import ReasonCounter
 from wheretolook.scenes.loading import save_glb
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import lognorm
 
-from wheretolook.dataset.thresholds import ACCURACY
+from wheretolook.dataset.config import ACCURACY
 from wheretolook.localization.confidence import RIGHT_PLACE, ConfidenceModel, ErrorModel, probabilities
-from wheretolook.localization.rig_localization import JointLocalization
+from wheretolook.localization.localizer import JointLocalization
 
 
 def pose(n_inliers: int, deviation_m: float, rivals: tuple[JointLocalization, ...] = ()) -> JointLocalization:

@@ -9,10 +9,9 @@ from scipy.spatial.transform import Rotation
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import camera_centers, compose_poses, pose_error, poses_looking_along
 from wheretolook.localization.confidence import probabilities
-from wheretolook.localization.estimation import PoseEstimator
+from wheretolook.localization.estimation import PoseEstimator, turn_errors
+from wheretolook.localization.localizer import JointLocalizer
 from wheretolook.localization.rig import Look, rig_of
-from wheretolook.localization.rig_localization import JointLocalizer
-from wheretolook.localization.turn_errors import turn_errors
 from wheretolook.utils.errors import PoseError
 
 CAMERA = PinholeCamera()

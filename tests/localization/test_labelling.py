@@ -11,11 +11,11 @@ import pytest
 
 from localization.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, file_bytes, label, map_room, times
 from one_scene import label_viewpoints
+from wheretolook.commands.options import MeshSource, ScenesConfig
 from wheretolook.commands.scenes import Scenes
-from wheretolook.commands.scenes_config import MeshSource, ScenesConfig
 from wheretolook.dataset.viewpoint_files import FIRST_FIELDS, SCHEMA, read_table, write_table
 from wheretolook.dataset.viewpoint_table import LOCALIZED, by_first, is_good, poses
-from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.extractor import Keypoints
 from wheretolook.features.matches import Matches
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import pose_error, transform

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from holdout.corridor import write_corridor
-from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.extractor import Keypoints
 from wheretolook.features.registry import all_kinds
 from wheretolook.geometry.camera import cameras_by_id
 from wheretolook.geometry.poses import pose_error
-from wheretolook.holdout.holdout import hold_out_blocks
-from wheretolook.holdout.holdout_blocks import choose_blocks
+from wheretolook.holdout.holdout import choose_blocks, hold_out_blocks
 from wheretolook.holdout.photo_map import open_map
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer

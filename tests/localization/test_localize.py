@@ -18,8 +18,7 @@ from wheretolook.cli import main
 from wheretolook.geometry.poses import Float, pose_error, poses_looking_along
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.io.poses import read_poses
-from wheretolook.localization.rig import checked_turns
-from wheretolook.localization.turns import read_turns
+from wheretolook.localization.rig import checked_turns, read_turns
 from wheretolook.mapping.colmap_model import read_model
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.landmarks import Landmarks

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from wheretolook.localization.pipeline import Step, run_pipeline
+from wheretolook.localization.shard import Step, run_pipeline
 
 
 @pytest.fixture(autouse=True)

@@ -11,14 +11,14 @@ import pytest
 
 from synthetic_dataset import make_dataset
 from wheretolook.commands.label import log_labels
+from wheretolook.dataset.config import ALL
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.thresholds import ALL
 from wheretolook.dataset.viewpoint_files import read_table, write_table
 from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, UNLABELLED, pose_columns
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.localization.report import POSITIVE, label_markdown, label_summary
-from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import artifact, newest_run
+from wheretolook.tracking.store import TrackingConfig
 from wheretolook.utils.errors import TableError
 
 NAN = float("nan")

@@ -14,11 +14,10 @@ from wheretolook.dataset.viewpoint_files import MATCH_FIELDS, SCHEMA, read_table
 from wheretolook.dataset.viewpoint_table import TOO_FEW_MATCHES, is_good, poses
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.poses import transform
-from wheretolook.localization.config import LocalizerConfig
+from wheretolook.localization.config import LocalizerConfig, versions
 from wheretolook.localization.labeller import MANIFEST
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.shard import label_rows
-from wheretolook.localization.versions import versions
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh

@@ -13,9 +13,17 @@ from wheretolook import LocalizationMap, load_scorer
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.pose_information import bearing_numbers
 from wheretolook.geometry.poses import poses_looking_along, rotation_angle_deg, rotation_looking_along
-from wheretolook.looks.joint_visibility import CandidateViews, candidate_views, log_position_variance
-from wheretolook.looks.selection import Rotations, best_views, candidates, score_of_set, select_views
-from wheretolook.looks.set_score import SetScoreModel
+from wheretolook.looks.selection import (
+    CandidateViews,
+    Rotations,
+    SetScoreModel,
+    best_views,
+    candidate_views,
+    candidates,
+    log_position_variance,
+    score_of_set,
+    select_views,
+)
 from wheretolook.scorers.base import Scorer
 from wheretolook.utils.errors import ConfigError, PlanningError
 from wheretolook_paper.evaluation.look_strategies import count_score, information_score

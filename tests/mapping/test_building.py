@@ -17,8 +17,7 @@ from wheretolook.mapping import triangulation
 from wheretolook.mapping.colmap_model import colmap_poses
 from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG, MapConfig
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
-from wheretolook.mapping.rendered_map import _walk, build_map
-from wheretolook.mapping.walk import plan_walk
+from wheretolook.mapping.rendered_map import _walk, build_map, plan_walk
 from wheretolook.rendering.appearance import Appearance
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.utils.errors import MapError

@@ -13,6 +13,7 @@ from wheretolook.geometry.camera import CameraConfig
 from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, MarkerConfig, PhotographsConfig
 from wheretolook.mapping.georeference import (
     MapScale,
+    Marker,
     fit_similarity,
     read_marker_table,
     read_positions,
@@ -20,7 +21,6 @@ from wheretolook.mapping.georeference import (
     scale_from_markers,
     scale_from_positions,
 )
-from wheretolook.mapping.markers import Marker
 from wheretolook.utils.errors import ConfigError, MapError
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float64)

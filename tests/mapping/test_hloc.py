@@ -14,8 +14,7 @@ from mapping.test_landmarks import hand_written_model
 from wheretolook.cli import main
 from wheretolook.mapping.colmap_model import model_arrays, read_model, write_model
 from wheretolook.mapping.feature_files import read_descriptors
-from wheretolook.mapping.mapped_images import open_colmap
-from wheretolook.mapping.sources import choose_features, find_features, find_photographs
+from wheretolook.mapping.mapped_images import choose_features, find_features, find_photographs, open_colmap
 from wheretolook.utils.errors import MapWarning
 from wheretolook.utils.files import sha256
 from wheretolook.utils.shipped import WEIGHTS, shipped

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from wheretolook.features.descriptors import quantize_descriptors, unit_descriptors
+from wheretolook.features.extractor import quantize_descriptors, unit_descriptors
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks, max_cosine_to_other
 from wheretolook.utils.errors import MapError, MapWarning

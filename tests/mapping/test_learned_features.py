@@ -10,7 +10,7 @@ import pytest
 
 from mapping.test_landmarks import hand_written_model
 from mapping.test_own_models import written
-from wheretolook.features.descriptors import unit_descriptors
+from wheretolook.features.extractor import unit_descriptors
 from wheretolook.features.registry import all_kinds
 from wheretolook.mapping.colmap_model import model_arrays
 from wheretolook.mapping.feature_files import read_features

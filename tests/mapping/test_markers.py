@@ -9,7 +9,7 @@ import pytest
 
 from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room
 from wheretolook.geometry.poses import transform
-from wheretolook.mapping.markers import MarkerView, detect_markers, place_marker
+from wheretolook.mapping.georeference import MarkerView, detect_markers, place_marker
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.utils.errors import MapError
 

@@ -16,7 +16,7 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import model_arrays, read_model
 from wheretolook.mapping.config import place_name
 from wheretolook.mapping.landmarks import load_colmap_landmarks
-from wheretolook.mapping.sanity import scale_warning, up_axis_warning
+from wheretolook.mapping.map_frame import scale_warning, up_axis_warning
 from wheretolook.utils.errors import MapError, MapWarning
 
 pytestmark = pytest.mark.filterwarnings("error::wheretolook.utils.errors.MapWarning")

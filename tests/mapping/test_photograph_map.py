@@ -16,13 +16,13 @@ from all_options import AllOptions, run
 from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room, take_photographs
 from wheretolook.commands.label import Label
 from wheretolook.commands.map import Map
+from wheretolook.commands.options import ScenesConfig
 from wheretolook.commands.sample import Sample
-from wheretolook.commands.scenes_config import ScenesConfig
 from wheretolook.commands.viewpoint_map import BuildViewpointMap
-from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.viewpoint_table import UNLABELLED, poses
 from wheretolook.geometry.poses import camera_centers
-from wheretolook.mapping import sfm as incremental
+from wheretolook.mapping import photograph_map as incremental
 from wheretolook.mapping.colmap_model import colmap_poses, model_arrays, read_model
 from wheretolook.mapping.config import FrameOptions, MapConfig, MarkerConfig, PhotographsConfig
 from wheretolook.mapping.georeference import fit_similarity, median_depths

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mapping.conftest import BoxFreeSpace
-from wheretolook.mapping import walk
-from wheretolook.mapping.walk import plan_walk
+from wheretolook.mapping import rendered_map as walk
+from wheretolook.mapping.rendered_map import plan_walk
 from wheretolook.utils.errors import ConfigError, SceneError
 
 SIZE = (8.0, 6.0, 2.6)

@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import experiment_id
-from wheretolook.tracking.store import client
+from wheretolook.tracking.store import TrackingConfig, client
 from wheretolook.utils.errors import InUseError, MissingRunError
 from wheretolook_paper.commands.ui import Ui, comparisons
 

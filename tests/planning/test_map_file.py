@@ -12,10 +12,8 @@ import numpy as np
 import pytest
 
 from planning.rooms import GRID, build, joined, room_landmarks, room_map
-from wheretolook.planning.map_building import update_viewpoint_map
-from wheretolook.planning.map_file import ARRAYS, DESCRIPTION, LAYOUT
-from wheretolook.planning.scene_map import shares_below
-from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.planning.scene_map import shares_below, update_viewpoint_map
+from wheretolook.planning.viewpoint_map import ARRAYS, DESCRIPTION, LAYOUT, ViewpointMap
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.utils.errors import MapFormatError
 

@@ -13,8 +13,7 @@ from scorers.test_scorers import weights_of
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.planning.map_building import build_viewpoint_map, update_viewpoint_map
-from wheretolook.planning.scene_map import shares_below
+from wheretolook.planning.scene_map import build_viewpoint_map, shares_below, update_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.scorers.registry import make_scorer, scorers
 from wheretolook.utils.errors import ConfigError

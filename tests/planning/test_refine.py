@@ -9,7 +9,7 @@ import pytest
 
 from planning.rooms import DIRECTIONS, GRID, free_voxels, room_landmarks, room_map
 from wheretolook.geometry.poses import Float
-from wheretolook.planning.refine import refine_directions
+from wheretolook.planning.stops import refine_directions
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
 

@@ -7,7 +7,7 @@ import pytest
 
 from planning.rooms import DIRECTIONS, GRID, build, free_voxels, room_landmarks, room_map
 from wheretolook.geometry.poses import poses_looking_along, rotation_angle_deg, rotation_looking_along
-from wheretolook.planning.map_building import build_viewpoint_map
+from wheretolook.planning.scene_map import build_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewChoice, ViewpointMap
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.utils.errors import ConfigError, SceneError

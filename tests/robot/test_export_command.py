@@ -20,10 +20,10 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import write_model
 from wheretolook.robot.wheretolook_robot import RobotScorer
 from wheretolook.scenes.loading import save_glb
+from wheretolook.scorers.weights import load_scorer
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import MapWarning
 from wheretolook.utils.shipped import shipped
-from wheretolook.weights.resolve import load_scorer
 
 WEIGHTS = shipped("data/release/weights/set.safetensors")
 

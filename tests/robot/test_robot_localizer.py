@@ -17,15 +17,13 @@ from scipy.spatial.transform import Rotation
 from synthetic_dataset import CAMERA, make_landmarks
 from wheretolook import load_scorer
 from wheretolook.features.config import ExtractorConfig
-from wheretolook.features.descriptors import quantize_descriptors
-from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.extractor import Keypoints, quantize_descriptors
 from wheretolook.features.matches import match
 from wheretolook.features.matching import DescriptorMatcher
 from wheretolook.features.sift import OpenCvSift
 from wheretolook.geometry.lattices import direction_lattice
-from wheretolook.geometry.local_origin import local_origin
 from wheretolook.geometry.poses import Float, camera_centers, pose_error, poses_looking_along, transform
-from wheretolook.geometry.similarity import Similarity
+from wheretolook.geometry.similarity import Similarity, local_origin
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer
@@ -33,10 +31,8 @@ from wheretolook.localization.rig import Look
 from wheretolook.looks.next_look import N_DIRECTIONS, NextLookSelector, mean_scores_by_pitch
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.map_frame import MapFrame
-from wheretolook.robot.export import export_robot
-from wheretolook.robot.image_sequence import ImageSequence
-from wheretolook.robot.localizer import RobotLocalizer
-from wheretolook.robot.localizer_export import export_localizer
+from wheretolook.robot.export import export_localizer, export_robot
+from wheretolook.robot.localizer import ImageSequence, RobotLocalizer
 from wheretolook.robot.wheretolook_robot import RobotScorer
 from wheretolook.scorers.base import Scorer
 from wheretolook.utils.errors import ConfigError, MapError

@@ -21,22 +21,20 @@ from synthetic_dataset import CAMERA, make_landmarks
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, invert_poses, poses_looking_along
-from wheretolook.inputs.channels import ATTRIBUTES
+from wheretolook.inputs.channels import ATTRIBUTES, FeatureStatistics
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.robot import wheretolook_robot
 from wheretolook.robot.export import export_robot, pinhole_of
 from wheretolook.robot.wheretolook_robot import RobotScorer
 from wheretolook.scorers.set import network as set_network
 from wheretolook.scorers.set.network import SetNetwork
+from wheretolook.scorers.weights import load_scorer
 from wheretolook.space.free_space import FreeSpace
-from wheretolook.training.trained_network import TrainedNetwork
-from wheretolook.training.training_range import TrainingRange
+from wheretolook.training.trained_network import TrainedNetwork, TrainingRange
 from wheretolook.utils.errors import CameraError, WeightsError
 from wheretolook.utils.shipped import shipped
 from wheretolook.visibility.occlusion import MeshOcclusion
-from wheretolook.weights.resolve import load_scorer
 
 pytestmark = pytest.mark.filterwarnings("ignore::wheretolook.utils.errors.OutOfRangeWarning")
 

@@ -9,7 +9,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from wheretolook.commands.scenes_config import ScenesConfig
+from wheretolook.commands.options import ScenesConfig
 from wheretolook.dataset.layout import SceneFolder
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.space.free_space import FreeSpace

@@ -9,7 +9,7 @@ import numpy as np
 
 from box_scenes import box_quads, quads_mesh
 from wheretolook import load_scorer
-from wheretolook.features.descriptors import quantize_descriptors
+from wheretolook.features.extractor import quantize_descriptors
 from wheretolook.features.opencv_sift import RootSift
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
@@ -18,8 +18,7 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.looks.next_look import mean_scores_by_pitch
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.warp_renderer import WarpRenderer
-from wheretolook.robot.export import export_robot
-from wheretolook.robot.localizer_export import export_localizer
+from wheretolook.robot.export import export_localizer, export_robot
 
 CENTER = np.array((3.0, 2.5, 1.2))
 WEIGHTS = Path(__file__).parents[2] / "data" / "release" / "weights" / "set.safetensors"

@@ -17,7 +17,7 @@ from PIL import Image
 from box_scenes import random_texture
 from scenes.test_loading import FACES, VERTICES, textured
 from wheretolook.scenes.loading import load_mesh
-from wheretolook.utils import memory
+from wheretolook.utils import devices as memory
 from wheretolook.utils.errors import SceneError
 
 

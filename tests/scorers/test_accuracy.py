@@ -17,7 +17,7 @@ from scipy.stats import lognorm
 
 from selection.room import write_room
 from synthetic_dataset import CAMERA, make_landmarks
-from wheretolook.dataset.thresholds import ACCURACY
+from wheretolook.dataset.config import ACCURACY
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import direction_lattice, fibonacci_sphere
 from wheretolook.geometry.poses import Float, poses_looking_along
@@ -28,11 +28,11 @@ from wheretolook.scorers.registry import find, make_scorer
 from wheretolook.scorers.set.accuracy import STATISTICS, AccuracyModel, LogError
 from wheretolook.scorers.set.network import ALL_STATISTICS
 from wheretolook.scorers.set.score import SetScorer
+from wheretolook.scorers.weights import load_scorer
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.training.weights import read_header
 from wheretolook.utils.errors import ConfigError, MapWarning, OutOfRangeWarning, WeightsError
 from wheretolook.utils.shipped import WEIGHTS, shipped
-from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.studies import fit_accuracy
 
 ACCURACIES = ((1e-9, 1e-9), (0.01, 0.1), ACCURACY, (0.1, 1.0), (0.25, 2.0), (math.inf, math.inf))

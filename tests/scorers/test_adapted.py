@@ -12,7 +12,7 @@ from sklearn.gaussian_process import GaussianProcessClassifier
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
 from synthetic_dataset import make_dataset
-from wheretolook.evaluation.calibration import expected_calibration_error
+from wheretolook.evaluation.statistics import expected_calibration_error
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -21,10 +21,10 @@ from wheretolook.scorers.adapted.gp_correction import PRIOR, LocalizedViews, ada
 from wheretolook.scorers.adapted.kernel import Correction, nearness
 from wheretolook.scorers.adapted.network import AdaptedNetwork
 from wheretolook.scorers.set.network import SetNetwork
+from wheretolook.scorers.weights import load_scorer
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import WeightsError
 from wheretolook.utils.shipped import WEIGHTS, shipped
-from wheretolook.weights.resolve import load_scorer
 
 SET = shipped(WEIGHTS) / "set.safetensors"
 

@@ -28,13 +28,12 @@ from wheretolook.scorers.matchability.config import MatchabilityConfig
 from wheretolook.scorers.matchability.network import MatchabilityNetwork
 from wheretolook.scorers.registry import learned, make_scorer, scorers
 from wheretolook.scorers.set.config import SetConfig
-from wheretolook.tracking.config import TrackingConfig
-from wheretolook.tracking.store import client
+from wheretolook.scorers.weights import load_scorer
+from wheretolook.tracking.store import TrackingConfig, client
 from wheretolook.training.provenance import TrainedModel
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.weights import METADATA_KEY, method_of_weights, read_training
 from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, TableError, WeightsError
-from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.scorers.conv import ConvConfig
 from wheretolook_paper.scorers.sphere import SphereConfig
 from wheretolook_paper.scorers.trees import TreesConfig

@@ -24,11 +24,10 @@ from wheretolook.mapping.mapped_images import MappedImages
 from wheretolook.robot.export import export_robot
 from wheretolook.robot.wheretolook_robot import RobotScorer
 from wheretolook.scorers.set.network import SetNetwork
-from wheretolook.scorers.set.own_images import OFFSETS, detection_offset, for_map
+from wheretolook.scorers.set.score import OFFSETS, detection_offset, for_map
+from wheretolook.scorers.weights import load_scorer
 from wheretolook.training.trained_network import TrainedNetwork
-from wheretolook.visibility.cached_occlusion import CachedOcclusion
-from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
-from wheretolook.weights.resolve import load_scorer
+from wheretolook.visibility.occlusion import CachedOcclusion, OcclusionModel, StoredOcclusion
 
 WIDE = PinholeCamera(640, 480, 320.0)
 NARROW = PinholeCamera(640, 480, 640.0)

@@ -13,9 +13,9 @@ from selection.room import write_room
 from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scorers.set.network import SetNetwork
+from wheretolook.scorers.weights import load_scorer
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.shipped import WEIGHTS, shipped
-from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.studies.calibrate_photographs import fitted_offset
 
 

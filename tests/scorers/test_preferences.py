@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wheretolook.features.descriptors import quantize_descriptors
+from wheretolook.features.extractor import quantize_descriptors
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks, max_cosine_to_other
-from wheretolook.weights.resolve import load_scorer
+from wheretolook.scorers.weights import load_scorer
 
 CAMERA = PinholeCamera(320, 240, 160.0)
 

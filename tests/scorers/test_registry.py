@@ -21,11 +21,10 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scorers import registry
 from wheretolook.scorers.registry import all_methods, make_scorer, methods_named, scorers
 from wheretolook.scorers.visible import METHODS
-from wheretolook.tracking.config import TrackingConfig
-from wheretolook.tracking.store import client
+from wheretolook.scorers.weights import load_scorer, resolve_weights
+from wheretolook.tracking.store import TrackingConfig, client
 from wheretolook.training.weights import read_weights, write_weights
 from wheretolook.utils.errors import ConfigError, WeightsError
-from wheretolook.weights.resolve import load_scorer, resolve_weights
 
 SOURCE = Path(wheretolook.__file__).parent
 WEIGHTS = Path(__file__).parents[2] / "data" / "release" / "weights"
@@ -37,7 +36,7 @@ from pathlib import Path
 import numpy as np
 
 from wheretolook.scorers.base import CountingScorer
-from wheretolook.scorers.method import Method, MethodStyle
+from wheretolook.scorers.registry import Method, MethodStyle
 
 
 @dataclass(frozen=True)
@@ -124,7 +123,7 @@ from wheretolook.commands.evaluate import evaluate_methods
 from wheretolook.commands.train import train_methods
 from wheretolook.utils.files import write_json
 from wheretolook.tracking.runs import newest_run
-from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.store import TrackingConfig
 
 Figure.savefig = lambda figure, file, **options: file.write(b"")  # figures are built, which is enough here
 folder = Path(sys.argv[1])
@@ -256,9 +255,9 @@ from pathlib import Path
 from synthetic_dataset import CAMERA, make_landmarks
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
+from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
 from wheretolook.scorers.registry import make_scorer
-from wheretolook.weights.resolve import load_scorer
+from wheretolook.scorers.weights import load_scorer
 
 weights, out = Path(sys.argv[1]), Path(sys.argv[2])
 rng = np.random.default_rng(1)

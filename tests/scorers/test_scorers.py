@@ -14,10 +14,9 @@ from synthetic_dataset import CAMERA, make_landmarks, make_mapping_poses
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.bins import BinnedViews
-from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
+from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, FeatureStatistics
 from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.scorers.adapted.network import AdaptedNetwork
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.bins import BinsScorer
@@ -26,8 +25,8 @@ from wheretolook.scorers.mlp.network import NetworkSpec, ViewpointNetwork
 from wheretolook.scorers.registry import make_scorer, scorers
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.visible import VisibleScorer
+from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.errors import CameraError, ConfigError, PoseError, WeightsError
-from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.scorers.conv.network import ConvNetwork, ConvSpec
 from wheretolook_paper.scorers.pooled_features import pool
 from wheretolook_paper.scorers.sphere import SphereConfig

@@ -10,8 +10,7 @@ import numpy as np
 import pandas as pd
 
 from selection.room import POINTS
-from wheretolook.select.pose_prior import PosePrior
-from wheretolook.select.where_to_look import WhereToLook
+from wheretolook.select.where_to_look import PosePrior, WhereToLook
 
 FREE_TO_X = 5.0  # beyond is geometry
 

@@ -10,8 +10,7 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.geometry.tsdf import DepthImage, TsdfConfig, TsdfVolume
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.space.config import FreeSpaceConfig
-from wheretolook.space.free_space import FreeSpace
-from wheretolook.space.tsdf_space import TsdfSpace, seen_through
+from wheretolook.space.free_space import FreeSpace, TsdfSpace, seen_through
 
 VOXEL_M = 0.03
 CLEARANCE_M = 0.2

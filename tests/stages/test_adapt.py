@@ -14,10 +14,10 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_files import write_table
 from wheretolook.dataset.viewpoint_table import is_good, poses
 from wheretolook.evaluation.adaptation import compare_log_odds
-from wheretolook.tracking.config import TrackingConfig
+from wheretolook.scorers.weights import load_scorer
 from wheretolook.tracking.runs import finished_runs
+from wheretolook.tracking.store import TrackingConfig
 from wheretolook.training.weights import read_training
-from wheretolook.weights.resolve import load_scorer
 
 
 @pytest.fixture

@@ -20,11 +20,10 @@ from wheretolook.dataset.viewpoint_files import write_table
 from wheretolook.dataset.viewpoint_table import LABELS, NO_POSE, UNLABELLED, is_good, poses
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.results import latest_scores
-from wheretolook.tracking.config import TrackingConfig
+from wheretolook.scorers.weights import load_scorer
 from wheretolook.tracking.runs import artifact, finished_runs, newest_run, start_run
-from wheretolook.tracking.store import client
+from wheretolook.tracking.store import TrackingConfig, client
 from wheretolook.utils.errors import ConfigError, TableError, WeightsError
-from wheretolook.weights.resolve import load_scorer
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 

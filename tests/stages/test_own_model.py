@@ -17,15 +17,14 @@ from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room, 
 from wheretolook.cli import main
 from wheretolook.commands.label import Label
 from wheretolook.commands.map import Map
-from wheretolook.commands.options import MapUseOptions, select_options
+from wheretolook.commands.options import MapUseOptions, ScenesConfig, select_options
 from wheretolook.commands.plan import Plan
 from wheretolook.commands.preconditions import extractor_of
 from wheretolook.commands.sample import Sample
-from wheretolook.commands.scenes_config import ScenesConfig
 from wheretolook.commands.viewpoint_map import BuildViewpointMap
+from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig, PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
@@ -37,7 +36,7 @@ from wheretolook.planning.config import PathConfig, PlanConfig, ViewpointMapConf
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.loading import save_glb
 from wheretolook.space.config import MappedSpaceConfig
-from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.store import TrackingConfig
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError, WeightsError
 
 SIZE = (6.0, 5.0, 3.0)

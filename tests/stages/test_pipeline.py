@@ -25,15 +25,13 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.localization.shard import LabelledShard, SceneJob, ShardWorker
 from wheretolook.scorers.registry import scorers
 from wheretolook.scorers.train_config import TrainConfig
-from wheretolook.space.free_space import FreeSpace
-from wheretolook.space.tsdf_space import TsdfSpace
-from wheretolook.tracking.config import TrackingConfig
+from wheretolook.scorers.weights import load_scorer
+from wheretolook.space.free_space import FreeSpace, TsdfSpace
 from wheretolook.tracking.runs import finished_runs, newest_run
+from wheretolook.tracking.store import TrackingConfig
 from wheretolook.utils.errors import TableError
-from wheretolook.utils.files import fingerprint
-from wheretolook.utils.reading import read_json_object
+from wheretolook.utils.files import fingerprint, read_json_object
 from wheretolook.visibility.occlusion import StoredOcclusion
-from wheretolook.weights.resolve import load_scorer
 
 pytestmark = pytest.mark.slow  # the whole line, several times over
 

@@ -13,11 +13,11 @@ from box_scenes import ROOM
 from planning.rooms import CAMERA, build, occlusion, room_landmarks, room_map, write_room_dataset
 from wheretolook.cli import main
 from wheretolook.dataset.layout import Dataset
-from wheretolook.planning.map_building import build_viewpoint_map
+from wheretolook.planning.scene_map import build_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.scorers.registry import make_scorer
+from wheretolook.scorers.weights import resolve_weights
 from wheretolook.utils.shipped import WEIGHTS, shipped
-from wheretolook.weights.resolve import resolve_weights
 
 LANDMARKS = room_landmarks(200)
 RELEASED = Path(__file__).parents[2] / "data" / "release" / "weights"

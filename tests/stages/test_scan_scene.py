@@ -9,11 +9,11 @@ import pytest
 from all_options import AllOptions, run
 from scans.recordings import COLOR, room, walk, write_seven_scenes
 from wheretolook.commands.map import Map
+from wheretolook.commands.options import MeshSource, ScenesConfig
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.scenes import Scenes
-from wheretolook.commands.scenes_config import MeshSource, ScenesConfig
+from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.geometry.camera import CameraConfig
 from wheretolook.geometry.poses import camera_centers

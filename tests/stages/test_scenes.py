@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from box_scenes import furnished_room
+from wheretolook.commands.options import MeshSource, ScenesConfig
 from wheretolook.commands.scenes import Scenes
-from wheretolook.commands.scenes_config import MeshSource, ScenesConfig
 from wheretolook.dataset.layout import Dataset
 from wheretolook.scenes.loading import save_glb
 from wheretolook.utils.errors import TableError

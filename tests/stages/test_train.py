@@ -19,13 +19,12 @@ from wheretolook.dataset.viewpoint_files import write_table
 from wheretolook.dataset.viewpoint_table import NO_POSE, UNLABELLED, is_good
 from wheretolook.scorers.mlp.network import ViewpointNetwork
 from wheretolook.scorers.train_config import TrainConfig
-from wheretolook.tracking.config import TrackingConfig
-from wheretolook.tracking.store import client
+from wheretolook.scorers.weights import load_scorer
+from wheretolook.tracking.store import TrackingConfig, client
 from wheretolook.training.data import ViewpointDataModule, hold_out_locations
 from wheretolook.training.provenance import training_fingerprint, was_trained_on
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import ConfigError, TableError
-from wheretolook.weights.resolve import load_scorer
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 

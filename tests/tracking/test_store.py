@@ -13,9 +13,8 @@ from pathlib import Path
 import pytest
 from tests.disks import fill, read_only, small_disk
 
-from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import artifact, experiment_id, finished_runs, start_run
-from wheretolook.tracking.store import check_store, client
+from wheretolook.tracking.store import TrackingConfig, check_store, client
 from wheretolook.utils.errors import TrackingError
 
 SOON_S = 30.0
@@ -109,7 +108,7 @@ def test_a_disk_without_room_is_found_before_work_starts_and_can_be_read(tmp_pat
 MAKE = """
 import sys
 from wheretolook.tracking.runs import start_run
-from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.store import TrackingConfig
 print("ready", flush=True)
 sys.stdin.readline()
 with start_run(TrackingConfig(sys.argv[1]), "a", "train", {"dataset": "d"}):

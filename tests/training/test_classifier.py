@@ -11,8 +11,8 @@ from torch import nn
 
 from wheretolook.inputs.channels import CHANNELS
 from wheretolook.scorers.mlp.network import add_noise
-from wheretolook.training.classifier import weight_penalty, weighted_bce
 from wheretolook.training.data import class_weights
+from wheretolook.training.fit import weight_penalty, weighted_bce
 
 
 def test_loss_equals_a_hand_computation() -> None:

@@ -18,7 +18,7 @@ from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.scorers.matchability.config import MatchabilityConfig
 from wheretolook.scorers.set.config import SetConfig
-from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.store import TrackingConfig
 from wheretolook.training.weights import read_weights
 from wheretolook_paper.scorers.trees import TreesConfig
 

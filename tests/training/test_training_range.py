@@ -10,7 +10,7 @@ import torch
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.inputs.landmark_features import ViewLandmarks
-from wheretolook.training.training_range import (
+from wheretolook.training.trained_network import (
     QUANTITIES,
     TrainingRange,
     bin_quantities,

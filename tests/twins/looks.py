@@ -7,8 +7,7 @@ from itertools import combinations
 import numpy as np
 
 from wheretolook.geometry.poses import Float
-from wheretolook.looks.joint_visibility import N_SUMS, CandidateViews
-from wheretolook.looks.selection import Rotations, SetScore, ViewSet, score_of_set
+from wheretolook.looks.selection import N_SUMS, CandidateViews, Rotations, SetScore, ViewSet, score_of_set
 
 
 def joint_sums(views: CandidateViews, rows: list[int]) -> Float:

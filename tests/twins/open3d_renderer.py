@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
-from wheretolook.geometry.local_origin import poses_from
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import check_poses
-from wheretolook.rendering.distorted import render_distorted
+from wheretolook.geometry.similarity import poses_from
 from wheretolook.rendering.textures import MAX_ANISOTROPY, build_pyramids, texel_gradients
-from wheretolook.rendering.types import Rendering, camera_rays
+from wheretolook.rendering.warp_renderer import Rendering, camera_rays, render_distorted
 
 Float = NDArray[np.floating[Any]]
 

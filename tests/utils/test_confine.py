@@ -7,10 +7,9 @@ import pytest
 from wheretolook.commands.options import Experiment
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.training.scenes import with_also
-from wheretolook.utils.confine import path_within, safe_child
+from wheretolook.training.data import with_also
 from wheretolook.utils.errors import ConfigError, TableError
-from wheretolook.utils.files import write_json
+from wheretolook.utils.files import path_within, safe_child, write_json
 
 OUTSIDE = ["../victim", "/victim", "a/../../victim", "..", ".", "", "a/b", "a\0b"]
 

@@ -1,6 +1,6 @@
 """Numbers of things are singular for one."""
 
-from wheretolook.utils.markdown import counted
+from wheretolook.utils.texts import counted
 
 
 def test_counted() -> None:

@@ -19,10 +19,8 @@ from wheretolook.commands.viewpoint_map import BuildViewpointMap
 from wheretolook.dataset.dataset_lock import changing
 from wheretolook.planning.config import PlanConfig, ViewpointMapConfig
 from wheretolook.select.waypoints import read_waypoints
-from wheretolook.utils.confine import check_folder_name
 from wheretolook.utils.errors import ConfigError, MapError, StorageError, TableError
-from wheretolook.utils.files import check_output, write_text
-from wheretolook.utils.reading import read_text
+from wheretolook.utils.files import check_folder_name, check_output, read_text, write_text
 
 
 def _fifo(folder: Path) -> Path:

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import yaml
 
+from wheretolook.utils.files import MAX_TEXT_BYTES, read_json, read_json_object, read_yaml
 from wheretolook.utils.npz_files import load_npy, load_npz, save_npz
-from wheretolook.utils.reading import MAX_TEXT_BYTES, read_json, read_json_object, read_yaml
 
 
 def npz_bomb(path: Path) -> None:

@@ -13,7 +13,7 @@ from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.visibility import frustum
 from wheretolook.visibility.counting import FrustumCounter
-from wheretolook.visibility.field_of_view import cells_of, octahedral_directions, tabulate
+from wheretolook.visibility.frustum import cells_of, octahedral_directions, tabulate
 from wheretolook.visibility.occlusion import DevicePoints
 
 DISTORTED = ColmapCamera("OPENCV", 640, 480, (300.0, 310.0, 330.0, 235.0, -0.2, 0.05, 1e-3, -1e-3))

@@ -11,9 +11,15 @@ from scipy.spatial.transform import Rotation
 from box_scenes import ROOM, furnished_room
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
-from wheretolook.visibility.cached_occlusion import CachedOcclusion
-from wheretolook.visibility.hidden_points import HiddenPointRemoval, on_hull, on_hull_plain
-from wheretolook.visibility.hull import LEAST_POINTS, hull_length, may_be_near_hull
+from wheretolook.visibility.hidden_points import (
+    LEAST_POINTS,
+    HiddenPointRemoval,
+    hull_length,
+    may_be_near_hull,
+    on_hull,
+    on_hull_plain,
+)
+from wheretolook.visibility.occlusion import CachedOcclusion
 
 ORIGIN = np.zeros((1, 3))
 

@@ -21,13 +21,12 @@ from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, Scen
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
 from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.scorers.adapted.config import AdaptConfig
-from wheretolook.tracking.config import TrackingConfig
-from wheretolook.tracking.store import check_store, kept_if_not_logged
+from wheretolook.scorers.weights import load_scorer, resolve_weights
+from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError, MapError, OutOfRangeWarning, SceneError, TableError
 from wheretolook.utils.files import fingerprint, missing_folders, remove_if_empty, storage_errors, write_text
 from wheretolook.utils.locks import hold
 from wheretolook.utils.validation import reject
-from wheretolook.weights.resolve import load_scorer, resolve_weights
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -340,7 +339,7 @@ def _save(target: _Target, whole: LocalizationMap, adapted: Adapted, views: Loca
 
     from wheretolook.scorers.adapted.network import AdaptedNetwork
     from wheretolook.scorers.set.network import SetNetwork
-    from wheretolook.scorers.set.own_images import for_map
+    from wheretolook.scorers.set.score import for_map
     from wheretolook.training.trained_network import TrainedNetwork
 
     base = for_map(TrainedNetwork.load(target.weights, SetNetwork, "set", device=whole.device), whole)

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wheretolook.commands.options import OcclusionOptions, ScorerOptions
-from wheretolook.dataset.names import LOCK
-from wheretolook.dataset.thresholds import checked_accuracy
+from wheretolook.dataset.config import LOCK, checked_accuracy
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.locks import hold
-from wheretolook.utils.system import cores
+from wheretolook.utils.processes import cores
 from wheretolook.utils.validation import check_range, reject
 
 if TYPE_CHECKING:
@@ -152,7 +151,7 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
         """Open the map with its photographs' features, and the occlusion model; results go to `work`."""
         from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
         from wheretolook.holdout.photo_map import features_of, open_map
-        from wheretolook.mapping.sources import find_features, find_photographs
+        from wheretolook.mapping.mapped_images import find_features, find_photographs
 
         mesh = self.mesh
         model = self.map if scene is None else scene.map

@@ -25,13 +25,13 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.scorers.registry import methods_named, scorers
 from wheretolook.scorers.train_config import TrainConfig
+from wheretolook.scorers.weights import load_scorer, resolve_weights
 from wheretolook.tracking.runs import ui_command
 from wheretolook.tracking.store import check_store
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import fingerprint
 from wheretolook.utils.version import VERSION
-from wheretolook.weights.resolve import load_scorer, resolve_weights
 
 SECONDS = {"scenes": 5.0, "map": 15.0, "sample": 1.0, "label": 75.0, "train": 25.0, "evaluate": 6.0}
 """Rough cost of a stage on two cores (the first four for each scene), from which the share done is estimated."""
@@ -198,8 +198,7 @@ def _update(bar: tqdm, seconds: float, work: float) -> None:
 def _print_results(options: Demo) -> None:
     """Print which method chose best, and where the picture, tables and runs are."""
     from wheretolook.evaluation.report import best_in_words
-    from wheretolook.evaluation.results import SCORES_CSV, SCORES_MD, SCORES_PNG, results_folder
-    from wheretolook.evaluation.scores import read_scores
+    from wheretolook.evaluation.results import SCORES_CSV, SCORES_MD, SCORES_PNG, read_scores, results_folder
 
     results = results_folder(Dataset.load(options.root), options.evaluate)
     picture = options.root / "results" / OVERVIEW

@@ -14,8 +14,7 @@ from wheretolook.commands.preconditions import load_dataset, open_scene
 from wheretolook.dataset.dataset_lock import reading, reads_dataset
 from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.tracking.config import TrackingConfig
-from wheretolook.tracking.store import check_store, kept_if_not_logged
+from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.files import write_text
 from wheretolook.visibility.config import OcclusionConfig
@@ -23,7 +22,7 @@ from wheretolook.visibility.config import OcclusionConfig
 if TYPE_CHECKING:
     import pandas as pd
 
-    from wheretolook.evaluation.photographs import HeldOutPhotographs
+    from wheretolook.evaluation.scoring import HeldOutPhotographs
     from wheretolook.training.provenance import TrainedModel
 
 
@@ -131,7 +130,7 @@ def evaluate_methods(
     that were held out of their maps are further views, with separate rows; `progress` shows a bar, and prints the table
     at the end unless `show` is off; `occlusion` has the settings of the models that `config.occlusions` names. Returns
     the tables of
-    `wheretolook.evaluation.scores.score_table`, one below the other, with columns `occlusion` and `candidates`.
+    `wheretolook.evaluation.results.score_table`, one below the other, with columns `occlusion` and `candidates`.
 
     Raises:
         TableError: there is no scene of the split, a viewpoint has no label, or all labels of a candidate set are of

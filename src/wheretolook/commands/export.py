@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from wheretolook.commands.options import CameraOptions
-from wheretolook.dataset.thresholds import checked_accuracy
+from wheretolook.dataset.config import checked_accuracy
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.shipped import or_shipped
@@ -66,8 +66,8 @@ class Export(CameraOptions, FrameOptions):
         """Write the robot's folder."""
         from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
         from wheretolook.robot.export import export_robot, pinhole_of
+        from wheretolook.scorers.weights import load_scorer, resolve_weights
         from wheretolook.select.waypoints import grid_waypoints
-        from wheretolook.weights.resolve import load_scorer, resolve_weights
 
         files = ColmapFiles(self.map, mesh=self.mesh, database=self.database, frame=self.frame_options())
         occlusion = "none" if self.mesh is None else "mesh"
@@ -86,7 +86,7 @@ class Export(CameraOptions, FrameOptions):
         assert weights is not None
         if self.localize:
             from wheretolook.looks.next_look import mean_scores_by_pitch
-            from wheretolook.robot.localizer_export import export_localizer
+            from wheretolook.robot.export import export_localizer
             from wheretolook.select.image_localizer import ImageLocalizer
 
             described = ImageLocalizer.open(self.map, self.database, self.frame_options()).landmarks

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def knows_photographs(files: SceneFolder, images: Path | None = None, database: Path | None = None) -> bool:
     """Return whether the photographs that a scene's map was made from, or their features, are known."""
     from wheretolook.mapping.colmap_model import holds_model
-    from wheretolook.mapping.sources import find_features, find_photographs
+    from wheretolook.mapping.mapped_images import find_features, find_photographs
 
     return holds_model(files.map) and any((images, database, find_features(files.map), find_photographs(files.map)))
 

@@ -11,21 +11,26 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from wheretolook.commands.options import LabelOptions, Log, MapUseOptions, Progress, ignore_progress, select_options
+from wheretolook.commands.options import (
+    LabelOptions,
+    Log,
+    MapUseOptions,
+    Progress,
+    ScenesConfig,
+    ignore_progress,
+    select_options,
+)
 from wheretolook.commands.preconditions import existing, extractor_of, load_dataset, naming_file, scene_job
 from wheretolook.commands.scenes import Scenes
-from wheretolook.commands.scenes_config import ScenesConfig
+from wheretolook.dataset.config import ALL
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.dataset.thresholds import ALL
-from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import log as log_to_run
 from wheretolook.tracking.runs import start_run
-from wheretolook.tracking.store import check_store, kept_if_not_logged
+from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.errors import MapError, SceneError, TableError
-from wheretolook.utils.files import write_json, write_text
-from wheretolook.utils.reading import read_json_object
+from wheretolook.utils.files import read_json_object, write_json, write_text
 
 if TYPE_CHECKING:
     import pandas as pd

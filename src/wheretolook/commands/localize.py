@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from wheretolook.commands.options import CameraOptions
-from wheretolook.dataset.thresholds import checked_accuracy
+from wheretolook.dataset.config import checked_accuracy
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.figures import KINDS
 from wheretolook.mapping.config import FrameOptions
@@ -106,8 +106,7 @@ class Localize(CameraOptions, FrameOptions):
 
     def run(self) -> list[Localized]:
         """Localize the images, write `out` and `figure`, and print a summary."""
-        from wheretolook.select.localized import check_localized_format, save_localized
-        from wheretolook.select.query_images import distinct_names
+        from wheretolook.select.localized import check_localized_format, distinct_names, save_localized
         from wheretolook.utils.devices import usable_device
 
         start = time.monotonic()
@@ -166,7 +165,7 @@ class Localize(CameraOptions, FrameOptions):
         """Yield the result of the rig, or of each image, with a progress bar."""
         from tqdm.auto import tqdm
 
-        from wheretolook.localization.prior import PosePrior
+        from wheretolook.localization.rig import PosePrior
         from wheretolook.select.localized import FAILED, Localized
 
         if self.prior is not None:

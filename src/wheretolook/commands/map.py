@@ -5,13 +5,24 @@ from __future__ import annotations
 import warnings
 import zlib
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from functools import wraps
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
-from wheretolook.commands.options import LabelOptions, Log, Progress, SceneOptions, ignore_progress
+from wheretolook.commands.options import (
+    NOT_SCENES,
+    DatasetOptions,
+    LabelOptions,
+    Log,
+    Progress,
+    SceneOptions,
+    ignore_progress,
+    select_options,
+)
 from wheretolook.commands.preconditions import (
     existing,
     load_dataset,
@@ -20,19 +31,18 @@ from wheretolook.commands.preconditions import (
     open_scene,
     refuse_release,
 )
-from wheretolook.commands.scenes_config import NOT_SCENES
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, describe_camera, draw_camera
 from wheretolook.geometry.poses import Float
-from wheretolook.mapping.config import ExistingModelConfig, MapConfig, place_name
+from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, place_name
 from wheretolook.mapping.georeference import read_scale
 from wheretolook.mapping.map_frame import read_frame
-from wheretolook.mapping.sources import source_of_map
+from wheretolook.mapping.mapped_images import source_of_map
 from wheretolook.utils.artifact_cache import cache_key
-from wheretolook.utils.confine import check_folder_name, path_within
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError
-from wheretolook.utils.files import fingerprint, size_and_time
+from wheretolook.utils.files import check_folder_name, fingerprint, path_within, size_and_time
+from wheretolook.utils.validation import reject
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,8 +125,7 @@ def _map_mesh(options: Map, files: SceneFolder, log: Log) -> None:
     if cache.is_current(files.landmarks, *model):
         log(f"{scene.name}: reusing {files.map}")
         return
-    from wheretolook.mapping.rendered_map import build_map
-    from wheretolook.mapping.walk import PartOfFloor
+    from wheretolook.mapping.rendered_map import PartOfFloor, build_map
 
     poses = _poses_of_recording(files, config.n_images)
     with naming_file(files.mesh):
@@ -197,7 +206,7 @@ def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     Returns the scene, and the dataset with it. Raises what `map_existing` does, and SceneError if the mesh cannot be used.
     """
     from wheretolook.mapping.colmap_model import read_model
-    from wheretolook.mapping.sources import choose_features
+    from wheretolook.mapping.mapped_images import choose_features
 
     settings = options.mapping.existing
     photographs = options.mapping.photographs
@@ -224,7 +233,7 @@ def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
         log(f"{scene.name}: reusing {scene.map}")
         return scene, dataset
     from wheretolook.mapping.imported_map import map_existing
-    from wheretolook.mapping.sanity import warn_of_mesh
+    from wheretolook.mapping.map_frame import warn_of_mesh
     from wheretolook.rendering.raycasting import MeshRaycaster
     from wheretolook.scenes.loading import load_mesh, save_glb
 
@@ -304,3 +313,51 @@ def _with_scene(scene: SceneFolder, root: Path) -> Dataset:
         if other.name != scene.name:
             scenes.append(other)
     return Dataset(root, tuple(sorted(scenes, key=lambda scene: scene.name)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOrMapOptions(SceneOptions, FrameOptions):
+    """A scene of a dataset, or a COLMAP model.
+
+    Args:
+        name: name of the dataset; by default demo, or with --map that of the map.
+        map: instead of a scene: folder of a COLMAP model, imported first as `wheretolook map --model` does.
+        mesh: a mesh of the map's scene (GLB, OBJ, PLY) in its frame.
+        database: the map's features: COLMAP's database.db, or hloc's feats-*.h5.
+        camera_id: the camera_id of one of the map's cameras, if it has several.
+    """
+
+    name: str = ""
+    map: Path | None = None
+    mesh: Path | None = None
+    database: Path | None = None
+    camera_id: int | None = None
+
+    def __post_init__(self) -> None:
+        frame = self.frame_options()
+        of_map = next(filter(None, (self.mesh, self.database, self.camera_id, *vars(frame).values())), None)
+        names = "--mesh, --database, --camera-id, --scale, --distance, --positions and --up"
+        reject((self.map is None and of_map is not None, f"{names} belong to --map", str(of_map)))
+        if not self.name:
+            object.__setattr__(self, "name", self.imported_name or DatasetOptions.name)
+        super().__post_init__()
+
+    @property
+    def imported_name(self) -> str:
+        """Name of the scene that `map` is imported as; empty without it."""
+        return "" if self.map is None else place_name(self.map)
+
+
+def imports_map(run: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorate `run` of a command to import the model in its option `map` first, unless its scene is up to date."""
+
+    @wraps(run)
+    def run_on_scene(command: Any, log: Log = print, progress: Progress = ignore_progress) -> Any:
+        if command.map is not None:
+            files = {"database": command.database, "mesh": command.mesh}
+            existing = ExistingModelConfig(command.map, **files, camera_id=command.camera_id)
+            mapping = MapConfig(frame=command.frame_options(), extractor=command.mapping.extractor, existing=existing)
+            replace(select_options(Map, command), mapping=mapping).run(log)
+        return run(command, log, progress)
+
+    return run_on_scene

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from wheretolook.commands.imported_scene import SceneOrMapOptions, imports_map
+from wheretolook.commands.map import SceneOrMapOptions, imports_map
 from wheretolook.commands.options import Log, Progress, ignore_progress
 from wheretolook.commands.preconditions import load_dataset, open_scene
 from wheretolook.dataset.dataset_lock import reads_dataset
@@ -16,10 +16,9 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.planning.config import PlanConfig
-from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import joined, start_run
 from wheretolook.tracking.runs import log as log_to_run
-from wheretolook.tracking.store import check_store, kept_if_not_logged
+from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.locks import hold
@@ -112,7 +111,7 @@ WAIT_S = 120.0  # for another plan to write its path into the same folder
 def _summary(path: PlannedPath) -> str:
     """Describe a path and its stops in a line."""
     from wheretolook.figures.path_film import score_text
-    from wheretolook.planning.view_sequence import lengths_along
+    from wheretolook.planning.routes import lengths_along
 
     text = f"{path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, views: {len(path.positions)}"
     if not np.isnan(path.scores).any():

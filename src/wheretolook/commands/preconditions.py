@@ -8,16 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from wheretolook.dataset.config import RELEASE_FILE
 from wheretolook.dataset.environment import EnvironmentConfig, SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.dataset.names import RELEASE_FILE
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig, describe_camera
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError
-from wheretolook.utils.files import fingerprint
-from wheretolook.utils.logs import LOG
-from wheretolook.utils.reading import read_json_object
-from wheretolook.utils.records import from_record
+from wheretolook.utils.files import fingerprint, read_json_object
+from wheretolook.utils.texts import LOG
+from wheretolook.utils.validation import from_record
 
 if TYPE_CHECKING:
     from wheretolook.commands.options import DatasetOptions, SceneOptions

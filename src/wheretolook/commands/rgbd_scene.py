@@ -6,15 +6,13 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from wheretolook.commands.options import DatasetOptions, Log, Progress
-from wheretolook.commands.scenes_config import NOT_SCENES
+from wheretolook.commands.options import NOT_SCENES, DatasetOptions, Log, Progress
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import CameraConfig, camera_of_record, describe_camera
 from wheretolook.scans.config import RgbdConfig
 from wheretolook.utils.artifact_cache import cache_key
-from wheretolook.utils.confine import check_folder_name
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.utils.files import size_and_time, write_json
+from wheretolook.utils.files import check_folder_name, size_and_time, write_json
 
 REPORT = "rgbd.json"
 """In the scene's folder: what was made of the recording."""

@@ -7,13 +7,13 @@ from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
-from wheretolook.commands.imported_scene import SceneOrMapOptions, imports_map
+from wheretolook.commands.map import SceneOrMapOptions, imports_map
 from wheretolook.commands.options import Log, Progress, ignore_progress
 from wheretolook.commands.preconditions import existing, load_dataset, naming_file, open_scene
+from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.geometry.camera import Camera, draw_camera, write_cameras
 from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.errors import MapError, SceneError

@@ -10,13 +10,12 @@ from importlib.metadata import entry_points
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from wheretolook.commands.options import DatasetOptions, Log, Progress, ignore_progress
+from wheretolook.commands.options import DatasetOptions, Log, MeshSource, Progress, ScenesConfig, ignore_progress
 from wheretolook.commands.preconditions import mesh_fingerprint, refuse_release
 from wheretolook.commands.rgbd_scene import fuse_recording
-from wheretolook.commands.scenes_config import MeshSource, ScenesConfig
+from wheretolook.dataset.config import Split
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, MappedFloor, SceneFolder
-from wheretolook.dataset.sampling_config import Split
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.errors import ConfigError, SceneError, TableError

@@ -42,7 +42,7 @@ class Score(SelectorOptions):
     skip: bool = False
 
     def __post_init__(self) -> None:
-        from wheretolook.select.formats import check_format
+        from wheretolook.select.views import check_format
 
         super().__post_init__()
         check_format(self.out, self.format, 1)

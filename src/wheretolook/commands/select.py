@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from wheretolook.commands.selector_options import SelectorOptions, finish
-from wheretolook.select.request import SelectionRequest
+from wheretolook.select.where_to_look import SelectionRequest
 from wheretolook.utils.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ class Select(SelectionRequest, SelectorOptions):
     lattice: Literal["fibonacci", "yaw-pitch"] = "fibonacci"
 
     def __post_init__(self) -> None:
-        from wheretolook.select.formats import check_format
+        from wheretolook.select.views import check_format
 
         SelectionRequest.__post_init__(self)
         SelectorOptions.__post_init__(self)

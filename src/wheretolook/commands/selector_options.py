@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.commands.options import CameraOptions, OcclusionOptions, ScorerOptions
-from wheretolook.dataset.thresholds import checked_accuracy
+from wheretolook.dataset.config import checked_accuracy
 from wheretolook.figures import KINDS
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.utils.errors import ConfigError
@@ -77,7 +77,7 @@ class SelectorOptions(CameraOptions, OcclusionOptions, ScorerOptions, FrameOptio
         from wheretolook.mapping.colmap_model import model_suffix
         from wheretolook.utils.devices import usable_device
         from wheretolook.utils.warp import start_warp
-        from wheretolook.visibility.listing import compile_kernels
+        from wheretolook.visibility.counting import compile_kernels
 
         model_suffix(self.map)
         device = usable_device(self.device)

@@ -12,15 +12,13 @@ from wheretolook.commands.options import DatasetOptions, Log, Progress, ignore_p
 from wheretolook.commands.preconditions import load_dataset
 from wheretolook.dataset.dataset_lock import reading, reads_dataset
 from wheretolook.dataset.layout import Dataset
-from wheretolook.scorers.method import Method
+from wheretolook.scorers.registry import Method
 from wheretolook.scorers.train_config import TrainConfig
-from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import log as log_to_run
 from wheretolook.tracking.runs import log_history, start_run
-from wheretolook.tracking.store import check_store, kept_if_not_logged, warn_not_logged
-from wheretolook.utils.confine import safe_child
+from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged, warn_not_logged
 from wheretolook.utils.errors import TrackingError
-from wheretolook.utils.files import sha256, temporary_folder, write_json, write_text
+from wheretolook.utils.files import safe_child, sha256, temporary_folder, write_json, write_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -79,8 +77,8 @@ def train_methods(
         TrackingError: the tracking store cannot be used. If it fails later, weights and records are kept, a
             TrackingWarning says that the training is not logged, and the next call logs it.
     """
+    from wheretolook.training.data import with_also
     from wheretolook.training.provenance import about_training, trained_before, weights_path
-    from wheretolook.training.scenes import with_also
 
     shared: Values = {"progress": progress, "kept": {}}
     models = []
@@ -112,8 +110,7 @@ def _train(
 
     from wheretolook.training.fit import RunLog
     from wheretolook.training.learner import TrainingJob
-    from wheretolook.training.provenance import TrainedModel, weights_path
-    from wheretolook.training.run_record import NOT_LOGGED, kept_metrics, params_of
+    from wheretolook.training.provenance import NOT_LOGGED, TrainedModel, kept_metrics, params_of, weights_path
 
     assert method.learn is not None
     path = weights_path(dataset, method.name)  # the title is that of its progress bar
@@ -146,7 +143,7 @@ def _train(
 
 def _log_later(model: TrainedModel, tracking: TrackingConfig) -> TrainedModel:
     """Log a training from the record of its weights, as training itself does."""
-    from wheretolook.training.run_record import NOT_LOGGED, history_not_logged, kept_metrics, params_of
+    from wheretolook.training.provenance import NOT_LOGGED, history_not_logged, kept_metrics, params_of
     from wheretolook.training.weights import read_record
 
     record = read_record(model.path)
@@ -164,7 +161,7 @@ def _log_later(model: TrainedModel, tracking: TrackingConfig) -> TrainedModel:
 
 
 def _log_artifacts(client: MlflowClient, run_id: str, weights: Path, history: pd.DataFrame | None) -> None:
-    from wheretolook.training.run_record import HISTORY_CSV
+    from wheretolook.training.provenance import HISTORY_CSV
 
     client.log_artifact(run_id, str(weights))
     if history is None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar
 
-from wheretolook.commands.imported_scene import SceneOrMapOptions, imports_map
+from wheretolook.commands.map import SceneOrMapOptions, imports_map
 from wheretolook.commands.options import Log, Progress, ignore_progress
 from wheretolook.commands.preconditions import load_dataset, naming_file, open_scene
 from wheretolook.dataset.dataset_lock import reads_dataset
@@ -52,7 +52,7 @@ class BuildViewpointMap(SceneOrMapOptions):
             SceneError: there is no mesh, or no voxel is free. MapFormatError: the map's folder holds something else.
         """
         from wheretolook.planning.scene_map import scene_scorer, scene_viewpoint_map
-        from wheretolook.weights.resolve import resolve_weights
+        from wheretolook.scorers.weights import resolve_weights
 
         dataset = load_dataset(self, "map")
         config = self.viewpoint_map

@@ -9,7 +9,7 @@ from functools import partial, wraps
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-from wheretolook.dataset.names import LOCK
+from wheretolook.dataset.config import LOCK
 from wheretolook.utils.locks import hold
 
 P = ParamSpec("P")

@@ -32,7 +32,7 @@ if TYPE_CHECKING:  # pandas and Warp are imported when first needed
     from wheretolook.mapping.landmarks import Landmarks
     from wheretolook.mapping.mapped_images import ColmapSource, MappedImages
     from wheretolook.rendering.raycasting import MeshRaycaster
-    from wheretolook.rendering.types import Renderer
+    from wheretolook.rendering.warp_renderer import Renderer
     from wheretolook.space.free_space import FreeSpace
     from wheretolook.space.mapped_space import MappedSpace
     from wheretolook.visibility.occlusion import OcclusionModel
@@ -160,7 +160,7 @@ class Environment(ABC):
     @cached_property
     def tsdf_space(self) -> FreeSpace:
         """Where a camera can be according to the depth images."""
-        from wheretolook.space.tsdf_space import TsdfSpace
+        from wheretolook.space.free_space import TsdfSpace
 
         images = self.depth_images
         return TsdfSpace(self.tsdf_volume, images, self.config.free_space, self.device, self.progress)
@@ -215,7 +215,7 @@ class Environment(ABC):
             self.check_occlusion(name)
             model: OcclusionModel = resolve_name(OCCLUSION_MODELS[name].model).from_inputs(self)
             if self.config.occlusion_cache_bytes and name != "none":
-                from wheretolook.visibility.cached_occlusion import CachedOcclusion
+                from wheretolook.visibility.occlusion import CachedOcclusion
 
                 model = CachedOcclusion(model, self.config.occlusion_cache_bytes)
             self._occlusion_models[name] = model
@@ -476,7 +476,7 @@ class ColmapEnvironment(Environment):
     @cached_property
     def localization_map(self) -> LocalizationMap:
         """The input of scorers; warns if the mesh seems to be in another frame."""
-        from wheretolook.mapping.sanity import warn_of_mesh
+        from wheretolook.mapping.map_frame import warn_of_mesh
 
         result = super().localization_map
         if self.files.mesh is not None:

@@ -11,16 +11,14 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.dataset.sampling_config import Split
+from wheretolook.dataset.config import Split
 from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of_record, read_cameras
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import CAMERAS_FILE, holds_model, load_mapping_poses
 from wheretolook.mapping.georeference import read_scale
 from wheretolook.utils.artifact_cache import ArtifactCache
-from wheretolook.utils.confine import safe_child
 from wheretolook.utils.errors import ConfigError, TableError
-from wheretolook.utils.files import fingerprint, write_json
-from wheretolook.utils.reading import read_json_object
+from wheretolook.utils.files import fingerprint, read_json_object, safe_child, write_json
 from wheretolook.utils.validation import check_choice
 
 if TYPE_CHECKING:

@@ -10,14 +10,14 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED, pose_columns
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along, rotation_looking_along
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.utils.devices import fitting
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.utils.memory import fitting
 from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
 from wheretolook.visibility.survey import Survey, SurveyOptions, survey
 

@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.dataset.names import LOCALIZED as LOCALIZED
-from wheretolook.dataset.names import NO_POSE as NO_POSE
-from wheretolook.dataset.names import TOO_FEW_MATCHES as TOO_FEW_MATCHES
+from wheretolook.dataset.config import LOCALIZED as LOCALIZED
+from wheretolook.dataset.config import NO_POSE as NO_POSE
+from wheretolook.dataset.config import TOO_FEW_MATCHES as TOO_FEW_MATCHES
 from wheretolook.geometry.poses import Float
 from wheretolook.io.poses import POSE_COLUMNS, pose_values, poses_of_values
 from wheretolook.utils.errors import TableError

@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 from scipy.special import expit
 from sklearn.metrics import roc_auc_score
 
-from wheretolook.evaluation.bootstrap import ClusterBootstrap
-from wheretolook.evaluation.calibration import expected_calibration_error
+from wheretolook.evaluation.statistics import ClusterBootstrap, expected_calibration_error
 from wheretolook.geometry.poses import Float
 from wheretolook.scorers.adapted.gp_correction import log_losses
-from wheretolook.utils.markdown import markdown_table
+from wheretolook.utils.texts import markdown_table
 
 RESAMPLES = 2000
 SQUARE_M = 1.0  # locations in one square of the floor of this side are resampled together

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from wheretolook.dataset.thresholds import THRESHOLDS
+from wheretolook.dataset.config import THRESHOLDS
 from wheretolook.scorers.registry import methods_named, scorers
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.shipped import or_shipped

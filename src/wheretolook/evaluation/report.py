@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from wheretolook.dataset.thresholds import ALL, threshold_label
+from wheretolook.dataset.config import ALL, threshold_label
 from wheretolook.dataset.viewpoint_table import FIRST, by_first
-from wheretolook.evaluation.scores import PHOTOGRAPHS, is_random, main_rows, methods_of, reference_of, threshold_keys
+from wheretolook.evaluation.results import PHOTOGRAPHS, is_random, main_rows, methods_of, reference_of, threshold_keys
 from wheretolook.scorers.styles import ORACLE, method_group, method_style
-from wheretolook.utils.markdown import markdown_table
+from wheretolook.utils.texts import markdown_table
 
 Row = Mapping[Any, Any]  # a row of a score table by its columns' names
 
@@ -24,7 +24,7 @@ SCENES_ABREAST = 8  # scenes in one table; more make another below
 
 
 def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> str:
-    """Format a score table (`wheretolook.evaluation.scores.score_table`) as Markdown.
+    """Format a score table (`wheretolook.evaluation.results.score_table`) as Markdown.
 
     The rows are of the first occlusion model and set of candidates: the first N with all columns; other N; both
     localizers; the share of locations with a good view; by scene; held-out photographs; calibration; probes.

@@ -12,14 +12,19 @@ from numpy.typing import NDArray
 
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good
-from wheretolook.evaluation.calibration import calibration_rows, fit_temperature
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.photographs import HeldOutPhotographs, photographs_set, score_photographs
-from wheretolook.evaluation.ranking import CandidateViews
-from wheretolook.evaluation.results import Evaluation, ScoredSet
-from wheretolook.evaluation.scores import choose, score_table
-from wheretolook.evaluation.scoring import Weights, check_unseen, choose_weights, score_scenes
-from wheretolook.evaluation.views import CandidateSet, candidate_sets, views_of
+from wheretolook.evaluation.ranking import CandidateSet, CandidateViews, candidate_sets, views_of
+from wheretolook.evaluation.results import Evaluation, ScoredSet, choose, score_table
+from wheretolook.evaluation.scoring import (
+    HeldOutPhotographs,
+    Weights,
+    check_unseen,
+    choose_weights,
+    photographs_set,
+    score_photographs,
+    score_scenes,
+)
+from wheretolook.evaluation.statistics import calibration_rows, fit_temperature
 from wheretolook.geometry.poses import Float
 from wheretolook.scorers.registry import is_probability, methods_named, scorers
 from wheretolook.training.provenance import TrainedModel

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import NoReturn
@@ -15,9 +15,10 @@ from tqdm.auto import tqdm
 
 from wheretolook.dataset.environment import EnvironmentConfig, SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
-from wheretolook.dataset.viewpoint_table import poses
+from wheretolook.dataset.viewpoint_table import is_good, poses
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.scores import reference_method
+from wheretolook.evaluation.ranking import CandidateSet, SceneViews, check_labels, join_scenes
+from wheretolook.evaluation.results import PHOTOGRAPHS, reference_method
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scorers.base import Scorer
@@ -182,3 +183,59 @@ def scorers_of(
             name = f"{method.name} {which}" if method.name in by_name else method.name
             by_name[name] = make_scorer(method.name, localization_map, *options)
     return by_name
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutPhotographs:
+    """B photographs of a scene, block after block, and the maps without them.
+
+    Attributes:
+        scene: the scene.
+        views: columns photograph (number, unique in a block), block, place (number of the location that views of a
+            block share), status, error_m (scaled to metres where the map has none) and error_deg.
+        poses: (B, 3, 4) cam_from_world.
+        maps: rows of `views`, and the map that they are scored on.
+    """
+
+    scene: SceneFolder
+    views: pd.DataFrame
+    poses: Float
+    maps: Sequence[tuple[NDArray[np.int64], LocalizationMap]]
+
+    @property
+    def occlusion(self) -> str:
+        """Name of the occlusion model."""
+        return self.maps[0][1].occlusion.name
+
+
+def photographs_set(photographs: Sequence[HeldOutPhotographs], config: EvaluateConfig) -> CandidateSet:
+    """Return the photographs of scenes as candidates; views of a block at the same place are one location.
+
+    Locations with a single view count, although they leave no choice. Raises a TableError if all photographs have the
+    same label.
+    """
+    views, location_id = join_scenes([_scene_views(one.views, config) for one in photographs])
+    check_labels(views.good[:, 0], PHOTOGRAPHS, photographs[0].scene.map)
+    return CandidateSet(PHOTOGRAPHS, np.ones(len(views.good), dtype=bool), views, location_id)
+
+
+def _scene_views(views: pd.DataFrame, config: EvaluateConfig) -> SceneViews:
+    ids, first, rows = np.unique(views["place"].to_numpy(np.int64), return_index=True, return_inverse=True)
+    good = np.stack([is_good(views, *limits) for limits in config.thresholds], axis=-1)
+    names = views["photograph"].to_numpy(np.int64)
+    return SceneViews(rows.reshape(-1), names, good, ids, views["block"].to_numpy(np.int64)[first])
+
+
+def score_photographs(
+    photographs: Sequence[HeldOutPhotographs], config: EvaluateConfig, weights: Weights, progress: bool
+) -> dict[str, Float]:
+    """Score (B,) the photographs of scenes by each method; raises as `wheretolook.evaluation.scoring.score_scenes`."""
+    parts = []
+    n_views = sum(len(one.views) for one in photographs)
+    with tqdm(total=n_views, desc="score photographs", unit="view", disable=not progress) as bar:
+        for one in photographs:
+            # the map with most landmarks decides whether weights adapted to another scene are rejected
+            largest = max((remaining for _, remaining in one.maps), key=lambda remaining: len(remaining.landmarks))
+            scorers_of(largest, config, weights)
+            parts.append(score_batches(one.scene, one.poses, one.maps, config, weights, bar, held_out=True))
+    return join_scores(parts)

@@ -1,15 +1,23 @@
-"""Settings of the keypoint extractor."""
+"""Options of extractors, and extraction of keypoints from images by them."""
 
 from __future__ import annotations
 
+from collections.abc import Generator, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.features.extractor import Extraction, Keypoints
 from wheretolook.features.opencv_sift import EDGE_THRESHOLD, MAX_KEYPOINTS, PEAK_THRESHOLD
 from wheretolook.features.registry import all_extractors, runnable_extractors
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import sha256
+from wheretolook.utils.processes import WorkerPool
 from wheretolook.utils.validation import check_choice, check_positive, check_range
 
 
@@ -56,3 +64,58 @@ class ExtractorConfig:
         if path:
             record["weights_sha256"] = sha256(Path(path)) if Path(path).is_file() else None
         return record
+
+
+class KeypointExtractor:
+    """Extracts keypoints with any extractor of `wheretolook.features.registry`, on a CPU core or a GPU.
+
+    Raises ConfigError if kornia, a network's weights or the device is missing.
+    """
+
+    def __init__(self, config: ExtractorConfig = ExtractorConfig(), device: str = "cpu") -> None:
+        self.config = config
+        build = all_extractors()[config.method].build
+        assert build is not None  # as checked by ExtractorConfig
+        self._extraction: Extraction = build(config, device)
+        self.on_gpu = self._extraction.batch > 1
+
+    def batch_of(self, width: int, height: int) -> int:
+        """Number of images of a size in a batch: fewer large ones, which take more GPU memory."""
+        return max(1, self._extraction.batch * 640 * 480 // (width * height))
+
+    def extract(self, rgb: NDArray[np.uint8]) -> Keypoints:
+        """Extract at most `max_keypoints` keypoints from an image (H, W, 3) uint8; their order depends only on the image.
+
+        Raises ValueError if it has another shape or type.
+        """
+        return self.extract_batch([rgb])[0]
+
+    def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
+        """Extract keypoints from images (H, W, 3) uint8 of one size, on a GPU in one batch. See `extract`."""
+        return self._extraction.extract_batch(images)
+
+    def extract_many(
+        self, images: Iterable[NDArray[np.uint8]], processes: WorkerPool
+    ) -> Generator[Keypoints, None, None]:
+        """Yield keypoints of many images (H, W, 3) uint8 in their order, from worker processes or GPU batches.
+
+        Only a few images are read ahead. Processes, as pycolmap's extractor holds the interpreter lock; the result does
+        not depend on their number.
+        """
+        if self.on_gpu:
+            source = iter(images)
+            for first in source:
+                more = self.batch_of(first.shape[1], first.shape[0]) - 1
+                yield from self.extract_batch([first, *islice(source, more)])
+        elif processes.workers <= 1:
+            yield from map(self.extract, images)
+        else:
+            yield from processes.map(_extract_in_worker, ((self.config, rgb) for rgb in images))
+
+
+_extractor_of = lru_cache(maxsize=1)(KeypointExtractor)
+
+
+def _extract_in_worker(job: tuple[ExtractorConfig, NDArray[np.uint8]]) -> Keypoints:
+    config, rgb = job
+    return _extractor_of(config).extract(rgb)

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from wheretolook.features.config import ExtractorConfig
-from wheretolook.features.extractor import check_image
-from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.extractor import Keypoints, check_image
 from wheretolook.utils.errors import ConfigError, WeightsError
 
 INSTALL = "pip install 'wheretolook[learned]'"

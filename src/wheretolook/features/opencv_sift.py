@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.features.descriptors import unit_descriptors
-from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.extractor import Keypoints, unit_descriptors
 
 MAX_KEYPOINTS = 2048
 PEAK_THRESHOLD = 0.02 / 3

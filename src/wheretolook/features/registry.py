@@ -6,10 +6,9 @@ from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
 
-from wheretolook.features.descriptors import DescriptorKind
-from wheretolook.features.extractor import Extractor
+from wheretolook.features.extractor import DescriptorKind, Extractor
 
-MODULES = ("sift", "aliked", "disk", "xfeat", "superpoint")
+MODULES = ("sift", "learned_extractors")
 """Modules of `wheretolook.features` that define `EXTRACTORS`."""
 
 

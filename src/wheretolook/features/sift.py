@@ -9,11 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.features.config import ExtractorConfig
-from wheretolook.features.descriptors import DescriptorKind, unit_descriptors
-from wheretolook.features.extractor import Extraction, Extractor, check_image
-from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.extractor import (
+    DescriptorKind,
+    Extraction,
+    Extractor,
+    Keypoints,
+    check_image,
+    unit_descriptors,
+)
 from wheretolook.features.opencv_sift import RootSift
-from wheretolook.utils.colmap import quiet_colmap
+from wheretolook.utils.extras import quiet_colmap
 
 SIFT = DescriptorKind("sift", 128, "uint8", colmap_type=0)
 

@@ -11,10 +11,9 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
-from wheretolook.features import warp_sift_description_kernels as kernels
-from wheretolook.features import warp_sift_kernels as scale_kernels
+from wheretolook.features import warp_sift_kernels as kernels
 from wheretolook.features.config import ExtractorConfig
-from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.extractor import Keypoints
 from wheretolook.features.warp_sift_kernels import BORDER, KEYS_OF_IMAGE, LAYERS, LEVELS, MAX_SIDE
 from wheretolook.utils.warp import Staging, start_warp
 
@@ -35,7 +34,7 @@ class WarpSift:
         self.config = config
         self.device = start_warp(device)
         self.block_bytes = block_bytes
-        limits: Any = scale_kernels.Limits()
+        limits: Any = kernels.Limits()
         # OpenCV rounds the threshold of the extremum itself down to a whole grey value.
         limits.pre_contrast = math.floor(0.5 * config.peak_threshold * 255)
         limits.contrast = config.peak_threshold
@@ -178,7 +177,7 @@ class ScaleSpace:
         self.sizes = octave_sizes(rows, columns)
         rows_of, columns_of = zip(*self.sizes, strict=True)
         *self.starts, self.image_size = np.cumsum([0, *(LEVELS * r * c for r, c in self.sizes)]).tolist()
-        pyramid: Any = scale_kernels.Pyramid()
+        pyramid: Any = kernels.Pyramid()
         pyramid.values = wp.empty(n_images * self.image_size, dtype=wp.float32, device=device)
         pyramid.image_size = self.image_size
         for name, values in (("starts", self.starts), ("rows", rows_of), ("columns", columns_of)):
@@ -215,7 +214,7 @@ class ScaleSpace:
                 shape = self.filled, LAYERS, rows - 2 * BORDER, columns - 2 * BORDER
                 inputs = [self.pyramid, octave, self.limits]
                 outputs = [self.number, self.keys]
-                wp.launch(scale_kernels.extrema_kernel, shape, inputs, outputs, device=self.device)
+                wp.launch(kernels.extrema_kernel, shape, inputs, outputs, device=self.device)
             number = int(self.number.numpy()[0])
             if number <= len(self.keys):
                 return np.asarray(torch.unique(wp.to_torch(self.keys[:number])).cpu().numpy())
@@ -232,7 +231,7 @@ class ScaleSpace:
 
         def level_of(octave: int, level: int, half_smooth: bool = False) -> Any:
             """A level of the pyramid, or the memory for one smoothed along its rows only."""
-            result: Any = scale_kernels.Level()
+            result: Any = kernels.Level()
             result.rows, result.columns = self.sizes[octave]
             result.values = self.half_smooth if half_smooth else self.pyramid.values
             result.image_size = 4 * self.rows * self.columns if half_smooth else self.image_size
@@ -249,15 +248,15 @@ class ScaleSpace:
 
         # all before the first launch, so that their module is compiled once
         kernels_of = {
-            radius: [scale_kernels.smooth_kernel(radius, along_rows) for along_rows in (True, False)]
+            radius: [kernels.smooth_kernel(radius, along_rows) for along_rows in (True, False)]
             for radius in sorted({*self.radii})
         }
 
-        add(scale_kernels.double_kernel, 0, self.grey, level_of(0, 0))
+        add(kernels.double_kernel, 0, self.grey, level_of(0, 0))
         smooth(0, 0, 0)
         for octave in range(len(self.sizes)):
             if octave > 0:
-                add(scale_kernels.halve_kernel, octave, level_of(octave - 1, LAYERS), level_of(octave, 0))
+                add(kernels.halve_kernel, octave, level_of(octave - 1, LAYERS), level_of(octave, 0))
             searched = octave > self.first_octave
             for level in range(1, LEVELS if searched else LAYERS + 1):
                 smooth(octave, level - 1, level)
@@ -279,8 +278,8 @@ def values_of_image(rows: int, columns: int) -> int:
 
 def _sigmas() -> list[float]:
     """Standard deviation of the filter that makes each level from the one before, the first from the doubled image."""
-    total = [scale_kernels.SIGMA * 2 ** (level / LAYERS) for level in range(LEVELS)]
-    first = math.sqrt(scale_kernels.SIGMA**2 - (2 * _ASSUMED_SIGMA) ** 2)
+    total = [kernels.SIGMA * 2 ** (level / LAYERS) for level in range(LEVELS)]
+    first = math.sqrt(kernels.SIGMA**2 - (2 * _ASSUMED_SIGMA) ** 2)
     return [first, *(math.sqrt(b**2 - a**2) for a, b in pairwise(total))]
 
 

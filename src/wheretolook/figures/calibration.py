@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
-from wheretolook.evaluation.scores import main_rows, methods_of
+from wheretolook.evaluation.results import main_rows, methods_of
 from wheretolook.figures.style import GREY, INK, RC, Style, new_figure
 from wheretolook.scorers.styles import method_style
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from wheretolook.dataset.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
+from wheretolook.dataset.config import ALL, THRESHOLDS, threshold_key, threshold_label
 from wheretolook.figures.style import INK, RC, Style, new_figure, scene_label
 from wheretolook.localization.report import POSITIVE, LabelSummary, threshold_sentence
 

@@ -12,10 +12,9 @@ from matplotlib.style import context
 from wheretolook.figures.animation import Pixels, pixels_of
 from wheretolook.figures.style import INK, RC, Style, frame, new_figure
 from wheretolook.geometry.poses import Float
-from wheretolook.planning.routes import PathView
-from wheretolook.planning.view_sequence import lengths_along
+from wheretolook.planning.routes import PathView, lengths_along
 from wheretolook.scorers.styles import method_style
-from wheretolook.utils.markdown import counted
+from wheretolook.utils.texts import counted
 
 PATH = "#CC3311"
 LANDMARKS = "#EE9900"

@@ -13,8 +13,8 @@ from matplotlib.lines import Line2D
 from matplotlib.style import context
 from matplotlib.ticker import MaxNLocator
 
-from wheretolook.dataset.thresholds import ALL, threshold_label
-from wheretolook.evaluation.scores import is_random, main_rows, reference_of, threshold_keys
+from wheretolook.dataset.config import ALL, threshold_label
+from wheretolook.evaluation.results import is_random, main_rows, reference_of, threshold_keys
 from wheretolook.figures.style import INK, RC, Style, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook.scorers.styles import ORACLE, method_group, method_style
@@ -29,7 +29,7 @@ def score_figure(scores: pd.DataFrame) -> Figure:
 
     One panel for the finest and one for the coarsest threshold, one row per method of `methods_to_show`, the best on
     top. The axes span the methods at least halfway from random choice to the oracle; arrows point to the others.
-    `scores` is a table of `wheretolook.evaluation.scores.score_table`; rows over all scenes of its first occlusion
+    `scores` is a table of `wheretolook.evaluation.results.score_table`; rows over all scenes of its first occlusion
     model and candidate set are drawn.
     """
     pooled = _pooled(scores)

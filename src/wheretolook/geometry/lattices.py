@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.poses import Float
+from wheretolook.utils.devices import fitting
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.memory import fitting
 from wheretolook.utils.validation import check_choice
 
 GOLDEN_ANGLE = np.pi * (1 + np.sqrt(5))  # radians between neighbours of the spiral: the paper's i * pi * (1 + sqrt 5)

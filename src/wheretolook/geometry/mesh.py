@@ -25,7 +25,7 @@ class TexturedMesh:
     triangle_texture: NDArray[np.int32]  # (T,) index into `textures`
     textures: tuple[NDArray[np.uint8], ...]  # each (H, W, 3), sRGB
     vertex_colors: NDArray[np.uint8] | None = None  # (V, 3), multiply the texture; None for white
-    # (3,) metres in the world, from which single precision measures, see `wheretolook.geometry.local_origin`
+    # (3,) metres in the world, from which single precision measures, see `wheretolook.geometry.similarity`
     origin: NDArray[np.floating[Any]] = field(default_factory=lambda: np.zeros(3))
 
     @property

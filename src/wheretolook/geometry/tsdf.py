@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import Camera
-from wheretolook.geometry.local_origin import local_origin, poses_from
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, camera_centers, check_poses
+from wheretolook.geometry.similarity import local_origin, poses_from
+from wheretolook.utils.devices import fitting
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.utils.memory import fitting
 from wheretolook.utils.validation import check_positive, check_range
 
 BLOCK_VOXELS = 8  # voxels along the side of a block

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
-from wheretolook.evaluation.calibration import reliability
+from wheretolook.evaluation.statistics import reliability
 from wheretolook.figures.style import BLUE, INK, RC, VERMILION, new_figure
 from wheretolook.geometry.poses import Float
 

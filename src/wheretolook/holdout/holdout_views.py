@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from wheretolook.dataset.layout import SceneFolder
-from wheretolook.evaluation.photographs import HeldOutPhotographs
+from wheretolook.evaluation.scoring import HeldOutPhotographs
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.holdout.holdout import HoldoutResult
 from wheretolook.holdout.metrics import places_of

@@ -16,8 +16,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.stats import rankdata
 from scipy.stats import t as student
 
-from wheretolook.evaluation.bootstrap import ClusterBootstrap, divide
-from wheretolook.evaluation.calibration import BINS, bins_of
+from wheretolook.evaluation.statistics import BINS, ClusterBootstrap, bins_of, divide
 from wheretolook.geometry.poses import Float
 
 RESAMPLES = 2000

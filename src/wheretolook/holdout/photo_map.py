@@ -1,37 +1,65 @@
-"""Open the map to check: its model, the features of its photographs, and the unit of its limits."""
+"""Simulates narrower views from the keypoints of photographs, so that more of them fail to localize."""
 
 from __future__ import annotations
 
 import shutil
 import warnings
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from wheretolook.dataset.thresholds import THRESHOLDS
+from wheretolook.dataset.config import THRESHOLDS
 from wheretolook.features.config import ExtractorConfig
-from wheretolook.geometry.camera import Camera, cameras_by_id
+from wheretolook.geometry.camera import Camera, PinholeCamera, cameras_by_id, field_of_view_deg
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.geometry.similarity import Similarity
-from wheretolook.holdout.crops import PANS, crop_pixels, crops_of
-from wheretolook.localization.versions import versions
+from wheretolook.localization.config import versions
 from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_arrays, read_model, registered_names
 from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, PhotographsConfig, place_name
 from wheretolook.mapping.feature_files import DATABASE_FILE, read_descriptors
 from wheretolook.mapping.georeference import DEPTH_M, median_depths
 from wheretolook.mapping.landmarks import load_colmap_landmarks
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame, find_frame, has_photographs
-from wheretolook.mapping.mapped_images import MappedImages
-from wheretolook.mapping.sources import find_features, find_photographs
+from wheretolook.mapping.mapped_images import MappedImages, find_features, find_photographs
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
-from wheretolook.utils.confine import safe_child
-from wheretolook.utils.errors import MapError, MapWarning
-from wheretolook.utils.files import fingerprint, size_and_time
-from wheretolook.utils.logs import LOG
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning
+from wheretolook.utils.files import fingerprint, safe_child, size_and_time
+from wheretolook.utils.texts import LOG
+
+PANS = (0.0, -1.0, 1.0)  # of the crops of a photograph: the middle one, and those at its left and right side
+
+
+@lru_cache(maxsize=64)
+def crops_of(camera: Camera, fov_deg: float) -> tuple[PinholeCamera, Float]:
+    """Return the pinhole of crops of a camera's images, and their rotations crop_from_camera (3, 3, 3).
+
+    The pinhole has the camera's focal length and proportions, and the horizontal field of view `fov_deg`. Raises
+    ConfigError if it is not narrower than the camera's.
+    """
+    whole_deg = field_of_view_deg(camera)[0]
+    if not fov_deg < whole_deg:
+        problem = "the photographs do not show more than the narrower views to simulate"
+        raise ConfigError(problem, value=f"{fov_deg:g} of {whole_deg:.0f} degrees", fix="Give a smaller --fov.")
+    focal = camera.colmap.mean_focal_px
+    width = max(2, round(2 * focal * np.tan(np.radians(fov_deg) / 2)))
+    pinhole = PinholeCamera(width, max(2, round(width * camera.height / camera.width)), focal)
+    pans = np.multiply(PANS, (whole_deg - fov_deg) / 2)
+    return pinhole, Rotation.from_euler("y", pans[:, None], degrees=True).as_matrix()
+
+
+def crop_pixels(camera: Camera, pixels: Float, fov_deg: float, crop: int) -> tuple[Float, NDArray[np.bool_]]:
+    """Return where pixels (K, 2) of a camera's image are in a crop, (K, 2), and which of them it shows, (K,)."""
+    pinhole, rotations = crops_of(camera, fov_deg)
+    rays = camera.colmap.unproject(np.asarray(pixels, dtype=np.float64)) @ rotations[crop].T
+    ahead = rays[:, 2] > 1e-6
+    moved = pinhole.project(np.where(ahead[:, None], rays, (0.0, 0.0, 1.0)))
+    return moved, ahead & pinhole.in_image(moved)
+
 
 MAX_ERROR_M, MAX_ERROR_DEG = THRESHOLDS[0]  # below both, a photograph counts as localized
 MAX_ERROR_OF_DEPTH = MAX_ERROR_M / DEPTH_M  # instead, where metres are unknown: of the photograph's median depth

@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.dataset.thresholds import Accuracy
+from wheretolook.dataset.config import Accuracy
 from wheretolook.evaluation.scoring import score_scale
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
@@ -24,11 +24,10 @@ from wheretolook.mapping.landmarks import load_colmap_landmarks
 from wheretolook.mapping.map_frame import IDENTITY
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import find, make_scorer
+from wheretolook.scorers.weights import load_scorer, resolve_weights
 from wheretolook.training.weights import method_of_weights
 from wheretolook.utils.errors import MapWarning, OutOfRangeWarning
-from wheretolook.visibility.cached_occlusion import CachedOcclusion
-from wheretolook.visibility.occlusion import OcclusionModel
-from wheretolook.weights.resolve import load_scorer, resolve_weights
+from wheretolook.visibility.occlusion import CachedOcclusion, OcclusionModel
 
 VISIBLE = "visible"  # the baseline; its score here is the number of landmarks in view
 

@@ -15,13 +15,12 @@ from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.mapping.map_frame import IDENTITY, MapFrame, has_photographs
+from wheretolook.mapping.map_frame import IDENTITY, MapFrame, has_photographs, warn_of_mesh
 from wheretolook.mapping.mapped_images import MappedImages, open_colmap
-from wheretolook.mapping.sanity import warn_of_mesh
 from wheretolook.utils.validation import check_positive
 from wheretolook.visibility import frustum
+from wheretolook.visibility.counting import in_view_by_table
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews, landmarks_in_view
-from wheretolook.visibility.listing import in_view_by_table
 from wheretolook.visibility.occlusion import NoOcclusion, OcclusionModel
 
 if TYPE_CHECKING:
@@ -74,7 +73,7 @@ class LocalizationMap:
                 own mapper kept.
             device: where kernels run.
             database: the COLMAP database the model was built from, or hloc's features in HDF5, for the landmarks'
-                ambiguity, which is unknown without; by default as `wheretolook.mapping.sources.choose_features`.
+                ambiguity, which is unknown without; by default as `wheretolook.mapping.mapped_images.choose_features`.
             frame: scale, distance, positions or up, see `wheretolook.mapping.config.FrameOptions`.
 
         Raises:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from wheretolook.geometry.poses import Float, invert_poses, quaternion_from_rotation, rotation_from_quaternion
 from wheretolook.utils.errors import TableError
-from wheretolook.utils.reading import MAX_TEXT_BYTES, read_text
+from wheretolook.utils.files import MAX_TEXT_BYTES, read_text
 
 QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
 TRANSLATION_COLUMNS = ("tx", "ty", "tz")

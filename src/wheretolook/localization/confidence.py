@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wheretolook.dataset.thresholds import ACCURACY, Accuracy
+from wheretolook.dataset.config import ACCURACY, Accuracy
 from wheretolook.geometry.poses import Float
-from wheretolook.localization.pose_ambiguity import log_ratio
-from wheretolook.utils.reading import read_json_object
-from wheretolook.utils.shipped_model import LogisticRegression
+from wheretolook.localization.estimation import log_ratio
+from wheretolook.utils.files import read_json_object
+from wheretolook.utils.shipped import LogisticRegression
 
 if TYPE_CHECKING:
-    from wheretolook.localization.rig_localization import JointLocalization
+    from wheretolook.localization.localizer import JointLocalization
 
 FEATURE_NAMES = ("log_elsewhere", "log_share", "log_own", "log_deviation_deg")
 """log(1 + support of the best competing pose), log of the inlier ratio of the matches, log of the ratio of this pose's

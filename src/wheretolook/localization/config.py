@@ -1,14 +1,17 @@
-"""Options of labelling."""
+"""Options of localization and labels, and the versions that decide a label."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import sha256
 from wheretolook.utils.validation import check_choice, check_positive, check_range
+from wheretolook.utils.version import VERSION
 
 
 @dataclass(frozen=True)
@@ -117,3 +120,15 @@ class LabelConfig:
             fix = "Give 0 for plain renderings, 0.3 for good photographs, up to 1 for poor ones."
             raise ConfigError("label.appearance must be within 0 and 1", value=self.appearance, fix=fix)
         check_range("label.changes", self.changes, 0, 1)
+
+
+@cache
+def versions() -> dict[str, str]:
+    """Versions of the packages that decide a label."""
+    result = {"wheretolook": VERSION}
+    for package in ("poselib", "pycolmap", "opencv-python-headless", "warp-lang", "numpy", "torch"):
+        try:
+            result[package] = version(package)
+        except PackageNotFoundError:  # installed some other way
+            result[package] = "unknown"
+    return result

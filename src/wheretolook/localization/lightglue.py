@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.extractor import Keypoints
 from wheretolook.features.learned import kornia_feature, load_state, one_thread
 from wheretolook.features.registry import all_extractors, all_kinds
 from wheretolook.mapping.colmap_model import model_arrays, read_model

@@ -11,8 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.dataset.sampling_config import Split
-from wheretolook.dataset.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
+from wheretolook.dataset.config import ALL, THRESHOLDS, Split, threshold_key, threshold_label
 from wheretolook.dataset.viewpoint_table import (
     FIRST,
     LOCALIZED,
@@ -24,7 +23,7 @@ from wheretolook.dataset.viewpoint_table import (
     poses,
 )
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.utils.markdown import markdown_table
+from wheretolook.utils.texts import markdown_table
 
 LABELS_CSV = "labels.csv"
 LABELS_MD = "labels.md"

@@ -1,19 +1,26 @@
-"""Matches of the views of a rig, and the poses of its views."""
+"""Views of one rig: their rotations and offsets, how they are read, and a prior of their pose."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
-from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.camera import Camera, field_of_view_deg
 from wheretolook.geometry.poses import Float, as_numbers, camera_centers, compose_poses, invert_poses, rigid_poses
-from wheretolook.utils.errors import PoseError
+from wheretolook.geometry.similarity import Similarity
+from wheretolook.io.poses import NAME_COLUMNS, QUATERNION_COLUMNS, NamedRows, poses_of_rows, read_named_rows
+from wheretolook.utils.errors import ConfigError, PoseError, TableError
+from wheretolook.utils.files import path_ends
 
 if TYPE_CHECKING:
     from wheretolook.features.matches import Matches
+
 
 IDENTITY: Float = np.eye(3, 4)
 
@@ -103,3 +110,132 @@ def rig_of(cam_from_world: Float) -> Float:
     cam_from_rig = compose_poses(cam_from_world, invert_poses(cam_from_world[0]))
     cam_from_rig[:, :, 3] = 0
     return cam_from_rig
+
+
+MAX_STAMP_DIFFERENCE_S = 0.02  # between an image named by its time and its row of the odometry
+BODY_UPRIGHT = 0.7  # z of a robot's own z axis in odometry, from which on it is no camera
+CAM_FROM_BODY = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # a camera that looks along x of a body whose z is up
+
+
+def read_turns(path: Path, images: Sequence[str]) -> Float:
+    """Read cam_from_rig (N, 3, 4) of images, by their names; the rig's origin is the first image.
+
+    The file has columns yaw and perhaps pitch and roll in degrees (yaw to the left, pitch upwards, roll clockwise), or qw,
+    qx, qy, qz (camera-to-rig), and perhaps positions in metres; or is a TUM trajectory of the camera (z forward) or of
+    a robot (x forward, z up) whose camera looks along x. Rows belong to the images of the same name, in the column
+    image, or of the nearest time stamp, if images are named by their time. Otherwise they are in the order of the
+    images, unless there is a column image.
+
+    Raises TableError if the file cannot be read, an image has no row or several, or a row is no rotation.
+    """
+    table = read_named_rows(path)
+    poses = _poses(table)
+    poses = poses[_rows_of(table, [PurePath(name) for name in images])]
+    centers = camera_centers(poses)
+    poses[:, :, 3] = -np.einsum("nij,nj->ni", poses[:, :, :3], centers - centers[0])
+    return poses
+
+
+def _poses(table: NamedRows) -> Float:
+    """Return cam_from_rig (R, 3, 4) of all rows."""
+    if {*QUATERNION_COLUMNS} <= {*table.columns}:
+        poses = poses_of_rows(table, orientations_only=True).cam_from_world
+        of_body = table.header[0] == "t" and (poses[:, 2, 2] > BODY_UPRIGHT).all()
+        return CAM_FROM_BODY @ poses if of_body else poses
+    angles = np.zeros((len(table.rows), 3))
+    for column, name in enumerate(("yaw", "pitch", "roll")):
+        given = [known for known in (name, f"{name}_deg") if known in table.columns]
+        if given:
+            angles[:, column] = table.numbers(given[:1])[:, 0]
+        elif name == "yaw":
+            fix = "Give qw, qx, qy, qz, or yaw and perhaps pitch and roll in degrees."
+            raise TableError("the columns state no rotation", path=table.path, value=",".join(table.header), fix=fix)
+    rotated = Rotation.from_euler("xz", -angles[:, 1:], degrees=True).as_matrix() @ CAM_FROM_BODY
+    rotations = rotated @ Rotation.from_euler("z", -angles[:, :1], degrees=True).as_matrix()
+    return np.pad(rotations, ((0, 0), (0, 0), (0, 1)))
+
+
+def _rows_of(table: NamedRows, images: Sequence[PurePath]) -> list[int]:
+    """Return the row of each image: by name, by time, or in order."""
+    is_named = any(name in table.columns for name in NAME_COLUMNS) and len({*table.names}) == len(table.names)
+    rows = {name: row for row, name in enumerate(table.names)} if is_named else {}
+    ends = [[*path_ends(path), path.stem] for path in images]
+    found = [next((rows[name] for name in names if name in rows), None) for names in ends]
+    if None in found and is_named:
+        found = _rows_by_time(table, images) or found
+    in_order = "image" not in table.columns and len(table.names) == len(images)
+    if in_order and not any(row is not None for row in found):
+        found = [*range(len(images))]
+    for path, row in zip(images, found, strict=True):
+        if row is None:
+            fix = f"Name it once in the column image, or give {len(images)} rows in the order of the images."
+            raise TableError("there is no rotation of this image", path=table.path, value=str(path), fix=fix)
+    return [row for row in found if row is not None]
+
+
+def _rows_by_time(table: NamedRows, images: Sequence[PurePath]) -> list[int | None]:
+    """Return the row of the nearest time stamp of each image; empty if names are no times or one has no row."""
+    try:
+        stamps = np.array(table.names, dtype=float)
+        times = np.array([path.stem for path in images], dtype=float)
+    except ValueError:
+        return []
+    difference = np.abs(stamps - times[:, None])
+    return difference.argmin(1).tolist() if (difference.min(1) <= MAX_STAMP_DIFFERENCE_S).all() else []
+
+
+MAX_DISTANCE_RATIO = 2.0  # distance over the mean mapping distance: farther landmarks are hardly detected
+YAW_MARGIN_DEG = 30.0  # how far the yaw may be off
+
+
+@dataclass(frozen=True, eq=False)
+class PosePrior:
+    """A rough location (3,) m in the world of the map, and the yaw of an image in degrees, if known."""
+
+    location: Float
+    yaw_deg: float | None = None
+
+    @classmethod
+    def of(cls, values: Sequence[float], world_from_map: Similarity) -> PosePrior:
+        """Convert x, y, z and perhaps yaw in the map. Raises ConfigError unless they are finite numbers."""
+        try:
+            numbers = as_numbers(values)
+        except PoseError:
+            numbers = np.zeros(0)
+        if numbers.shape not in ((3,), (4,)) or not np.isfinite(numbers).all():
+            fix = "Give x,y,z in the map, and perhaps the yaw in degrees."
+            raise ConfigError("this is no prior of the pose", value=values, fix=fix)
+        return cls(world_from_map.apply(numbers[:3]), float(numbers[3]) if len(numbers) == 4 else None)
+
+    def allows(self, points: Float, mapping_distance_m: Float, camera: Camera) -> NDArray[np.bool_]:
+        """Return which landmarks, points (N, 3) m, the camera may detect from near the prior, whatever its pitch."""
+        offset: Float = points - self.location
+        allowed = np.linalg.norm(offset, axis=1) <= MAX_DISTANCE_RATIO * mapping_distance_m
+        if self.yaw_deg is not None:
+            angle = np.degrees(np.arctan2(offset[:, 1], offset[:, 0])) - self.yaw_deg
+            limit = max(field_of_view_deg(camera)) / 2 + YAW_MARGIN_DEG
+            allowed &= np.abs((angle + 180) % 360 - 180) <= limit
+        return np.asarray(allowed)
+
+
+def matches_among(matches: Matches, allowed: NDArray[np.bool_], max_ratio: float | None) -> Matches:
+    """Match keypoints again with the allowed (N,) of their nearest landmarks.
+
+    With a maximum ratio, the nearest allowed landmark is compared with the second nearest allowed one, or with the last
+    of the nearest if there is none. A landmark keeps its nearest keypoint.
+    """
+    near = allowed[matches.near]
+    keypoints = np.flatnonzero(near.any(axis=1))
+    near = near[keypoints]
+    squared = matches.squared[keypoints]
+    rows = np.arange(len(keypoints))
+    first = near.argmax(axis=1)
+    near[rows, first] = False
+    second = np.where(near.any(axis=1), near.argmax(axis=1), near.shape[1] - 1)
+    distance = squared[rows, first]
+    if max_ratio is not None:
+        rows = np.flatnonzero(distance < max_ratio**2 * squared[rows, second])
+    landmarks = matches.near[keypoints, first]
+    rows = rows[np.argsort(distance[rows], kind="stable")]
+    rows = np.sort(rows[np.unique(landmarks[rows], return_index=True)[1]])
+    return matches._replace(keypoints=keypoints[rows], landmarks=landmarks[rows])

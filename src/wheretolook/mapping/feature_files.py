@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.features.descriptors import DescriptorKind, Stored, unit_descriptors
+from wheretolook.features.extractor import DescriptorKind, Stored, unit_descriptors
 from wheretolook.features.registry import all_kinds
 from wheretolook.features.sift import SIFT
 from wheretolook.mapping.colmap_model import ModelArrays
 from wheretolook.utils.errors import MapError, MapWarning
-from wheretolook.utils.reading import check_file, max_expanded_bytes
+from wheretolook.utils.files import check_file, max_expanded_bytes
 
 DATABASE_FILE = "database.db"  # COLMAP's usual name
 HDF5_SUFFIXES = (".h5", ".hdf5")

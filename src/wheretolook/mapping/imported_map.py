@@ -22,10 +22,10 @@ from wheretolook.mapping.config import EXHAUSTIVE_UP_TO, PARTNERS, MapConfig
 from wheretolook.mapping.georeference import MapScale, MarkedPhotographs, check_tables
 from wheretolook.mapping.map_folder import DATABASE_FILE, MapDraft, MapReport, MapRun, finish_map, replacing_map
 from wheretolook.mapping.map_frame import IDENTITY, find_frame
-from wheretolook.mapping.sfm import PhotographFeatures, photograph_features
+from wheretolook.mapping.photograph_map import PhotographFeatures, photograph_features
 from wheretolook.mapping.triangulation import choose_pairs, triangulate_model
-from wheretolook.utils.confine import path_within
 from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.files import path_within
 from wheretolook.utils.images import image_size
 
 _EITHER = "Leave --database out to triangulate again, or --images to keep the model's landmarks."

@@ -1,4 +1,4 @@
-"""Landmarks of a map and their attributes: the input of visibility, features and scorers."""
+"""Names of the attributes of a map's landmarks. Not in `landmarks.py`, so that options are read without PyTorch."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.features.descriptors import DescriptorKind, unit_descriptors
+from wheretolook.features.extractor import DescriptorKind, unit_descriptors
 from wheretolook.features.registry import all_kinds
 from wheretolook.features.sift import SIFT
-from wheretolook.geometry.local_origin import local_origin
 from wheretolook.geometry.poses import Float
-from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
+from wheretolook.geometry.similarity import local_origin
 from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, read_model, select_points
 from wheretolook.mapping.feature_files import read_descriptors
 from wheretolook.utils.errors import MapError, MapWarning
@@ -24,6 +23,20 @@ from wheretolook.utils.npz_files import load_npz, save_npz
 
 if TYPE_CHECKING:
     import pycolmap
+
+
+MAP_ATTRIBUTES = (
+    "track_length",  # logarithm of the number of observations
+    "reprojection_error",  # mean error in pixels
+    "triangulation_angle",  # logarithm of the largest angle between two rays, in degrees
+    "direction_spread",  # 1 - |mean mapping direction|
+    "ambiguity",  # cosine between the landmark's descriptor and the nearest one of another landmark
+    "mapped_distance",  # logarithm of the mean mapping distance, in metres
+    "distance_spread",  # standard deviation of the mapping distances over their mean
+    "mapped_pixel_size",  # logarithm of the mean mapping distance over the mapping cameras' focal length in pixels
+)
+"""Attributes of a landmark that scorers use; NaN where a value is unknown."""
+
 
 _BLOCK = 4096  # landmarks whose tracks are gathered at a time
 _PROGRESS_AFTER_S = 2.0

@@ -1,25 +1,201 @@
-"""Make a map from photographs alone: incremental mapping, gravity alignment, scale."""
+"""Map photographs by structure from motion."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from tqdm.auto import tqdm
 
+from wheretolook.features.extractor import DescriptorKind, Stored
+from wheretolook.features.registry import kind_of
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.geometry.similarity import Similarity
-from wheretolook.mapping.colmap_model import colmap_poses, describe_cameras, registered_names
-from wheretolook.mapping.config import MapConfig
+from wheretolook.mapping.colmap_model import colmap_poses, describe_cameras, read_model, registered_names, write_model
+from wheretolook.mapping.config import EXHAUSTIVE_UP_TO, MapConfig
 from wheretolook.mapping.georeference import MapScale, MarkedPhotographs, check_tables
 from wheretolook.mapping.gravity import estimate_gravity
-from wheretolook.mapping.map_folder import MapDraft, MapReport, finish_map, replacing_map
+from wheretolook.mapping.map_folder import MapDraft, MapReport, MapRun, finish_map, replacing_map
 from wheretolook.mapping.map_frame import IDENTITY, find_frame
-from wheretolook.mapping.photographs import photograph_cameras
-from wheretolook.mapping.sfm import map_incrementally, photograph_features
-from wheretolook.utils.errors import ConfigError
+from wheretolook.mapping.photographs import (
+    PhotographCameras,
+    list_photographs,
+    photograph_cameras,
+    photograph_pairs,
+    read_photograph,
+    reduce_photograph,
+)
+from wheretolook.mapping.triangulation import extract_with_colors, fill_database, match_pairs, write_matches
+from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
+from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.extras import quiet_colmap, storing_in_database
+from wheretolook.utils.files import temporary_folder
+
+_MIN_IMAGES = 3  # of a model: two photographs do not determine a camera
+_MANIFEST = "steps.json"
+_VERSION = 2  # of the format of finished steps
+
+
+@dataclass(frozen=True, eq=False)
+class PhotographFeatures:
+    """Keypoints of photographs."""
+
+    names: list[str]  # of the I photographs, relative to their folder
+    full_sizes: NDArray[np.int64]  # (I, 2) width and height as taken, upright
+    sizes: NDArray[np.int64]  # (I, 2) width and height as mapped
+    stored: list[Stored]  # pixels and descriptors of each photograph's keypoints
+    colors: list[NDArray[np.uint8]]  # (N_i, 3) uint8 of each photograph's keypoints
+    key: str  # hash of everything that determines the keypoints
+    kind: DescriptorKind  # of the descriptors
+
+
+@dataclass(frozen=True, eq=False)
+class MappedPhotographs:
+    """The result of incremental mapping."""
+
+    model: Any  # the largest `pycolmap.Reconstruction`, in a frame and scale of its own; photograph i has the id i + 1
+    database: Path  # COLMAP's database of keypoints and verified matches
+    model_sizes: list[int]  # photographs in each model, the largest first
+
+
+def photograph_features(
+    folder: Path, work: Path, run: MapRun, names: list[str] | None = None, turned: bool = True
+) -> PhotographFeatures:
+    """Extract keypoints of photographs in a folder, at most `max_side_px` large; those of a finished run are reused.
+
+    Takes all photographs unless names are given; `turned` is that of `read_photograph`. Raises MapError if one cannot
+    be read, or the folder holds fewer than two.
+    """
+    names = list_photographs(folder) if names is None else names
+    extractor = run.config.extractor
+    stats = [(folder / name).stat() for name in names]
+    files = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in zip(names, stats, strict=True)]
+    key = cache_key(_VERSION, files, run.config.photographs.max_side_px, extractor.record(), turned)
+    arrays = _cached_arrays(work, key, "features", lambda: _extract(folder, names, turned, run))
+    ends = np.cumsum(arrays["counts"])[:-1]
+    pixels, descriptors, colors = (np.split(arrays[name], ends) for name in ("pixels", "descriptors", "colors"))
+    stored = list(zip(pixels, descriptors, strict=True))
+    kind = kind_of(extractor.method)
+    return PhotographFeatures(names, arrays["full_sizes"], arrays["sizes"], stored, colors, key, kind)
+
+
+def map_incrementally(
+    work: Path, features: PhotographFeatures, cameras: PhotographCameras, run: MapRun
+) -> MappedPhotographs:
+    """Match photographs, verify the matches, and map incrementally (Schonberger and Frahm, CVPR 2016).
+
+    Finished steps are cached in `work`. The worker processes match; COLMAP's bundle adjustment takes as many threads.
+    Raises MapError if the photographs do not overlap enough for a map.
+    """
+    seed = run.seed % 2**31  # COLMAP keeps it in an int
+    pairs = photograph_pairs(len(features.names), EXHAUSTIVE_UP_TO, run.config.photographs.overlap)
+    key = cache_key(features.key, pairs.tolist())
+    database = work / "database.db"
+
+    def match() -> dict[str, NDArray[Any]]:
+        with storing_in_database(database):
+            matches = list(match_pairs(features.stored, pairs, work, run.processes, run.progress, features.kind))
+        return {"matches": np.concatenate(matches), "counts": np.array([*map(len, matches)])}
+
+    arrays = _cached_arrays(work, key, "matches", match)
+    matches = np.split(arrays["matches"], np.cumsum(arrays["counts"])[:-1])
+    intrinsics = [camera.todict() for camera in cameras.cameras]
+    key = cache_key(key, intrinsics, cameras.camera_of.tolist(), cameras.given, seed)
+    folder = work / "sparse"
+    cache = ArtifactCache(work, key, "sparse", _MANIFEST)
+    results = cache.load("sparse.json") if cache.is_current(database, folder) else None
+    if results is None:
+        cache.clear()
+        database.unlink(missing_ok=True)
+        shutil.rmtree(folder, ignore_errors=True)
+        with storing_in_database(database):
+            fill_database(database, _unposed_model(features, cameras), features.stored, features.kind)
+            write_matches(database, pairs, matches)
+            model_sizes = _reconstruct(database, folder, cameras, seed, run)
+        results = cache.store({"sparse.json": {"model_sizes": model_sizes}})
+    return MappedPhotographs(read_model(folder), database, results["sparse.json"]["model_sizes"])
+
+
+def _cached_arrays(
+    work: Path, key: str, step: str, compute: Callable[[], dict[str, NDArray[Any]]]
+) -> dict[str, NDArray[Any]]:
+    """Arrays of a step of work, read from its file or computed and written there."""
+    cache = ArtifactCache(work, key, step, _MANIFEST)
+    name = f"{step}.npz"
+    return (cache.load(name) or cache.store({name: compute()}))[name]
+
+
+def _extract(folder: Path, names: list[str], turned: bool, run: MapRun) -> dict[str, NDArray[Any]]:
+    """Sizes, keypoints, descriptors and colours of photographs, as the arrays of `features.npz`."""
+    sizes = []
+
+    def images() -> Iterator[NDArray[np.uint8]]:
+        for name in names:
+            rgb = read_photograph(folder / name, turned)
+            reduced = reduce_photograph(rgb, run.config.photographs.max_side_px)
+            sizes.append((rgb.shape[1::-1], reduced.shape[1::-1]))
+            yield reduced
+
+    extracted = extract_with_colors(images(), len(names), "map: extract", run, same_size=False)
+    rows = [(len(color), pixels, descriptors, color) for (pixels, descriptors), color in extracted]
+    counts, pixels, descriptors, colors = zip(*rows, strict=True)
+    full_sizes, reduced_sizes = np.swapaxes(sizes, 0, 1)
+    return {
+        "full_sizes": full_sizes,
+        "sizes": reduced_sizes,
+        "counts": np.array(counts),
+        "pixels": np.concatenate(pixels),
+        "descriptors": np.concatenate(descriptors),
+        "colors": np.concatenate(colors),
+    }
+
+
+def _unposed_model(features: PhotographFeatures, cameras: PhotographCameras) -> Any:
+    """Make a reconstruction of photographs and their cameras, without poses."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    for camera in cameras.cameras:
+        model.add_camera_with_trivial_rig(camera)
+    for index, (name, row) in enumerate(zip(features.names, cameras.camera_of.tolist(), strict=True)):
+        image = pycolmap.Image(name=name, camera_id=cameras.cameras[row].camera_id, image_id=index + 1)
+        model.add_image_with_trivial_frame(image)
+    return model
+
+
+def _reconstruct(database: Path, folder: Path, cameras: PhotographCameras, seed: int, run: MapRun) -> list[int]:
+    """Verify matches, map, and write the largest model. Returns the number of photographs in each, largest first."""
+    import pycolmap
+
+    threads = run.processes.workers
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    options = pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=threads, extract_colors=False)
+    options.min_model_size = _MIN_IMAGES
+    options.ba_refine_focal_length = options.ba_refine_extra_params = not cameras.given
+    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = not cameras.given
+    options.triangulation.random_seed = options.mapper.random_seed = seed
+    options.mapper.num_threads = threads
+    pycolmap.set_random_seed(seed)
+    bar = tqdm(total=len(cameras.camera_of), desc="map: register", disable=not run.progress, unit="image")
+    steps: Any = {"initial_image_pair_callback": lambda: bar.update(2), "next_image_callback": lambda: bar.update(1)}
+    with temporary_folder(".partial", parent=folder.parent) as models, quiet_colmap("ERROR"), bar:
+        verifier = pycolmap.GeometricVerifierOptions(num_threads=threads)
+        pycolmap.geometric_verification(str(database), verifier, two_view_geometry_options=verification)
+        mapped = pycolmap.incremental_mapping(str(database), str(models), str(models), options, **steps)
+    ordered = sorted(mapped.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+    if not ordered:
+        fix = f"Give at least {_MIN_IMAGES} sharp photographs from different places, each of which overlaps the next;"
+        fix += " a focal length (mapping.photographs.camera_params) helps."
+        raise MapError("the photographs do not overlap enough for a map", path=database, fix=fix)
+    write_model(ordered[0], folder)
+    return [model.num_reg_images() for model in ordered]
+
 
 _FIX = "Raise mapping.photographs.max_reprojection_error_px, or take sharper photographs."
 

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import ColmapCamera
 from wheretolook.mapping.config import PhotographsConfig
-from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.extras import quiet_colmap
 from wheretolook.utils.images import read_image
-from wheretolook.utils.logs import LOG
+from wheretolook.utils.texts import LOG
 
 if TYPE_CHECKING:
     import pycolmap

@@ -12,18 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.features.descriptors import DescriptorKind, Stored
-from wheretolook.features.extraction import KeypointExtractor
-from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.config import KeypointExtractor
+from wheretolook.features.extractor import DescriptorKind, Keypoints, Stored
 from wheretolook.features.registry import kind_of
 from wheretolook.features.sift import SIFT
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.local_origin import local_origin
 from wheretolook.geometry.poses import camera_centers, transform
+from wheretolook.geometry.similarity import local_origin
 from wheretolook.mapping.config import MAX_EPIPOLAR_ERROR_PX, MIN_TRIANGULATION_ANGLE_DEG
 from wheretolook.mapping.feature_files import name_kind
 from wheretolook.mapping.map_folder import MapRun, color_points
-from wheretolook.utils.colmap import quiet_colmap, storing_in_database
+from wheretolook.utils.extras import quiet_colmap, storing_in_database
 from wheretolook.utils.files import temporary_folder
 from wheretolook.utils.processes import WorkerPool
 
@@ -197,7 +196,7 @@ def _match_by_similarity(
 ) -> list[NDArray[np.uint32]]:
     """Match mutual nearest neighbours: (M, 2) indices of keypoints for each pair."""
     from wheretolook.features.learned import one_thread
-    from wheretolook.features.similarity import SimilarityMatcher
+    from wheretolook.features.matching import SimilarityMatcher
 
     results = []
     with one_thread():

@@ -18,9 +18,9 @@ from wheretolook.planning.routes import PathView, PlannedPath
 from wheretolook.planning.rrt import check_ends, plan_path
 from wheretolook.planning.scene_map import check_methods, planner_map, scene_scorer
 from wheretolook.planning.stops import check_stopping, stops_along, within_pitch
-from wheretolook.rendering.types import Renderer
+from wheretolook.rendering.warp_renderer import Renderer
 from wheretolook.scorers.registry import is_probability
-from wheretolook.weights.resolve import resolve_weights
+from wheretolook.scorers.weights import resolve_weights
 
 
 def plan_by_methods(

@@ -1,22 +1,221 @@
-"""Build the viewpoint map of a scene or COLMAP model, and its variant for planners."""
+"""Build a viewpoint map: of a scene, or of any occlusion model and scorer."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from tqdm.auto import tqdm
 
+from wheretolook.dataset.config import Accuracy
 from wheretolook.dataset.environment import Environment
-from wheretolook.dataset.thresholds import Accuracy
-from wheretolook.geometry.lattices import ViewLattice
-from wheretolook.planning.map_building import build_viewpoint_map
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.lattices import ViewLattice, VoxelGrid
+from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.planning.config import MAX_DIRECTIONS
 from wheretolook.planning.rrt import Space
-from wheretolook.planning.viewpoint_map import ViewpointMap
+from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import FALLBACK, is_probability, make_scorer, methods_named, scorers
-from wheretolook.weights.resolve import load_scorer
+from wheretolook.scorers.weights import load_scorer
+from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.validation import check_range
+from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
+from wheretolook.visibility.survey import SurveyOptions, survey
+
+Text = str | None  # text of progress bars; None shows none
+
+VIEWS_AT_ONCE = 16_384
+"""Views scored at a time, in whole locations: enough to fill a GPU, few enough for the progress bar to move."""
+
+SIGHT_BYTES = 1 << 28  # memory for lines of sight tested at a time in an update, one byte each
+
+SCORE_TOLERANCE = 1e-4  # absolute and relative, of scores computed again: networks may sum in another order
+
+
+def build_viewpoint_map(
+    scorer: Scorer, grid: VoxelGrid, free: ArrayLike, directions: ArrayLike, lattice: str = "", progress: Text = None
+) -> ViewpointMap:
+    """Score every direction at the centre of every free voxel of a grid.
+
+    Args:
+        scorer: any method, on the localization map to be used.
+        grid: of V voxels, metres.
+        free: ids (L,) of the voxels that a camera can be in, or a mask (V,) of all voxels.
+        directions: (D, 3) optical axes in the world, of any length.
+        lattice: name of the directions, for the map's origin.
+        progress: text of the progress bar; None shows none.
+
+    Raises:
+        SceneError: no voxel is free, or the centre of one is inside geometry.
+        MapError: the map has no landmarks.
+        ConfigError: no directions or more than 65,536, or ids outside the grid.
+        ValueError: directions that are not (D, 3), not finite or of length 0.
+    """
+    axes = _unit(directions)
+    given = np.asarray(free)
+    rows = np.flatnonzero(given) if given.dtype == bool else np.unique(given.astype(np.int64))
+    if len(rows) == 0:
+        raise SceneError("no voxel is free", value=len(grid), fix="Refine the grid, or check its position.")
+    if rows[0] < 0 or rows[-1] >= len(grid):
+        raise ConfigError("ids of free voxels lie outside the grid", value=(int(rows[0]), int(rows[-1])))
+    landmarks = scorer.localization_map.landmarks
+    row_of_voxel = np.full(len(grid), -1, dtype=np.int32)
+    row_of_voxel[rows] = np.arange(len(rows))
+    by_row = _score_and_count(scorer, grid.centers()[rows], axes, progress)
+    digests = landmark_digests(landmarks)
+    return ViewpointMap(grid, row_of_voxel, axes, *by_row, landmarks.ids, digests, _origin(scorer, lattice, digests))
+
+
+def update_viewpoint_map(
+    old: ViewpointMap, scorer: Scorer, progress: Text = None
+) -> tuple[ViewpointMap, NDArray[np.int64]]:
+    """Update a viewpoint map after landmarks were added: the same as building it again, for networks up to rounding.
+
+    Landmarks are compared by id. Voxels from which a new landmark, or one whose attributes have changed, is unoccluded
+    are scored again. Nothing else can change if a score depends only on landmarks in view (`Scorer.local`) and
+    landmarks do not hide one another (`OcclusionModel.landmarks_hide`). Otherwise, and if landmarks were removed or
+    moved, all voxels are scored again. The method, camera, occlusion and the scene's geometry must be the same. Returns the
+    new map, and the ids of the voxels that were scored again.
+
+    Raises:
+        ConfigError: the map was derived from another; the method, camera or occlusion model differs; or scores or
+            counts changed in a voxel where they cannot, so that weights or geometry must have changed.
+        SceneError, MapError: as in `build_viewpoint_map`.
+    """
+    landmarks = scorer.localization_map.landmarks
+    occlusion = scorer.localization_map.occlusion
+    if derived := old.origin.derived:
+        fix = "Update the one it was derived from, and derive it again."
+        raise ConfigError("a viewpoint map derived from another cannot be updated", value=derived, fix=fix)
+    digests = landmark_digests(landmarks)
+    origin = _origin(scorer, old.origin.lattice, digests)
+    for name in ("scorer", "camera", "occlusion"):
+        before = getattr(old.origin, name)
+        if getattr(origin, name) != before:
+            fix = f"Use {before!r}, or build it again."
+            raise ConfigError(f"the viewpoint map was built with another {name}", value=getattr(origin, name), fix=fix)
+    changed = _changed_landmarks(old, landmarks, digests)
+    if changed is None or occlusion.landmarks_hide or not scorer.local:
+        stale = np.ones(len(old.scores), dtype=bool)
+    else:
+        stale = _any_unoccluded(occlusion, landmarks.points, changed, old.locations)
+        _check_unchanged(old, scorer, np.flatnonzero(~stale)[:1])
+    by_row = {name: getattr(old, name).copy() for name in ("ranked", "scores", "n_visible")}
+    if stale.any():
+        again = _score_and_count(scorer, old.locations[stale], old.directions, progress)
+        for array, values in zip(by_row.values(), again, strict=True):
+            array[stale] = values
+    new = replace(old, **by_row, landmark_ids=landmarks.ids, landmark_digests=digests, origin=origin)
+    return new, old.voxel_of_row[stale]
+
+
+def landmark_digests(landmarks: Landmarks) -> NDArray[np.uint64]:
+    """Compute digests (N, 2) of each landmark's position and of its attributes: BLAKE2b of 8 bytes, little-endian."""
+    attributes = np.concatenate([landmarks.mapping_direction, landmarks.attributes()], axis=1)
+    return np.stack([_digests(landmarks.points), _digests(attributes)], axis=1)
+
+
+def _digests(rows: NDArray[Any]) -> NDArray[np.uint64]:
+    digests = b"".join(hashlib.blake2b(row.tobytes(), digest_size=8).digest() for row in rows)
+    return np.frombuffer(digests, dtype="<u8").astype(np.uint64)
+
+
+def _score_and_count(
+    scorer: Scorer, locations: Float, directions: Float, progress: Text
+) -> tuple[NDArray[np.uint16], NDArray[np.float32], NDArray[np.uint32]]:
+    """Return ranked ids, scores and numbers of landmarks in view, each (L, D), of directions at locations (L, 3) m."""
+    localization_map = scorer.localization_map
+    points = localization_map.landmarks.points
+    text = progress and f"{progress}: count"
+    options = SurveyOptions(keep=1, keep_occlusion=False, device=localization_map.device, progress=text)
+    rotations = rotation_looking_along(directions)
+    counted = survey(localization_map.camera, rotations, locations, points, localization_map.occlusion, options)
+    ranked = np.empty((len(locations), len(directions)), dtype=np.uint16)
+    scores = np.empty(ranked.shape, dtype=np.float32)
+    block = max(1, VIEWS_AT_ONCE // len(directions))
+    text = progress and f"{progress}: score"
+    with tqdm(total=len(locations), desc=text, unit="voxel", disable=progress is None) as bar:
+        for begin in range(0, len(locations), block):
+            rows = slice(begin, begin + block)
+            values = _score_exactly(scorer, locations[rows], directions)
+            ranked[rows] = np.argsort(-values, axis=1, kind="stable")
+            scores[rows] = values
+            bar.update(len(values))
+    return ranked, scores, counted.counts.astype(np.uint32)
+
+
+def _score_exactly(scorer: Scorer, locations: Float, directions: Float) -> Float:
+    """Scores (L, D) of directions (D, 3) at locations (L, 3) m; `Scorer.score_directions` may approximate them."""
+    poses = poses_looking_along(np.repeat(locations, len(directions), axis=0), np.tile(directions, (len(locations), 1)))
+    return scorer.score(poses).reshape(len(locations), len(directions))
+
+
+def _unit(directions: ArrayLike) -> Float:
+    axes = np.asarray(directions, dtype=np.float64).reshape(-1, 3)
+    check_range("the number of directions", len(axes), 1, MAX_DIRECTIONS)
+    rotation_looking_along(axes)  # raises if one has no length or is not finite
+    length = np.linalg.norm(axes, axis=1, keepdims=True)
+    return np.where(np.abs(length - 1) < 1e-12, axes, axes / length)  # unit vectors stay the same to the bit
+
+
+def _changed_landmarks(
+    old: ViewpointMap, landmarks: Landmarks, digests: NDArray[np.uint64]
+) -> NDArray[np.int64] | None:
+    """Return rows of landmarks that are new or have other attributes; None if some were removed or moved."""
+    place = np.searchsorted(landmarks.ids, old.landmark_ids)
+    place = np.minimum(place, max(0, len(landmarks) - 1))
+    kept = len(landmarks) > 0 and np.array_equal(landmarks.ids[place], old.landmark_ids)
+    if not kept or not np.array_equal(digests[place, 0], old.landmark_digests[:, 0]):
+        return None
+    same = np.zeros(len(landmarks), dtype=bool)
+    same[place] = digests[place, 1] == old.landmark_digests[:, 1]
+    return np.flatnonzero(~same)
+
+
+def _any_unoccluded(
+    occlusion: OcclusionModel, points: Float, rows: NDArray[np.int64], locations: Float
+) -> NDArray[np.bool_]:
+    """Whether at least one of the landmarks at some rows of points (N, 3) m is unoccluded from locations (L, 3) m."""
+    unoccluded = np.zeros(len(locations), dtype=bool)
+    columns: Any = slice(None)
+    if isinstance(occlusion, StoredOcclusion):  # it holds results for all landmarks of its map
+        columns = rows
+    else:
+        points = points[rows]
+    step = max(1, SIGHT_BYTES // max(1, len(points)))
+    for begin in range(0, len(locations), step):
+        block = slice(begin, begin + step)
+        unoccluded[block] = occlusion.unoccluded(locations[block], points)[:, columns].any(axis=1)
+    return unoccluded
+
+
+def _check_unchanged(old: ViewpointMap, scorer: Scorer, rows: NDArray[np.int64]) -> None:
+    """Raise a ConfigError if voxels that see no new landmark have other scores or counts."""
+    if len(rows) == 0:
+        return
+    _, scores, n_visible = _score_and_count(scorer, old.locations[rows], old.directions, None)
+    same_scores = np.allclose(scores, old.scores[rows], rtol=SCORE_TOLERANCE, atol=SCORE_TOLERANCE)
+    if not (same_scores and np.array_equal(n_visible, old.n_visible[rows])):
+        problem = "weights or geometry have changed: scores differ in a voxel that sees no new landmark"
+        raise ConfigError(problem, value=old.locations[rows[0]].tolist(), fix="Build the map again.")
+
+
+def _origin(scorer: Scorer, lattice: str, digests: NDArray[np.uint64]) -> MapOrigin:
+    localization_map = scorer.localization_map
+    camera = localization_map.camera
+    digest = hashlib.sha256(localization_map.landmarks.ids.tobytes() + digests.tobytes()).hexdigest()[:16]
+    intrinsics = camera.colmap.record()
+    if isinstance(camera, PinholeCamera):  # stored in one form, whatever the model
+        intrinsics |= {"model": "PINHOLE", "params": [float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy)]}
+    return MapOrigin(scorer.name, lattice, intrinsics, localization_map.occlusion.name, digest)
+
 
 REACH = 2  # voxels along each axis from which views may be taken
 

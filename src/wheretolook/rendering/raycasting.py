@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.rendering import ray_kernels
 from wheretolook.rendering.ray_kernels import cast_kernel, clear_kernel, distance_kernel, unoccluded_kernel
-from wheretolook.utils.parts import in_threads
-from wheretolook.utils.system import cores
+from wheretolook.utils.devices import in_threads
+from wheretolook.utils.processes import cores
 from wheretolook.utils.warp import start_warp, vec3_array
 
 BLOCK_DIM = 64  # threads of a block on a GPU: rays of a block wait for its longest

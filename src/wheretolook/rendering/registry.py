@@ -9,7 +9,7 @@ from wheretolook.utils.validation import check_choice
 
 if TYPE_CHECKING:
     from wheretolook.geometry.mesh import TexturedMesh
-    from wheretolook.rendering.types import Renderer
+    from wheretolook.rendering.warp_renderer import Renderer
 
 RENDERERS = {"warp": "wheretolook.rendering.warp_renderer:WarpRenderer"}
 """Classes of renderers, constructed with a mesh and a device."""

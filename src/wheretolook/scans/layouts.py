@@ -17,9 +17,8 @@ import pandas as pd
 
 from wheretolook.geometry.poses import Float, invert_poses, rotation_from_quaternion
 from wheretolook.io.poses import read_rows
-from wheretolook.utils.confine import path_within
 from wheretolook.utils.errors import SceneError
-from wheretolook.utils.reading import read_text
+from wheretolook.utils.files import path_within, read_text
 
 _MAX_APART_S = 0.02  # between a colour image and its depth image or pose, as in TUM's associate.py
 _RIGID_TOLERANCE = 1e-2  # of a rotation's entries

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.local_origin import poses_from
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, transform
+from wheretolook.geometry.similarity import poses_from
 from wheretolook.rendering.registry import make_renderer
-from wheretolook.rendering.types import Renderer
+from wheretolook.rendering.warp_renderer import Renderer
 from wheretolook.scans.frames import RgbdFrames, evenly
 
 MAX_PHOTOGRAPHS = 100  # larger sets are subsampled evenly

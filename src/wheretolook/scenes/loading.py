@@ -15,8 +15,8 @@ import trimesh
 from numpy.typing import NDArray
 from PIL import Image
 
-from wheretolook.geometry.local_origin import local_origin
 from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.similarity import local_origin
 from wheretolook.scenes.mesh_checks import check_mesh_file
 from wheretolook.utils.errors import SceneError
 from wheretolook.utils.files import write_bytes

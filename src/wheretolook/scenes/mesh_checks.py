@@ -14,10 +14,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from wheretolook.utils.devices import fitting
 from wheretolook.utils.errors import SceneError
+from wheretolook.utils.files import max_expanded_bytes, parse_json_object, read_text
 from wheretolook.utils.images import image_size
-from wheretolook.utils.memory import fitting
-from wheretolook.utils.reading import max_expanded_bytes, parse_json_object, read_text
 
 MAX_PLY_HEADER = 1 << 16  # bytes
 MAX_MTL_BYTES = 16_000_000

@@ -1,1 +1,1 @@
-"""Methods that score viewpoints: one module or folder each, with its record (`wheretolook.scorers.method.Method`)."""
+"""Methods that score viewpoints: one module or folder each, with its record (`wheretolook.scorers.registry.Method`)."""

@@ -15,7 +15,7 @@ from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
 from wheretolook.utils.errors import CameraError, ConfigError
 
 if TYPE_CHECKING:
-    from wheretolook.dataset.thresholds import Accuracy
+    from wheretolook.dataset.config import Accuracy
     from wheretolook.inputs.bins import BinnedViews
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.visibility.frustum import LandmarkSets
@@ -51,7 +51,7 @@ class Scorer(ABC):
     a pose depends on that pose alone, not on the batch, and is deterministic. Higher is better; scores are in [0, 1]
     where the method allows, but only their order matters for choosing a view.
 
-    A new method is one file with a subclass and a record (`wheretolook.scorers.method.Method`), named in
+    A new method is one file with a subclass and a record (`wheretolook.scorers.registry.Method`), named in
     `registry.MODULES`. One that needs binned landmarks derives from `BinnedScorer`.
     """
 

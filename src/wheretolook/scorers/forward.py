@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 
 from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.method import MethodStyle, ScorerOptions, rule
 from wheretolook.scorers.random import uniform
+from wheretolook.scorers.registry import MethodStyle, ScorerOptions, rule
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.method import MethodStyle, ScorerOptions, rule
+from wheretolook.scorers.registry import MethodStyle, ScorerOptions, rule
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from wheretolook.scorers.method import Group, MethodStyle
-from wheretolook.scorers.registry import find
+from wheretolook.scorers.registry import Group, MethodStyle, find
 
 ORACLE = "oracle"  # the best views by their labels, in tables and figures
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, make_dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from wheretolook.scorers.method import Method
-from wheretolook.scorers.registry import learned, methods_named
+from wheretolook.scorers.registry import Method, learned, methods_named
 from wheretolook.training.config import SharedConfig
 from wheretolook.utils.errors import ConfigError
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float
 from wheretolook.scorers.base import CountingScorer
-from wheretolook.scorers.method import MethodStyle, rule
+from wheretolook.scorers.registry import MethodStyle, rule
 
 
 class VisibleScorer(CountingScorer):

@@ -1,43 +1,89 @@
-"""Localizes images in a COLMAP map whose descriptors are known."""
+"""Reads hloc's files of image pairs: the mapping images that retrieval found for each query."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
 
-from wheretolook.dataset.thresholds import ACCURACY, Accuracy, checked_accuracy
+from wheretolook.dataset.config import ACCURACY, Accuracy, checked_accuracy
 from wheretolook.features.config import ExtractorConfig
-from wheretolook.features.keypoints import Keypoints
+from wheretolook.features.extractor import Keypoints
 from wheretolook.features.matches import Matches
 from wheretolook.features.registry import kind_of, runnable_extractors
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.config import LocalizerConfig
-from wheretolook.localization.localizer import Localizer
-from wheretolook.localization.prior import PosePrior, matches_among
-from wheretolook.localization.rig import IDENTITY, Look, checked_turns
-from wheretolook.localization.rig_localization import POSES_OF_A_VIEW, POSES_OF_AN_IMAGE, JointLocalizer
-from wheretolook.localization.turns import read_turns
-from wheretolook.mapping.colmap_model import model_arrays, read_model
+from wheretolook.localization.localizer import POSES_OF_A_VIEW, POSES_OF_AN_IMAGE, JointLocalizer, Localizer
+from wheretolook.localization.rig import IDENTITY, Look, PosePrior, checked_turns, matches_among, read_turns
+from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, observation_matrix, read_model
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.georeference import REPORT_FILE
-from wheretolook.mapping.image_pairs import ImagePairs
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.map_folder import LANDMARKS_FILE
 from wheretolook.mapping.map_frame import MapFrame, find_frame
-from wheretolook.mapping.sources import find_features
-from wheretolook.select.localized import Localized
-from wheretolook.select.query_images import QueryImage, QueryImages, distinct_names
-from wheretolook.utils.errors import ConfigError, MapError, PoseError
-from wheretolook.utils.reading import read_json_object
-from wheretolook.utils.records import from_record
+from wheretolook.mapping.mapped_images import find_features
+from wheretolook.select.localized import Localized, QueryImage, QueryImages, distinct_names
+from wheretolook.utils.errors import ConfigError, MapError, PoseError, TableError
+from wheretolook.utils.files import path_ends, read_json_object, read_text
+from wheretolook.utils.validation import from_record
+
+MAX_BYTES = 2**28
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePairs:
+    """The mapping images paired with each query, and the landmarks that they observe."""
+
+    path: Path
+    images: dict[str, list[int]]  # rows of mapping images in the model, by the query's name in the file
+    observed: csr_array  # (I, N) which landmarks they observe
+
+    @classmethod
+    def read(cls, path: Path, model: ModelArrays, landmark_ids: NDArray[np.int64]) -> ImagePairs:
+        """Read a file with lines "query mapping_image", given a model and the ids (N,) of its landmarks, ascending.
+
+        Raises TableError if a line is not two names, or no image of the model is named.
+        """
+        images: dict[str, list[int]] = defaultdict(list)
+        row_of = {name: row for row, name in enumerate(model.image_names)}
+        try:
+            lines = read_text(path, MAX_BYTES).splitlines()
+        except (OSError, ValueError) as error:
+            raise TableError(f"the pairs of images cannot be read: {error}", path=path) from error
+        for number, line in enumerate(lines, 1):
+            names = line.split()
+            if len(names) not in (0, 2):
+                fix = "Give hloc's file of pairs: a query and a mapping image in each line."
+                raise TableError(f"line {number} is not a pair of images", path=path, value=line[:80], fix=fix)
+            if names:
+                images[names[0]] += [row_of[name] for name in names[1:] if name in row_of]
+        if not any(images.values()):
+            fix = f"Its images have names such as {model.image_names[0]}." if model.image_names else ""
+            raise TableError("no mapping image of the pairs is in the model", path=path, fix=fix)
+        points = np.intersect1d(model.point_ids, landmark_ids, return_indices=True)[1]
+        return cls(path, images, observation_matrix(model)[:, points])
+
+    def landmarks(self, query: str) -> NDArray[np.int64]:
+        """Return the rows of the landmarks of a query, by its path or the end of it. Raises TableError if it has none."""
+        names = path_ends(PurePath(query))
+        found = next((self.images[name] for name in names if name in self.images), None)
+        if found is None:
+            ends = [rows for name, rows in self.images.items() if PurePath(name).name == names[-1]]
+            if len(ends) != 1:
+                fix = "Name it in the first column."
+                raise TableError("the pairs do not name this image", path=self.path, value=query, fix=fix)
+            found = ends[0]
+        return np.unique(self.observed[found].indices).astype(np.int64)
+
 
 Image = str | Path | NDArray[np.uint8]
 
@@ -127,7 +173,7 @@ class ImageLocalizer:
         Args:
             images: a file, or an array (H, W, 3) uint8 RGB; with `turns` several.
             turns: rotations `cam_from_rig` (N, 3, 3), or poses (N, 3, 4) in metres; or a file, see
-                `wheretolook.localization.turns.read_turns`.
+                `wheretolook.localization.rig.read_turns`.
             camera: of the images, or its camera_id in the model; None for the model's, or a pinhole of the EXIF focal
                 length, see `QueryImages`.
             prior: rough location x, y, z of the camera in the map, and perhaps yaw in degrees of an image: one more

@@ -1,11 +1,12 @@
-"""Where to look at locations of a COLMAP map: the best views by any method of scoring."""
+"""Which views are asked for: how many, within which pitch, and how far the camera may turn."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,36 +14,154 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
+from wheretolook.dataset.config import ACCURACY, Accuracy
 from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, EnvironmentConfig
-from wheretolook.dataset.thresholds import ACCURACY, Accuracy
 from wheretolook.geometry.camera import Camera, PinholeCamera, parse_camera
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along, rigid_poses
+from wheretolook.inputs.landmark_features import ReasonCounter
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.inputs.reasons import ReasonCounter
 from wheretolook.looks.next_look import NextLook, NextLookSelector, mean_scores_by_pitch
-from wheretolook.looks.selection import best_views, separated
+from wheretolook.looks.selection import MAX_VIEWS, best_views, separated
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.planning.config import StopConfig
-from wheretolook.planning.routes import PlannedPath
+from wheretolook.planning.routes import PlannedPath, TurnLimit, best_sequence
 from wheretolook.planning.stops import stops_along
-from wheretolook.planning.view_sequence import TurnLimit, best_sequence
-from wheretolook.select.pose_prior import ALTERNATIVES, PosePrior
-from wheretolook.select.request import SelectionRequest
+from wheretolook.scorers.base import Scorer
 from wheretolook.select.views import SelectedViews, joined
 from wheretolook.select.waypoints import Waypoints, grid_waypoints, usable_waypoints
 from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError, PlanningError
+from wheretolook.utils.validation import check_limits, check_pitch, check_range, reject
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from wheretolook.scorers.base import Scorer
     from wheretolook.select.image_localizer import Image, ImageLocalizer
     from wheretolook.select.localized import Localized
+
+
+@dataclass(frozen=True)
+class SelectionRequest:
+    """Which views are selected at each waypoint.
+
+    Args:
+        n: number of best views of each waypoint.
+        looks: instead of n, number of views that are chosen to be localized jointly, for a camera that turns there.
+        pitch_deg: lowest and highest pitch in degrees, 90 straight up.
+        pan_deg: lowest and highest yaw in degrees relative to the robot's heading at the waypoint, positive to its left.
+        apart_deg: with n, least angle between the best views of a waypoint, in degrees.
+        max_turn_deg: greatest rotation between a view and the next, in the order of the waypoints. The views are then
+            the sequence with the greatest sum of scores within the limit, exactly.
+        max_total_turn_deg: with looks, how far the camera turns in all from the first to the last.
+        least_score: with max_turn_deg and looks: where the sequence's view scores less, the waypoint becomes a stop
+            with the fewest further looks that reach this score jointly, `looks` in all at most.
+        sigma_m: standard deviation in metres of the robot's x and y each: reports the views' expected scores.
+        yaw_sigma_deg: the same of its yaw in degrees.
+        skip: leave out waypoints outside the map or inside geometry.
+    """
+
+    n: int = 1
+    looks: int | None = None
+    pitch_deg: tuple[float, float] | None = None
+    pan_deg: tuple[float, float] | None = None
+    apart_deg: float | None = None
+    max_turn_deg: float | None = None
+    max_total_turn_deg: float | None = None
+    least_score: float | None = None
+    sigma_m: float | None = None
+    yaw_sigma_deg: float | None = None
+    skip: bool = False
+
+    def __post_init__(self) -> None:
+        check_pitch("pitch_deg", self.pitch_deg or (-90.0, 90.0))
+        low, high = check_limits("pan_deg", self.pan_deg or (-180.0, 180.0))
+        fix = "Give degrees, the lowest first, such as -60 60, or 150 210 for the back."
+        if not (-360 <= low < high <= 360 and high - low <= 360):
+            raise ConfigError("pan_deg is a lowest and a highest yaw", value=(low, high), fix=fix)
+        joint = self.looks is not None
+        in_order = self.max_turn_deg is not None
+        stopping = self.least_score is not None
+        for name in ("max_turn_deg", "max_total_turn_deg", "sigma_m", "yaw_sigma_deg"):
+            check_range(name, getattr(self, name) or 0, 0)
+        reject(
+            (self.apart_deg is not None and self.n == 1, "apart_deg needs an n of at least 2", self.apart_deg),
+            (not 0 <= (self.apart_deg or 0) <= 180, "apart_deg must be 0 to 180", self.apart_deg),
+            (not isinstance(self.n, Integral) or self.n < 1, "n must be a whole number of at least 1", self.n),
+            (joint and self.looks not in range(1, MAX_VIEWS + 1), f"looks must be 1 to {MAX_VIEWS}", self.looks),
+            (stopping and not (joint and in_order), "least_score needs looks and max_turn_deg", self.least_score),
+            (stopping and not 0 < (self.least_score or 0) <= 1, "least_score must be above 0, to 1", self.least_score),
+            (joint and self.n > 1, "n and looks exclude each other", (self.n, self.looks)),
+            (in_order and self.n > 1, "max_turn_deg is for one view of each waypoint: leave n out", self.n),
+            (joint and in_order and not stopping, "looks with max_turn_deg need least_score", self.looks),
+        )
+        if self.max_total_turn_deg is not None and (stopping or not joint):
+            problem = "max_total_turn_deg needs looks, and excludes least_score"
+            raise ConfigError(problem, value=self.max_total_turn_deg)
+
+
+DRAWS = 32  # of the true pose, the same at each waypoint
+ALTERNATIVES = 60  # directions with the best scores, which are compared
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """Gaussian uncertainty of a robot's pose: of x and y each in metres, and of yaw in degrees; height is known."""
+
+    sigma_m: float
+    yaw_sigma_deg: float
+
+    def draws(self) -> tuple[Float, Float]:
+        """Return errors of position (DRAWS, 3) m and rotations about the vertical (DRAWS, 3, 3), in the world."""
+        normal = np.random.default_rng(0).standard_normal((DRAWS, 3))
+        offsets = normal * (self.sigma_m, self.sigma_m, 0.0)
+        yaw = np.radians(self.yaw_sigma_deg) * normal[:, 2]
+        rotations = np.tile(np.eye(3), (DRAWS, 1, 1))
+        rotations[:, 0, 0] = rotations[:, 1, 1] = np.cos(yaw)
+        rotations[:, 1, 0] = np.sin(yaw)
+        rotations[:, 0, 1] = -rotations[:, 1, 0]
+        return offsets, rotations
+
+    def expected_scores(
+        self,
+        scorer: Scorer,
+        points: Float,
+        axes: Float,
+        allowed: NDArray[np.bool_],
+        chosen: tuple[NDArray[np.int64], Float],
+        progress: bool = False,
+    ) -> tuple[Float, Float]:
+        """Compute mean scores over draws of the true pose outside geometry, while the robot turns by its estimate.
+
+        Args:
+            scorer: scores views.
+            points: (W, 3) m, estimated locations in the world.
+            axes: (D, 3) directions scored at each.
+            allowed: (W, D) those that are compared.
+            chosen: rows of points (V,), and optical axes (V, 3), of the selected views.
+            progress: show a bar.
+
+        Returns:
+            (V,) of each selected view, and (V,) the highest of all compared directions at its location.
+        """
+        of_view, view_axes = chosen
+        expected, best = np.empty(len(of_view)), np.empty(len(of_view))
+        offsets, rotations = self.draws()
+        for row in tqdm(range(len(points)), desc="prior", unit="waypoint", disable=not progress):
+            views = np.flatnonzero(of_view == row)
+            directions = np.concatenate([view_axes[views], axes[allowed[row]]])
+            at = points[row] + offsets
+            free = ~scorer.localization_map.occlusion.inside_geometry(at)
+            free |= ~free.any()
+            pairs = zip(at[free], rotations[free], strict=True)
+            scores = [scorer.score_directions(point[None], directions @ turn.T)[0] for point, turn in pairs]
+            mean = np.mean(scores, axis=0)
+            expected[views], best[views] = mean[: len(views)], mean.max()
+        return expected, best
+
 
 VIEWS_PER_STEP = {"cpu": 1 << 13, "cuda": 1 << 17}  # of the progress bar, in whole waypoints
 
@@ -128,7 +247,7 @@ class WhereToLook:
             ConfigError: no such method, camera, occlusion, lattice or device.
         """
         from wheretolook.scorers.registry import make_scorer
-        from wheretolook.weights.resolve import load_scorer, resolve_weights
+        from wheretolook.scorers.weights import load_scorer, resolve_weights
 
         device = usable_device(device)
         camera = _described_camera(camera, fov_deg)
@@ -273,7 +392,7 @@ class WhereToLook:
             heading_deg: yaws (W,) of the robot at the points, for a limit on pan.
             progress: show a progress bar.
             accuracy: limits of the errors that the scores refer to, see `at_accuracy`.
-            options: further fields of `wheretolook.select.request.SelectionRequest`. With `looks`, the rank is the
+            options: further fields of `wheretolook.select.where_to_look.SelectionRequest`. With `looks`, the rank is the
                 order to look in, and `set_score` the probability that the set localizes; with `least_score`, the view
                 of the sequence has rank 1.
 

@@ -23,8 +23,7 @@ from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from wheretolook.tracking.config import TrackingConfig
-from wheretolook.tracking.store import client
+from wheretolook.tracking.store import TrackingConfig, client
 from wheretolook.utils.errors import MissingRunError, TrackingError
 from wheretolook.utils.version import VERSION
 

@@ -1,4 +1,4 @@
-"""Opens the MLflow store, and re-raises whatever fails in it as TrackingError."""
+"""The MLflow store: its options, its making, and its errors."""
 
 from __future__ import annotations
 
@@ -8,18 +8,48 @@ import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, cast
 
-from wheretolook.tracking.config import TrackingConfig
 from wheretolook.utils.errors import StorageError, TrackingError, TrackingWarning
 from wheretolook.utils.files import copy_file, storage_errors, temporary_folder, write_json
 from wheretolook.utils.locks import hold
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """Where runs are logged.
+
+    Args:
+        folder: folder of the MLflow store. Created when needed; holds `mlflow.db` and `artifacts/`.
+        experiment: name of one MLflow experiment for all runs; by default, each dataset and purpose has its own, such
+            as `release: evaluation`.
+    """
+
+    folder: str = "mlruns"
+    experiment: str = ""
+
+    @property
+    def root(self) -> Path:
+        """Absolute path of the store's folder."""
+        return Path(self.folder).expanduser().resolve()
+
+    @property
+    def uri(self) -> str:
+        """Tracking URI of the store."""
+        return f"sqlite:///{self.root / 'mlflow.db'}"
+
+    @property
+    def artifacts(self) -> str:
+        """Artifact location of the experiments."""
+        return str(self.root / "artifacts")
+
 
 _FREE_BYTES = 2**20  # required before work starts
 _LOCK_WAIT_S = 60.0  # for another process that creates the store, which takes it 4 s on two cores

@@ -1,12 +1,12 @@
-"""Labelled viewpoints as binned tensors, and the data modules of all learners."""
+"""Training scenes of a dataset and of further ones, without PyTorch."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from math import ceil
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import pandas as pd
@@ -18,13 +18,121 @@ from tqdm.auto import tqdm
 
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses
-from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
-from wheretolook.inputs.statistics import FeatureStatistics
-from wheretolook.training.batches import Batch, IndexBatches, TensorViews
+from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, FeatureStatistics
 from wheretolook.training.config import FittingConfig, SharedConfig
-from wheretolook.training.scenes import training_scenes
-from wheretolook.training.training_range import TrainingRange, bin_quantities
+from wheretolook.training.trained_network import TrainingRange, bin_quantities
 from wheretolook.utils.errors import ConfigError, TableError
+from wheretolook.utils.files import fingerprint, safe_child
+
+
+def with_also(dataset: Dataset, names: Sequence[str]) -> Dataset:
+    """Return a dataset together with the train scenes of others in the same folder.
+
+    Raises a TableError if there is no such dataset or it has no train scene; a ConfigError if it is named
+    twice or is the dataset itself, or one of its scenes is one of the dataset's under another name.
+    """
+    if len({dataset.name, *names}) <= len(names):
+        fix = "Name other datasets in the same folder, each once."
+        raise ConfigError("a dataset is named twice", value=list(names), fix=fix)
+    scenes = list(dataset.scenes)
+    for name in names:
+        other = Dataset.load(safe_child(dataset.root.parent, name, "a dataset's name"))
+        scenes += training_scenes(Dataset(other.root, other.split("train")))
+    if names:
+        scene_of: dict[str, SceneFolder] = {}
+        for scene in scenes:
+            landmarks = fingerprint(scene.landmarks) if scene.landmarks.is_file() else str(scene.folder)
+            if landmarks in scene_of:
+                fix = "Leave the dataset out of train.also: scenes must not cross splits."
+                raise ConfigError(f"this is the scene {scene_of[landmarks].folder} again", path=scene.folder, fix=fix)
+            scene_of[landmarks] = scene
+    return Dataset(dataset.root, tuple(scenes))
+
+
+def training_scenes(dataset: Dataset) -> list[SceneFolder]:
+    """Return train scenes, then val scenes; a TableError without train scenes."""
+    if not dataset.split("train"):
+        fix = "Make one, or train on another dataset."
+        raise TableError("the dataset has no train scene", path=dataset.root, fix=fix)
+    return [*dataset.split("train"), *dataset.split("val")]
+
+
+class Batch(NamedTuple):
+    """One process's share of a batch."""
+
+    inputs: tuple[Tensor, ...]  # of the network, tensors with B rows
+    labels: Tensor  # (B,) float32
+    total: int  # examples in the whole batch, over all processes
+
+
+class IndexBatches(ABC):
+    """Batches of the examples in `rows` (n,), without workers or work for a single example.
+
+    Every process cuts the same batches of `batch_size` and keeps its `share` of each, (its rank, the number of
+    processes). Shares differ by one example at most and may be empty, so that all processes take equally many steps.
+    With a `shuffle_seed` every pass has its own order, the same in every run; None keeps the order of `rows`. The order
+    is drawn by NumPy if `numpy_order`, else by the generator that `collate` is called with.
+    """
+
+    numpy_order = False
+
+    def __init__(
+        self, rows: Tensor, batch_size: int, shuffle_seed: int | None = None, share: tuple[int, int] = (0, 1)
+    ) -> None:
+        self.rows = rows
+        self.batch_size = batch_size
+        self.shuffle_seed = shuffle_seed
+        self.share = share
+        self._passes = 0
+
+    def __len__(self) -> int:
+        return ceil(len(self.rows) / self.batch_size)
+
+    def __iter__(self) -> Iterator[Batch]:
+        rows = self.rows
+        generator = torch.Generator(rows.device)
+        if self.shuffle_seed is not None:
+            generator.manual_seed(1_000_003 * self.shuffle_seed + self._passes)
+            if self.numpy_order:
+                rng = np.random.default_rng([self.shuffle_seed, self._passes])
+                rows = rows[torch.from_numpy(rng.permutation(len(rows))).to(rows.device)]
+            else:
+                rows = rows[torch.randperm(len(rows), generator=generator, device=rows.device)]
+            self._passes += 1
+        for part in rows.split(self.batch_size):
+            yield self.collate(part, generator)
+
+    def share_of(self, whole: Tensor) -> Tensor:
+        """Return this process's part of a tensor with a row for each example of a batch."""
+        rank, world_size = self.share
+        return whole.tensor_split(world_size)[rank]
+
+    @abstractmethod
+    def collate(self, rows: Tensor, generator: torch.Generator) -> Batch:
+        """Return this process's share of a whole batch of rows, with random numbers of the generator if shuffled."""
+
+
+@dataclass(frozen=True, eq=False)
+class TensorViews:
+    """Labelled viewpoints, described by tensors of one device and by arrays."""
+
+    def _tensors(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+
+    def to(self, device: torch.device | str) -> Self:
+        """Return the same views with their tensors on a device."""
+        return replace(self, **{name: value.to(device) for name, value in self._tensors().items()})
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the tensors."""
+        return next(value.device for value in self._tensors().values())
+
+    @property
+    def n_bytes(self) -> int:
+        """Memory of the tensors."""
+        return sum(value.nbytes for value in self._tensors().values())
+
 
 BLOCK = 4096  # views binned at a time
 GPU_MEMORY_FACTOR = 2  # views are stored on a GPU with this many times the memory they need

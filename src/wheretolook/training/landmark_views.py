@@ -17,16 +17,13 @@ from tqdm.auto import tqdm
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
 from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good, poses
 from wheretolook.geometry.poses import Float
-from wheretolook.inputs.channels import ATTRIBUTES, OF_SIZE
+from wheretolook.inputs.channels import ATTRIBUTES, OF_SIZE, FeatureStatistics
 from wheretolook.inputs.landmark_features import LandmarkDescriber, ViewLandmarks
-from wheretolook.inputs.statistics import FeatureStatistics
-from wheretolook.training.batches import Batch, IndexBatches, TensorViews
 from wheretolook.training.config import SharedConfig
-from wheretolook.training.data import ViewsDataModule, labelled_rows
+from wheretolook.training.data import Batch, IndexBatches, TensorViews, ViewsDataModule, labelled_rows, training_scenes
 from wheretolook.training.fit import home_device
 from wheretolook.training.learner import TrainingJob
-from wheretolook.training.scenes import training_scenes
-from wheretolook.training.training_range import TrainingRange, camera_quantities, view_quantities
+from wheretolook.training.trained_network import TrainingRange, camera_quantities, view_quantities
 
 DISTANCES = [ATTRIBUTES.index(name) for name in OF_SIZE]
 
@@ -48,7 +45,7 @@ class LandmarkViews(TensorViews):
     error_m: Tensor  # (B,) float32, position error; infinite where it is not localized or its orientation is off
     scene: NDArray[np.int64]  # (B,) index of each view's scene in the order given
     location: NDArray[np.int64]  # (B,) location_id of each view, unique only within its scene
-    quantities: Float  # (B, 6), `wheretolook.training.training_range.QUANTITIES`
+    quantities: Float  # (B, 6), `wheretolook.training.trained_network.QUANTITIES`
     detected: Tensor | None = None  # (E,) bool, whether the localizer detected the landmark; None if not requested
 
     def __len__(self) -> int:

@@ -13,10 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.dataset.layout import Dataset
 from wheretolook.geometry.camera import Camera
-from wheretolook.training.classifier import ViewpointClassifier
 from wheretolook.training.config import SharedConfig
 from wheretolook.training.data import ViewsDataModule
-from wheretolook.training.fit import EpochRecord, RunLog, fit
+from wheretolook.training.fit import EpochRecord, RunLog, ViewpointClassifier, fit
 from wheretolook.training.trained_network import StoredNetwork, TrainedNetwork
 
 

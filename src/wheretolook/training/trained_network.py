@@ -1,22 +1,190 @@
-"""A trained network with what is needed to score with it, saved to a weights file and loaded."""
+"""The range of a model's training views, and warnings about views outside of it."""
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import isfinite
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from wheretolook.dataset.thresholds import ACCURACY, Accuracy, checked_accuracy
-from wheretolook.geometry.camera import Camera, camera_of_record
-from wheretolook.training.training_range import TrainingRange
+from wheretolook.dataset.config import ACCURACY, Accuracy, checked_accuracy
+from wheretolook.geometry.camera import Camera, camera_of_record, field_of_view_deg
+from wheretolook.geometry.poses import Float
+from wheretolook.inputs.landmark_features import ViewLandmarks
 from wheretolook.training.weights import check_method_of_weights, read_weights, write_weights
-from wheretolook.utils.errors import ConfigError, WeightsError
+from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, WeightsError
+
+QUANTITIES = {
+    "distance_m": "mean distance of the landmarks in view {:.3g} m",
+    "depth_m": "mean depth of the filled bins {:.3g} m",
+    "in_view": "{:.0f} landmarks in view",
+    "across_deg": "field of view across {:.1f} degrees",
+    "down_deg": "field of view down {:.1f} degrees",
+    "focal_px": "focal length {:.4g} px",
+}
+"""Quantities of a view, NaN where unknown, and their text in messages. The mean distance is geometric."""
+
+LANDMARK_QUANTITIES = ("distance_m", "depth_m", "in_view")
+ANGLES = ("across_deg", "down_deg")
+DISTANCES = ("distance_m", "depth_m")
+
+QUANTILES = (0.005, 0.995)  # of the training views that bound the range
+MAX_DISTANCE_QUANTILE = 0.975
+"""Of the training views, bounds distances from above. Three quarters of the farther ones are of three scenes, and scenes
+that are scaled in training show the same surfaces: neither covers spaces of that size."""
+MARGIN = 1.25  # factor that widens the range beyond these quantiles; for angles, degrees
+MARGIN_DEG = 2.0
+TOLERATED = 0.05  # share of the views scored at once that may be out of range without a warning
+
+
+@dataclass(frozen=True)
+class TrainingRange:
+    """Lowest and highest value of some of `QUANTITIES` over the training views; the others are unbounded."""
+
+    bounds: Mapping[str, tuple[float, float]]
+
+    @classmethod
+    def of(cls, quantities: Float) -> TrainingRange:
+        """Return the range of views with `QUANTITIES` (B, 6), without those that have no landmark."""
+        bounds = {}
+        for name, values in zip(QUANTITIES, quantities[_have_landmarks(quantities)].T, strict=True):
+            known = values[np.isfinite(values)]
+            if len(known):
+                low, high = np.quantile(known, QUANTILES).tolist()
+                wider = (low - MARGIN_DEG, high + MARGIN_DEG) if name in ANGLES else (low / MARGIN, high * MARGIN)
+                if name in DISTANCES:
+                    wider = low / MARGIN, float(np.quantile(known, MAX_DISTANCE_QUANTILE))
+                bounds[name] = (round(wider[0], 4), round(wider[1], 4))
+        return cls(bounds)
+
+    @classmethod
+    def of_camera(cls, camera: Camera | None) -> TrainingRange:
+        """Return the range that only a training camera's field of view bounds; unbounded without a camera."""
+        if camera is None:
+            return cls({})
+        angles = zip(ANGLES, field_of_view_deg(camera), strict=True)
+        return cls({name: (angle - MARGIN_DEG, angle + MARGIN_DEG) for name, angle in angles})
+
+    @classmethod
+    def of_record(cls, record: Mapping[str, Any]) -> TrainingRange:
+        """Return the range of a `record`; KeyError, TypeError, IndexError or ValueError if it is invalid."""
+        bounds = dict(record)
+        return cls({name: (float(bounds[name][0]), float(bounds[name][1])) for name in QUANTITIES if name in bounds})
+
+    def at_accuracy(self, ratio: float) -> TrainingRange:
+        """Return the range for an accuracy `ratio` times that of the training labels.
+
+        Errors grow with distance, so a finer accuracy is in range up to distances as many times shorter. A coarser one
+        does not extend the range: spaces of that size are not covered.
+        """
+        bounds = dict(self.bounds)
+        for name in bounds.keys() & DISTANCES:
+            low, high = bounds[name]
+            farthest = high * min(ratio, 1.0)
+            bounds[name] = min(low, farthest), farthest
+        return TrainingRange(bounds)
+
+    def record(self) -> dict[str, list[float]]:
+        """Return the bounds as JSON values."""
+        return {name: list(bounds) for name, bounds in self.bounds.items()}
+
+    @property
+    def bounds_landmarks(self) -> bool:
+        """Whether the range bounds more than the camera."""
+        return any(name in self.bounds for name in LANDMARK_QUANTITIES)
+
+    @cached_property
+    def _limits(self) -> Float:
+        """Lowest and highest value of each of `QUANTITIES`, (2, 6)."""
+        return np.array([self.bounds.get(name, (-np.inf, np.inf)) for name in QUANTITIES]).T
+
+    def outside(self, quantities: Float) -> NDArray[np.bool_]:
+        """Return which of `QUANTITIES` (B, 6) are outside the range; unknown ones are not."""
+        low, high = self._limits
+        return np.asarray((quantities < low) | (quantities > high))
+
+    def contains(self, quantities: Float) -> NDArray[np.bool_]:
+        """Return which views with `QUANTITIES` (B, 6) are in the range, (B,)."""
+        return np.asarray(~self.outside(quantities).any(axis=1))
+
+    def complaint(self, quantities: Float, tolerated: float = 0.0) -> str:
+        """Describe how views leave the range; "" if at most the share `tolerated` of those with landmarks does.
+
+        Each quantity is reported by its median over the views where it is outside.
+        """
+        with_landmarks = quantities[_have_landmarks(quantities)]
+        outside = self.outside(with_landmarks)
+        n_outside = int(np.count_nonzero(outside.any(axis=1)))
+        if n_outside <= tolerated * len(outside):
+            return ""
+        parts = []
+        for column, (name, text) in enumerate(QUANTITIES.items()):
+            if outside[:, column].any():
+                low, high = self.bounds[name]
+                value = np.median(with_landmarks[outside[:, column], column])
+                parts.append(f"{text.format(value)} (in range: {low:.3g} to {high:.3g})")
+        return f"{n_outside} of {len(outside)} views are unlike the training views: {', '.join(parts)}"
+
+
+@dataclass
+class RangeWatch:
+    """Checks scored views until it has warned; `watching` is whether there is anything left to check."""
+
+    watching: bool
+
+    def check(self, name: str, training_range: TrainingRange, quantities: Sequence[Float]) -> None:
+        """Warn once, with an `OutOfRangeWarning`, if too many views of `quantities`, parts (B, 6), are out of range.
+
+        The warning points to the caller of the calling function.
+        """
+        if not self.watching or not quantities:
+            return
+        if complaint := training_range.complaint(np.concatenate(quantities), TOLERATED):
+            self.watching = False
+            text = f"{name}: {complaint}. Their scores are less reliable; Scorer.in_range returns which."
+            warnings.warn(text, OutOfRangeWarning, stacklevel=3)
+
+
+def _have_landmarks(quantities: Float) -> NDArray[np.bool_]:
+    """Return which views with `QUANTITIES` (B, 6) see any landmark, (B,): they have a distance or a depth."""
+    return np.asarray(np.isfinite(quantities[:, :2]).any(axis=1))
+
+
+def camera_quantities(camera: Camera) -> Float:
+    """Return the `QUANTITIES` (6,) of a camera; the field of view is 360 degrees if no ray meets the image's edges."""
+    angles = np.nan_to_num(field_of_view_deg(camera), nan=360.0)
+    return np.array([np.nan, np.nan, np.nan, *angles, camera.mean_focal_px])
+
+
+def bin_quantities(depth_sums: Float, n_filled: NDArray[np.integer[Any]]) -> Float:
+    """Return `QUANTITIES` (B, 6) of binned views: sums (B,) of the mean depths of their bins, and filled bins (B,)."""
+    quantities = np.full((len(depth_sums), len(QUANTITIES)), np.nan)
+    some = n_filled > 0
+    quantities[some, 1] = depth_sums[some] / n_filled[some]
+    return quantities
+
+
+def view_quantities(landmarks: ViewLandmarks, n_visible: Tensor, of_camera: Float) -> Float:
+    """Return `QUANTITIES` (B, 6) of views, from all of their `n_visible` (B,) landmarks or a sample.
+
+    `of_camera` are the `camera_quantities` of their camera.
+    """
+    log_distance = landmarks.values[:, landmarks.attributes.index("distance")].contiguous()
+    mean = torch.segment_reduce(log_distance, "mean", lengths=landmarks.counts)
+    quantities = np.tile(of_camera, (len(landmarks), 1))
+    counts = n_visible.cpu().numpy()
+    quantities[:, 0] = mean.exp().cpu().numpy()
+    quantities[:, 2] = np.where(counts > 0, counts, np.nan)
+    return quantities
 
 
 class StoredNetwork(nn.Module, ABC):

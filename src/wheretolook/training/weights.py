@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 from safetensors import SafetensorError, safe_open
 
 from wheretolook.utils.errors import WeightsError
-from wheretolook.utils.files import write_bytes
-from wheretolook.utils.reading import parse_json_object, read_json_object
+from wheretolook.utils.files import parse_json_object, read_json_object, write_bytes
 
 if TYPE_CHECKING:
     from torch import Tensor

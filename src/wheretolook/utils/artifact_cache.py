@@ -8,8 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from wheretolook.utils.files import atomic_write, write_json
-from wheretolook.utils.reading import read_json, read_json_object
+from wheretolook.utils.files import atomic_write, read_json, read_json_object, write_json
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -1,11 +1,18 @@
-"""Selects the device to compute on."""
+"""Devices, free memory, and work in parts over threads."""
 
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from typing import Any, TypeVar
+
+import psutil
 
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.processes import cores
+from wheretolook.utils.texts import LOG
 
 
 def usable_device(device: str) -> str:
@@ -54,3 +61,63 @@ def _torch_gpus() -> int:
     import torch
 
     return torch.cuda.device_count() if torch.cuda.is_available() else 0
+
+
+def available_bytes() -> int:
+    """Return the memory available without swapping, in bytes."""
+    return int(psutil.virtual_memory().available)
+
+
+def fitting(bytes_each: int) -> int:
+    """Return how many items of `bytes_each` fit into 80 % of the available memory."""
+    return available_bytes() * 4 // 5 // bytes_each
+
+
+def halving(run: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Return a function of a batch that runs its halves, one after the other, where a GPU's memory does not suffice.
+
+    `run` returns one result for each item of a batch, which can be sliced: a sequence or array, of halves a list.
+    """
+
+    def run_or_halve(batch: Any) -> Any:
+        try:
+            return run(batch)
+        except RuntimeError as error:  # of PyTorch, or of Warp
+            text = str(error).lower()
+            if len(batch) < 2 or not ("out of memory" in text or "failed to allocate" in text):
+                raise
+        import torch
+
+        torch.cuda.empty_cache()
+        half = len(batch) // 2
+        LOG.warning("GPU memory does not suffice for %d views at a time; %d follow at a time", len(batch), half)
+        return [*run_or_halve(batch[:half]), *run_or_halve(batch[half:])]
+
+    return run_or_halve
+
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def run_in_parts(n_rows: int, rows_at_once: int, work: Callable[[slice], None], device: str = "cpu") -> None:
+    """Call `work` with slices of at most `rows_at_once` rows that cover `n_rows` rows.
+
+    On the CPU, `work` is called from as many threads as there are cores, unless there is a single slice only. NumPy,
+    PyTorch and Warp release Python's lock while they compute, so that the threads use several cores.
+    """
+    parts = [slice(start, min(start + rows_at_once, n_rows)) for start in range(0, n_rows, rows_at_once)]
+    threads = min(len(parts), cores()) if device == "cpu" else 1
+    list(in_threads(work, parts, threads))
+
+
+def in_threads(work: Callable[[Item], Result], items: Sequence[Item], threads: int) -> Iterator[Result]:
+    """Yield the results of `work` for each item in their order, computed by so many threads, or here if one is enough.
+
+    Raises what a thread raises.
+    """
+    if threads < 2 or len(items) < 2:
+        yield from map(work, items)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        yield from pool.map(work, items)

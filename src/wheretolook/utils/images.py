@@ -7,7 +7,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from wheretolook.utils.reading import check_file
+from wheretolook.utils.files import check_file
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

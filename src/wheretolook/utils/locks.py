@@ -14,7 +14,7 @@ from pathlib import Path
 
 from wheretolook.utils.errors import InUseError, LockWarning
 from wheretolook.utils.files import missing_folders, remove_if_empty
-from wheretolook.utils.system import OPEN_LOCK, lock_file
+from wheretolook.utils.processes import OPEN_LOCK, lock_file
 
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)
 _NOT_WRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOSPC)

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.utils.files import atomic_write
-from wheretolook.utils.reading import check_file, max_expanded_bytes
+from wheretolook.utils.files import atomic_write, check_file, max_expanded_bytes
 
 
 def save_npz(path: Path, arrays: Mapping[str, NDArray[Any]], compress: bool = False) -> None:

@@ -16,7 +16,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from wheretolook.utils.reading import check_file, max_expanded_bytes
+from wheretolook.utils.files import check_file, max_expanded_bytes
 
 MAX_FOOTER_BYTES = 2_000_000  # about 10,000 columns of row groups
 MAX_LIST_LENGTH = 2000  # of lists in the footer, such as columns; Arrow overflows the stack at 10,000 nested columns

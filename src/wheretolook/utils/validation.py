@@ -1,12 +1,17 @@
-"""Checks of options: each raises a ConfigError that names the option and its value."""
+"""Check values of options, and suggest the nearest allowed one."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import dataclasses
+import difflib
+from collections.abc import Iterable, Mapping
 from math import degrees, inf, pi
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from wheretolook.utils.errors import ConfigError
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 
 def check_positive(name: str, value: float) -> None:
@@ -55,3 +60,34 @@ def reject(*cases: tuple[bool, str, object]) -> None:
     for holds, problem, value in cases:
         if holds:
             raise ConfigError(problem, value=value)
+
+
+def did_you_mean(name: str, names: Iterable[str], prefix: str = "") -> str | None:
+    """Return a question that suggests the known name nearest to a wrong one, after a prefix; None if none is near."""
+    near = nearest(name, names)
+    return near and f"Did you mean {prefix}{near}?"
+
+
+def nearest(name: str, names: Iterable[str]) -> str | None:
+    """Return the known name that a wrong one resembles, or that ends alike in another group; None if none does."""
+    known = [*names]
+    last = name.rpartition(".")[2]
+    same = [other for other in known if other.rpartition(".")[2] == last]
+    matches = difflib.get_close_matches(name, same, 1, 0) or difflib.get_close_matches(name, known, 1, 0.6)
+    if not matches:
+        by_last = {other.rpartition(".")[2]: other for other in reversed(known)}
+        matches = [by_last[other] for other in difflib.get_close_matches(last, by_last, 1, 0.75)]
+    return matches[0] if matches else None
+
+
+T = TypeVar("T", bound="DataclassInstance")
+
+
+def from_record(settings: type[T], values: Mapping[str, Any]) -> T:
+    """Return settings that `dataclasses.asdict` recorded. Raises ConfigError if a constant had another value."""
+    fixed = {field.name for field in dataclasses.fields(settings) if not field.init}
+    for name in fixed & {*values}:
+        if values[name] != getattr(settings, name):
+            fix = f"Make the result again: {name} is {getattr(settings, name)} now."
+            raise ConfigError(f"{name} is no longer an option", value=values[name], fix=fix)
+    return settings(**{name: value for name, value in values.items() if name not in fixed})

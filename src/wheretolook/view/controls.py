@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from wheretolook.dataset.thresholds import THRESHOLDS, threshold_key, threshold_label
+from wheretolook.dataset.config import THRESHOLDS, threshold_key, threshold_label
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError
 from wheretolook.view.drawing import escape_markdown, legend

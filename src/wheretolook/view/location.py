@@ -13,7 +13,7 @@ from wheretolook.geometry.lattices import axes_of_angles
 from wheretolook.geometry.poses import Float, poses_looking_along, quaternion_from_rotation, rotation_from_quaternion
 from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.utils.errors import ConfigError, TableError
-from wheretolook.utils.markdown import counted
+from wheretolook.utils.texts import counted
 from wheretolook.view import drawing
 from wheretolook.view.controls import value_of
 from wheretolook.view.scores import ScoredLocation, score_location
@@ -21,7 +21,7 @@ from wheretolook.view.session import Session
 from wheretolook.view.worker import NOW, SOON
 
 if TYPE_CHECKING:  # torch and Warp are imported when scores are first computed
-    from wheretolook.inputs.reasons import ReasonCounts
+    from wheretolook.inputs.landmark_features import ReasonCounts
 
 MARKERS = ("/sphere", "/view", "/views", "/turn", "/seen")  # hidden while the browser's camera is inside
 SETTLE_S = 0.3  # camera motion this soon after the program moved the camera is not by hand

@@ -30,7 +30,7 @@ class Photographs:
     def of_model(cls, model: Path, folder: Path, world_from_map: Similarity) -> Self | None:
         """Collect the registered images of a COLMAP model that exist in a folder; None if none does."""
         from wheretolook.mapping.colmap_model import read_model
-        from wheretolook.mapping.sources import has_image
+        from wheretolook.mapping.mapped_images import has_image
 
         images = read_model(model).images.values()
         shown = [image for image in images if image.has_pose and has_image(folder, image.name)]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wheretolook.geometry.poses import camera_centers
-from wheretolook.utils.markdown import counted
+from wheretolook.utils.texts import counted
 from wheretolook.view.controls import value_of
 from wheretolook.view.drawing import escape_markdown
 from wheretolook.view.session import Session

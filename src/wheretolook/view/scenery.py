@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.utils.markdown import counted
+from wheretolook.utils.texts import counted
 from wheretolook.view import drawing
 from wheretolook.view.controls import LIMITS
 from wheretolook.view.scores import FIRST_CELLS, Floor, score_in_blocks

@@ -85,7 +85,7 @@ class ViewedMap:
     @cached_property
     def warnings(self) -> tuple[str, ...]:
         """What was assumed or seems wrong of the map's unit and direction up, and signs that the mesh is in another frame."""
-        from wheretolook.mapping.sanity import mesh_warning
+        from wheretolook.mapping.map_frame import mesh_warning
 
         warnings: tuple[str, ...] = ()
         if self.mapping_poses is not None and len(self.mapping_poses):
@@ -211,7 +211,7 @@ def open_map(
         ConfigError: there is no such camera.
         WeightsError: the weights cannot be used.
     """
-    from wheretolook.mapping.sanity import warn_of_mesh
+    from wheretolook.mapping.map_frame import warn_of_mesh
 
     config = EnvironmentConfig(occlusion_cache_bytes=OCCLUSION_BYTES)
     environment = ColmapEnvironment(ColmapFiles(path, mesh, frame=frame), camera, config=config, device=device)
@@ -260,7 +260,7 @@ def open_scene(
 def _photographs(model: Path, folder: Path | None = None, frame: MapFrame = IDENTITY) -> Photographs | None:
     """Find the photographs of a COLMAP model, in a folder or where it was mapped from."""
     from wheretolook.mapping.colmap_model import holds_model
-    from wheretolook.mapping.sources import find_photographs
+    from wheretolook.mapping.mapped_images import find_photographs
     from wheretolook.view.photographs import Photographs
 
     folder = folder or find_photographs(model)

@@ -21,7 +21,7 @@ class AvailableWeights:
     """
 
     def __init__(self, features: str, own: Mapping[str, Path | None]) -> None:
-        from wheretolook.weights.resolve import weights_by_method
+        from wheretolook.scorers.weights import weights_by_method
 
         self.files: dict[str, Path] = {}
         self.origins: dict[str, str] = {}
@@ -58,7 +58,7 @@ def scene_weights(files: SceneFolder, landmarks: Landmarks) -> dict[str, Path | 
     trained = None
     if any((root / "weights").glob("*.safetensors")):
         from wheretolook.dataset.layout import Dataset
-        from wheretolook.weights.resolve import resolve_weights
+        from wheretolook.scorers.weights import resolve_weights
 
         trained = resolve_weights(dataset=Dataset.load(root))
         if trained is not None and not trained.is_relative_to(root):

@@ -12,10 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import Camera
+from wheretolook.utils.devices import fitting, in_threads
 from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.utils.memory import fitting
-from wheretolook.utils.parts import in_threads
-from wheretolook.utils.system import cores
+from wheretolook.utils.processes import cores
 from wheretolook.visibility.counting import FrustumCounter
 from wheretolook.visibility.counting_kernel import best_kernel, pack_kernel
 from wheretolook.visibility.occlusion import DevicePoints, OcclusionModel, StoredOcclusion

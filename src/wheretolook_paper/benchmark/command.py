@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from wheretolook.commands.options import Command
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.system import cores
+from wheretolook.utils.processes import cores
 from wheretolook.utils.validation import check_range
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ from wheretolook.utils.processes import WorkerPool
 from wheretolook_paper.benchmark.folder import DRAWN_CAMERA, BenchmarkScene
 
 if TYPE_CHECKING:
-    from wheretolook.rendering.types import Renderer
+    from wheretolook.rendering.warp_renderer import Renderer
 
 _FIX = "Localize with the benchmark's own script instead: --localizer none."
 _RENDER_BATCH = 16

@@ -28,7 +28,7 @@ from wheretolook_paper.benchmark.scores import Scores
 if TYPE_CHECKING:
     from wheretolook.geometry.mesh import TexturedMesh
     from wheretolook.localization.localizer import Localizer
-    from wheretolook.rendering.types import Renderer
+    from wheretolook.rendering.warp_renderer import Renderer
 
 POSES = "selected_gt_poses.txt"
 IMAGES = "images"
@@ -121,7 +121,7 @@ class SceneRound:
         return read_poses(path)
 
     def _selection_key(self, method: str) -> str:
-        from wheretolook.weights.resolve import resolve_weights
+        from wheretolook.scorers.weights import resolve_weights
 
         config = self.config
         parts: list[Any] = [VERSION, self._model_key, fingerprint(self.scene.mesh), fingerprint(self.scene.waypoints)]
@@ -284,7 +284,7 @@ class SceneRound:
 
     @cached_property
     def _map_key(self) -> str:
-        from wheretolook.localization.versions import versions
+        from wheretolook.localization.config import versions
 
         return cache_key("map", self._model_key, fingerprint(self.scene.mesh), versions())
 

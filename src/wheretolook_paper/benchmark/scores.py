@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.dataset.thresholds import THRESHOLDS, threshold_key
+from wheretolook.dataset.config import THRESHOLDS, threshold_key
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import TableError
 from wheretolook_paper.benchmark.files import IMAGE_ENDING, ErrorFile, PoseFile

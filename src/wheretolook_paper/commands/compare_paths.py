@@ -10,8 +10,7 @@ from wheretolook.commands.options import LabelOptions, Log, Progress, SceneOptio
 from wheretolook.commands.preconditions import extractor_of, load_dataset, open_scene
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.layout import Dataset
-from wheretolook.tracking.config import TrackingConfig
-from wheretolook.tracking.store import check_store, kept_if_not_logged
+from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.files import atomic_write, write_text
 from wheretolook_paper.paths.config import PathsConfig
@@ -81,7 +80,7 @@ class ComparePaths(SceneOptions, LabelOptions):
 
 def _comparisons(options: ComparePaths, dataset: Dataset, log: Log) -> list[SceneComparison]:
     from wheretolook.localization.shard import SceneJob
-    from wheretolook.weights.resolve import resolve_weights
+    from wheretolook.scorers.weights import resolve_weights
     from wheretolook_paper.paths.scene_comparison import SceneComparison
 
     config = options.paths

@@ -18,13 +18,12 @@ from wheretolook_paper.evaluation.looks import LOOKS_CSV, LOOKS_MD, NUMBERS, STR
 if TYPE_CHECKING:
     from wheretolook.evaluation.config import EvaluateConfig
     from wheretolook.scorers.base import Scorer
-    from wheretolook.tracking.config import TrackingConfig
+    from wheretolook.tracking.store import TrackingConfig
 
 
 def write_reports(folder: Path, table: pd.DataFrame) -> None:
     """Write the paper's tables and, of several occlusion models, `occlusion.png`, from a table of scores."""
-    from wheretolook.evaluation.results import OCCLUSION_PNG, VARIANTS_CSV
-    from wheretolook.evaluation.scores import main_rows, read_scores
+    from wheretolook.evaluation.results import OCCLUSION_PNG, VARIANTS_CSV, main_rows, read_scores
     from wheretolook.figures.style import save_figure
     from wheretolook_paper.evaluation.paper_tables import write_paper_tables
     from wheretolook_paper.figures.occlusion import occlusion_figure
@@ -63,7 +62,7 @@ def evaluate_look_sets(
     if there is no scene with one camera whose labels have the pixels of their matches (`--label.store_pixels true`).
     """
     from wheretolook.evaluation.results import results_folder
-    from wheretolook.weights.resolve import load_scorer, resolve_weights
+    from wheretolook.scorers.weights import load_scorer, resolve_weights
 
     scenes = [
         scene
@@ -97,9 +96,7 @@ def compare_looks(scene: SceneFolder, scorer: Scorer, config: LookConfig, progre
 
     Raises a TableError if the labels lack the pixels of their matches.
     """
-    from wheretolook.looks.joint_visibility import candidate_views
-    from wheretolook.looks.selection import score_of_set
-    from wheretolook.looks.set_score import SetScoreModel
+    from wheretolook.looks.selection import SetScoreModel, candidate_views, score_of_set
     from wheretolook_paper.evaluation.joint_labels import label_sets
     from wheretolook_paper.evaluation.look_strategies import choose_set
 

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from wheretolook.commands.options import DatasetOptions, Log
+from wheretolook.dataset.config import RELEASE_FILE
 from wheretolook.dataset.dataset_lock import reads_dataset
-from wheretolook.dataset.names import RELEASE_FILE
-from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import ui_command
-from wheretolook.tracking.store import check_store
+from wheretolook.tracking.store import TrackingConfig, check_store
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import temporary_folder
 from wheretolook_paper.figures.config import FiguresConfig

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from wheretolook.commands.evaluate import Evaluate
 from wheretolook.commands.options import Experiment, Log, Progress, ignore_progress, select_options
 from wheretolook.commands.preconditions import load_dataset
+from wheretolook.dataset.config import RELEASE_FILE
 from wheretolook.dataset.dataset_lock import changing, reading, reads_dataset
-from wheretolook.dataset.names import RELEASE_FILE
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.tracking.store import check_store
-from wheretolook.utils.confine import check_folder_name, safe_child
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.files import copy_file, write_text
+from wheretolook.utils.files import check_folder_name, copy_file, safe_child, write_text
 
 if TYPE_CHECKING:
     from wheretolook.dataset.layout import Dataset

@@ -12,8 +12,7 @@ from wheretolook.commands.options import Log, Progress, SceneOptions, ignore_pro
 from wheretolook.commands.preconditions import extractor_of, load_dataset, open_scene
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.tracking.config import TrackingConfig
-from wheretolook.tracking.store import check_store, kept_if_not_logged
+from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.files import atomic_write, fingerprint, write_text
 from wheretolook.utils.validation import check_choice, check_range
@@ -125,7 +124,7 @@ class Relocalize(SceneOptions):
 
     def _robot(self, dataset: Dataset, files: SceneFolder, log: Log) -> SimulatedRobot:
         from wheretolook.planning.scene_map import scene_scorer
-        from wheretolook.weights.resolve import resolve_weights
+        from wheretolook.scorers.weights import resolve_weights
         from wheretolook_paper.evaluation.relocalization import SimulatedRobot
 
         scene = open_scene(self, files)
@@ -145,8 +144,8 @@ class Relocalize(SceneOptions):
 
     def _simulated(self, dataset: Dataset, files: SceneFolder, log: Log) -> pd.DataFrame:
         """Simulate in a scene, or read the cached result."""
+        from wheretolook.scorers.weights import resolve_weights
         from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
-        from wheretolook.weights.resolve import resolve_weights
 
         weights = resolve_weights(self.method, self.weights, dataset=dataset, log=log)
         inputs = [fingerprint(path) for path in (files.mesh, files.landmarks, files.table, weights) if path is not None]

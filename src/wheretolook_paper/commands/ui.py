@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from http.client import HTTPConnection
 
 from wheretolook.commands.options import Command
-from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.store import TrackingConfig
 from wheretolook.utils.errors import ConfigError, MissingRunError
 from wheretolook_paper.experiment_notes import experiment_link, first_view
 

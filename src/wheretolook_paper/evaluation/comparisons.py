@@ -6,7 +6,7 @@ from functools import partial
 
 import pandas as pd
 
-from wheretolook.dataset.thresholds import ALL, threshold_label
+from wheretolook.dataset.config import ALL, threshold_label
 from wheretolook.evaluation.report import (
     Row,
     best_views,
@@ -16,7 +16,7 @@ from wheretolook.evaluation.report import (
     score_text,
     share_text,
 )
-from wheretolook.evaluation.scores import PHOTOGRAPHS, RELEASED_DIVISOR, main_rows, threshold_keys
+from wheretolook.evaluation.results import PHOTOGRAPHS, RELEASED_DIVISOR, main_rows, threshold_keys
 from wheretolook.scorers.styles import ORACLE, method_group
 
 _CANDIDATES = (

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from wheretolook.geometry.poses import Float
-from wheretolook.looks.joint_visibility import CandidateViews
-from wheretolook.looks.selection import Rotations, select_views
-from wheretolook.looks.set_score import SetScoreModel
+from wheretolook.looks.selection import CandidateViews, Rotations, SetScoreModel, select_views
 from wheretolook_paper.fisher.metrics import metric_of
 
 

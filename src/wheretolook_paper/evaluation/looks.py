@@ -9,11 +9,11 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 
-from wheretolook.evaluation.bootstrap import ClusterBootstrap
-from wheretolook.tracking.config import TrackingConfig
+from wheretolook.evaluation.statistics import ClusterBootstrap
 from wheretolook.tracking.runs import BEST_TAG
+from wheretolook.tracking.store import TrackingConfig
 from wheretolook.utils.files import write_text
-from wheretolook.utils.markdown import markdown_table
+from wheretolook.utils.texts import markdown_table
 
 LOOKS_CSV = "looks.csv"
 LOOKS_MD = "looks.md"

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pandas as pd
 
-from wheretolook.dataset.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
-from wheretolook.evaluation.scores import RELEASED_DIVISOR, main_rows, methods_of
+from wheretolook.dataset.config import ALL, THRESHOLDS, threshold_key, threshold_label
+from wheretolook.evaluation.results import RELEASED_DIVISOR, main_rows, methods_of
 from wheretolook.scorers.styles import method_style
 from wheretolook.utils.files import write_text
-from wheretolook.utils.markdown import markdown_table
+from wheretolook.utils.texts import markdown_table
 from wheretolook_paper.evaluation.comparisons import comparisons_markdown
 
 KEYS = tuple(map(threshold_key, THRESHOLDS))  # the paper's thresholds
@@ -74,7 +74,7 @@ _SOURCES = ("normalized", "normalized_low", "normalized_high", "released")
 def paper_tables(scores: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Return the paper's tables, "vs_others" and "input_variants", with this project's numbers next to the printed ones.
 
-    Uses the rows of a score table (`wheretolook.evaluation.scores.score_table`) over all scenes with N = 1, those
+    Uses the rows of a score table (`wheretolook.evaluation.results.score_table`) over all scenes with N = 1, those
     of the first occlusion model and the first set of candidates.
 
     A row for each of the paper's in its order: `paper_row` (its name there), `method` (its name here) and for each

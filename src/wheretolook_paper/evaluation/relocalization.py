@@ -17,17 +17,15 @@ from tqdm.auto import tqdm
 
 from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good
-from wheretolook.evaluation.bootstrap import ClusterBootstrap
-from wheretolook.evaluation.calibration import precision_area
+from wheretolook.evaluation.statistics import ClusterBootstrap, precision_area
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.localization.config import LocalizerConfig
-from wheretolook.localization.localizer import Localizer
+from wheretolook.localization.localizer import JointLocalization, Localizer
 from wheretolook.localization.rig import Look, rig_of
-from wheretolook.localization.rig_localization import JointLocalization
 from wheretolook.looks.next_look import NextLookSelector, angles_to_views, mean_scores_by_pitch
 from wheretolook.scorers.base import Scorer
-from wheretolook.utils.markdown import markdown_table
+from wheretolook.utils.texts import markdown_table
 from wheretolook_paper.evaluation.joint_labels import SET_COLUMNS, set_label
 
 COLUMNS = ("location_id", "policy", "n_looks", "hypothesis", *SET_COLUMNS[2:-1])

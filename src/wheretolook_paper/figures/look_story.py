@@ -12,16 +12,15 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 from numpy.typing import ArrayLike
 
-from wheretolook.dataset.thresholds import THRESHOLDS
+from wheretolook.dataset.config import THRESHOLDS
 from wheretolook.figures.animation import Pixels, pixels_of
 from wheretolook.figures.dollhouse import Dollhouse, draw_house, draw_segments, frustum_segments
 from wheretolook.figures.style import BLUE, GREEN, RC, VERMILION, Style, new_figure
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.localization.confidence import ConfidenceModel
-from wheretolook.localization.localizer import Localizer
+from wheretolook.localization.localizer import JointLocalization, JointLocalizer, Localizer
 from wheretolook.localization.rig import Look, rig_of
-from wheretolook.localization.rig_localization import JointLocalization, JointLocalizer
 from wheretolook.utils.errors import PoseError
 
 MAX_ERROR_M, MAX_ERROR_DEG = THRESHOLDS[0]

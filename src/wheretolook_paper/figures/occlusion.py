@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.style import context
 
-from wheretolook.dataset.thresholds import ALL, threshold_label
-from wheretolook.evaluation.scores import is_random, main_rows, methods_of, threshold_keys
+from wheretolook.dataset.config import ALL, threshold_label
+from wheretolook.evaluation.results import is_random, main_rows, methods_of, threshold_keys
 from wheretolook.figures.scores import methods_to_show
 from wheretolook.figures.style import INK, RC, new_figure
 from wheretolook.scorers.styles import ORACLE, method_style
@@ -27,7 +27,7 @@ def occlusion_figure(scores: pd.DataFrame) -> Figure:
     The share is that at the finest threshold, in % of the oracle's, with bootstrap intervals. A row for each method, a
     mark for each occlusion model; the random choice and the oracle are lines. Shown are the methods that
     `figures.scores.methods_to_show` chooses and that occlusion changes, on axes that begin where the marks do.
-    `scores` are tables of `wheretolook.evaluation.scores.score_table`, one below the other, with a column `occlusion`;
+    `scores` are tables of `wheretolook.evaluation.results.score_table`, one below the other, with a column `occlusion`;
     the rows over all scenes, of the first N and the first set of candidates, are drawn.
     """
     scores = main_rows(scores, ("candidates",))

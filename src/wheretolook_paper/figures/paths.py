@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
-from wheretolook.dataset.thresholds import ALL
+from wheretolook.dataset.config import ALL
 from wheretolook.figures.style import INK, RC, Style, new_figure, scene_label
 from wheretolook.scorers.styles import method_style
 

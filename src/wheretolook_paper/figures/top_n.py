@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.style import context
 
-from wheretolook.dataset.thresholds import ALL, threshold_label
-from wheretolook.evaluation.scores import main_rows, methods_of, threshold_keys
+from wheretolook.dataset.config import ALL, threshold_label
+from wheretolook.evaluation.results import main_rows, methods_of, threshold_keys
 from wheretolook.figures.style import GREY, PRINT, TWO_COLUMNS_IN, Style, new_figure
 from wheretolook.scorers.registry import all_methods, find
 from wheretolook.scorers.styles import ORACLE, method_style
@@ -35,7 +35,7 @@ def top_n_figure(scores: pd.DataFrame, methods: Sequence[str] = ()) -> Figure:
     locations with a good one among N, the oracle's as lines. Whiskers are 95 % bootstrap intervals. Open grey marks are
     the paper's numbers, which it prints for N = 1 only, on other scenes and divided by its released code's constant.
 
-    `scores` is a table of `wheretolook.evaluation.scores.score_table`; its rows over all scenes are drawn, of the first
+    `scores` is a table of `wheretolook.evaluation.results.score_table`; its rows over all scenes are drawn, of the first
     occlusion model and set of candidates; without methods named, those that are `of_the_few`.
     """
     scores = main_rows(scores)

@@ -10,7 +10,7 @@ import warp as wp
 from wheretolook.geometry.camera import ColmapCamera
 from wheretolook.geometry.pose_information import N_NUMBERS, bearing_numbers
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.utils.parts import run_in_parts
+from wheretolook.utils.devices import run_in_parts
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.frustum import (
     PosedViews,

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from wheretolook.geometry.pose_information import N_NUMBERS, TRACE
 from wheretolook.geometry.poses import Float
-from wheretolook.utils.parts import run_in_parts
+from wheretolook.utils.devices import run_in_parts
 from wheretolook.utils.warp import start_warp
 from wheretolook_paper.fisher import metrics_kernel
 from wheretolook_paper.fisher.metrics_kernel import eigenvalues_kernel

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from wheretolook.dataset.thresholds import ALL
+from wheretolook.dataset.config import ALL
 from wheretolook.dataset.viewpoint_table import LOCALIZED
-from wheretolook.evaluation.bootstrap import ClusterBootstrap, divide
+from wheretolook.evaluation.statistics import ClusterBootstrap, divide
 from wheretolook.planning.config import FORWARD
-from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import (
     ALL_METHODS,
     BEST_TAG,
@@ -27,7 +26,8 @@ from wheretolook.tracking.runs import (
     logged_last,
     start_run,
 )
-from wheretolook.utils.markdown import markdown_table
+from wheretolook.tracking.store import TrackingConfig
+from wheretolook.utils.texts import markdown_table
 from wheretolook_paper.paths.config import PathsConfig
 
 PATHS_CSV = "paths.csv"

@@ -10,20 +10,18 @@ from typing import Any
 import pandas as pd
 import yaml
 
+from wheretolook.dataset.config import ALL, THRESHOLDS, threshold_key, threshold_label
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.thresholds import ALL, THRESHOLDS, threshold_key, threshold_label
 from wheretolook.evaluation.report import score_markdown
-from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV
-from wheretolook.evaluation.scores import read_scores
+from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV, read_scores
 from wheretolook.localization.report import POSITIVE, label_summary
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.registry import learned
 from wheretolook.scorers.styles import method_style
 from wheretolook.training.config import DECIDING
 from wheretolook.utils.errors import TableError, WeightsError
-from wheretolook.utils.files import sha256
-from wheretolook.utils.markdown import markdown_table
-from wheretolook.utils.reading import read_json_object
+from wheretolook.utils.files import read_json_object, sha256
+from wheretolook.utils.texts import markdown_table
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_paper.evaluation.comparisons import comparisons_markdown
 from wheretolook_paper.release.copy import read_about, size_text, sizes
@@ -83,7 +81,7 @@ def _weight_files(release: Dataset) -> list[Path]:
 
 
 def _best(release: Dataset) -> Path:
-    from wheretolook.weights.resolve import resolve_weights
+    from wheretolook.scorers.weights import resolve_weights
 
     best = resolve_weights(path=release.root / "weights")
     assert best is not None

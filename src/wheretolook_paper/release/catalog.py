@@ -16,23 +16,21 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from wheretolook.dataset.layout import Dataset
-from wheretolook.evaluation.calibration import read_calibration
 from wheretolook.evaluation.report import score_markdown
-from wheretolook.evaluation.results import CALIBRATION_CSV, SCORES_CSV
-from wheretolook.evaluation.scores import read_scores
+from wheretolook.evaluation.results import CALIBRATION_CSV, SCORES_CSV, read_scores
+from wheretolook.evaluation.statistics import read_calibration
 from wheretolook.figures.calibration import calibration_figure
 from wheretolook.figures.path_film import methods_figure
 from wheretolook.figures.scores import regret_figure, score_figure
 from wheretolook.figures.style import save_figure
 from wheretolook.scorers.registry import learned
-from wheretolook.tracking.config import TrackingConfig
+from wheretolook.scorers.weights import load_scorer
 from wheretolook.tracking.runs import artifact, finished_runs
-from wheretolook.tracking.store import client, kept_if_not_logged
-from wheretolook.training.run_record import HISTORY_CSV
+from wheretolook.tracking.store import TrackingConfig, client, kept_if_not_logged
+from wheretolook.training.provenance import HISTORY_CSV
 from wheretolook.utils.errors import ConfigError, MissingRunError, WhereToLookError
 from wheretolook.utils.files import write_text
-from wheretolook.utils.markdown import markdown_table
-from wheretolook.weights.resolve import load_scorer
+from wheretolook.utils.texts import markdown_table
 from wheretolook_paper.evaluation.comparisons import comparisons_markdown
 from wheretolook_paper.evaluation.looks import LOOKS_CSV
 from wheretolook_paper.figures.config import FiguresConfig

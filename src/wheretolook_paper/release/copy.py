@@ -13,17 +13,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from wheretolook.dataset.config import RELEASE_FILE
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.dataset.names import RELEASE_FILE
 from wheretolook.dataset.viewpoint_files import write_table
 from wheretolook.mapping.colmap_model import CAMERAS_FILE, save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.scorers.method import Method
-from wheretolook.scorers.registry import learned, scorers
-from wheretolook.utils.confine import safe_child
+from wheretolook.scorers.registry import Method, learned, scorers
 from wheretolook.utils.errors import ConfigError, StorageError, WeightsError
-from wheretolook.utils.files import sha256, write_json
-from wheretolook.utils.reading import read_json_object
+from wheretolook.utils.files import read_json_object, safe_child, sha256, write_json
 from wheretolook.utils.version import VERSION
 from wheretolook.visibility.occlusion import StoredOcclusion
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from wheretolook.dataset.config import RELEASE
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.names import RELEASE
-from wheretolook.tracking.config import TrackingConfig
+from wheretolook.tracking.store import TrackingConfig
 from wheretolook.utils.errors import ConfigError
 
 RELEASE_VARIABLE = "WHERETOLOOK_RELEASE"

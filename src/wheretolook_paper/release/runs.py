@@ -15,13 +15,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from wheretolook.dataset.config import ALL
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.thresholds import ALL
 from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good
-from wheretolook.evaluation.results import SCORES_CSV, best_of, evaluation_params, runs_of_rows
-from wheretolook.evaluation.scores import read_scores
+from wheretolook.evaluation.results import SCORES_CSV, best_of, evaluation_params, read_scores, runs_of_rows
 from wheretolook.scorers.registry import learned
-from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import (
     ALL_METHODS,
     AUC,
@@ -37,8 +35,9 @@ from wheretolook.tracking.runs import (
     log_nested,
     start_run,
 )
+from wheretolook.tracking.store import TrackingConfig
 from wheretolook.tracking.store import client as client_of
-from wheretolook.training.run_record import HISTORY_CSV, kept_metrics, params_of
+from wheretolook.training.provenance import HISTORY_CSV, kept_metrics, params_of
 from wheretolook.utils.files import temporary_folder, write_text
 from wheretolook.utils.locks import hold
 from wheretolook_paper.evaluation.looks import LOOKS_CSV, log_looks

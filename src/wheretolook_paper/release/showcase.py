@@ -14,10 +14,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
+from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.environment import EnvironmentConfig, SceneEnvironment
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.sampling import free_locations
-from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.viewpoint_table import instructive_location, is_good
 from wheretolook.figures.dollhouse import Dollhouse, dollhouse
 from wheretolook.geometry.lattices import VoxelGrid
@@ -25,7 +25,7 @@ from wheretolook.geometry.poses import Float
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.space.config import FreeSpaceConfig
 from wheretolook.utils.errors import SceneError
-from wheretolook.utils.records import from_record
+from wheretolook.utils.validation import from_record
 from wheretolook.visibility.config import OcclusionConfig
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_paper.release.copy import read_about

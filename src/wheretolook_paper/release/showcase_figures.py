@@ -19,7 +19,7 @@ from wheretolook.planning.config import PlanConfig
 from wheretolook.planning.method_paths import path_views, plan_by_methods
 from wheretolook.planning.routes import PathView
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.binned_network import BinnedNetworkScorer
+from wheretolook.scorers.mlp.network import BinnedNetworkScorer
 from wheretolook.visibility.frustum import pixels_of
 from wheretolook.visibility.survey import Survey, SurveyOptions, survey
 from wheretolook_paper.figures.inputs import BinnedImage

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from wheretolook.dataset.thresholds import threshold_label
-from wheretolook.evaluation.scores import RELEASED_DIVISOR
-from wheretolook.tracking.config import TrackingConfig
+from wheretolook.dataset.config import threshold_label
+from wheretolook.evaluation.results import RELEASED_DIVISOR
 from wheretolook.tracking.runs import newest_artifact
+from wheretolook.tracking.store import TrackingConfig
 from wheretolook_paper.evaluation.paper_tables import KEYS
 
 if TYPE_CHECKING:

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from wheretolook.dataset.layout import Dataset
-from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import artifact, finished_runs
-from wheretolook.training.run_record import HISTORY_CSV, history_not_logged, params_of
+from wheretolook.tracking.store import TrackingConfig
+from wheretolook.training.provenance import HISTORY_CSV, history_not_logged, params_of
 from wheretolook.utils.errors import WeightsError
-from wheretolook.utils.files import write_text
-from wheretolook.utils.reading import read_json_object
+from wheretolook.utils.files import read_json_object, write_text
 
 if TYPE_CHECKING:
     from mlflow.entities import Run

@@ -13,10 +13,9 @@ from torch import Tensor
 from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.inputs.landmark_features import LandmarkDescriber, ViewLandmarks
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.scorers.landmark_scorer import LandmarkScorer
 from wheretolook.scorers.matchability.network import MatchabilityNetwork, expected_parts
-from wheretolook.training.trained_network import TrainedNetwork
-from wheretolook.training.training_range import QUANTITIES, camera_quantities, view_quantities
+from wheretolook.scorers.set.score import LandmarkScorer
+from wheretolook.training.trained_network import QUANTITIES, TrainedNetwork, camera_quantities, view_quantities
 from wheretolook_paper.fisher.metrics import METRICS, metric_of
 from wheretolook_paper.scorers.pooled_features import image_cells
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from wheretolook.scorers.method import Group, Method, MethodStyle, ScorerOptions
+from wheretolook.scorers.registry import Group, Method, MethodStyle, ScorerOptions
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap

@@ -9,7 +9,7 @@ import numpy as np
 from wheretolook.geometry.lattices import axes_of_angles, yaw_pitch_angles
 from wheretolook.geometry.poses import Float, check_poses, poses_looking_along
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.method import MethodStyle, rule
+from wheretolook.scorers.registry import MethodStyle, rule
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap

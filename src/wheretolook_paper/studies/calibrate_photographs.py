@@ -21,7 +21,7 @@ from jsonargparse import auto_cli
 from scipy.optimize import minimize_scalar
 from scipy.special import expit
 
-from wheretolook.evaluation.calibration import expected_calibration_error
+from wheretolook.evaluation.statistics import expected_calibration_error
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.weights import read_record, read_training

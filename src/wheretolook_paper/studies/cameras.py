@@ -20,13 +20,12 @@ import pandas as pd
 from jsonargparse import auto_cli
 from sklearn.metrics import roc_auc_score
 
+from wheretolook.dataset.config import Split
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.sampling_config import Split
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, is_good, poses
-from wheretolook.evaluation.bootstrap import ClusterBootstrap
-from wheretolook.evaluation.calibration import expected_calibration_error
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.scoring import score_scenes
+from wheretolook.evaluation.statistics import ClusterBootstrap, expected_calibration_error
 from wheretolook.geometry.camera import field_of_view_deg
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.scorers.registry import is_probability

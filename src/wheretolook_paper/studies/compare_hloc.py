@@ -38,28 +38,25 @@ from jsonargparse import auto_cli
 from tqdm.auto import tqdm
 
 from wheretolook.commands.map import Map
+from wheretolook.commands.options import MeshSource, ScenesConfig
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.scenes import Scenes
-from wheretolook.commands.scenes_config import MeshSource, ScenesConfig
+from wheretolook.dataset.config import Accuracy, SampleConfig
 from wheretolook.dataset.environment import SceneEnvironment
-from wheretolook.dataset.sampling_config import SampleConfig
-from wheretolook.dataset.thresholds import Accuracy
 from wheretolook.dataset.viewpoint_table import poses as poses_of_table
-from wheretolook.evaluation.calibration import precision_area, precision_over_coverage
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.scoring import score_scenes
-from wheretolook.features.config import ExtractorConfig
-from wheretolook.features.extraction import KeypointExtractor
-from wheretolook.features.keypoints import Keypoints
+from wheretolook.evaluation.statistics import precision_area, precision_over_coverage
+from wheretolook.features.config import ExtractorConfig, KeypointExtractor
+from wheretolook.features.extractor import Keypoints
 from wheretolook.features.registry import all_kinds, kind_of
 from wheretolook.geometry.camera import Camera, camera_of, write_cameras
 from wheretolook.geometry.poses import Float, camera_centers, pose_error
 from wheretolook.io.poses import images_text
 from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.config import LabelConfig, LocalizerConfig
-from wheretolook.localization.localizer import Localizer
+from wheretolook.localization.localizer import POSES_OF_AN_IMAGE, Localizer
 from wheretolook.localization.rig import Look
-from wheretolook.localization.rig_localization import POSES_OF_AN_IMAGE
 from wheretolook.mapping.colmap_model import colmap_poses, holds_model, read_model, registered_names
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.feature_files import read_features
@@ -68,11 +65,11 @@ from wheretolook.mapping.map_folder import DATABASE_FILE, IMAGES_FOLDER, MapRun
 from wheretolook.mapping.photographs import read_photograph
 from wheretolook.mapping.triangulation import triangulate_model
 from wheretolook.scenes.config import SceneKind
+from wheretolook.scorers.weights import resolve_weights
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import atomic_write, write_bytes, write_text
 from wheretolook.utils.processes import WorkerPool
-from wheretolook.weights.resolve import resolve_weights
 from wheretolook_paper.studies.photographs import posed_model
 
 MATCHERS = {"aliked": "aliked+lightglue", "disk": "disk+lightglue", "opencv": "NN-ratio"}  # of hloc, by extractor

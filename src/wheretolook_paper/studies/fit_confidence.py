@@ -18,8 +18,8 @@ from jsonargparse import auto_cli
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import roc_auc_score
 
-from wheretolook.dataset.thresholds import Accuracy
-from wheretolook.evaluation.calibration import expected_calibration_error
+from wheretolook.dataset.config import Accuracy
+from wheretolook.evaluation.statistics import expected_calibration_error
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.confidence import (
     FEATURE_NAMES,

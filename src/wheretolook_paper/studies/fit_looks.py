@@ -23,10 +23,10 @@ from wheretolook.dataset.layout import SceneFolder
 from wheretolook.dataset.viewpoint_files import read_table
 from wheretolook.dataset.viewpoint_table import is_good, poses
 from wheretolook.geometry.poses import camera_centers
-from wheretolook.looks import set_score
-from wheretolook.looks.joint_visibility import candidate_views, log_position_variance
+from wheretolook.looks import selection as set_score
+from wheretolook.looks.selection import candidate_views, log_position_variance
+from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.shipped import WEIGHTS, shipped
-from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.evaluation.joint_labels import label_sets
 
 VARIANCE = 0.375  # weight of the log of the position's variance, relative to the log-odds

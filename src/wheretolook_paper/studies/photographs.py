@@ -37,9 +37,8 @@ from wheretolook.mapping.colmap_model import colmap_poses, holds_model
 from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG, FrameOptions, MapConfig, PhotographsConfig
 from wheretolook.mapping.georeference import fit_similarity
 from wheretolook.mapping.map_folder import MapRun
-from wheretolook.mapping.photograph_map import map_photographs
+from wheretolook.mapping.photograph_map import map_photographs, photograph_features
 from wheretolook.mapping.photographs import SUFFIXES
-from wheretolook.mapping.sfm import photograph_features
 from wheretolook.mapping.triangulation import (
     Stored,
     choose_pairs,
@@ -49,8 +48,8 @@ from wheretolook.mapping.triangulation import (
     surface_overlap,
     write_matches,
 )
-from wheretolook.utils.colmap import quiet_colmap
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.extras import quiet_colmap
 from wheretolook.utils.processes import WorkerPool
 
 FOCAL_PX = 525.0  # initial focal length of photographs with poses

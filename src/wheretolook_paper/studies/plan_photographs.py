@@ -35,8 +35,7 @@ from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, Envi
 from wheretolook.figures.style import save_figure
 from wheretolook.geometry.camera import field_of_view_deg
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
-from wheretolook.holdout.holdout import hold_out_blocks
-from wheretolook.holdout.holdout_blocks import choose_blocks
+from wheretolook.holdout.holdout import choose_blocks, hold_out_blocks
 from wheretolook.holdout.photo_map import PhotographedMap, features_of, open_map
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.georeference import DEPTH_M
@@ -45,8 +44,8 @@ from wheretolook.planning.config import FORWARD, PathConfig, PlanConfig
 from wheretolook.planning.method_paths import path_views, plan_by_methods
 from wheretolook.planning.rrt import Space
 from wheretolook.planning.scene_map import scene_scorer
+from wheretolook.scorers.weights import resolve_weights
 from wheretolook.utils.errors import PlanningError
-from wheretolook.weights.resolve import resolve_weights
 from wheretolook_paper.figures.photograph_paths import (
     AXIS,
     LANDMARKS_CSV,

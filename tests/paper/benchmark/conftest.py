@@ -12,8 +12,8 @@ import pytest
 
 from mapping.conftest import ROOM_SIZE, BoxFreeSpace, box_room
 from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.mapping.rendered_map import plan_walk
 from wheretolook.mapping.triangulation import posed_model
-from wheretolook.mapping.walk import plan_walk
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh, save_glb
 from wheretolook_paper.benchmark.folder import CAMERA, DRAWN_CAMERA, BenchmarkScene

@@ -12,12 +12,12 @@ from PIL import Image
 from synthetic_release import history, make_release
 from synthetic_scores import make_scores
 from wheretolook.cli import main
+from wheretolook.dataset.config import ALL
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.thresholds import ALL
 from wheretolook.planning.config import PathConfig, PlanConfig
 from wheretolook.scorers.styles import method_style
-from wheretolook.tracking.config import TrackingConfig
 from wheretolook.tracking.runs import newest_artifact, newest_run
+from wheretolook.tracking.store import TrackingConfig
 from wheretolook_paper.figures.config import FiguresConfig
 from wheretolook_paper.figures.top_n import ROWS, top_n_figure, top_n_table
 from wheretolook_paper.release.catalog import ITEMS, write_items

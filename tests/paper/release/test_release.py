@@ -17,20 +17,20 @@ from learning_options import changed, train_config
 from synthetic_dataset import CAMERA, make_dataset
 from wheretolook.cli import parse_command
 from wheretolook.commands.evaluate import Evaluate
-from wheretolook.commands.scenes_config import ScenesConfig
+from wheretolook.commands.options import ScenesConfig
 from wheretolook.commands.train import Train
 from wheretolook.commands.train import train_methods as train
+from wheretolook.dataset.config import RELEASE, RELEASE_FILE
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.names import RELEASE, RELEASE_FILE
 from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.report import score_markdown
-from wheretolook.tracking.config import TrackingConfig
+from wheretolook.scorers.weights import load_scorer
+from wheretolook.tracking.store import TrackingConfig
 from wheretolook.training.data import load_views
 from wheretolook.utils.errors import ConfigError, StorageError, WeightsError
 from wheretolook.utils.files import write_json
 from wheretolook.visibility.occlusion import StoredOcclusion
-from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.commands.release import Release, release_settings
 from wheretolook_paper.release import copy as releases
 from wheretolook_paper.release.card import release_card

@@ -11,21 +11,20 @@ import numpy as np
 import pytest
 
 from synthetic_dataset import make_landmarks, make_mapping_poses
+from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.sampling import free_locations, sample_viewpoints
-from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.viewpoint_files import write_table
 from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, outcome_in_words, poses
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
-from wheretolook.inputs.statistics import FeatureStatistics
+from wheretolook.inputs.channels import FeatureStatistics
 from wheretolook.mapping.colmap_model import save_mapping_poses
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.binned_network import BinnedNetworkScorer
-from wheretolook.scorers.mlp.network import NetworkSpec, ViewpointNetwork
+from wheretolook.scorers.mlp.network import BinnedNetworkScorer, NetworkSpec, ViewpointNetwork
 from wheretolook.space.config import FreeSpaceConfig
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.training.trained_network import TrainedNetwork

@@ -14,9 +14,9 @@ from synthetic_dataset import CAMERA, make_dataset
 from wheretolook.commands.train import train_methods as train
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import is_good, poses
-from wheretolook.tracking.config import TrackingConfig
+from wheretolook.scorers.weights import load_scorer
+from wheretolook.tracking.store import TrackingConfig
 from wheretolook.training.weights import method_of_weights, read_training
-from wheretolook.weights.resolve import load_scorer
 from wheretolook_paper.scorers.pooled_features import POOLED
 from wheretolook_paper.scorers.trees import TreesConfig
 from wheretolook_paper.scorers.trees.learn import BoostedTrees, PooledViews, fit_trees, load_pooled

@@ -14,7 +14,7 @@ from wheretolook.scorers.adapted.kernel import Correction
 from wheretolook.scorers.adapted.network import AdaptedNetwork
 from wheretolook.scorers.adapted.place import MIN_SHARE, share_of_place
 from wheretolook.scorers.base import Scorer, ViewReport
-from wheretolook.scorers.method import ScorerOptions
+from wheretolook.scorers.registry import ScorerOptions
 from wheretolook.scorers.set.score import SetScorer
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import WeightsError

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from wheretolook.scorers.matchability.config import MatchabilityConfig
-from wheretolook.scorers.method import Method, MethodStyle, imported
+from wheretolook.scorers.registry import Method, MethodStyle, imported
 
 METHODS = (
     Method(

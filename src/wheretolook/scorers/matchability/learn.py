@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from wheretolook.scorers.matchability.network import MatchabilityNetwork
-from wheretolook.training.batches import Batch, IndexBatches
+from wheretolook.training.data import Batch, IndexBatches
 from wheretolook.training.landmark_views import DISTANCES, LandmarkDataModule, random_log_scales
 from wheretolook.training.learner import TrainingJob, TrainingResult, train_network
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.inputs.channels import ALL_CHANNELS, PAPER_VARIANTS
-from wheretolook.scorers.method import Method, MethodStyle, imported, network_scorer
 from wheretolook.scorers.mlp.config import RELEASED_SETTINGS, MlpConfig
+from wheretolook.scorers.registry import Method, MethodStyle, imported, network_scorer
 
 if TYPE_CHECKING:
     from wheretolook.training.learner import TrainingJob, TrainingResult
@@ -25,7 +25,7 @@ def _network(inputs: str, style: MethodStyle, channels: tuple[str, ...], **field
         style=style,
         group="learned",
         build=network_scorer(
-            "wheretolook.scorers.binned_network:BinnedNetworkScorer",
+            "wheretolook.scorers.mlp.network:BinnedNetworkScorer",
             "wheretolook.scorers.mlp.network:ViewpointNetwork",
             name,
         ),

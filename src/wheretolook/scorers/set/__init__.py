@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from wheretolook.scorers.method import Method, MethodStyle, imported, network_scorer
+from wheretolook.scorers.registry import Method, MethodStyle, imported, network_scorer
 from wheretolook.scorers.set.config import SetConfig
 
 METHODS = (

@@ -25,13 +25,13 @@ import torch
 from scipy.special import log_ndtr
 from torch import Tensor
 
-from wheretolook.dataset.thresholds import Accuracy
+from wheretolook.dataset.config import Accuracy
 from wheretolook.geometry.poses import Float
 from wheretolook.scorers.set.network import ALL_STATISTICS, SetNetwork
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import WeightsError
-from wheretolook.utils.reading import read_json_object
-from wheretolook.utils.shipped_model import LogisticRegression
+from wheretolook.utils.files import read_json_object
+from wheretolook.utils.shipped import LogisticRegression
 
 
 @dataclass(frozen=True)

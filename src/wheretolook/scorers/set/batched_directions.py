@@ -17,19 +17,18 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from wheretolook.dataset.thresholds import Accuracy
+from wheretolook.dataset.config import Accuracy
 from wheretolook.geometry.poses import Float, check_locations, rotation_looking_along
 from wheretolook.inputs.landmark_features import ragged_blocks
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.mapping.attribute_names import MAP_ATTRIBUTES
+from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
 from wheretolook.scorers.matchability.network import N_EXPECTED, bearing_precision
 from wheretolook.scorers.set.accuracy import probabilities
 from wheretolook.scorers.set.network import SetNetwork, expected_cells
 from wheretolook.training.trained_network import TrainedNetwork
-from wheretolook.utils.system import cores
-from wheretolook.visibility.listing import FrustumLister, ListedViews, Surroundings
+from wheretolook.utils.processes import cores
+from wheretolook.visibility.counting import FrustumLister, ListedViews, Surroundings, choose_size
 from wheretolook.visibility.occlusion import DevicePoints
-from wheretolook.visibility.sphere_cells import choose_size
 
 SERVED = {
     "log_expected_inliers",

@@ -1,8 +1,10 @@
-"""Scorer of a network over the set of visible landmarks."""
+"""Base of the scorers that learned from single visible landmarks."""
 
 from __future__ import annotations
 
-from copy import copy
+from bisect import bisect_left
+from copy import copy, deepcopy
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -10,17 +12,175 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wheretolook.dataset.thresholds import Accuracy, checked_accuracy, threshold_key
+from wheretolook.dataset.config import Accuracy, checked_accuracy, threshold_key
+from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, check_poses
-from wheretolook.inputs.landmark_features import ViewLandmarks
+from wheretolook.inputs.landmark_features import LandmarkDescriber, ViewLandmarks
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.scorers.base import ViewReport
-from wheretolook.scorers.landmark_scorer import LandmarkScorer
+from wheretolook.mapping.colmap_model import observation_matrix, select_points
+from wheretolook.scorers.base import LandmarkProbabilities, Scorer, ViewReport
+from wheretolook.scorers.matchability.network import bearing_precision
 from wheretolook.scorers.set.accuracy import AccuracyModel, probabilities, statistics_of
 from wheretolook.scorers.set.batched_directions import BatchedDirections
 from wheretolook.scorers.set.network import SetNetwork
-from wheretolook.scorers.set.own_images import for_map
-from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook.training.trained_network import (
+    RangeWatch,
+    TrainedNetwork,
+    TrainingRange,
+    camera_quantities,
+    view_quantities,
+)
+from wheretolook.visibility.frustum import LandmarkSets
+from wheretolook.visibility.occlusion import CachedOcclusion, StoredOcclusion
+
+
+class LandmarkScorer(Scorer):
+    """Scores a view by the named attributes of its visible landmarks, of which at most `max_landmarks` are described.
+
+    Without a stored range of the training views, the field of view of their camera, if it was one, bounds the range.
+    `score` warns once with an `OutOfRangeWarning`, see `RangeWatch`.
+    """
+
+    max_landmarks: int | None = None
+
+    def __init__(
+        self,
+        localization_map: LocalizationMap,
+        attributes: tuple[str, ...],
+        training_range: TrainingRange | None,
+        camera: Camera | None,
+    ) -> None:
+        super().__init__(localization_map)
+        self.training_range = TrainingRange.of_camera(camera) if training_range is None else training_range
+        self.describer = LandmarkDescriber(localization_map, attributes)
+        self._of_camera = camera_quantities(localization_map.camera)
+        self._serves_camera = bool(self.training_range.contains(self._of_camera[None])[0])
+        self._watch = RangeWatch(self.training_range.bounds_landmarks or not self._serves_camera)
+
+    def in_range(self, cam_from_world: Float) -> NDArray[np.bool_]:
+        """Return which poses (B, 3, 4) have views like the training views, (B,) bool."""
+        cam_from_world = check_poses(cam_from_world)
+        inside = np.full(len(cam_from_world), self._serves_camera)
+        if self._serves_camera and self.training_range.bounds_landmarks:
+            for rows, described, n_visible in self.describer.in_blocks(cam_from_world, self.max_landmarks):
+                inside[rows] = self._in_range(described, n_visible)
+        return inside
+
+    def log_odds_of_detection(self, values: Tensor) -> Tensor | None:
+        """Return the log-odds (E,) that landmarks (E, A) are detected; None if the method does not predict them."""
+        return None
+
+    def landmark_probabilities(
+        self, cam_from_world: Float, visible: LandmarkSets | None = None
+    ) -> LandmarkProbabilities | None:
+        """See `Scorer.landmark_probabilities`."""
+        with torch.inference_mode():
+            described = self.describer.describe(check_poses(cam_from_world), visible)
+            log_odds = self.log_odds_of_detection(described.values)
+            if log_odds is None:
+                return None
+            precision = bearing_precision(described.values, described.attributes)
+        return LandmarkProbabilities(
+            described.rows.cpu().numpy(), log_odds.sigmoid().double().cpu().numpy(), precision.double().cpu().numpy()
+        )
+
+    def _in_range(self, described: ViewLandmarks, n_visible: Tensor) -> NDArray[np.bool_]:
+        """Return which of some views are in the training range, (B,)."""
+        return self.training_range.contains(view_quantities(described, n_visible, self._of_camera))
+
+    def _quantities(self, described: ViewLandmarks, n_visible: Tensor) -> list[Float]:
+        """Return the quantities the range watch checks; empty once it has warned, or has nothing to warn of."""
+        return [view_quantities(described, n_visible, self._of_camera)] if self._watch.watching else []
+
+
+MIN_IMAGES = 5  # of a map whose tracks show how often landmarks are detected
+BLOCKS = 8  # of images that are held out one after the other
+SHARE = 1 / 8  # of the images that a block takes
+TESTED = 2  # images of a block, at most
+MAX_POINTS = 20_000  # of the map that are examined, evenly spread
+MIN_OBSERVED = 50  # observations of remaining landmarks in the held-out images
+OFFSET_LANDMARKS = 512  # of an image that are described
+OFFSETS = np.linspace(-1, 2, 61).tolist()
+
+
+def for_map(trained: TrainedNetwork[SetNetwork], localization_map: LocalizationMap) -> TrainedNetwork[SetNetwork]:
+    """Return a network calibrated for a map of photographs; the same network for a map of renders.
+
+    The log-odds of detection get `detection_offset`, those of the view `TrainedNetwork.photograph_offset`.
+    """
+    if not localization_map.photographs:
+        return trained
+    network = deepcopy(trained.network)
+    last = network.matchability.layers[-1]
+    assert isinstance(last, torch.nn.Linear)
+    with torch.no_grad():
+        last.bias.add_(_known_offset(network, localization_map))
+    return replace(trained.for_photographs(), network=network)
+
+
+def _known_offset(network: SetNetwork, localization_map: LocalizationMap) -> float:
+    """Return `detection_offset`, estimated once for all cameras and parts of a map."""
+    if localization_map.images is None:
+        return 0.0
+    known = localization_map.images.offsets
+    occlusion = localization_map.occlusion
+    if isinstance(occlusion, CachedOcclusion):
+        occlusion = occlusion.model
+    if isinstance(occlusion, StoredOcclusion):  # of all landmarks at some locations only
+        return 0.0
+    key = (occlusion, *(float(values.sum()) for values in network.parameters()))
+    if key not in known:
+        known[key] = detection_offset(network, localization_map)
+    return known[key]
+
+
+def detection_offset(network: SetNetwork, localization_map: LocalizationMap) -> float:
+    """Estimate the offset of a network's log-odds of detection on a map from the tracks of its landmarks.
+
+    Blocks of images that share landmarks are held out. With the offset, the network predicts as many detections of the
+    remaining landmarks as there are observations of them in the held-out images. 0 if the images are unknown, fewer
+    than `MIN_IMAGES`, or observe hardly any of these landmarks. Measured in docs/research/cameras.md.
+    """
+    images = localization_map.images
+    if images is None or len(images) < MIN_IMAGES:
+        return 0.0
+    kept = np.zeros(len(images.arrays.points), dtype=bool)
+    kept[:: max(1, -(-len(kept) // MAX_POINTS))] = True
+    images = replace(images, arrays=select_points(images.arrays, kept))
+    observes = observation_matrix(images.arrays)
+    n_observed = 0.0
+    parts: list[tuple[torch.Tensor, torch.Tensor]] = []
+    seeing = np.flatnonzero(np.asarray(observes.sum(1)).reshape(-1))
+    for first in seeing[_spread(len(seeing), BLOCKS)]:
+        common = (observes @ observes[[first]].T).toarray().reshape(-1)
+        block = np.argsort(-common, kind="stable")[: max(1, round(len(images) * SHARE))]
+        block = block[common[block] > 0]
+        remaining = images.without(block)
+        if len(remaining) == 0:
+            continue
+        describer = LandmarkDescriber(replace(localization_map, landmarks=remaining), network.attributes)
+        tested = block[_spread(len(block), TESTED)]
+        n_observed += observes[tested][:, np.isin(images.arrays.point_ids, remaining.ids)].sum()
+        for row in tested:
+            views = describer.of_camera(images.cameras[row]).in_blocks(images.poses[[row]], OFFSET_LANDMARKS)
+            for _, described, n_visible in views:
+                with torch.inference_mode():
+                    log_odds = network.matchability(described.values).double()
+                parts.append((log_odds, (n_visible / max(1, len(log_odds))).expand(len(log_odds))))
+    if n_observed < MIN_OBSERVED:
+        return 0.0
+    log_odds, weights = (torch.cat(part) for part in zip(*parts, strict=True))
+
+    def surplus(offset: float) -> float:
+        return float((weights * (log_odds + offset).sigmoid()).sum()) - n_observed
+
+    return OFFSETS[min(bisect_left(OFFSETS, 0.0, key=surplus), len(OFFSETS) - 1)]
+
+
+def _spread(n: int, max_count: int) -> np.ndarray:
+    """Return at most so many evenly spread rows of n."""
+    return np.unique(np.linspace(0, n - 1, min(max_count, n)).round().astype(int))
+
 
 MAX_LANDMARKS = 1024
 """Landmarks of a view that are described at most; of more, an even sample represents all. Against all, log-odds differ

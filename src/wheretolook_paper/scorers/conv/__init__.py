@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from wheretolook.scorers.method import Method, MethodStyle, imported, network_scorer
+from wheretolook.scorers.registry import Method, MethodStyle, imported, network_scorer
 from wheretolook.training.config import FittingConfig, check_range
 from wheretolook.utils.errors import ConfigError
 
@@ -39,7 +39,7 @@ METHODS = (
         style=MethodStyle("convolutional, landmark attributes", "#AA4499", "8", (0, (3, 1))),
         group="learned",
         build=network_scorer(
-            "wheretolook.scorers.binned_network:BinnedNetworkScorer",
+            "wheretolook.scorers.mlp.network:BinnedNetworkScorer",
             "wheretolook_paper.scorers.conv.network:ConvNetwork",
             "conv",
         ),

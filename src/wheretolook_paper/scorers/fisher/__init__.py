@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Literal
 
-from wheretolook.scorers.method import Method, MethodStyle, ScorerOptions, imported, no_params
+from wheretolook.scorers.registry import Method, MethodStyle, ScorerOptions, imported, no_params
 
 if TYPE_CHECKING:
     from wheretolook.geometry.camera import Camera

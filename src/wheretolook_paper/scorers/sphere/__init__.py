@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from wheretolook.scorers.method import Method, MethodStyle, imported, network_scorer
+from wheretolook.scorers.registry import Method, MethodStyle, imported, network_scorer
 from wheretolook.training.config import FittingConfig, check_range
 from wheretolook.utils.errors import ConfigError
 

@@ -17,9 +17,8 @@ from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.geometry.poses import Float, split_poses
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
-from wheretolook.training.batches import Batch, IndexBatches, TensorViews
 from wheretolook.training.config import SharedConfig
-from wheretolook.training.data import ViewsDataModule, labelled_rows, labels_of
+from wheretolook.training.data import Batch, IndexBatches, TensorViews, ViewsDataModule, labelled_rows, labels_of
 from wheretolook.utils.errors import MapError
 from wheretolook_paper.scorers.sphere import SphereConfig
 

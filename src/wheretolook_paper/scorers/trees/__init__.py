@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from wheretolook.scorers.method import Method, MethodStyle, ScorerOptions, imported
+from wheretolook.scorers.registry import Method, MethodStyle, ScorerOptions, imported
 from wheretolook.utils.validation import check_positive, check_range
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.inputs.channels import ATTRIBUTES
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scorers.base import BLOCK
-from wheretolook.scorers.landmark_scorer import LandmarkScorer
+from wheretolook.scorers.set.score import LandmarkScorer
 from wheretolook_paper.scorers.pooled_features import pool
 from wheretolook_paper.scorers.trees.learn import BoostedTrees
 

@@ -7,8 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, overload
 
-from wheretolook.scorers.method import ScorerOptions
-from wheretolook.scorers.registry import SUBSTITUTES, build_scorer, check_method, members, scorers
+from wheretolook.scorers.registry import SUBSTITUTES, ScorerOptions, build_scorer, check_method, members, scorers
 from wheretolook.training.weights import method_of_weights, preference, read_training, read_weights
 from wheretolook.utils.errors import ConfigError, WeightsError
 from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped
@@ -132,7 +131,7 @@ def _folders(folder: Path, features: str) -> Iterator[Path]:
 
 def _best_for_dataset(dataset: Dataset, kinds: set[str], log: Callable[[str], None]) -> Path | None:
     """Return the preferred file that serves a dataset's cameras, from the first folder that has any."""
-    from wheretolook.dataset.names import RELEASE
+    from wheretolook.dataset.config import RELEASE
     from wheretolook.geometry.camera import camera_of_record
     from wheretolook.scorers.base import same_field_of_view
     from wheretolook.training.provenance import was_trained_on

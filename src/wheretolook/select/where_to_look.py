@@ -47,7 +47,7 @@ ALTERNATIVES = 60  # directions with the best scores, which are compared
 
 
 @dataclass(frozen=True)
-class PosePrior:
+class PoseUncertainty:
     """Gaussian uncertainty of a robot's pose: of x and y each in metres, and of yaw in degrees; height is known."""
 
     sigma_m: float
@@ -360,7 +360,7 @@ class WhereToLook:
         else:
             views = self._sequence_with_stops(waypoints, axes, scores, request, progress)
         if request.sigma_m or request.yaw_sigma_deg:
-            prior = PosePrior(request.sigma_m or 0.0, request.yaw_sigma_deg or 0.0)
+            prior = PoseUncertainty(request.sigma_m or 0.0, request.yaw_sigma_deg or 0.0)
             chosen = views.waypoint, views.axes @ self.frame.world_from_map.rotation.T
             allowed &= scores >= -np.sort(-scores, axis=1)[:, :ALTERNATIVES][:, -1:]
             expected, best = prior.expected_scores(self.scorer, waypoints.points, axes, allowed, chosen, progress)

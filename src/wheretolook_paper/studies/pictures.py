@@ -51,7 +51,7 @@ TABLES = {
 """Experiment and saved view of each picture of a table."""
 
 TABLE_SIZE = 1200, 620
-PLOT_SIZE = 1075, 560
+PLOT_SIZE = 1075, 575
 SCATTER_SIZE = 1075, 610
 LOAD_S = 180  # until a page is complete
 LEFT, TOP = 206, 14

@@ -18,6 +18,7 @@ from tempfile import TemporaryDirectory
 from urllib.parse import urlencode
 
 from jsonargparse import auto_cli
+from matplotlib.figure import Figure
 from matplotlib.style import context
 from PIL import Image
 
@@ -98,9 +99,11 @@ def draw_figures(dataset: Dataset, tracking: TrackingConfig) -> None:
             continue
         drawn = io.BytesIO()
         with context(RC):
-            item.draw(Source(dataset, tracking, runs)).savefig(drawn, dpi=300)
+            figure = item.draw(Source(dataset, tracking, runs))
+            assert isinstance(figure, Figure)
+            figure.savefig(drawn, dpi=300)
         image = Image.open(drawn).convert("RGB")
-        image.resize((width, round(image.height * width / image.width))).save(path, quality=85, method=6)
+        image.resize((width, round(image.height * width / image.width))).save(path, quality=65, method=6)
         print(path, flush=True)
 
 
@@ -130,11 +133,10 @@ def draw_pages(tracking: TrackingConfig, profile: Path) -> None:
                 _save(tab, path, SCATTER_SIZE)
 
 
-_ACTIVE, _SELECTED = (
-    f"[...document.querySelectorAll('.du-bois-light-select-{part}')].map(e => e.innerText.trim())"
-    for part in ("item-option-active", "selection-item-content")
-)
-"""Scripts that return the texts of the highlighted options and of the selected ones."""
+def _wait_for(tab: Tab, name: str, part: str) -> None:
+    """Wait until a part of a list, such as its highlighted option, has this text."""
+    script = f"[...document.querySelectorAll('.du-bois-light-select-{part}')].map(e => e.innerText.trim())"
+    tab.wait(lambda tab: name in tab.evaluate(script))
 
 
 def _choose_axes(tab: Tab, plot: Plot) -> None:
@@ -143,9 +145,9 @@ def _choose_axes(tab: Tab, plot: Plot) -> None:
         tab.click_on(".du-bois-light-select-selector", index)
         for name in names:
             tab.call("Input.insertText", text=name)  # filters the list
-            tab.wait(lambda tab, name=name: name in tab.evaluate(_ACTIVE))
+            _wait_for(tab, name, "item-option-active")
             tab.key("Enter", 13)
-            tab.wait(lambda tab, name=name: name in tab.evaluate(_SELECTED))
+            _wait_for(tab, name, "selection-item-content")
         tab.key("Escape", 27)
 
 

@@ -43,7 +43,7 @@ SCENES = ("aws_house", "nexuiz_aggressor", "nexuiz_aggressor_b", "nexuiz_desertf
           "nexuiz_dieselpower_b")  # fmt: skip
 FEW = ("--sample.max_locations", "60", "--sample.max_directions", "14")
 
-FILMED_PAIR = "0"
+FILMED_PAIR = "1"
 """Start and goal of the film: a path on which looking ahead fails on a part."""
 
 Words = Sequence[str]

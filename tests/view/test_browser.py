@@ -13,12 +13,12 @@ from PIL import Image
 pytest.importorskip("viser")
 
 from selection.room import POINTS, WEIGHTS, write_room
-from wheretolook_paper.studies.browser import Browser, chromium
 from wheretolook.geometry.poses import poses_looking_along, rotation_from_quaternion
 from wheretolook.view.paths import FORWARD, RecordedPath, looking_ahead
 from wheretolook.view.server import Viewer
 from wheretolook.view.state import ViewState
 from wheretolook.view.viewed_map import open_map
+from wheretolook_paper.studies.browser import Browser, chromium
 
 RING = 0.65  # radius of the rings over their size
 

@@ -262,6 +262,16 @@ raise SystemExit(cli.main(["map"]))
         assert process.wait(timeout=30) == 130
 
 
+@pytest.mark.parametrize("arguments", [["--help"], ["select", "--help"], ["evaluate", "--list-methods"]])
+def test_a_closed_output_ends_a_command_silently(arguments: list[str]) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "wheretolook", *arguments]
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE)
+    os.close(writer)
+    assert done.stderr == b"" and done.returncode in (0, 141)  # argparse ignores that its help was not read
+
+
 def test_debug_shows_the_traceback(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["scenes", "--camera.width", "0", "--debug"]) == 2
     assert "Traceback" in capsys.readouterr().err

@@ -65,7 +65,11 @@ ENVIRONMENT = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line. Returns the exit code: 0, 2 for bad input, 130 when interrupted by Ctrl-C or SIGTERM."""
+    """Run the command line.
+
+    Returns the exit code: 0, 2 for bad input, 130 when interrupted by Ctrl-C or SIGTERM, 141 when the reader of the
+    output, such as `head`, has closed it.
+    """
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     collect_less_garbage()
@@ -79,10 +83,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, interrupt)
         run_command([argument for argument in given if argument != "--debug"])
+        sys.stdout.flush()
         return 0
     except KeyboardInterrupt:
         print("\nwheretolook: interrupted; finished work is kept, run the same command to continue", file=sys.stderr)
         return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the flush at the exit fails
+        return 141
     except (WhereToLookError, OSError) as error:
         if debug:
             traceback.print_exc()

@@ -86,17 +86,15 @@ class Tab:
         self.wait(lambda tab: tab.evaluate(script) is not None, 20)
         self.click(*self.evaluate(script))
 
-    def enter(self, text: str) -> None:
-        """Type a text and press Enter."""
-        self.call("Input.insertText", text=text)
-        time.sleep(0.5)  # lists are filtered after a delay
+    def key(self, name: str, code: int) -> None:
+        """Press a key, given its name and its Windows key code."""
         for kind in ("keyDown", "keyUp"):
-            self.call("Input.dispatchKeyEvent", type=kind, key="Enter", code="Enter", windowsVirtualKeyCode=13)
+            self.call("Input.dispatchKeyEvent", type=kind, key=name, code=name, windowsVirtualKeyCode=code)
 
     def save(self, path: Path, left: int, top: int, width: int, height: int) -> None:
         """Write a rectangle of the page as a WebP file."""
         clip = {"x": left, "y": top, "width": width, "height": height, "scale": 1}
-        image = self.call("Page.captureScreenshot", format="webp", quality=85, clip=clip)
+        image = self.call("Page.captureScreenshot", format="webp", quality=75, clip=clip)
         path.write_bytes(base64.b64decode(image["data"]))
 
     def press(self, label: str) -> None:

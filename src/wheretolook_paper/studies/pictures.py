@@ -18,6 +18,7 @@ from tempfile import TemporaryDirectory
 from urllib.parse import urlencode
 
 from jsonargparse import auto_cli
+from matplotlib.figure import Figure
 from matplotlib.style import context
 from PIL import Image
 
@@ -43,13 +44,16 @@ FIGURES = {
 """Item of the catalog and width in pixels of each picture."""
 
 TABLES = {
-    "docs/images/mlflow-methods.webp": ("release: evaluation", "methods", 620),
-    "docs/images/mlflow-top-n.webp": ("release: evaluation", "top-n", 620),
-    "docs/images/mlflow-inputs.webp": ("release: training", "trained", 520),
+    "docs/images/mlflow-methods.webp": ("release: evaluation", "methods"),
+    "docs/images/mlflow-top-n.webp": ("release: evaluation", "top-n"),
+    "docs/images/mlflow-inputs.webp": ("release: training", "trained"),
 }
-"""Experiment, saved view and height in pixels of each picture of a table."""
+"""Experiment and saved view of each picture of a table."""
 
-TABLE_WIDTH, PLOT_WIDTH, PLOT_HEIGHT = 1200, 1075, 580
+TABLE_SIZE = 1200, 620
+PLOT_SIZE = 1075, 575
+SCATTER_SIZE = 1075, 610
+LOAD_S = 180  # until a page is complete
 LEFT, TOP = 206, 14
 """Where the pages of MLflow begin, right of its menu."""
 
@@ -94,9 +98,11 @@ def draw_figures(dataset: Dataset, tracking: TrackingConfig) -> None:
             continue
         drawn = io.BytesIO()
         with context(RC):
-            item.draw(Source(dataset, tracking, runs)).savefig(drawn, dpi=300)
+            figure = item.draw(Source(dataset, tracking, runs))
+            assert isinstance(figure, Figure)
+            figure.savefig(drawn, dpi=300)
         image = Image.open(drawn).convert("RGB")
-        image.resize((width, round(image.height * width / image.width))).save(path, quality=85, method=6)
+        image.resize((width, round(image.height * width / image.width))).save(path, quality=65, method=6)
         print(path, flush=True)
 
 
@@ -106,19 +112,30 @@ def draw_pages(tracking: TrackingConfig, profile: Path) -> None:
     with socket.create_server((ADDRESS, 0)) as probe:
         port = probe.getsockname()[1]
     server = f"http://{NAME}:{port}/"
-    with serving(tracking, port), closing(Browser(profile, (LEFT + TABLE_WIDTH + TOP, 700))) as browser:
-        for path, (experiment, view, height) in TABLES.items():
+    with serving(tracking, port), closing(Browser(profile, (LEFT + TABLE_SIZE[0] + TOP, 700))) as browser:
+        for path, (experiment, view) in TABLES.items():
             tab = browser.open(server + experiment_link(ids[experiment], view))
-            tab.wait(lambda tab: "matching runs" in tab.text and "\n0 matching" not in tab.text)
-            _save(tab, path, TABLE_WIDTH, height)
-        browser.size = (LEFT + PLOT_WIDTH + TOP, 700)
+            tab.wait(lambda tab: "matching runs" in tab.text and "\n0 matching" not in tab.text, LOAD_S)
+            _save(tab, path, TABLE_SIZE)
+        browser.size = (LEFT + PLOT_SIZE[0] + TOP, 700)
         for path, plot in PLOTS.items():
             experiment = ids[plot.experiment]
             runs = [run.info.run_id for run in client(tracking).search_runs([experiment], plot.search)]
             compared = urlencode({"runs": json.dumps(runs), "experiments": json.dumps([experiment])})
             tab = browser.open(f"{server}#/compare-runs?{compared}")
-            (_choose_axes if plot.parameters else _choose_scatter)(tab, plot)
-            _save(tab, path, PLOT_WIDTH, PLOT_HEIGHT)
+            tab.wait(lambda tab: "Clear All" in tab.text, LOAD_S)
+            if plot.parameters:
+                _choose_axes(tab, plot)
+                _save(tab, path, PLOT_SIZE)
+            else:
+                _choose_scatter(tab, plot)
+                _save(tab, path, SCATTER_SIZE)
+
+
+def _wait_for(tab: Tab, name: str, part: str) -> None:
+    """Wait until a part of a list, such as its highlighted option, has this text."""
+    script = f"[...document.querySelectorAll('.du-bois-light-select-{part}')].map(e => e.innerText.trim())"
+    tab.wait(lambda tab: name in tab.evaluate(script))
 
 
 def _choose_axes(tab: Tab, plot: Plot) -> None:
@@ -126,7 +143,11 @@ def _choose_axes(tab: Tab, plot: Plot) -> None:
     for index, names in enumerate((plot.parameters, plot.metrics)):
         tab.click_on(".du-bois-light-select-selector", index)
         for name in names:
-            tab.enter(name)
+            tab.call("Input.insertText", text=name)  # filters the list
+            _wait_for(tab, name, "item-option-active")
+            tab.key("Enter", 13)
+            _wait_for(tab, name, "selection-item-content")
+        tab.key("Escape", 27)
 
 
 def _choose_scatter(tab: Tab, plot: Plot) -> None:
@@ -136,10 +157,10 @@ def _choose_scatter(tab: Tab, plot: Plot) -> None:
         tab.press(name)
 
 
-def _save(tab: Tab, path: str, width: int, height: int) -> None:
+def _save(tab: Tab, path: str, size: tuple[int, int]) -> None:
     tab.click(LEFT + 400, TOP + 50)  # closes lists
     time.sleep(2)
-    tab.save(Path(path), LEFT, TOP, width, height)
+    tab.save(Path(path), LEFT, TOP, *size)
     print(path, flush=True)
 
 

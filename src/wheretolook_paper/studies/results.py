@@ -43,6 +43,8 @@ SCENES = ("aws_house", "nexuiz_aggressor", "nexuiz_aggressor_b", "nexuiz_desertf
           "nexuiz_dieselpower_b")  # fmt: skip
 FEW = ("--sample.max_locations", "60", "--sample.max_directions", "14")
 
+FILMED_PAIR = "1"
+"""Start and goal of the film: a path on which looking ahead fails on a part."""
 
 Words = Sequence[str]
 
@@ -86,6 +88,9 @@ def steps(meshes: Path = Path("MESHES"), photographs: Path = Path("PHOTOGRAPHS")
                      label=("--label.store_pixels", "true"))  # fmt: skip
     ranked = on_looks("evaluate", "--evaluate.weights", f"[{WEIGHTS[0]}]", "--evaluate.methods", "[set, visible]")
     study = "wheretolook_paper.studies.photographs"
+    film = ("--config", "configs/others.yaml", "--name", "film", "--scenes.test", "1")
+    compared = ("--paths.methods", "[forward, set]", "--paths.pairs", "8")
+    shown = ("--scene", "apartment-210", "--name", "film", "--path", "data/film/results/paths/apartment-210")
     photographed = ("--out", str(RESULTS / "photographs.csv"))
     return {
         "interiors": Step([demo("interiors", "--scenes.test", "0", *bundled)], _generalization, "meshes"),
@@ -107,7 +112,16 @@ def steps(meshes: Path = Path("MESHES"), photographs: Path = Path("PHOTOGRAPHS")
             needs="photographs",
         ),
         "release": Step([("wheretolook", "release", "--config", "configs/release.yaml")]),
+        "film": Step(
+            [
+                *(("wheretolook", stage, *film) for stage in ("scenes", "map")),
+                ("wheretolook", "compare-paths", *film, *compared),
+                ("wheretolook", "view", *shown, "--pair", FILMED_PAIR, "--film", "docs/images/lost.webp"),
+            ]
+        ),
+        "pictures": Step([("wheretolook_paper.studies.pictures",)]),
         "pages": Step([], _pages),
+        "notebooks": Step([], _notebooks),
     }
 
 
@@ -137,6 +151,11 @@ def _pages() -> None:
     numbers = Numbers(Path())
     for page in pages(numbers):
         write_text(Path(page), updated(page, numbers))
+
+
+def _notebooks() -> None:
+    """Execute the notebooks of the checkout and store their outputs."""
+    subprocess.run([sys.executable, "notebooks/execute.py"], check=True)
 
 
 def outdated(only: Sequence[str] = ()) -> Iterator[str]:

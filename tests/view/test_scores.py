@@ -89,7 +89,7 @@ def test_a_scene_of_a_dataset_has_its_labels(tmp_path: Path) -> None:
     dataset = make_dataset(tmp_path / "set", ("test",), n_locations=4, n_directions=5)
     viewed = open_scene(tmp_path, dataset.scenes[0].name, "", None, WEIGHTS, "cpu")
     assert viewed.labels is not None and len(viewed.labels) == 20 and viewed.camera == CAMERA
-    assert viewed.mesh is None and viewed.photographs is None
+    assert viewed.mesh is None
     assert len(viewed.floor("visible", "none", 1.5).cells)
 
 

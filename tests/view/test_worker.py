@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from waiting import wait_until
-from wheretolook.view.level_of_detail import LevelOfDetail
 from wheretolook.view.worker import LATER, NOW, SOON, Worker
 
 
@@ -66,24 +65,3 @@ def test_no_urgency_starves(monkeypatch: pytest.MonkeyPatch) -> None:
         wait_until(lambda n=n: len(clicks) == len(floors) == n, 10)  # type: ignore[misc]
     worker.stop()
     assert np.diff(floors)[0] >= 0.6
-
-
-@pytest.mark.parametrize(
-    ("gap_s", "step_m", "levels"),
-    [(0.12, 0.4, [1, 2]), (0.12, 0.1, []), (0.01, 0.4, [])],  # slow browser, slow hand, fast browser
-)
-def test_detail_is_reduced_while_the_camera_of_a_slow_browser_moves(
-    gap_s: float, step_m: float, levels: list[int]
-) -> None:
-    shown: list[int] = []
-    detail = LevelOfDetail(shown.append, 2)
-    for step in range(10):
-        detail.moved((step_m * step, 0.0, 9.0), (0.0, 0.0, 0.0))
-        detail.moved((step_m * step, 0.0, 9.0), (0.0, 0.0, 0.0))  # browsers send each pose twice
-        time.sleep(gap_s)
-    if levels:
-        wait_until(lambda: shown == [*levels, 0], 2)
-        detail.moved((99.0, 0.0, 9.0), (0.0, 0.0, 0.0))
-        assert shown[-1] == 2  # begins with the last level
-    else:
-        assert shown == []

@@ -16,14 +16,6 @@ from wheretolook.view.viewed_map import ViewedMap
 HINT = "Click a location on the coloured floor for the score of every direction and the best views."
 LIMITS = {threshold_label(threshold_key(limits)): limits for limits in THRESHOLDS}
 STEP_M = 0.05  # of heights
-FILES = {
-    "CSV": ("csv", ".csv"),
-    "JSON": ("json", ".json"),
-    "TUM trajectory": ("tum", ".tum"),
-    "COLMAP images.txt": ("colmap", ".txt"),
-    "benchmark poses": ("benchmark", ".txt"),
-}
-"""Formats of saved views: the name in `wheretolook select` and the file name suffix of each."""
 _BLANK = np.full((270, 360, 3), (38, 40, 46), np.uint8)
 
 
@@ -39,11 +31,6 @@ class Controls:
                 self._add_location(gui, state)
             with gui.add_folder("Layers", expand_by_default=False):
                 self._add_layers(gui, viewed, state)
-        if viewed.paths:
-            with tabs.add_tab("Path"):
-                self._add_paths(gui, viewed)
-        with tabs.add_tab("Waypoints"):
-            self._add_waypoints(gui)
         with tabs.add_tab("Share"):
             self._add_share(gui, state)
 
@@ -88,25 +75,7 @@ class Controls:
         self.limits = gui.add_dropdown("localized within", tuple(LIMITS), visible=has_labels)
         self.label_summary = gui.add_markdown("", visible=has_labels)
 
-    def _add_paths(self, gui: Any, viewed: ViewedMap) -> None:
-        self.play = gui.add_button("Play")
-        self.step = gui.add_slider("step", 1, max(map(len, viewed.paths.values())), 1, 1)
-        self.path_captions = {}
-        self.path_pictures = {}
-        for name in viewed.paths:
-            self.path_captions[name] = gui.add_markdown(f"**{escape_markdown(name)}**")
-            self.path_pictures[name] = gui.add_image(_BLANK)
-
-    def _add_waypoints(self, gui: Any) -> None:
-        self.placing = gui.add_checkbox("add waypoints by clicks", False)
-        self.waypoints = gui.add_markdown("No waypoints yet.")
-        self.add = gui.add_button("Add the selected location")
-        self.clear = gui.add_button("Remove all")
-        self.format = gui.add_dropdown("format", tuple(FILES))
-        self.save = gui.add_button("Save with best views")
-
     def _add_share(self, gui: Any, state: ViewState) -> None:
-        self.photo = gui.add_button("Save a picture")
         self.dark = gui.add_checkbox("dark", False)
         self.link = gui.add_markdown("")
         self.state = gui.add_text("state", state.text(), hint="For wheretolook view --state.")

@@ -23,6 +23,9 @@ FALSE_POSITIVE = (213, 94, 0)
 FALSE_NEGATIVE = (0, 114, 178)
 """Colours of labelled views by prediction: localizes or not, as predicted or not."""
 
+CAMERA_COLOR = (86, 180, 233)
+LANDMARK_COLOR = (150, 150, 155)
+
 FADE = 0.65  # share of grey in the colour of a location below the threshold
 CELL_PX = 6  # pixels of a floor's cell, so that its edges stay sharp
 MAX_FRUSTA = 1500

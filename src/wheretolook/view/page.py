@@ -1,4 +1,4 @@
-"""The page of one client: scene, selected location, waypoints and paths, and what connects them."""
+"""The page of one client: scene, selected location and paths, and what connects them."""
 
 from __future__ import annotations
 
@@ -8,11 +8,8 @@ import numpy as np
 
 from wheretolook.view import drawing
 from wheretolook.view.controls import value_of
-from wheretolook.view.level_of_detail import LevelOfDetail
 from wheretolook.view.location import LocationView
-from wheretolook.view.player import Player
-from wheretolook.view.saving import WaypointList, save_picture
-from wheretolook.view.scenery import FEWER_LANDMARKS, Scenery
+from wheretolook.view.scenery import Scenery
 from wheretolook.view.session import Session, once
 from wheretolook.view.state import ViewState
 from wheretolook.view.viewed_map import ViewedMap
@@ -31,20 +28,17 @@ class Page(Session):
         super().__init__(client, viewed, worker, state, host)
         self.scenery = Scenery(self)
         self.place = LocationView(self)
-        self.waypoints = WaypointList(self)
-        self._detail = LevelOfDetail(self._set_level, len(FEWER_LANDMARKS))
         self._connect()
         self.controls.dark.value = dark
         self.set_theme(dark)
         if state.eye is not None and state.target is not None:
             client.camera.position = np.array(state.eye)
             client.camera.look_at = np.array(state.target)
+        self.scenery.draw_paths()
         self.draw_scene()
         self.fill_floor()
         if state.place is not None:
             self.place.select(np.array(state.place), None if state.yaw is None else (state.yaw, state.pitch or 0.0))
-        if viewed.paths:
-            Player(self)
 
     def _connect(self) -> None:
         c = self.controls
@@ -58,7 +52,6 @@ class Page(Session):
             self.on(handle, self._layers_changed)
         self.on(c.limits, self.draw_labels)
         self.on(c.dark, lambda: self.set_theme(bool(c.dark.value)))
-        self.on(c.photo, lambda: save_picture(self.client))
         self.client.camera.on_update(self.callback(lambda _: self._camera_moved()))
         clicks: Any = self.scene.on_click()  # typed for plain functions, takes coroutines too
         clicks(self.callback(self._clicked))
@@ -93,32 +86,23 @@ class Page(Session):
     def _layers_changed(self) -> None:
         self.submit("scene", SOON, once(self.draw_scene))
 
-    def _set_level(self, level: int) -> None:
-        if not self.closed:
-            with self.client.atomic():
-                self.scenery.set_level(level)
-
     def _camera_moved(self) -> None:
         camera = self.client.camera
         eye = tuple(map(float, camera.position))
         target = tuple(map(float, camera.look_at))
         if np.isfinite((eye, target)).all():
-            self._detail.moved(eye, target)  # type: ignore[arg-type]
             self.update(eye=eye, target=target)
             self.submit("state", LATER, once(self.show_state))
         self.place.camera_moved()
 
     def _clicked(self, event: Any) -> None:
-        """Select the clicked location of the floor, or add it to the waypoints."""
+        """Select the clicked location of the floor."""
         point = intersect_plane(event.ray_origin, event.ray_direction, self.scenery.floor_m)
         low, high = self.viewed.bounds[:, :2]
         if point is None or not ((point[:2] >= low) & (point[:2] <= high)).all():
             return
         point[2] = self.state.height
-        if self.controls.placing.value:
-            self.waypoints.add(point)
-        else:
-            self.place.select(point)
+        self.place.select(point)
 
     def draw_scene(self) -> None:
         """Draw mesh, landmarks, mapping cameras and labels."""

@@ -1,4 +1,4 @@
-"""Read paths to play: a planned path, compared paths, or any file of poses."""
+"""Read paths to show: a planned path, compared paths, or any file of poses."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.map_frame import IDENTITY
-from wheretolook.planning.config import FORWARD
 from wheretolook.utils.errors import TableError
 
 MAX_COORDINATE_M = 1e9
@@ -43,10 +42,11 @@ Paths = dict[str, RecordedPath]
 def read_paths(path: Path, pair: int = 0, world_from_map: Similarity = IDENTITY.world_from_map) -> Paths:
     """Read the views along a path by method; of compared paths those of one start-goal pair.
 
-    Poses are moved from the map's own frame to the world. A single path is accompanied by `FORWARD`: the same locations seen by a camera that looks ahead. Raises TableError
-    if the file is missing or has no valid poses.
+    Poses are moved from the map's own frame to the world. A single path is accompanied by `FORWARD`: the same locations
+    seen by a camera that looks ahead. Raises TableError if the file is missing or has no valid poses.
     """
     from wheretolook.io.poses import read_poses
+    from wheretolook.planning.config import FORWARD
 
     if path.is_dir():
         path = next((path / name for name in ("path.csv", "views.parquet") if (path / name).is_file()), path)
@@ -55,7 +55,7 @@ def read_paths(path: Path, pair: int = 0, world_from_map: Similarity = IDENTITY.
     else:
         paths = {"planned" if path.name == "path.csv" else path.stem: RecordedPath(read_poses(path).cam_from_world)}
     if not 1 <= len(paths) <= MAX_METHODS:
-        problem = f"1 to {MAX_METHODS} methods can be played"
+        problem = f"1 to {MAX_METHODS} methods can be shown"
         raise TableError(problem, path=path, value=len(paths), fix="Correct --pair, or leave out methods.")
     for along in paths.values():
         finite = (np.abs(along.cam_from_world) < MAX_COORDINATE_M).all()  # False for NaN

@@ -1,4 +1,4 @@
-"""Draw the scene for one client: mesh, landmarks, mapping cameras, coloured floor, labels."""
+"""Draw the scene for one client: mesh, landmarks, mapping cameras, paths, coloured floor, labels."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.geometry.poses import camera_centers
 from wheretolook.utils.texts import counted
 from wheretolook.view import drawing
 from wheretolook.view.controls import LIMITS
@@ -21,9 +21,7 @@ REDRAW_S = 0.4  # between two images of a growing floor
 CELLS_PER_STEP = 2  # one per core
 MESH_LOADING_S = 1.5  # until a browser has loaded a mesh
 MAX_LANDMARKS = 400_000
-FEWER_LANDMARKS = (20_000, 5_000, 1_500)  # for slow browsers whose camera moves, by level of detail
-CAMERA_COLOR = (86, 180, 233)
-LANDMARK_COLOR = (150, 150, 155)
+PATH_COLORS = ((120, 120, 120), (213, 94, 0), (0, 114, 178), (0, 158, 115), (204, 121, 167))
 
 
 class Scenery:
@@ -38,8 +36,6 @@ class Scenery:
         self._floor: Floor | None = None
         self._mesh: bytes | None = None
         self._mesh_name = ""
-        self._level = 0  # of detail of the landmarks
-        self._landmark_lock = threading.Lock()
 
     def draw(self) -> None:
         """Draw the enabled layers below the cut; from inside the scene the whole mesh only."""
@@ -50,11 +46,13 @@ class Scenery:
         points = self.viewed.landmarks.points
         if cut is not None:
             points = points[points[:, 2] <= cut]
-        self._draw_landmarks(points if layers["landmarks"] else points[:0])
+        stride = max(1, -(-len(points) // MAX_LANDMARKS))
+        points = points[::stride] if layers["landmarks"] else points[:0]
+        self.session.add_points("/landmarks", points, drawing.LANDMARK_COLOR, 0.0018 * self.viewed.size_m)
         poses = self.viewed.mapping_poses
         if layers["cameras"] and poses is not None and not inside:
             edges = drawing.frusta(self.viewed.camera, poses, self.viewed.marker_m)
-            self.session.add_lines("/cameras", edges, CAMERA_COLOR, 1.2)
+            self.session.add_lines("/cameras", edges, drawing.CAMERA_COLOR, 1.2)
         else:
             self.scene.remove_by_name("/cameras")
         for name in ("floor", "labels"):
@@ -80,21 +78,18 @@ class Scenery:
         if name != self._mesh_name:
             self.scene.remove_by_name(name)
 
-    def _draw_landmarks(self, points: Float) -> None:
-        """Draw one point cloud per level of detail, of which one is visible."""
-        with self._landmark_lock:
-            for level, limit in enumerate((MAX_LANDMARKS, *FEWER_LANDMARKS)):
-                thinned = points[:: max(1, -(-len(points) // limit))]
-                size_m = 0.0018 * self.viewed.size_m
-                self.session.add_points(_cloud(level), thinned, LANDMARK_COLOR, size_m, level == self._level)
-
-    def set_level(self, level: int) -> None:
-        """Show all landmarks (0), or fewer (1 to the number of `FEWER_LANDMARKS`)."""
-        with self._landmark_lock:
-            for number in {level, self._level}:
-                if (handle := self.scene.get_handle_by_name(_cloud(number))) is not None:
-                    handle.visible = number == level
-            self._level = level
+    def draw_paths(self) -> None:
+        """Draw the positions and cameras of each path, and its name at the end."""
+        marker_m = self.viewed.marker_m
+        for number, (name, path) in enumerate(self.viewed.paths.items()):
+            positions = camera_centers(path.cam_from_world)
+            steps = np.stack([positions[:-1], positions[1:]], axis=1)
+            edges = drawing.frusta(self.viewed.camera, path.cam_from_world, marker_m)
+            color = PATH_COLORS[number % len(PATH_COLORS)]
+            self.session.add_lines(f"/paths/{name}", np.concatenate([steps, edges]), color, 2.0)
+            # above each other, since paths may share their positions
+            label_position = positions[-1] + (0.0, 0.0, (1 + number) * marker_m)
+            self.scene.add_label(f"/paths/{name}/name", name, position=label_position, font_screen_scale=0.8)
 
     def fill_floor(self, state: ViewState) -> Iterator[None]:
         """Score and colour the floor, some cells per step."""
@@ -172,7 +167,3 @@ class Scenery:
         segments = np.stack([starts, starts + self.viewed.marker_m * cam_from_world[:, 2, :3]], axis=1)
         self.session.add_lines("/labels", segments, drawing.line_ends(colors), 2.0)
         self.controls.label_summary.content = summary
-
-
-def _cloud(level: int) -> str:
-    return f"/landmarks-{level}" if level else "/landmarks"

@@ -21,7 +21,6 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.mapping.config import FrameOptions
-from wheretolook.mapping.map_frame import IDENTITY, MapFrame
 from wheretolook.utils.errors import MapError, TableError, WhereToLookError
 from wheretolook.utils.shipped import or_shipped
 from wheretolook.view import drawing
@@ -36,7 +35,6 @@ if TYPE_CHECKING:  # torch and Warp are imported when first needed: the page ope
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.scorers.base import Scorer
     from wheretolook.select.where_to_look import WhereToLook
-    from wheretolook.view.photographs import Photographs
 
 MAX_SCORERS = 8  # kept in memory; those of large maps take 100 MB each
 MAX_FLOORS = 64
@@ -58,14 +56,12 @@ class ViewedMap:
         environment: Environment,
         own_weights: Mapping[str, Path | None],
         labels: pd.DataFrame | None = None,
-        photographs: Photographs | None = None,
     ) -> None:
         self.name = name
         self.environment = environment
         self.weights = AvailableWeights(environment.landmarks.features, own_weights)
         self.labels = labels  # labelled viewpoints
-        self.photographs = photographs
-        self.paths: Paths = {}  # to play
+        self.paths: Paths = {}  # to show
         self.landmarks = environment.landmarks
         self.camera = environment.camera
         self.frame = environment.frame  # the map's own, of coordinates that are read, shown or saved
@@ -178,16 +174,12 @@ class ViewedMap:
     def picture(self, pose: Float, visible: drawing.VisibleLandmarks) -> tuple[drawing.Rgb, str]:
         """Return an image (H, W, 3) of a view (3, 4) and its caption.
 
-        The view is rendered; without a mesh it is the nearest photograph, or else the landmarks alone. Landmarks are
-        drawn in the colours of their probabilities, except on photographs, which show another view.
+        The view is rendered; without a mesh it is the landmarks alone. Landmarks are drawn in the colours of their
+        probabilities.
         """
         if self.mesh is not None:
             rgb = self.environment.renderer.render(drawing.small_camera(self.camera), pose[None]).rgb[0]
             return drawing.picture(rgb, self.camera, visible), "rendered; landmarks by detection probability"
-        if self.photographs is not None:
-            number = self.photographs.nearest(pose)
-            rgb = self.photographs.read(number, drawing.PICTURE_PX)
-            return rgb, f"nearest photograph, {self.photographs.names[number]}"
         return drawing.picture(None, self.camera, visible), "landmarks in view by detection probability"
 
 
@@ -195,13 +187,12 @@ def open_map(
     path: Path,
     mesh: Path | None = None,
     camera: Camera | int | None = None,
-    images: Path | None = None,
     weights: Path | None = None,
     device: str = "cpu",
     data: Path = Path("data"),
     frame: FrameOptions = FrameOptions(),
 ) -> ViewedMap:
-    """Open a COLMAP model, a mesh in its frame, and the folder of its images.
+    """Open a COLMAP model and a mesh in its frame.
 
     By default views are scored by weights adapted to the model in the folder `data`, or by bundled ones.
 
@@ -221,7 +212,7 @@ def open_map(
     if mesh is not None:
         warn_of_mesh(mesh, landmarks.points, environment.raycaster)
     own = {"given": or_shipped(weights)} if weights else map_weights(path, data, landmarks)
-    return ViewedMap(environment.name, environment, own, photographs=_photographs(path, images, environment.frame))
+    return ViewedMap(environment.name, environment, own)
 
 
 def open_scene(
@@ -254,16 +245,4 @@ def open_scene(
         if CAMERA_ID in table:
             shown &= table[CAMERA_ID] == number
         labels = table[shown].reset_index(drop=True) if shown.any() else None
-    return ViewedMap(files.name, environment, own, labels, _photographs(files.map))
-
-
-def _photographs(model: Path, folder: Path | None = None, frame: MapFrame = IDENTITY) -> Photographs | None:
-    """Find the photographs of a COLMAP model, in a folder or where it was mapped from."""
-    from wheretolook.mapping.colmap_model import holds_model
-    from wheretolook.mapping.mapped_images import find_photographs
-    from wheretolook.view.photographs import Photographs
-
-    folder = folder or find_photographs(model)
-    return (
-        Photographs.of_model(model, folder, frame.world_from_map) if folder is not None and holds_model(model) else None
-    )
+    return ViewedMap(files.name, environment, own, labels)

@@ -13,9 +13,8 @@ pytest.importorskip("viser")
 from selection.room import POINTS, WEIGHTS, write_room
 from wheretolook.geometry.poses import poses_looking_along, rotation_from_quaternion
 from wheretolook.planning.config import FORWARD
-from wheretolook.view.paths import RecordedPath, looking_ahead
 from wheretolook.view.server import Viewer
-from wheretolook.view.state import ViewState
+from wheretolook.view.state import RecordedPath, ViewState, looking_ahead
 from wheretolook.view.viewed_map import open_map
 from wheretolook_paper.studies.browser import Browser, chromium
 

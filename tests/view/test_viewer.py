@@ -30,9 +30,8 @@ from wheretolook.scenes.loading import save_glb
 from wheretolook.utils.errors import ConfigError, InUseError, MapWarning
 from wheretolook.view.drawing import escape_markdown
 from wheretolook.view.page import intersect_plane
-from wheretolook.view.paths import RecordedPath, looking_ahead
 from wheretolook.view.server import Viewer, check_port
-from wheretolook.view.state import ViewState
+from wheretolook.view.state import RecordedPath, ViewState, looking_ahead
 from wheretolook.view.viewed_map import open_map
 
 STATE = ViewState(method="visible", occlusion="none")

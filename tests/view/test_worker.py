@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from waiting import wait_until
-from wheretolook.view.worker import LATER, NOW, SOON, Worker
+from wheretolook.view.session import LATER, NOW, SOON, Worker
 
 
 def test_urgent_jobs_go_first_and_failures_stop_nothing_else() -> None:
@@ -43,8 +43,8 @@ def test_urgent_jobs_go_first_and_failures_stop_nothing_else() -> None:
 
 def test_no_urgency_starves(monkeypatch: pytest.MonkeyPatch) -> None:
     """Floors wait while a view is turned without end, but not for ever; nor do clicked locations."""
-    monkeypatch.setattr("wheretolook.view.worker.PATIENCE_S", 0.6)
-    monkeypatch.setattr("wheretolook.view.worker.CLICK_PATIENCE_S", 0.2)
+    monkeypatch.setattr("wheretolook.view.session.PATIENCE_S", 0.6)
+    monkeypatch.setattr("wheretolook.view.session.CLICK_PATIENCE_S", 0.2)
     worker = Worker()
     floors: list[float] = []
     clicks: list[float] = []

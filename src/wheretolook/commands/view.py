@@ -105,8 +105,7 @@ class View(CameraOptions, FrameOptions):
         """Serve the page until interrupted; or write a recording or a film."""
         start = time.monotonic()
         self._check_environment()
-        from wheretolook.view.paths import read_paths
-        from wheretolook.view.state import ViewState
+        from wheretolook.view.state import ViewState, read_paths
 
         state = ViewState.parse(self.state)
         if self.method:

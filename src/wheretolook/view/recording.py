@@ -15,9 +15,8 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.utils.files import atomic_write
 from wheretolook.view import drawing
-from wheretolook.view.scores import Floor
 from wheretolook.view.state import ViewState
-from wheretolook.view.viewed_map import ViewedMap
+from wheretolook.view.viewed_map import Floor, ViewedMap
 
 
 class Recording:

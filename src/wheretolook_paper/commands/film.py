@@ -21,8 +21,7 @@ from wheretolook.planning.config import FORWARD
 from wheretolook.utils.errors import ConfigError
 from wheretolook.view import drawing
 from wheretolook.view.drawing import VisibleLandmarks
-from wheretolook.view.paths import RecordedPath
-from wheretolook.view.state import ViewState
+from wheretolook.view.state import RecordedPath, ViewState
 from wheretolook.view.viewed_map import ViewedMap
 
 FRAME_MS = 220

@@ -37,7 +37,6 @@ REDRAW_S = 0.4  # between two images of a growing floor
 CELLS_PER_STEP = 2  # one per core
 MESH_LOADING_S = 1.5  # until a browser has loaded a mesh
 MAX_LANDMARKS = 400_000
-PATH_COLORS = ((120, 120, 120), (213, 94, 0), (0, 114, 178), (0, 158, 115), (204, 121, 167))
 
 
 class LocationView:
@@ -264,17 +263,13 @@ class Scenery:
             self.scene.remove_by_name(name)
 
     def draw_paths(self) -> None:
-        """Draw the positions and cameras of each path, and its name at the end."""
-        marker_m = self.viewed.marker_m
+        """Draw the positions and cameras of each path."""
         for number, (name, path) in enumerate(self.viewed.paths.items()):
             positions = camera_centers(path.cam_from_world)
             steps = np.stack([positions[:-1], positions[1:]], axis=1)
-            edges = drawing.frusta(self.viewed.camera, path.cam_from_world, marker_m)
-            color = PATH_COLORS[number % len(PATH_COLORS)]
-            self.session.add_lines(f"/paths/{name}", np.concatenate([steps, edges]), color, 2.0)
-            # above each other, since paths may share their positions
-            label_position = positions[-1] + (0.0, 0.0, (1 + number) * marker_m)
-            self.scene.add_label(f"/paths/{name}/name", name, position=label_position, font_screen_scale=0.8)
+            edges = drawing.frusta(self.viewed.camera, path.cam_from_world, self.viewed.marker_m)
+            lines = np.concatenate([steps, edges])
+            self.session.add_lines(f"/paths/{name}", lines, drawing.path_color(number), 2.0)
 
     def fill_floor(self, state: ViewState) -> Iterator[None]:
         """Score and colour the floor, some cells per step."""

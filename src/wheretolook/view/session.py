@@ -174,6 +174,11 @@ class Controls:
         threshold = min(max(state.threshold, 0.0), 1.0)
         hint = "Locations with lower scores are paler."
         self.threshold = gui.add_slider("threshold", 0.0, 1.0, 0.01, threshold, hint=hint)
+        names = [
+            f'<span style="color:rgb{drawing.path_color(number)}">■</span> {drawing.escape_markdown(name)}'
+            for number, name in enumerate(viewed.paths)
+        ]
+        self.paths = gui.add_markdown(f"Paths: {', '.join(names)}", visible=bool(names))
 
     def _add_location(self, gui: Any, state: ViewState) -> None:
         self.summary = gui.add_markdown(HINT)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.ranking import CandidateViews, choose_at_random, choose_best, choose_oracle, rank_views
+from wheretolook.evaluation.ranking import RankedViews, choose_at_random, choose_best, choose_oracle, rank_views
 from wheretolook.evaluation.results import reference_method, score_table, threshold_keys
 from wheretolook.utils.errors import ConfigError
 
-HAND = CandidateViews(
+HAND = RankedViews(
     # location 0 has four views, location 1 has one, location 2 has three, in mixed order
     location=np.array([2, 0, 0, 1, 0, 2, 0, 2]),
     viewpoint_id=np.array([5, 12, 11, 9, 10, 6, 13, 7]),
@@ -23,13 +23,13 @@ HAND = CandidateViews(
 HAND_SCORES = np.array([0.2, 0.9, 0.5, 0.1, 0.5, 0.2, 0.4, 0.9])
 
 
-def random_views(rng: np.random.Generator, n_locations: int = 40) -> CandidateViews:
+def random_views(rng: np.random.Generator, n_locations: int = 40) -> RankedViews:
     location = np.repeat(np.arange(n_locations), rng.integers(1, 15, n_locations))
     order = rng.permutation(len(location))
     quality = rng.random(len(location))
     good = quality[:, None] < [0.3, 0.5]
     scene = np.sort(rng.integers(0, 3, n_locations))
-    return CandidateViews(location[order], np.arange(len(location))[order], good[order], scene, np.arange(n_locations))
+    return RankedViews(location[order], np.arange(len(location))[order], good[order], scene, np.arange(n_locations))
 
 
 @pytest.mark.parametrize(

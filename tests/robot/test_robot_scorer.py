@@ -21,8 +21,9 @@ from synthetic_dataset import CAMERA, make_landmarks
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, invert_poses, poses_looking_along
-from wheretolook.inputs.channels import ATTRIBUTES, FeatureStatistics
+from wheretolook.inputs.channels import ATTRIBUTES
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.robot import wheretolook_robot
 from wheretolook.robot.export import export_robot, pinhole_of

@@ -14,8 +14,8 @@ from synthetic_dataset import CAMERA
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good, poses
 from wheretolook.geometry import pose_information as information
-from wheretolook.inputs.channels import FeatureStatistics
 from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.scorers.matchability.network import MatchabilityNetwork, bearing_numbers, expected_parts
 from wheretolook.scorers.set.config import SetConfig
 from wheretolook.scorers.set.learn import of_size

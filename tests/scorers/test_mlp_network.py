@@ -8,7 +8,8 @@ import torch
 
 from twins.bins import compact as move_to_front_plain
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.inputs.channels import ALL_CHANNELS, LANDMARK_CHANNELS, PAPER_VARIANTS, FeatureStatistics
+from wheretolook.inputs.channels import ALL_CHANNELS, LANDMARK_CHANNELS, PAPER_VARIANTS
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.scorers.mlp.network import BinnedInput, NetworkSpec, ViewpointNetwork, move_to_front
 
 BINS = 6

@@ -14,9 +14,10 @@ from synthetic_dataset import CAMERA, make_landmarks, make_mapping_poses
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.bins import BinnedViews
-from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, FeatureStatistics
+from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
 from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.scorers.adapted.network import AdaptedNetwork
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.bins import BinsScorer

@@ -10,12 +10,12 @@ import numpy as np
 import pandas as pd
 
 from selection.room import POINTS
-from wheretolook.select.where_to_look import PosePrior, WhereToLook
+from wheretolook.select.where_to_look import PoseUncertainty, WhereToLook
 
 FREE_TO_X = 5.0  # beyond is geometry
 
 
-def expected(prior: PosePrior, score: Any) -> tuple[np.ndarray, np.ndarray]:
+def expected(prior: PoseUncertainty, score: Any) -> tuple[np.ndarray, np.ndarray]:
     """Compute expected scores of a view along x at the origin, where only the direction y is allowed."""
     occlusion = SimpleNamespace(inside_geometry=lambda points: points[:, 0] > FREE_TO_X)
     scorer: Any = SimpleNamespace(score_directions=score, localization_map=SimpleNamespace(occlusion=occlusion))
@@ -24,13 +24,17 @@ def expected(prior: PosePrior, score: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_means_of_known_scores() -> None:
-    along_x = expected(PosePrior(0.0, 45.0), lambda points, axes: axes[None, :, 0])
+    along_x = expected(PoseUncertainty(0.0, 45.0), lambda points, axes: axes[None, :, 0])
     np.testing.assert_allclose(along_x[0], np.exp(-(np.radians(45) ** 2) / 2), atol=0.12)  # E cos of a normal angle
-    squared = expected(PosePrior(2.0, 0.0), lambda points, axes: np.tile((points**2).sum(1)[:, None], (1, len(axes))))
+    squared = expected(
+        PoseUncertainty(2.0, 0.0), lambda points, axes: np.tile((points**2).sum(1)[:, None], (1, len(axes)))
+    )
     np.testing.assert_allclose(squared[0], 2 * 2.0**2, rtol=0.35)  # two coordinates: no error of height
-    shifted = expected(PosePrior(20.0, 0.0), lambda points, axes: np.tile(points[:, :1] <= FREE_TO_X, (1, len(axes))))
+    shifted = expected(
+        PoseUncertainty(20.0, 0.0), lambda points, axes: np.tile(points[:, :1] <= FREE_TO_X, (1, len(axes)))
+    )
     np.testing.assert_array_equal(shifted[0], 1)  # no draw inside geometry
-    sideways = expected(PosePrior(0.0, 0.0), lambda points, axes: axes[None, :, 1])
+    sideways = expected(PoseUncertainty(0.0, 0.0), lambda points, axes: axes[None, :, 1])
     np.testing.assert_allclose(sideways, [[0.0], [1.0]])
 
 

@@ -19,8 +19,8 @@ from wheretolook.io.poses import images_text, tum_text
 from wheretolook.scans.depth_images import read_depth_images
 from wheretolook.scenes.loading import save_glb
 from wheretolook.scorers.base import Scorer
-from wheretolook.select.waypoints import read_waypoints
-from wheretolook.select.where_to_look import SelectionRequest, WhereToLook
+from wheretolook.select.waypoints import SelectionRequest, read_waypoints
+from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError, WhereToLookError
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 

@@ -1,4 +1,4 @@
-"""Parquet files that expand to gigabytes, or would overflow the stack, are refused before they do."""
+"""Parquet files that would overflow the stack are refused, and those that pandas writes are read."""
 
 from __future__ import annotations
 
@@ -9,24 +9,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from wheretolook.utils.parquet_files import read_parquet
-
-
-def _giant_list(path: Path) -> None:
-    """One row: a list of zeros."""
-    n = 40_000_000
-    column = pa.ListArray.from_arrays(pa.array([0, n], pa.int32()), pa.array(np.zeros(n, np.int32)))
-    pq.write_table(pa.table({"rows": column}), path, compression="none", data_page_size=2**30, store_schema=False)
-
-
-def _long_text(path: Path) -> None:
-    """65,536 times the same 20 MB: a kilobyte."""
-    texts = pa.DictionaryArray.from_arrays(pa.array(np.zeros(65536, np.int32)), pa.array(["x" * 20_000_000]))
-    options = {"compression": "zstd", "store_schema": False, "dictionary_pagesize_limit": 2**30}
-    pq.write_table(pa.table({"status": texts}), path, **options)
 
 
 def _nested(path: Path, depth: int) -> None:
@@ -46,13 +31,9 @@ def _nested(path: Path, depth: int) -> None:
     path.write_bytes(b"PAR1" + description + struct.pack("<I", len(description)) + b"PAR1")
 
 
-BOMBS = [_giant_list, _long_text, lambda p: _nested(p, 100_000)]
-
-
-@pytest.mark.parametrize("make", BOMBS)
-def test_bombs_are_refused(make, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_deeply_nested_columns_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.parquet"
-    make(path)
+    _nested(path, 100_000)
     before = pa.default_memory_pool().max_memory() or 0
     start = time.process_time()
     with pytest.raises(ValueError):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from wheretolook.commands.selector_options import SelectorOptions, finish
-from wheretolook.select.where_to_look import SelectionRequest
+from wheretolook.select.waypoints import SelectionRequest
 from wheretolook.utils.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from wheretolook.geometry.poses import Float, camera_centers, rotation_from_quat
 from wheretolook.io.poses import POSE_COLUMNS, QUATERNION_COLUMNS, TRANSLATION_COLUMNS
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import atomic_write
-from wheretolook.utils.parquet_files import open_parquet, read_columns
+from wheretolook.utils.parquet_files import open_parquet
 
 CENTER_COLUMNS = ("x_m", "y_m", "z_m")
 
@@ -130,7 +130,7 @@ def read_table(path: Path, matches: bool = False, pixels: bool = False) -> pd.Da
                     fix = f"Label again with `--label.store_{'pixels' if pixels else 'matches'} true`; "
                     fix += "compact tables never hold them."
                 raise TableError("columns are missing", path=path, value=missing, fix=fix)
-            frame: pd.DataFrame = read_columns(file, path, schema.names).cast(schema).to_pandas()
+            frame: pd.DataFrame = file.read(schema.names).cast(schema).to_pandas()
     except ValueError as error:
         raise TableError(f"not a readable table of viewpoints: {error}", path=path, fix=fix) from error
     length = np.linalg.norm(frame[[*QUATERNION_COLUMNS]], axis=1)

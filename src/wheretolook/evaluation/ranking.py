@@ -22,7 +22,7 @@ Ids = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class CandidateViews:
+class RankedViews:
     """B labelled views at L locations to choose from.
 
     Attributes:
@@ -45,10 +45,10 @@ class CandidateViews:
         """L."""
         return len(self.location_scene)
 
-    def only(self, mask: NDArray[np.bool_]) -> CandidateViews:
+    def only(self, mask: NDArray[np.bool_]) -> RankedViews:
         """Return the views where `mask` (B,) is set; locations are renumbered without empty ones, scenes are not."""
         kept, location = np.unique(self.location[mask], return_inverse=True)
-        return CandidateViews(
+        return RankedViews(
             location, self.viewpoint_id[mask], self.good[mask], self.location_scene[kept], self.location_block[kept]
         )
 
@@ -63,14 +63,14 @@ class SceneViews(NamedTuple):
     location_block: Ids  # (L,)
 
 
-def join_scenes(parts: Sequence[SceneViews]) -> tuple[CandidateViews, Ids]:
+def join_scenes(parts: Sequence[SceneViews]) -> tuple[RankedViews, Ids]:
     """Join views of scenes, numbered in this order; also returns the location_id (L,) of each location."""
     sizes = [len(part.location_id) for part in parts]
     starts = np.cumsum([0, *sizes])
     locations, names, good, ids, blocks = zip(*parts, strict=True)
     location = np.concatenate([rows + start for rows, start in zip(locations, starts, strict=False)])
     scene = np.repeat(np.arange(len(parts)), sizes)
-    views = CandidateViews(location, np.concatenate(names), np.concatenate(good), scene, np.concatenate(blocks))
+    views = RankedViews(location, np.concatenate(names), np.concatenate(good), scene, np.concatenate(blocks))
     return views, np.concatenate(ids)
 
 
@@ -87,7 +87,7 @@ class TopN:
         return TopN(self.chosen[locations], self.good[locations], self.any_good[locations])
 
 
-def rank_views(views: CandidateViews, scores: Float) -> Ids:
+def rank_views(views: RankedViews, scores: Float) -> Ids:
     """Rank views within their locations by scores (B,): (B,) from 0, the highest; ties by rising viewpoint_id."""
     order = np.lexsort((views.viewpoint_id, -scores, views.location))
     location = views.location[order]
@@ -97,21 +97,21 @@ def rank_views(views: CandidateViews, scores: Float) -> Ids:
     return ranks
 
 
-def choose_best(views: CandidateViews, ranks: Ids, n: int) -> TopN:
+def choose_best(views: RankedViews, ranks: Ids, n: int) -> TopN:
     """Choose the n views of every location that rank first (`rank_views`), or all where there are fewer."""
     return _top(views, _sum_by_location(views, views.good & (ranks < n)[:, None]), n)
 
 
-def choose_oracle(views: CandidateViews, n: int) -> TopN:
+def choose_oracle(views: RankedViews, n: int) -> TopN:
     """Choose up to n good views of every location for each threshold: the oracle."""
     return _top(views, np.minimum(_sum_by_location(views, views.good), n), n)
 
 
-def _top(views: CandidateViews, good: Float, n: int) -> TopN:
+def _top(views: RankedViews, good: Float, n: int) -> TopN:
     return TopN(np.minimum(_n_views(views), n), good, (good > 0).astype(np.float64))
 
 
-def choose_at_random(views: CandidateViews, n: int) -> TopN:
+def choose_at_random(views: RankedViews, n: int) -> TopN:
     """Compute the exact expectation of choosing n views of every location uniformly, without replacement.
 
     With g good views of m, min(n, m) g / m of the chosen ones are good, and at least one is with probability
@@ -127,11 +127,11 @@ def choose_at_random(views: CandidateViews, n: int) -> TopN:
     return TopN(chosen[:, 0], chosen * good / total, 1 - none)
 
 
-def _n_views(views: CandidateViews) -> Float:
+def _n_views(views: RankedViews) -> Float:
     return np.bincount(views.location, minlength=views.n_locations).astype(np.float64)
 
 
-def _sum_by_location(views: CandidateViews, flags: NDArray[np.bool_]) -> Float:
+def _sum_by_location(views: RankedViews, flags: NDArray[np.bool_]) -> Float:
     columns = [np.bincount(views.location, weights=column, minlength=views.n_locations) for column in flags.T]
     return np.stack(columns, axis=-1)
 
@@ -149,13 +149,13 @@ class CandidateSet:
 
     name: str
     mask: NDArray[np.bool_]
-    views: CandidateViews
+    views: RankedViews
     location_id: Ids
 
 
 def views_of(
     scenes: Sequence[SceneFolder], tables: Sequence[pd.DataFrame], config: EvaluateConfig
-) -> tuple[CandidateViews, Ids]:
+) -> tuple[RankedViews, Ids]:
     """Return all labelled views of scenes in the order of their tables, and the location_id (L,) of each location.
 
     If all tables have labels by the first RANSAC result, too, these give a second half of the columns of `good`. Raises a
@@ -183,7 +183,7 @@ def _scene_views(scene: SceneFolder, table: pd.DataFrame, config: EvaluateConfig
 
 
 def candidate_sets(
-    views: CandidateViews,
+    views: RankedViews,
     location_id: Ids,
     scenes: Sequence[SceneFolder],
     tables: Sequence[pd.DataFrame],

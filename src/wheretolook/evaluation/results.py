@@ -37,7 +37,7 @@ from wheretolook.dataset.viewpoint_table import FIRST
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.ranking import (
     CandidateSet,
-    CandidateViews,
+    RankedViews,
     TopN,
     choose_at_random,
     choose_best,
@@ -115,7 +115,7 @@ def is_random(method: str) -> bool:
     return bool(getattr(find(method), "is_random_baseline", False))
 
 
-def choose(views: CandidateViews, scores: Mapping[str, Float], top_n: Sequence[int]) -> Choices:
+def choose(views: RankedViews, scores: Mapping[str, Float], top_n: Sequence[int]) -> Choices:
     """Choose N views of every location by each method's scores (B,), and by the oracle."""
     choices: dict[tuple[str, int], TopN] = {}
     for method, values in scores.items():
@@ -140,7 +140,7 @@ def reference_method(methods: Iterable[str], name: str) -> str:
 
 
 def score_table(
-    views: CandidateViews,
+    views: RankedViews,
     scores: Mapping[str, Float],
     scenes: Sequence[str],
     config: EvaluateConfig,
@@ -294,7 +294,7 @@ class Evaluation:
 
     scenes: Sequence[SceneFolder]
     weights: Mapping[Path, str]  # files of weights, and the method that each serves
-    views: CandidateViews  # all labelled views
+    views: RankedViews  # all labelled views
     scored: Sequence[ScoredSet]  # for each occlusion model and candidate set
     table: pd.DataFrame  # their score tables, one below the other
     calibration: pd.DataFrame  # reliability curves of learned methods, see `calibration_rows`; empty without any

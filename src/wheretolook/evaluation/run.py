@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.ranking import CandidateSet, CandidateViews, candidate_sets, views_of
+from wheretolook.evaluation.ranking import CandidateSet, RankedViews, candidate_sets, views_of
 from wheretolook.evaluation.results import Evaluation, ScoredSet, choose, score_table
 from wheretolook.evaluation.scoring import (
     HeldOutPhotographs,
@@ -54,7 +54,7 @@ def compare_methods(
     photographed = {one.scene.name for one in photographs}
     rendered = [scene for scene in scenes if scene.name not in photographed or has_labels(scene)]
     parts: list[ScoredSet] = []
-    scored: list[tuple[CandidateViews, Mapping[str, Float]]] = []  # of each occlusion model
+    scored: list[tuple[RankedViews, Mapping[str, Float]]] = []  # of each occlusion model
     if rendered:
         tables = [scene.read_table() for scene in rendered]
         views, location_id = views_of(rendered, tables, config)

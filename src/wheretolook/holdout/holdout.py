@@ -202,7 +202,7 @@ class HoldoutResult:
 
 
 @dataclass(frozen=True, eq=False)
-class _Job:
+class _BlockJob:
     """Inputs of holding out one block in a worker process."""
 
     source: PhotographedMap  # without its model, which is in a folder
@@ -232,14 +232,14 @@ def hold_out_blocks(
     model = folder / "model"
     job_source = replace(source, model=None)
     results = dict[int, HoldoutResult | None]()
-    jobs = list[_Job]()
+    jobs = list[_BlockJob]()
     for block in blocks:
         cache = ArtifactCache(
             folder / f"{block.number:02}", cache_key(key, block.held_out.tolist(), block.tested.tolist())
         )
         results[block.number] = _load(cache, block)
         if results[block.number] is None:
-            jobs.append(_Job(job_source, model, block, cache, device))
+            jobs.append(_BlockJob(job_source, model, block, cache, device))
     jobs.sort(key=lambda job: -len(job.block.tested))  # no process is left with the largest block at the end
     if jobs:
         write_model(source.model, model)
@@ -301,7 +301,7 @@ def _model(folder: Path) -> Any:
     return read_model(folder)
 
 
-def _run(job: _Job) -> None:
+def _run(job: _BlockJob) -> None:
     """Hold out a block, localize its photographs, and store the result."""
     import torch
 
@@ -336,7 +336,7 @@ def _observed(image: Any, source: PhotographedMap, row: int, crop: int) -> NDArr
     return np.unique(ids[source.pixels_in_view(row, crop, pixels)[1]])
 
 
-def _localize(job: _Job, landmarks: Landmarks) -> pd.DataFrame:
+def _localize(job: _BlockJob, landmarks: Landmarks) -> pd.DataFrame:
     """Localize the tested photographs of a block against the remaining landmarks."""
     source = job.source
     tested = job.block.tested.tolist()

@@ -17,7 +17,7 @@ from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility import frustum
 from wheretolook.visibility.frustum import PosedViews
-from wheretolook.visibility.frustum_kernel import Views, dot, entry_offset, in_view, pixel_of
+from wheretolook.visibility.frustum_kernel import ViewBatch, dot, entry_offset, in_view, pixel_of
 
 if TYPE_CHECKING:
     from wheretolook.mapping.landmarks import Landmarks
@@ -59,7 +59,7 @@ def cell_of(grid: BinGrid, pixel: wp.vec2d) -> wp.int32:
 
 @wp.kernel
 def bin_kernel(
-    views: Views,
+    views: ViewBatch,
     grid: BinGrid,
     directions: wp.array[wp.vec3],
     attributes: wp.array2d[wp.float32],  # (0, .) if they are not asked for
@@ -99,7 +99,7 @@ def bin_kernel(
 
 @wp.kernel
 def count_bins_kernel(
-    views: Views,
+    views: ViewBatch,
     grid: BinGrid,
     lanes: wp.int32,
     occupied: wp.array2d[wp.int32],  # 0 where no landmark has been seen in a bin yet

@@ -15,7 +15,7 @@ TILE = wp.constant(8)
 
 
 @wp.struct
-class Appearance:
+class TexturedTriangles:
     corner_uvs: wp.array2d[wp.vec2]
     texel_gradients: wp.array2d[wp.vec3]
     triangle_texture: wp.array[wp.int32]
@@ -40,7 +40,7 @@ def _texel(texels: wp.array[wp.uint32], index: wp.int32):
 
 
 @wp.func
-def _bilinear(a: Appearance, texture: wp.int32, level: wp.int32, uv: wp.vec2):
+def _bilinear(a: TexturedTriangles, texture: wp.int32, level: wp.int32, uv: wp.vec2):
     """Colour at uv in one mip level, the texture repeated."""
     width = wp.max(1, a.texture_size[texture, 0] >> level)
     height = wp.max(1, a.texture_size[texture, 1] >> level)
@@ -65,7 +65,13 @@ def _bilinear(a: Appearance, texture: wp.int32, level: wp.int32, uv: wp.vec2):
 
 @wp.func
 def shade(
-    a: Appearance, face: int, weights: wp.vec3, depth_m: float, normal: wp.vec3, direction: wp.vec3, to_ray: wp.mat33
+    a: TexturedTriangles,
+    face: int,
+    weights: wp.vec3,
+    depth_m: float,
+    normal: wp.vec3,
+    direction: wp.vec3,
+    to_ray: wp.mat33,
 ):
     """Colour of a hit, filtered over the pixel's footprint."""
     uv = weights[0] * a.corner_uvs[face, 0] + weights[1] * a.corner_uvs[face, 1] + weights[2] * a.corner_uvs[face, 2]
@@ -138,7 +144,7 @@ def ray_through(to_ray: wp.mat33, column: wp.int32, row: wp.int32):
 @wp.kernel(enable_backward=False)
 def trace_kernel(
     mesh: wp.uint64,
-    appearance: Appearance,
+    appearance: TexturedTriangles,
     centers: wp.array[wp.vec3],
     ray_from_pixel: wp.array[wp.mat33],
     rgb: wp.array3d[wp.vec3ub],
@@ -269,7 +275,7 @@ def shade_kernel(
     projected: wp.array2d[wp.vec3d],
     vertices: wp.array[wp.vec3],
     triangle: wp.array3d[wp.int32],
-    appearance: Appearance,
+    appearance: TexturedTriangles,
     ray_from_pixel: wp.array[wp.mat33],
     rgb: wp.array3d[wp.vec3ub],
     depth_m: wp.array3d[wp.float32],

@@ -15,7 +15,14 @@ from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.geometry.similarity import poses_from
-from wheretolook.rendering.kernels import TILE, Appearance, project_kernel, raster_kernel, shade_kernel, trace_kernel
+from wheretolook.rendering.kernels import (
+    TILE,
+    TexturedTriangles,
+    project_kernel,
+    raster_kernel,
+    shade_kernel,
+    trace_kernel,
+)
 from wheretolook.rendering.raycasting import warp_mesh
 from wheretolook.rendering.textures import build_pyramids, texel_gradients
 from wheretolook.utils.errors import ConfigError, SceneError
@@ -170,7 +177,7 @@ class WarpRenderer:
     def _upload(self, mesh: TexturedMesh) -> Any:
         pyramids = build_pyramids(mesh.textures)
         colors = np.zeros((0, 3)) if mesh.vertex_colors is None else mesh.vertex_colors / 255.0
-        appearance = Appearance()
+        appearance = TexturedTriangles()
         appearance.corner_uvs = self._array(mesh.corner_uvs, wp.vec2)
         appearance.texel_gradients = self._array(texel_gradients(mesh), wp.vec3)
         appearance.triangle_texture = self._array(mesh.triangle_texture, wp.int32)

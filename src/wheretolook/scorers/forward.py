@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.random import uniform
-from wheretolook.scorers.registry import MethodStyle, ScorerOptions, rule
+from wheretolook.scorers.registry import BuildOptions, MethodStyle, rule
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
@@ -57,7 +57,7 @@ class ForwardScorer(Scorer):
         return np.asarray((1 + np.clip(cosines, -1, 1)) / 2)
 
 
-def _build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+def _build(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
     heading = options.heading[0] if len(options.heading) == 1 else options.heading or None
     return ForwardScorer(localization_map, heading, options.seed)
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.registry import MethodStyle, ScorerOptions, rule
+from wheretolook.scorers.registry import BuildOptions, MethodStyle, rule
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
@@ -49,7 +49,7 @@ def _splitmix64(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return state ^ (state >> np.uint64(31))
 
 
-def _build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+def _build(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
     return RandomScorer(localization_map, options.seed)
 
 

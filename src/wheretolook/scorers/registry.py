@@ -40,7 +40,7 @@ class MethodStyle:
 
 
 @dataclass(frozen=True)
-class ScorerOptions:
+class BuildOptions:
     """What some methods need besides the map."""
 
     seed: int = 0  # of random methods
@@ -68,7 +68,7 @@ class Method:
     style: MethodStyle
     group: Group = "rules"
     # builds its scorer; weights are given and of the right method if it needs any. None if it scores no views by itself
-    build: Callable[[LocalizationMap, ScorerOptions], Scorer] | None = None
+    build: Callable[[LocalizationMap, BuildOptions], Scorer] | None = None
     weights: str = ""  # name of the learned method whose weights it scores with; "" if it needs none
     position: int = 1000  # in tables and lists
     family: str = ""  # name that stands for all methods of the family in options
@@ -100,10 +100,10 @@ def imported(reference: str) -> Callable[..., Any]:
     return lambda *arguments: resolve_name(reference)(*arguments)
 
 
-def network_scorer(scorer: str, network: str, *methods: str) -> Callable[[LocalizationMap, ScorerOptions], Scorer]:
+def network_scorer(scorer: str, network: str, *methods: str) -> Callable[[LocalizationMap, BuildOptions], Scorer]:
     """Return a function that builds a scorer from weights of these methods; both classes as in `imported`."""
 
-    def build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+    def build(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
         from wheretolook.training.trained_network import TrainedNetwork
 
         assert options.weights is not None
@@ -243,18 +243,18 @@ def make_scorer(
     if name not in scorers() and (not kinds or "" in kinds or len({*kinds}) < len(kinds)):
         check_method(name)
     if kinds == [""]:
-        return build_scorer(methods[0], localization_map, ScorerOptions(seed, None, heading))
+        return build_scorer(methods[0], localization_map, BuildOptions(seed, None, heading))
     if weights is None:
         raise ConfigError("the method needs weights", value=name, fix="Give a file that the train command wrote.")
     kind = method_of_weights(weights)
     if kind not in kinds:
         fix = f"Give weights of {' or '.join(kinds)}, or train them."
         raise WeightsError(f"these weights are not of {name}", path=weights, value=kind, fix=fix)
-    options = ScorerOptions(seed, Path(weights), heading, anywhere)
+    options = BuildOptions(seed, Path(weights), heading, anywhere)
     return build_scorer(methods[kinds.index(kind)], localization_map, options)
 
 
-def build_scorer(method: Method, localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+def build_scorer(method: Method, localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
     """Build a scorer; errors name the file of weights."""
     assert method.build is not None
     try:

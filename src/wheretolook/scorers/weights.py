@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, overload
 
-from wheretolook.scorers.registry import SUBSTITUTES, ScorerOptions, build_scorer, check_method, members, scorers
+from wheretolook.scorers.registry import SUBSTITUTES, BuildOptions, build_scorer, check_method, members, scorers
 from wheretolook.training.weights import method_of_weights, preference, read_training, read_weights
 from wheretolook.utils.errors import ConfigError, WeightsError
 from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped
@@ -112,7 +112,7 @@ def load_scorer(
     path = resolve_weights(path=weights, features=localization_map.landmarks.features)
     assert path is not None
     method = check_method(method_of_weights(path))
-    return build_scorer(method, localization_map, ScorerOptions(weights=path, anywhere=anywhere))
+    return build_scorer(method, localization_map, BuildOptions(weights=path, anywhere=anywhere))
 
 
 def _self_scoring() -> set[str]:

@@ -18,7 +18,8 @@ from tqdm.auto import tqdm
 
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses
-from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, FeatureStatistics
+from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.training.config import FittingConfig, SharedConfig
 from wheretolook.training.trained_network import TrainingRange, bin_quantities
 from wheretolook.utils.errors import ConfigError, TableError

@@ -17,8 +17,9 @@ from tqdm.auto import tqdm
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
 from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good, poses
 from wheretolook.geometry.poses import Float
-from wheretolook.inputs.channels import ATTRIBUTES, OF_SIZE, FeatureStatistics
+from wheretolook.inputs.channels import ATTRIBUTES, OF_SIZE
 from wheretolook.inputs.landmark_features import LandmarkDescriber, ViewLandmarks
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.training.config import SharedConfig
 from wheretolook.training.data import Batch, IndexBatches, TensorViews, ViewsDataModule, labelled_rows, training_scenes
 from wheretolook.training.fit import home_device

@@ -15,6 +15,8 @@ from pathlib import Path, PurePath, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import yaml
+
 from wheretolook.utils.errors import ConfigError, StorageError
 
 STORAGE_FIX = "Free disk space, fix permissions or name another folder, then run again; finished work is kept."
@@ -199,8 +201,6 @@ def path_within(folder: Path, name: str, whose: str) -> Path:
 MAX_TEXT_BYTES = 16_000_000  # of a JSON file: a hundred thousand photographs or shards
 MAX_JSON_VALUES = 1_500_000  # an empty list takes three bytes of a file and eighty of memory
 MAX_YAML_BYTES = 100_000
-MAX_YAML_DEPTH = 50  # PyYAML's compiled loader overflows the stack at some ten thousand
-MAX_YAML_SIZE = 1_000_000  # values and characters, with aliases written out
 MAX_RATIO = 100  # of expanded to stored bytes of arrays and tables; occlusion of the bundled maps has 8, a bomb 1032
 FREE_BYTES = 128_000_000  # that any file of arrays may expand to
 
@@ -263,58 +263,20 @@ def read_json_object(path: Path) -> dict[str, Any]:
     return parse_json_object(read_text(path))
 
 
+class _UniqueKeys(yaml.SafeLoader):
+    """Loads plain values and raises a YAMLError for a key that is given twice: the first value would be ignored."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = [key.value for key, _ in node.value if isinstance(key.value, str) and key.value != "<<"]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise yaml.YAMLError(f"the key {key} is given twice")
+        return super().construct_mapping(node, deep)
+
+
 def read_yaml(path: Path) -> Any:
-    """Read a YAML file of plain values with a safe loader, which creates no objects of classes that a file names.
-
-    Raises ValueError if it is none, if a key is given twice, or if its aliases expand to too much.
-    """
-    import yaml
-
-    text = read_text(path, MAX_YAML_BYTES)
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    depth = 0
+    """Read a YAML file of plain values. Raises ValueError if it is none, or if a key is given twice."""
     try:
-        for event in yaml.parse(text, Loader=loader):
-            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > MAX_YAML_DEPTH:
-                raise ValueError("its values are nested too deeply")
-        _check_keys(yaml.compose(text, Loader=loader))
-        content = yaml.load(text, Loader=loader)
+        return _UniqueKeys(read_text(path, MAX_YAML_BYTES)).get_single_data()
     except (yaml.YAMLError, RecursionError, TypeError, OverflowError) as error:
         raise ValueError(" ".join(str(error).split())) from error
-    _check_expanded_size(content)
-    return content
-
-
-def _check_keys(root: Any) -> None:
-    """Raise ValueError if a mapping in a tree of YAML nodes has a key twice: the first value would be ignored."""
-    pending = [root]
-    known: set[int] = set()  # nodes may be shared by aliases
-    while pending:
-        node = pending.pop()
-        if isinstance(node, tuple):
-            pending += node
-        elif isinstance(getattr(node, "value", None), list) and id(node) not in known:
-            known.add(id(node))
-            pending += node.value
-            keys = [key.value for key, _ in node.value if isinstance(key.value, str)] if node.id == "mapping" else []
-            for key in keys:
-                if keys.count(key) > 1 and key != "<<":
-                    raise ValueError(f"the key {key} is given twice")
-
-
-def _check_expanded_size(content: Any) -> None:
-    """Raise ValueError if a nested value, each reference to a shared part counted, is larger than `MAX_YAML_SIZE`."""
-    pending = [content]
-    size = 0
-    while pending:
-        value = pending.pop()
-        size += 1
-        if isinstance(value, dict):
-            pending += [*value, *value.values()]
-        elif isinstance(value, list):
-            pending += value
-        elif isinstance(value, str):
-            size += len(value)
-        if size + len(pending) > MAX_YAML_SIZE:
-            raise ValueError(f"with its aliases written out, it is larger than {MAX_YAML_SIZE:,}")

@@ -308,7 +308,7 @@ def views_on_device(views: PosedViews, rows: slice, points: Any, unoccluded: tup
     """`Views` as the kernels take them, of some of the views; points and sets are already on the device."""
     assert isinstance(views.camera, PinholeCamera)
     rotations, centers = split_poses(views.cam_from_world[rows])
-    there: Any = frustum_kernel.Views()
+    there: Any = frustum_kernel.ViewBatch()
     sides = frustum_sides(views.camera, rotations)
     there.sides = wp.array(sides, dtype=wp.vec3, device=device)
     there.rounding = sides_rounding(sides)

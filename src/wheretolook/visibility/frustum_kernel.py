@@ -14,7 +14,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
-class Views:
+class ViewBatch:
     """B views of a pinhole camera, and the landmarks that are unoccluded from their locations."""
 
     sides: wp.array2d[wp.vec3]  # (B, 5), see `frustum_sides`
@@ -43,7 +43,7 @@ def offset_from(location: wp.vec3d, point: wp.vec3d) -> wp.vec3:
 
 
 @wp.func
-def entry_offset(views: Views, view: wp.int32, entry: wp.int32) -> wp.vec3:
+def entry_offset(views: ViewBatch, view: wp.int32, entry: wp.int32) -> wp.vec3:
     """Offset from a view's camera centre to the landmark of an entry of `unoccluded`."""
     return offset_from(views.centers[view], views.points[views.unoccluded[entry]])
 
@@ -92,7 +92,7 @@ def pixel_of(axes: wp.mat33, offset: wp.vec3, focal: wp.vec2d, center: wp.vec2d)
 
 @wp.kernel
 def collect_kernel(
-    views: Views,
+    views: ViewBatch,
     write: wp.bool,
     out_starts: wp.array[wp.int32],
     lengths: wp.array[wp.int32],

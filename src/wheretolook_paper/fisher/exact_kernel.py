@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import warp as wp
 
-from wheretolook.visibility.frustum_kernel import Views, entry_offset, in_view, least_product, rounding_error
+from wheretolook.visibility.frustum_kernel import ViewBatch, entry_offset, in_view, least_product, rounding_error
 
 
 @wp.kernel(enable_backward=False)
-def information_kernel(views: Views, rounding: wp.float32, near_radius: wp.float32, numbers: wp.array2d[wp.float64]):
+def information_kernel(
+    views: ViewBatch, rounding: wp.float32, near_radius: wp.float32, numbers: wp.array2d[wp.float64]
+):
     """The 15 numbers of each view, see `wheretolook.geometry.pose_information`."""
     view = wp.tid()
     location = views.location_rows[view]

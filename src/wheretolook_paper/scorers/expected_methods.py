@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from wheretolook.scorers.registry import Group, Method, MethodStyle, ScorerOptions
+from wheretolook.scorers.registry import BuildOptions, Group, Method, MethodStyle
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def _expected(name: str, kind: str, about: str, style: MethodStyle, group: Group) -> Method:
-    def build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+    def build(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
         from wheretolook_paper.scorers.expected import ExpectedScorer
 
         assert options.weights is not None

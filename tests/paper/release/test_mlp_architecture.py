@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from wheretolook.inputs.channels import PAPER_VARIANTS, FeatureStatistics
+from wheretolook.inputs.channels import PAPER_VARIANTS
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.scorers.mlp.network import NetworkSpec, ViewpointNetwork
 from wheretolook_paper.release.mlp_architecture import architecture_table
 

@@ -19,7 +19,7 @@ from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, outcome_in_w
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
-from wheretolook.inputs.channels import FeatureStatistics
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.mapping.colmap_model import save_mapping_poses
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.config import ApartmentConfig

@@ -14,7 +14,7 @@ from wheretolook.scorers.adapted.kernel import Correction
 from wheretolook.scorers.adapted.network import AdaptedNetwork
 from wheretolook.scorers.adapted.place import MIN_SHARE, share_of_place
 from wheretolook.scorers.base import Scorer, ViewReport
-from wheretolook.scorers.registry import ScorerOptions
+from wheretolook.scorers.registry import BuildOptions
 from wheretolook.scorers.set.score import SetScorer
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import WeightsError
@@ -23,7 +23,7 @@ from wheretolook.utils.probability import finite_log_odds
 MIN_DISTANCE = 1e-12  # of probabilities from 0 and 1, so that their log-odds are finite
 
 
-def adapted_scorer(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+def adapted_scorer(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
     """Build the scorer of adapted weights; a WeightsError if the map is of another scene."""
     assert options.weights is not None
     trained = TrainedNetwork.load(options.weights, AdaptedNetwork, "adapted")

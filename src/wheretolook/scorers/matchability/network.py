@@ -9,7 +9,8 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from wheretolook.inputs.channels import ATTRIBUTES, FeatureStatistics
+from wheretolook.inputs.channels import ATTRIBUTES
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.training.trained_network import StoredNetwork
 
 INITIAL_LOG_ODDS = -2.0  # of detection, by an untrained network: about one in eight, as in real views

@@ -13,8 +13,9 @@ from torch import Tensor, nn
 
 from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.inputs.bins import BinnedViews
-from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, FeatureStatistics, Layout
+from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, Layout
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.scorers.base import BLOCK, BinnedScorer, check_field_of_view
 from wheretolook.scorers.mlp.config import MlpConfig
 from wheretolook.training.trained_network import (

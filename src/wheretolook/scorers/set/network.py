@@ -11,8 +11,9 @@ from torch import Tensor, nn
 from torch.nn.functional import batch_norm, binary_cross_entropy_with_logits, logsigmoid
 
 from wheretolook.geometry.pose_information import PLACES, PRIOR, SIGNS
-from wheretolook.inputs.channels import ATTRIBUTES, FeatureStatistics
+from wheretolook.inputs.channels import ATTRIBUTES
 from wheretolook.inputs.landmark_features import ViewLandmarks
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.scorers.matchability.network import (
     N_EXPECTED,
     LandmarkNetwork,

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import relu
 
-from wheretolook.inputs.channels import FeatureStatistics
+from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.scorers.mlp.network import BinnedNetwork, StandardBins, statistics_of_record, statistics_record
 
 

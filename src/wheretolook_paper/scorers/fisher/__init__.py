@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Literal
 
-from wheretolook.scorers.registry import Method, MethodStyle, ScorerOptions, imported, no_params
+from wheretolook.scorers.registry import BuildOptions, Method, MethodStyle, imported, no_params
 
 if TYPE_CHECKING:
     from wheretolook.geometry.camera import Camera
@@ -26,7 +26,7 @@ APPROXIMATIONS: dict[Approximation, tuple[str, str, Any]] = {
 
 
 def _metric(metric: str, approximation: Approximation, about_origin: bool) -> Method:
-    def build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+    def build(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
         from wheretolook_paper.scorers.fisher.score import FisherScorer
 
         return FisherScorer(localization_map, metric, approximation, about_origin)
@@ -57,7 +57,7 @@ def _metric(metric: str, approximation: Approximation, about_origin: bool) -> Me
 
 
 def _probe(name: str, scorer: str, about: str, style: MethodStyle) -> Method:
-    def build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+    def build(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
         built: Scorer = imported(f"wheretolook_paper.scorers.fisher.score:{scorer}")(localization_map)
         return built
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from wheretolook.scorers.registry import Method, MethodStyle, ScorerOptions, imported
+from wheretolook.scorers.registry import BuildOptions, Method, MethodStyle, imported
 from wheretolook.utils.validation import check_positive, check_range
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class TreesConfig:
         check_range("l2", self.l2, 0)
 
 
-def _build(localization_map: LocalizationMap, options: ScorerOptions) -> Scorer:
+def _build(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
     from wheretolook_paper.scorers.trees.learn import BoostedTrees
     from wheretolook_paper.scorers.trees.score import TreesScorer
 

@@ -74,7 +74,7 @@ def test_plain_image_has_no_keypoints(method):
 
 
 def test_quantized_descriptors_survive_the_round_trip():
-    descriptors = KeypointExtractor().extract(color_texture(0)).descriptors
+    descriptors = KeypointExtractor(ExtractorConfig()).extract(color_texture(0)).descriptors
     stored = quantize_descriptors(descriptors)
     assert stored.dtype == np.uint8
     np.testing.assert_array_equal(quantize_descriptors(unit_descriptors(stored)), stored)

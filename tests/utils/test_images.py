@@ -12,9 +12,8 @@ import pytest
 
 from wheretolook.io.depth import read_depth
 from wheretolook.mapping.photographs import read_photograph
-from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.errors import MapError
 from wheretolook.utils.images import image_size, read_image
-from wheretolook.view.photographs import Photographs
 
 
 def png(path: Path, side: int) -> Path:
@@ -35,9 +34,6 @@ def test_a_bomb_is_refused_by_its_size(tmp_path: Path) -> None:
         read_photograph(path)
     with pytest.raises(ValueError):
         read_depth(path)
-    shown = Photographs(tmp_path, ("a.png",), np.eye(3, 4)[None])
-    with pytest.raises(ConfigError):
-        shown.read(0, 360)
 
 
 def test_images_are_read_as_they_are(tmp_path: Path) -> None:

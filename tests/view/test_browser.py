@@ -1,22 +1,20 @@
-"""The viewer in headless Chromium: clicks, paths, links, downloads; without errors in the browser."""
+"""The viewer in headless Chromium: clicks, paths, links; without errors in the browser."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 pytest.importorskip("viser")
 
 from selection.room import POINTS, WEIGHTS, write_room
 from wheretolook.geometry.poses import poses_looking_along, rotation_from_quaternion
-from wheretolook.view.paths import FORWARD, RecordedPath, looking_ahead
+from wheretolook.planning.config import FORWARD
 from wheretolook.view.server import Viewer
-from wheretolook.view.state import ViewState
+from wheretolook.view.state import RecordedPath, ViewState, looking_ahead
 from wheretolook.view.viewed_map import open_map
 from wheretolook_paper.studies.browser import Browser, chromium
 
@@ -50,10 +48,7 @@ def pixel_of(camera: Any, point: np.ndarray) -> tuple[float, float]:
     return camera.image_width / 2 + focal * x / z, camera.image_height / 2 + focal * y / z
 
 
-def test_a_location_is_clicked_a_path_plays_and_a_link_opens_the_same_view(
-    viewer: Viewer, browser: Browser, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("wheretolook.view.player.STEP_S", 1.0)  # a page without a GPU may skip shorter steps
+def test_a_location_is_clicked_and_a_link_opens_the_same_view(viewer: Viewer, browser: Browser) -> None:
     tab = browser.open(f"http://{viewer.address}")
     tab.wait(lambda tab: "Click a location" in tab.text and " locations" in tab.text)
     (session,) = viewer.sessions.values()
@@ -63,10 +58,6 @@ def test_a_location_is_clicked_a_path_plays_and_a_link_opens_the_same_view(
     location = session.location
     np.testing.assert_allclose(location.position[:2], at[:2], atol=0.1)
     assert f"{location.best.n_visible[0]:,} landmarks in view" in tab.text
-    tab.press("Path")
-    tab.wait(lambda tab: "forward: score" in tab.text and "● localized" in tab.text)
-    tab.press("Play")
-    tab.wait(lambda tab: "● lost" in tab.text)
     other = browser.open(session.state.link(f"localhost:{viewer.port}"))
     other.wait(lambda tab: "landmarks in view" in tab.text)
     joined = viewer.sessions[max(viewer.sessions)]
@@ -74,23 +65,11 @@ def test_a_location_is_clicked_a_path_plays_and_a_link_opens_the_same_view(
     assert tab.errors == other.errors == []
 
 
-def test_views_and_an_image_are_saved_and_rings_turn_the_view(viewer: Viewer, browser: Browser, tmp_path: Path) -> None:
+def test_rings_turn_the_view(viewer: Viewer, browser: Browser) -> None:
     at = np.array([1.6, 2.1, 1.5])
     tab = browser.open(ViewState(occlusion="none", n=3, place=(1.6, 2.1, 1.5)).link(f"localhost:{viewer.port}"))
-    tab.downloads(tmp_path)
     tab.wait(lambda tab: "landmarks in view" in tab.text)
     session = viewer.sessions[max(viewer.sessions)]
-    tab.press("Waypoints")
-    tab.press("Add the selected location")
-    tab.wait(lambda _: "1.60, 2.10, 1.50" in session.controls.waypoints.content)
-    tab.press("Save with best views")
-    tab.wait(lambda _: (tmp_path / "views.csv").is_file())
-    tab.press("Share")
-    tab.press("Save a picture")
-    tab.wait(lambda _: (tmp_path / "wheretolook.png").is_file())
-    with Image.open(tmp_path / "wheretolook.png") as picture:
-        assert picture.width > 300
-    tab.press("Scene")
     before = session.place.axis.copy()
     turn = poses_looking_along(at, before)[:, :3].T  # the rings have the camera's axes
     radius = 3.0 * session.viewed.marker_m * RING

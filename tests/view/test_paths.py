@@ -15,9 +15,9 @@ from selection.room import POINTS
 from wheretolook.dataset.viewpoint_table import pose_columns
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.io.poses import tum_text
+from wheretolook.planning.config import FORWARD
 from wheretolook.utils.errors import ConfigError, TableError
-from wheretolook.view.paths import FORWARD, looking_ahead, read_paths
-from wheretolook.view.state import ViewState
+from wheretolook.view.state import ViewState, looking_ahead, read_paths
 
 STATE = ViewState("visible", "none", 3, 0.25, 1.4, 2.0, (1.0, 2.0, 1.5), -30.0, 5.0, (0.0, 0.0, 9.0), (1.0, 1.0, 0.0))
 

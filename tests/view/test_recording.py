@@ -14,7 +14,7 @@ from wheretolook.scenes.loading import save_glb
 from wheretolook.select.where_to_look import WhereToLook
 
 
-def test_a_recording_holds_scene_floor_location_and_paths(tmp_path: Path) -> None:
+def test_a_recording_holds_scene_floor_and_paths(tmp_path: Path) -> None:
     pytest.importorskip("rerun")
     from rerun.chunk import RrdReader
 
@@ -24,10 +24,9 @@ def test_a_recording_holds_scene_floor_location_and_paths(tmp_path: Path) -> Non
     recording = tmp_path / "made" / "room.rrd"
     options = ["--map", str(sparse), "--method", "visible", "--weights", str(WEIGHTS)]
     options += ["--path", str(tmp_path / "way.tum"), "--record", str(recording)]
-    assert main(["view", *options, "--state", "occlusion=none;n=2;height=1.5;place=1.5,2,1.5"]) == 0
+    assert main(["view", *options, "--state", "occlusion=none;height=1.5"]) == 0
     entities = {chunk.entity_path for chunk in RrdReader(recording).stream()}
-    names = ("landmarks", "cameras", "floor", "best", "place/sphere", "place/views", "place/best", "path/way")
-    names += ("path/forward", "path/way/camera", "path/forward/camera")
+    names = ("landmarks", "cameras", "floor", "path/way", "path/forward", "path/way/camera", "path/forward/camera")
     assert {f"/world/{name}" for name in names} | {"/score/way", "/score/forward"} <= entities
 
 

@@ -14,8 +14,7 @@ from wheretolook.mapping.config import FrameOptions
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import TableError
 from wheretolook.view import drawing
-from wheretolook.view.scores import FIRST_CELLS, score_in_blocks, score_location
-from wheretolook.view.viewed_map import ViewedMap, open_map, open_scene
+from wheretolook.view.viewed_map import FIRST_CELLS, ViewedMap, open_map, open_scene, score_in_blocks, score_location
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +73,7 @@ def test_probabilities_of_visible_landmarks_sum_to_the_expected_inliers(room: Vi
 
 
 def test_labelled_views_are_scored_in_blocks(room: ViewedMap, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wheretolook.view.scores.BLOCK", 3)
+    monkeypatch.setattr("wheretolook.view.viewed_map.BLOCK", 3)
     scorer = room.selector("set", "none").scorer
     axes = np.array([(-1.0, -0.5, 0.0), (1.0, 0.2, 0.0), (-1.0, 0.0, 0.0), (0.3, 1.0, 0.0)])
     poses = poses_looking_along(np.tile(POINTS[0], (4, 1)), axes)
@@ -89,7 +88,7 @@ def test_a_scene_of_a_dataset_has_its_labels(tmp_path: Path) -> None:
     dataset = make_dataset(tmp_path / "set", ("test",), n_locations=4, n_directions=5)
     viewed = open_scene(tmp_path, dataset.scenes[0].name, "", None, WEIGHTS, "cpu")
     assert viewed.labels is not None and len(viewed.labels) == 20 and viewed.camera == CAMERA
-    assert viewed.mesh is None and viewed.photographs is None
+    assert viewed.mesh is None
     assert len(viewed.floor("visible", "none", 1.5).cells)
 
 

@@ -24,16 +24,14 @@ from box_scenes import furnished_room
 from selection.room import POINTS, WEIGHTS, write_room
 from waiting import wait_until
 from wheretolook.cli import main
+from wheretolook.geometry.poses import camera_centers
+from wheretolook.planning.config import FORWARD
 from wheretolook.scenes.loading import save_glb
-from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import ConfigError, InUseError, MapWarning
-from wheretolook.view.controls import FILES
 from wheretolook.view.drawing import escape_markdown
 from wheretolook.view.page import intersect_plane
-from wheretolook.view.paths import FORWARD, RecordedPath, looking_ahead
-from wheretolook.view.saving import views_at, views_file
 from wheretolook.view.server import Viewer, check_port
-from wheretolook.view.state import ViewState
+from wheretolook.view.state import RecordedPath, ViewState, looking_ahead
 from wheretolook.view.viewed_map import open_map
 
 STATE = ViewState(method="visible", occlusion="none")
@@ -115,8 +113,8 @@ def test_a_flood_of_messages_does_not_delay_other_clients(viewer: Viewer) -> Non
         session = join(viewer, bad)
         n_threads = threading.active_count()
         for turn in range(200):
-            values = {"yaw": turn % 180, "step": turn % 80 + 1, "threshold": turn / 200, "height": 1e308}
-            values |= dict.fromkeys(("play", "add", "save", "photo"), True) | {"method": f"none {turn}"}
+            values = {"yaw": turn % 180, "threshold": turn / 200, "height": 1e308}
+            values |= {"inside": bool(turn % 2), "leave": True, "method": f"none {turn}"}
             for sent in (click(), camera(), setting(session, "yaw", 1.0, "no such field")):
                 bad.send(sent)
             for name, value in values.items():
@@ -188,13 +186,12 @@ def test_a_mesh_in_another_frame_is_reported_in_terminal_and_page(sparse: Path, 
     assert any("from the mesh" in text for text in viewed.warnings)
 
 
-@pytest.mark.parametrize("format", FILES)
-def test_waypoints_are_saved_as_select_saves_them(format: str, sparse: Path, tmp_path: Path) -> None:
-    look = WhereToLook.from_colmap(sparse, method="visible", occlusion="none", directions=60)
-    kind, suffix = FILES[format]
-    file = tmp_path / f"views{suffix}"
-    look.best(POINTS, 1 if kind in ("tum", "benchmark") else 3).save(file, kind)
-    assert views_file([*views_at(look, POINTS, 3, format)], format) == file.read_bytes()
+def test_paths_are_drawn_with_their_cameras(viewer: Viewer) -> None:
+    positions = camera_centers(viewer.viewed.paths[FORWARD].cam_from_world)
+    with connect(viewer) as client:
+        lines = join(viewer, client).scene.get_handle_by_name(f"/paths/{FORWARD}").points
+    np.testing.assert_allclose(lines[: len(positions) - 1, 1], positions[1:], atol=1e-6)
+    assert len(lines) == len(positions) - 1 + 8 * len(positions)  # edges of a frustum
 
 
 def test_rays_meet_the_floor() -> None:

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from waiting import wait_until
-from wheretolook.view.level_of_detail import LevelOfDetail
-from wheretolook.view.worker import LATER, NOW, SOON, Worker
+from wheretolook.view.session import LATER, NOW, SOON, Worker
 
 
 def test_urgent_jobs_go_first_and_failures_stop_nothing_else() -> None:
@@ -44,8 +43,8 @@ def test_urgent_jobs_go_first_and_failures_stop_nothing_else() -> None:
 
 def test_no_urgency_starves(monkeypatch: pytest.MonkeyPatch) -> None:
     """Floors wait while a view is turned without end, but not for ever; nor do clicked locations."""
-    monkeypatch.setattr("wheretolook.view.worker.PATIENCE_S", 0.6)
-    monkeypatch.setattr("wheretolook.view.worker.CLICK_PATIENCE_S", 0.2)
+    monkeypatch.setattr("wheretolook.view.session.PATIENCE_S", 0.6)
+    monkeypatch.setattr("wheretolook.view.session.CLICK_PATIENCE_S", 0.2)
     worker = Worker()
     floors: list[float] = []
     clicks: list[float] = []
@@ -66,24 +65,3 @@ def test_no_urgency_starves(monkeypatch: pytest.MonkeyPatch) -> None:
         wait_until(lambda n=n: len(clicks) == len(floors) == n, 10)  # type: ignore[misc]
     worker.stop()
     assert np.diff(floors)[0] >= 0.6
-
-
-@pytest.mark.parametrize(
-    ("gap_s", "step_m", "levels"),
-    [(0.12, 0.4, [1, 2]), (0.12, 0.1, []), (0.01, 0.4, [])],  # slow browser, slow hand, fast browser
-)
-def test_detail_is_reduced_while_the_camera_of_a_slow_browser_moves(
-    gap_s: float, step_m: float, levels: list[int]
-) -> None:
-    shown: list[int] = []
-    detail = LevelOfDetail(shown.append, 2)
-    for step in range(10):
-        detail.moved((step_m * step, 0.0, 9.0), (0.0, 0.0, 0.0))
-        detail.moved((step_m * step, 0.0, 9.0), (0.0, 0.0, 0.0))  # browsers send each pose twice
-        time.sleep(gap_s)
-    if levels:
-        wait_until(lambda: shown == [*levels, 0], 2)
-        detail.moved((99.0, 0.0, 9.0), (0.0, 0.0, 0.0))
-        assert shown[-1] == 2  # begins with the last level
-    else:
-        assert shown == []

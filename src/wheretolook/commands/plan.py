@@ -194,4 +194,4 @@ def _record(views: list[PathView], landmarks: np.ndarray, camera: Camera, file: 
             recording.stream.set_time("view", sequence=number)
             recording.log_camera("world/camera", poses_looking_along(view.position, view.axis), camera, view.rgb)
             recording.stream.log("world/camera/landmarks", recording.rerun.Points2D(view.pixels))
-            recording.log_score("score", view.score)
+            recording.stream.log("score", recording.rerun.Scalars(view.score))

@@ -37,7 +37,7 @@ class View(CameraOptions, FrameOptions):
     Examples:
       wheretolook view --scene apartment-000
       wheretolook view --map sparse/0 --mesh house.glb
-      wheretolook view --map sparse/0 --images photographs --port 8081
+      wheretolook view --map sparse/0 --port 8081
       wheretolook view --scene apartment-000 --path data/demo/apartment-000/path
       wheretolook view --scene apartment-000 --record apartment.rrd    # for the Rerun viewer, nothing is served
 
@@ -47,8 +47,7 @@ class View(CameraOptions, FrameOptions):
         name: dataset of the scene, if several have such a scene.
         map: instead, folder of a COLMAP model.
         mesh: a mesh of the map's scene (GLB, OBJ, PLY) in its frame.
-        images: its photographs, shown next to views.
-        path: a path to play.
+        path: a path to show.
         pair: which start and goal of compared paths.
         weights: file or folder of weights; by default the scene's own, or the bundled ones.
         method: method that scores at first; by default that of the weights.
@@ -66,7 +65,6 @@ class View(CameraOptions, FrameOptions):
     name: str = ""
     map: Path | None = None
     mesh: Path | None = None
-    images: Path | None = None
     path: Path | None = None
     pair: int = 0
     weights: Path | None = None
@@ -80,7 +78,7 @@ class View(CameraOptions, FrameOptions):
     device: str = "auto"
 
     def __post_init__(self) -> None:
-        own = (self.mesh, self.images, self.camera_id, *vars(self.frame_options()).values())
+        own = (self.mesh, self.camera_id, *vars(self.frame_options()).values())
         of_map = any(value is not None for value in own)
         record = self.record
         film = self.film
@@ -88,7 +86,7 @@ class View(CameraOptions, FrameOptions):
             ((self.map is None) == (self.scene is None), "what is viewed is given by either --scene or --map", None),
             (
                 self.scene is not None and of_map,
-                "--mesh, --images, --camera-id and the map's scale and up belong to --map",
+                "--mesh, --camera-id and the map's scale and up belong to --map",
                 self.scene,
             ),
             (record is not None and film is not None, "give either --record or --film", None),
@@ -107,8 +105,7 @@ class View(CameraOptions, FrameOptions):
         """Serve the page until interrupted; or write a recording or a film."""
         start = time.monotonic()
         self._check_environment()
-        from wheretolook.view.paths import read_paths
-        from wheretolook.view.state import ViewState
+        from wheretolook.view.state import ViewState, read_paths
 
         state = ViewState.parse(self.state)
         if self.method:
@@ -156,8 +153,6 @@ class View(CameraOptions, FrameOptions):
         from wheretolook.utils.extras import require
         from wheretolook.view.server import check_port
 
-        if self.images is not None and not self.images.is_dir():
-            raise ConfigError("there is no such folder of photographs", path=self.images, fix="Correct the path.")
         if self.record is not None:
             require("rerun")
         elif self.film is None:
@@ -170,8 +165,7 @@ class View(CameraOptions, FrameOptions):
         device = usable_device(self.device)
         camera = self.named_camera()
         if self.map is not None:
-            given = (self.mesh, camera, self.images, self.weights, device, self.data, self.frame_options())
-            return open_map(self.map, *given)
+            return open_map(self.map, self.mesh, camera, self.weights, device, self.data, self.frame_options())
         assert self.scene is not None and not isinstance(camera, int)
         return open_scene(self.data, self.scene, self.name, camera, self.weights, device)
 

@@ -72,7 +72,7 @@ class KeypointExtractor:
     Raises ConfigError if kornia, a network's weights or the device is missing.
     """
 
-    def __init__(self, config: ExtractorConfig = ExtractorConfig(), device: str = "cpu") -> None:
+    def __init__(self, config: ExtractorConfig, device: str = "cpu") -> None:
         self.config = config
         build = all_extractors()[config.method].build
         assert build is not None  # as checked by ExtractorConfig

@@ -23,6 +23,10 @@ FALSE_POSITIVE = (213, 94, 0)
 FALSE_NEGATIVE = (0, 114, 178)
 """Colours of labelled views by prediction: localizes or not, as predicted or not."""
 
+CAMERA_COLOR = (86, 180, 233)
+LANDMARK_COLOR = (150, 150, 155)
+PATH_COLORS = ((120, 120, 120), (0, 114, 178), (0, 158, 115), (204, 121, 167), (230, 159, 0))
+
 FADE = 0.65  # share of grey in the colour of a location below the threshold
 CELL_PX = 6  # pixels of a floor's cell, so that its edges stay sharp
 MAX_FRUSTA = 1500
@@ -44,6 +48,11 @@ def _colormap() -> Any:
     from matplotlib import colormaps
 
     return colormaps["cividis"].with_extremes(bad=f"#{bytes(UNKNOWN).hex()}")
+
+
+def path_color(number: int) -> tuple[int, int, int]:
+    """Return the colour of a path by its number."""
+    return PATH_COLORS[number % len(PATH_COLORS)]
 
 
 def score_colors(values: Float, low: float = 0.0, high: float = 1.0) -> Rgb:

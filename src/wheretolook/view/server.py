@@ -12,18 +12,16 @@ import threading
 import time
 import warnings
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
 
 from wheretolook.utils.errors import ConfigError, InUseError
+from wheretolook.view.page import Page
+from wheretolook.view.session import Worker
 from wheretolook.view.state import ViewState
 from wheretolook.view.viewed_map import ViewedMap
-from wheretolook.view.worker import Worker
-
-if TYPE_CHECKING:
-    from wheretolook.view.page import Page
 
 LOCAL = ("localhost", "127.0.0.1", "::1")  # names of this machine, unreachable from others
 HEADERS = ("Host", "Origin", "X-Forwarded-Host")
@@ -115,8 +113,6 @@ class Viewer:
             _log.exception("a client could not be served")
 
     def _start_session(self, client: Any, path: str, host: str) -> None:
-        from wheretolook.view.page import Page
-
         problem = None
         state = self.state
         try:

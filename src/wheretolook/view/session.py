@@ -1,34 +1,239 @@
-"""State, controls and queued work of one browser client."""
+"""One browser client: its controls, state and queued work."""
 
 from __future__ import annotations
 
 import logging
+import math
+import threading
 import time
-from collections.abc import Callable, Coroutine, Iterator
-from dataclasses import replace
-from threading import Lock
+from collections.abc import Callable, Coroutine, Hashable, Iterator
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from wheretolook.dataset.config import THRESHOLDS, threshold_key, threshold_label
 from wheretolook.geometry.poses import Float, quaternion_from_rotation
 from wheretolook.utils.errors import ConfigError, WhereToLookError
 from wheretolook.view import drawing
-from wheretolook.view.controls import Controls, value_of
-from wheretolook.view.scores import ScoredLocation
-from wheretolook.view.state import ViewState
-from wheretolook.view.viewed_map import ViewedMap
-from wheretolook.view.worker import NOW, Worker
+from wheretolook.view.state import MAX_VIEWS, ViewState
+from wheretolook.view.viewed_map import ScoredLocation, ViewedMap
 
 if TYPE_CHECKING:
     from viser import ClientHandle
 
     from wheretolook.select.where_to_look import WhereToLook
 
-_log = logging.getLogger(__name__)
+NOW = 0
+SOON = 1
+LATER = 2
+"""Urgencies: a view turned by hand, a clicked location, the floor."""
+
+QUIET_S = 0.4
+PATIENCE_S = 4.0
+"""A LATER job does not start within QUIET_S of a NOW job, since the next one would wait for its step, unless no LATER
+job has run for PATIENCE_S."""
+
+CLICK_PATIENCE_S = 1.0  # a SOON job precedes NOW jobs if none has run for this long
+
+HINT = "Click a location on the coloured floor for the score of every direction and the best views."
+LIMITS = {threshold_label(threshold_key(limits)): limits for limits in THRESHOLDS}
+STEP_M = 0.05  # of heights
+_BLANK = np.full((270, 360, 3), (38, 40, 46), np.uint8)
 
 HEADROOM_M = 0.35  # above the floor, where a mesh is cut by default
 NOTICE_S = 0.5  # minimum time between two error notifications
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(eq=False)
+class _Job:
+    key: tuple[Hashable, Hashable]  # owner and kind
+    urgency: int
+    steps: Iterator[object]
+    on_error: Callable[[Exception], None]
+
+
+class Worker:
+    """Runs jobs, each an iterator, one step at a time in one thread, since scorers are not thread-safe.
+
+    Before each step the most urgent job is chosen; equally urgent jobs alternate. A job that raises ends, and its
+    `on_error` is called.
+    """
+
+    def __init__(self, name: str = "scores") -> None:
+        self._jobs: dict[tuple[Hashable, Hashable], _Job] = {}  # the next of each urgency first
+        self._last_run = [-math.inf] * 3  # by urgency
+        self._changed = threading.Condition()
+        self._stopped = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def submit(
+        self,
+        owner: Hashable,
+        kind: Hashable,
+        urgency: int,
+        steps: Iterator[object],
+        on_error: Callable[[Exception], None],
+    ) -> None:
+        """Queue a job of an owner. It replaces the pending job of the same owner and kind."""
+        job = _Job((owner, kind), urgency, steps, on_error)
+        with self._changed:
+            self._jobs.pop(job.key, None)
+            self._jobs[job.key] = job
+            self._changed.notify()
+
+    def forget(self, owner: Hashable) -> None:
+        """Drop all jobs of an owner."""
+        with self._changed:
+            self._jobs = {key: job for key, job in self._jobs.items() if key[0] != owner}
+
+    def stop(self, wait: bool = True) -> None:
+        """End the thread after its current step, and by default wait for it."""
+        with self._changed:
+            self._stopped = True
+            self._changed.notify()
+        if wait:
+            self._thread.join(timeout=10)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                while not self._jobs and not self._stopped:
+                    self._changed.wait()
+                if self._stopped:
+                    return
+                job = self._next_job()
+                start = min(self._last_run[NOW] + QUIET_S, self._last_run[LATER] + PATIENCE_S)
+                pause_s = start - time.monotonic()
+                if job.urgency == LATER and pause_s > 0:
+                    self._changed.wait(pause_s)
+                    continue
+            finished = self._step(job)
+            self._last_run[job.urgency] = time.monotonic()
+            with self._changed:
+                if self._jobs.get(job.key) is job:
+                    del self._jobs[job.key]
+                    if not finished:
+                        self._jobs[job.key] = job  # behind the others
+
+    def _next_job(self) -> _Job:
+        """Return the first of the most urgent jobs, or of less urgent ones that have waited too long."""
+        now = time.monotonic()
+        patience_s = (math.inf, CLICK_PATIENCE_S, PATIENCE_S)
+
+        def order(job: _Job) -> tuple[bool, int]:
+            overdue = now - self._last_run[job.urgency] > patience_s[job.urgency]
+            return not overdue, job.urgency
+
+        return min(self._jobs.values(), key=order)
+
+    def _step(self, job: _Job) -> bool:
+        """Run a step of a job; return whether the job has ended."""
+        try:
+            next(job.steps)
+            return False
+        except StopIteration:
+            return True
+        except Exception as error:  # must not end the thread
+            _log.debug("a job failed: %s", job.key, exc_info=error)
+            try:
+                job.on_error(error)
+            except Exception:
+                _log.exception("an error could not be reported")
+            return True
+
+
+class Controls:
+    """Handles of all elements of the panel, which is made by a `viser.GuiApi`."""
+
+    def __init__(self, gui: Any, viewed: ViewedMap, state: ViewState) -> None:
+        self.leave = gui.add_button("Leave first person", visible=False, color="orange")
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Scene"):
+            self._add_map(gui, viewed, state)
+            with gui.add_folder("Location"):
+                self._add_location(gui, state)
+            with gui.add_folder("Layers", expand_by_default=False):
+                self._add_layers(gui, viewed, state)
+        with tabs.add_tab("Share"):
+            self._add_share(gui, state)
+
+    def _add_map(self, gui: Any, viewed: ViewedMap, state: ViewState) -> None:
+        warnings = "\n\n".join(f"⚠ {drawing.escape_markdown(text[0].upper() + text[1:])}." for text in viewed.warnings)
+        self.warnings = gui.add_markdown(warnings, visible=bool(warnings))
+        self.status = gui.add_markdown("")
+        self.legend = gui.add_html(drawing.legend(0, 1))
+        self.method = gui.add_dropdown("method", viewed.weights.methods, initial_value=state.method)
+        self.weights = gui.add_markdown("")
+        self.occlusion = gui.add_dropdown("occlusion model", viewed.occlusions, initial_value=state.occlusion)
+        self.height = _height_slider(gui, "camera height", viewed.bounds[:, 2], state.height)
+        self.height.hint = "Height z in metres at which locations are scored and selected."
+        threshold = min(max(state.threshold, 0.0), 1.0)
+        hint = "Locations with lower scores are paler."
+        self.threshold = gui.add_slider("threshold", 0.0, 1.0, 0.01, threshold, hint=hint)
+        names = [
+            f'<span style="color:rgb{drawing.path_color(number)}">■</span> {drawing.escape_markdown(name)}'
+            for number, name in enumerate(viewed.paths)
+        ]
+        self.paths = gui.add_markdown(f"Paths: {', '.join(names)}", visible=bool(names))
+
+    def _add_location(self, gui: Any, state: ViewState) -> None:
+        self.summary = gui.add_markdown(HINT)
+        self.n = gui.add_slider("best views", 1, MAX_VIEWS, 1, state.n)
+        self.view = gui.add_slider("selected view", 1, max(2, state.n), 1, 1)
+        self.yaw = gui.add_slider("yaw, degrees", -180.0, 180.0, 0.5, 0.0)
+        self.pitch = gui.add_slider("pitch, degrees", -90.0, 90.0, 0.5, 0.0)
+        hint = "Move to the selected view; drag to turn it."
+        self.inside = gui.add_checkbox("first person", False, hint=hint)
+        self.picture = gui.add_image(_BLANK, visible=False)
+        self.picture_legend = gui.add_html(
+            drawing.legend(0, 1, "probability that a landmark is detected"), visible=False
+        )
+        self.picture_caption = gui.add_markdown("")
+
+    def _add_layers(self, gui: Any, viewed: ViewedMap, state: ViewState) -> None:
+        z = viewed.landmarks.points[:, 2] if viewed.mesh is None else viewed.mesh.bounds[:, 2]
+        self.cut = _height_slider(gui, "cut above, m", z, state.cut)
+        has_mesh = viewed.mesh is not None
+        has_labels = viewed.labels is not None
+        self.layers = {
+            "mesh": gui.add_checkbox("mesh", has_mesh, disabled=not has_mesh),
+            "landmarks": gui.add_checkbox("landmarks", not has_mesh),
+            "floor": gui.add_checkbox("floor", True),
+            "cameras": gui.add_checkbox("cameras", False, disabled=viewed.mapping_poses is None),
+            "labels": gui.add_checkbox("labels", False, disabled=not has_labels),
+        }
+        self.limits = gui.add_dropdown("localized within", tuple(LIMITS), visible=has_labels)
+        self.label_summary = gui.add_markdown("", visible=has_labels)
+
+    def _add_share(self, gui: Any, state: ViewState) -> None:
+        self.dark = gui.add_checkbox("dark", False)
+        self.link = gui.add_markdown("")
+        self.state = gui.add_text("state", state.text(), hint="For wheretolook view --state.")
+
+
+def _height_slider(gui: Any, label: str, heights: Float, value: float | None) -> Any:
+    """Add a slider over the multiples of STEP_M that span heights, at a value or at its upper end."""
+    first = np.floor(heights.min() / STEP_M)
+    last = max(np.ceil(heights.max() / STEP_M), first + 1)
+    step = last if value is None else np.clip(round(value / STEP_M), first, last)
+    return gui.add_slider(label, *(round(float(k) * STEP_M, 3) for k in (first, last)), STEP_M, round(step * STEP_M, 3))
+
+
+def value_of(handle: Any) -> Any:
+    """Return the value of a control. Raises ConfigError if a client has set one that it does not offer.
+
+    Callbacks run in several threads: one can read a control before its own callback has restored it.
+    """
+    value = handle.value
+    options = getattr(handle, "options", (value,))
+    high = getattr(handle, "max", None)
+    if value not in options or not (high is None or handle.min <= value <= high):
+        raise ConfigError("this control has no such value", value=value, fix="Choose one that it offers.")
+    return value
 
 
 class Session:
@@ -47,7 +252,7 @@ class Session:
         self.location: ScoredLocation | None = None  # selected
         self.controls = Controls(client.gui, viewed, self.state)
         self.closed = False
-        self._lock = Lock()
+        self._lock = threading.Lock()
         self._inbox = Worker(f"client {client.client_id}")
         self._notified = -NOTICE_S  # time of the last error notification
 

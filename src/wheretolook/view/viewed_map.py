@@ -1,14 +1,16 @@
-"""The map that the viewer shows: a scene of a dataset, or a COLMAP model with or without a mesh."""
+"""The map that the viewer shows, its weights, and scores of a floor, a location and labelled views."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from wheretolook.dataset.environment import (
     ColmapEnvironment,
@@ -21,28 +23,229 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.mapping.config import FrameOptions
-from wheretolook.mapping.map_frame import IDENTITY, MapFrame
 from wheretolook.utils.errors import MapError, TableError, WhereToLookError
-from wheretolook.utils.shipped import or_shipped
+from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped
 from wheretolook.view import drawing
-from wheretolook.view.paths import Paths
-from wheretolook.view.scores import FLOOR_DIRECTIONS, Floor, floor_at
-from wheretolook.view.state import ViewState
-from wheretolook.view.weights import AvailableWeights, map_weights, scene_weights
+from wheretolook.view.state import Paths, ViewState
 
 if TYPE_CHECKING:  # torch and Warp are imported when first needed: the page opens before them
     import pandas as pd
 
+    from wheretolook.dataset.layout import SceneFolder
     from wheretolook.inputs.localization_map import LocalizationMap
+    from wheretolook.mapping.landmarks import Landmarks
     from wheretolook.scorers.base import Scorer
+    from wheretolook.select.views import SelectedViews
     from wheretolook.select.where_to_look import WhereToLook
-    from wheretolook.view.photographs import Photographs
+
+FLOOR_CELLS = 1200  # approximate number of cells in a floor's rectangle
+MIN_CELL_M = 0.1
+FLOOR_DIRECTIONS = 96
+"""Directions per cell of a floor, 19 degrees apart: the best score is within 0.02 of that of 500 directions, in a third
+of the time."""
+
+FIRST_CELLS = 12  # scored before a floor is drawn
+ABOVE_GROUND_M = 0.03  # above carpets
+BLOCK = 1 << 10  # labelled views scored per step
 
 MAX_SCORERS = 8  # kept in memory; those of large maps take 100 MB each
 MAX_FLOORS = 64
 MAX_MESHES = 4
 DIRECTIONS = 500  # scored at a location, as by `wheretolook select`
 OCCLUSION_BYTES = 1 << 26  # memory for cached lines of sight
+
+
+@dataclass(eq=False)
+class Floor:
+    """Free cells of a horizontal grid, and the best score in each once computed."""
+
+    selector: WhereToLook  # scores the cells in its directions
+    height_m: float
+    lower: Float  # (2,) m, corner of the grid
+    cell_m: float
+    shape: tuple[int, int]  # rows along y, columns along x
+    cells: NDArray[np.int64]  # (K,) flat indices of free cells, in farthest-first order
+    drawn_m: float  # height at which the floor is drawn
+    scores: Float = field(init=False)  # (K,) NaN until computed
+    axes: Float = field(init=False)  # (K, 3) best directions
+    n_scored: int = 0
+
+    def __post_init__(self) -> None:
+        self.scores = np.full(len(self.cells), np.nan)
+        self.axes = np.full((len(self.cells), 3), np.nan)
+
+    @property
+    def points(self) -> Float:
+        """Centres of the free cells (K, 3), metres."""
+        rows, columns = np.divmod(self.cells, self.shape[1])
+        xy = self.lower + (np.stack([columns, rows], axis=1) + 0.5) * self.cell_m
+        return np.column_stack([xy, np.full(len(xy), self.height_m)])
+
+    def score_next(self, n: int) -> bool:
+        """Score the next n cells. Returns whether any were left."""
+        rows = slice(self.n_scored, min(self.n_scored + n, len(self.cells)))
+        if rows.start == rows.stop:
+            return False
+        scores = self.selector.scorer.score_directions(self.points[rows], self.selector.directions)
+        self.scores[rows] = scores.max(axis=1)
+        self.axes[rows] = self.selector.directions[scores.argmax(axis=1)]
+        self.n_scored = rows.stop
+        return True
+
+    def raster(self) -> Float:
+        """Return scores (rows, columns), NaN outside free space; cells not yet scored have the nearest one's score."""
+        from scipy.spatial import cKDTree
+
+        values = np.full(self.shape, np.nan)
+        if self.n_scored:
+            _, nearest = cKDTree(self.points[: self.n_scored]).query(self.points)
+            values.flat[self.cells] = self.scores[nearest]
+        return values
+
+
+def floor_at(selector: WhereToLook, height_m: float) -> Floor:
+    """Make the floor of the free cells at a height of the selector's space, without those inside geometry.
+
+    It is drawn on the ground if its height is known, where it hides less than at the camera's height.
+    """
+    space = selector.space
+    low, high = np.asarray(space.bounds, dtype=np.float64)[:, :2]
+    cell = max(MIN_CELL_M, float(np.sqrt(np.prod(high - low) / FLOOR_CELLS)))
+    columns, rows = (max(1, ceil(length)) for length in (high - low) / cell)
+    lower = (low + high) / 2 - np.array([columns, rows]) * cell / 2
+    floor = Floor(selector, height_m, lower, cell, (rows, columns), np.arange(rows * columns), height_m)
+    free = space.is_free(floor.points)
+    free[free] = ~selector.localization_map.occlusion.inside_geometry(floor.points[free])
+    cells = np.flatnonzero(free)
+    drawn_m = height_m
+    if len(cells) and hasattr(space, "floor_below"):
+        drawn_m = float(np.median(space.floor_below(floor.points[cells]))) + ABOVE_GROUND_M
+    order = farthest_first(np.stack(np.divmod(cells, columns), axis=1))
+    return Floor(selector, height_m, lower, cell, (rows, columns), cells[order], drawn_m)
+
+
+def farthest_first(points: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Order points (K, 2) from a central one, each the farthest from all before it; indices (K,).
+
+    The first n cover the rest within twice the optimal distance (Gonzalez, "Clustering to minimize the maximum
+    intercluster distance", 1985).
+    """
+    order = np.zeros(len(points), dtype=np.int64)
+    distance = -((points - points.mean(axis=0)) ** 2).sum(1) if len(points) else np.empty(0)
+    for k in range(len(points)):
+        order[k] = distance.argmax()
+        to_new = ((points - points[order[k]]) ** 2).sum(1)
+        distance = to_new if k == 0 else np.minimum(distance, to_new)
+        distance[order[k]] = -1
+    return order
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredLocation:
+    """A location with the score of each direction and its best views."""
+
+    position: Float  # (3,) m
+    directions: Float  # (D, 3) unit optical axes
+    scores: Float  # (D,)
+    best: SelectedViews  # best first
+
+
+def score_location(selector: WhereToLook, position: Float, n: int) -> ScoredLocation:
+    """Score all directions at a position (3,) m and select the n best views, as `wheretolook select` does.
+
+    Raises TableError if the position is outside the map or inside geometry.
+    """
+    best = selector.best(position[None], n)
+    scores = selector.scorer.score_directions(position[None], selector.directions)[0]
+    return ScoredLocation(position, selector.directions, scores, best)
+
+
+def score_in_blocks(scorer: Scorer, cam_from_world: Float) -> Generator[None, None, Float]:
+    """Score poses (B, 3, 4) block by block; the generator returns the scores (B,)."""
+    scores = np.empty(len(cam_from_world))
+    for begin in range(0, len(scores), BLOCK):
+        rows = slice(begin, begin + BLOCK)
+        scores[rows] = scorer.score(cam_from_world[rows])
+        yield
+    return scores
+
+
+class AvailableWeights:
+    """Weights files and their origin, by the method that they belong to; the preferred method comes first.
+
+    Made from existing files or folders by origin, followed by the bundled weights, for a map with `features`. Raises
+    WeightsError if they cannot be used.
+    """
+
+    def __init__(self, features: str, own: Mapping[str, Path | None]) -> None:
+        from wheretolook.scorers.weights import weights_by_method
+
+        self.files: dict[str, Path] = {}
+        self.origins: dict[str, str] = {}
+        for origin, place in {**own, "bundled with wheretolook": shipped(WEIGHTS)}.items():
+            for method, path in weights_by_method(place, features).items() if place is not None else ():
+                if method not in self.files:
+                    self.files[method] = path
+                    self.origins[method] = origin
+
+    def describe(self, method: str) -> str:
+        """Describe the weights that a method scores with; empty for a method without weights."""
+        from wheretolook.scorers.registry import scorers
+
+        kind = scorers()[method].weights
+        return f"weights {self.origins[kind]}: {self.files[kind].name}" if kind in self.files else ""
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Methods that can score with these weights or without any, the preferred one first."""
+        from wheretolook.scorers.registry import scorers
+
+        usable = [
+            name
+            for name, method in scorers().items()
+            if method.group != "probes" and name != "random" and (not method.weights or method.weights in self.files)
+        ]
+        first = next(iter(self.files), "")
+        return tuple(sorted(usable, key=lambda name: (scorers()[name].weights != first, name != first)))
+
+
+def scene_weights(files: SceneFolder, landmarks: Landmarks) -> dict[str, Path | None]:
+    """Find weights adapted to a scene and those trained with its dataset."""
+    root = files.folder.parent
+    trained = None
+    if any((root / "weights").glob("*.safetensors")):
+        from wheretolook.dataset.layout import Dataset
+        from wheretolook.scorers.weights import resolve_weights
+
+        trained = resolve_weights(dataset=Dataset.load(root))
+        if trained is not None and not trained.is_relative_to(root):
+            trained = None
+    adapted = _if_adapted_to(root / "adapted" / f"{files.name}.safetensors", landmarks)
+    return {"adapted to this scene": adapted, "trained with this dataset": trained}
+
+
+def map_weights(model: Path, data: Path, landmarks: Landmarks) -> dict[str, Path | None]:
+    """Find weights adapted to a COLMAP model by `wheretolook adapt --map`."""
+    from wheretolook.mapping.config import place_name
+
+    path = data / "checks" / place_name(model) / "adapted.safetensors"
+    return {"adapted to this scene": _if_adapted_to(path, landmarks)}
+
+
+def _if_adapted_to(path: Path, landmarks: Landmarks) -> Path | None:
+    """Return the path if the file has weights adapted to a scene with these landmarks."""
+    if not path.is_file():
+        return None
+    from safetensors import SafetensorError, safe_open
+
+    from wheretolook.scorers.adapted.place import MIN_SHARE, share_of_place
+
+    try:
+        with safe_open(path, framework="np") as file:
+            place = file.get_tensor("place")
+    except (SafetensorError, OSError):
+        return None
+    return path if share_of_place(place, landmarks.points) >= MIN_SHARE else None
 
 
 class ViewedMap:
@@ -58,14 +261,12 @@ class ViewedMap:
         environment: Environment,
         own_weights: Mapping[str, Path | None],
         labels: pd.DataFrame | None = None,
-        photographs: Photographs | None = None,
     ) -> None:
         self.name = name
         self.environment = environment
         self.weights = AvailableWeights(environment.landmarks.features, own_weights)
         self.labels = labels  # labelled viewpoints
-        self.photographs = photographs
-        self.paths: Paths = {}  # to play
+        self.paths: Paths = {}  # to show
         self.landmarks = environment.landmarks
         self.camera = environment.camera
         self.frame = environment.frame  # the map's own, of coordinates that are read, shown or saved
@@ -178,16 +379,12 @@ class ViewedMap:
     def picture(self, pose: Float, visible: drawing.VisibleLandmarks) -> tuple[drawing.Rgb, str]:
         """Return an image (H, W, 3) of a view (3, 4) and its caption.
 
-        The view is rendered; without a mesh it is the nearest photograph, or else the landmarks alone. Landmarks are
-        drawn in the colours of their probabilities, except on photographs, which show another view.
+        The view is rendered; without a mesh it is the landmarks alone. Landmarks are drawn in the colours of their
+        probabilities.
         """
         if self.mesh is not None:
             rgb = self.environment.renderer.render(drawing.small_camera(self.camera), pose[None]).rgb[0]
             return drawing.picture(rgb, self.camera, visible), "rendered; landmarks by detection probability"
-        if self.photographs is not None:
-            number = self.photographs.nearest(pose)
-            rgb = self.photographs.read(number, drawing.PICTURE_PX)
-            return rgb, f"nearest photograph, {self.photographs.names[number]}"
         return drawing.picture(None, self.camera, visible), "landmarks in view by detection probability"
 
 
@@ -195,13 +392,12 @@ def open_map(
     path: Path,
     mesh: Path | None = None,
     camera: Camera | int | None = None,
-    images: Path | None = None,
     weights: Path | None = None,
     device: str = "cpu",
     data: Path = Path("data"),
     frame: FrameOptions = FrameOptions(),
 ) -> ViewedMap:
-    """Open a COLMAP model, a mesh in its frame, and the folder of its images.
+    """Open a COLMAP model and a mesh in its frame.
 
     By default views are scored by weights adapted to the model in the folder `data`, or by bundled ones.
 
@@ -221,7 +417,7 @@ def open_map(
     if mesh is not None:
         warn_of_mesh(mesh, landmarks.points, environment.raycaster)
     own = {"given": or_shipped(weights)} if weights else map_weights(path, data, landmarks)
-    return ViewedMap(environment.name, environment, own, photographs=_photographs(path, images, environment.frame))
+    return ViewedMap(environment.name, environment, own)
 
 
 def open_scene(
@@ -254,16 +450,4 @@ def open_scene(
         if CAMERA_ID in table:
             shown &= table[CAMERA_ID] == number
         labels = table[shown].reset_index(drop=True) if shown.any() else None
-    return ViewedMap(files.name, environment, own, labels, _photographs(files.map))
-
-
-def _photographs(model: Path, folder: Path | None = None, frame: MapFrame = IDENTITY) -> Photographs | None:
-    """Find the photographs of a COLMAP model, in a folder or where it was mapped from."""
-    from wheretolook.mapping.colmap_model import holds_model
-    from wheretolook.mapping.mapped_images import find_photographs
-    from wheretolook.view.photographs import Photographs
-
-    folder = folder or find_photographs(model)
-    return (
-        Photographs.of_model(model, folder, frame.world_from_map) if folder is not None and holds_model(model) else None
-    )
+    return ViewedMap(files.name, environment, own, labels)

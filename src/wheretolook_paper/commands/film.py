@@ -17,11 +17,11 @@ from wheretolook.figures.dollhouse import Dollhouse, dollhouse, draw_house, draw
 from wheretolook.figures.style import BLUE, GREEN, RC, VERMILION, Style, frame, new_figure
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import camera_centers
+from wheretolook.planning.config import FORWARD
 from wheretolook.utils.errors import ConfigError
 from wheretolook.view import drawing
 from wheretolook.view.drawing import VisibleLandmarks
-from wheretolook.view.paths import FORWARD, RecordedPath
-from wheretolook.view.state import ViewState
+from wheretolook.view.state import RecordedPath, ViewState
 from wheretolook.view.viewed_map import ViewedMap
 
 FRAME_MS = 220

@@ -117,10 +117,6 @@ class Tab:
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1, buttons=1)
             time.sleep(0.03)
 
-    def downloads(self, folder: Path) -> None:
-        """Save downloads in a folder."""
-        self.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
-
     def close(self) -> None:
         self._socket.close()
 

@@ -93,8 +93,9 @@ class Plan(SceneOrMapOptions):
         views[method] = path_views(path, scene.localization_map, renderer)
         folder = (config.out or files.folder / "path").resolve()  # "." gets a name, too
         with hold(folder.with_name(f".{folder.name}.lock"), "plan", wait_s=WAIT_S):
-            drawn = views, scene.landmarks.points, f"{scene.name}, {method}", folder, config.film
-            written = [name for report in reports("plan") for name in report(*drawn)]
+            written = []
+            for report in reports("plan"):
+                written += report(views, scene.landmarks.points, f"{scene.name}, {method}", folder, config.film)
             table = _table(path, scene.frame.world_from_map.inverse, stopping=config.stops.looks > 1)
             write_text(folder / "path.csv", table.to_csv(index=False, lineterminator="\n"))
             if config.rerun:

@@ -78,8 +78,8 @@ display(training_figure(curves) if curves else Markdown(f"No run has a history y
 
 # %%
 from wheretolook.evaluation.statistics import read_calibration
-from wheretolook.figures.calibration import calibration_figure
 from wheretolook.tracking.runs import newest_artifact
+from wheretolook_paper.figures.calibration import calibration_figure
 
 calibration = read_calibration(newest_artifact(tracking, "evaluate", "calibration.csv", release.name))
 display(calibration_figure(calibration))

@@ -61,7 +61,7 @@ paper_styler(latest_paper_table(tracking, "input_variants", release.name))
 
 # %%
 from wheretolook.evaluation.results import latest_scores
-from wheretolook.figures.scores import regret_figure, score_figure
+from wheretolook_paper.figures.scores import regret_figure, score_figure
 
 scores = latest_scores(tracking, release.name)
 display(score_figure(scores))
@@ -100,6 +100,6 @@ display(occlusion_figure(scores))
 # The complete evaluation, also in `results/scores.md` of the dataset.
 
 # %%
-from wheretolook.evaluation.report import score_markdown
+from wheretolook_paper.evaluation.score_report import score_markdown
 
 display(Markdown(score_markdown(scores)))

@@ -48,8 +48,8 @@ table[["x", "y", "z", "yaw_deg", "pitch_deg", "score", "expected_inliers", "n_vi
 # likely to localize. Where all are dark no direction helps: the mapping camera has not been there.
 
 # %%
-from wheretolook.figures.dollhouse import dollhouse
 from wheretolook.scenes.loading import load_mesh
+from wheretolook_paper.figures.dollhouse import dollhouse
 from wheretolook_paper.figures.pipeline import ranked_figure
 
 waypoints = look.grid(0.4)

@@ -33,7 +33,6 @@ from IPython.display import display
 
 from wheretolook import LocalizationMap, load_scorer, poses_looking_along
 from wheretolook.dataset.sampling import free_locations
-from wheretolook.figures.dollhouse import dollhouse
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.localization.localizer import Localizer
@@ -45,6 +44,7 @@ from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh, save_glb
 from wheretolook.space.free_space import FreeSpace
+from wheretolook_paper.figures.dollhouse import dollhouse
 from wheretolook_paper.figures.look_story import localize_views, story_figure
 from wheretolook_paper.figures.looks import looks_figure
 from wheretolook_paper.release.notebook import open_release

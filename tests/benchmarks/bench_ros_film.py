@@ -36,9 +36,9 @@ from sensor_msgs.msg import Image
 from wheretolook_ros.conversions import Array, pose_matrix, pose_message
 
 from ros.processes import HEAD, Robot, base_at, environment, running
-from wheretolook.figures.animation import save_moving
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.space.free_space import FreeSpace
+from wheretolook_paper.figures.animation import save_moving
 
 STORE = get_typestore(Stores.ROS2_KILTED)
 TOPICS = {

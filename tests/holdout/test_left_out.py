@@ -15,7 +15,6 @@ from synthetic_dataset import make_dataset
 from wheretolook.cli import main, parse_command
 from wheretolook.commands.evaluate import evaluate_methods
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.report import score_markdown
 from wheretolook.holdout.holdout import hold_out_blocks
 from wheretolook.holdout.holdout_views import evaluated_photographs
 from wheretolook.holdout.photo_map import WORK, open_map
@@ -27,6 +26,7 @@ from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.weights import read_training
 from wheretolook.utils.shipped import WEIGHTS, shipped
 from wheretolook.visibility.occlusion import NoOcclusion
+from wheretolook_paper.evaluation.score_report import score_markdown
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 SET = shipped(WEIGHTS) / "set.safetensors"

@@ -117,7 +117,7 @@ from planning.rooms import patiently
 from synthetic_dataset import make_dataset
 from wheretolook.cli import parse_command
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.figures.scores import score_figure
+from wheretolook_paper.figures.scores import score_figure
 from wheretolook.scenes.loading import save_glb
 from wheretolook.commands.evaluate import evaluate_methods
 from wheretolook.commands.train import train_methods

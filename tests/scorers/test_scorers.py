@@ -80,7 +80,7 @@ def weights_of(method: str, path: Path, localization_map: LocalizationMap) -> Pa
     else:
         network = SetNetwork(NO_STATISTICS, pooled=2)
         if method == "adapted":
-            network = AdaptedNetwork(network, 1.0, 0.0, 1.0, 4.0, 0, 0)
+            network = AdaptedNetwork(network, 1.0, 0.0, 0)
     return save_network(path, method, network)
 
 

@@ -20,7 +20,7 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.tracking.runs import newest_run
 from wheretolook.tracking.store import TrackingConfig
 from wheretolook.utils.errors import ConfigError, PoseError, TableError
-from wheretolook_paper.commands.evaluation_extras import LookConfig, evaluate_look_sets
+from wheretolook_paper.commands.reports import LookConfig, evaluate_look_sets
 from wheretolook_paper.evaluation.joint_labels import SET_COLUMNS, label_sets
 from wheretolook_paper.evaluation.looks import look_table, stopping_table
 

@@ -16,7 +16,6 @@ from tests.disks import file_limit, fill, read_only, small_disk
 from tests.synthetic_dataset import CAMERA, make_mapping_poses
 
 from wheretolook.dataset.viewpoint_files import SCHEMA, write_table
-from wheretolook.figures.animation import save_moving
 from wheretolook.figures.style import save_figure
 from wheretolook.mapping.colmap_model import colmap_poses, write_model
 from wheretolook.scenes.loading import save_glb
@@ -25,6 +24,7 @@ from wheretolook.utils.errors import StorageError
 from wheretolook.utils.files import copy_file, write_text
 from wheretolook.utils.npz_files import save_npy, save_npz
 from wheretolook.visibility.occlusion import StoredOcclusion
+from wheretolook_paper.figures.animation import save_moving
 
 RNG = np.random.default_rng(0)
 NOISE = RNG.random(30_000)

@@ -27,7 +27,7 @@ BASE = WEIGHTS / "set.safetensors"
 def save_adapted(path: Path, landmarks: np.ndarray) -> None:
     """Save weights adapted to the scene of these landmarks that halve all log-odds."""
     base = TrainedNetwork.load(BASE, SetNetwork, "set")
-    network = AdaptedNetwork(base.network, base.scale, base.offset, 1.0, 4.0, 1, 50)
+    network = AdaptedNetwork(base.network, base.scale, base.offset, 50)
     network.place[:] = torch.from_numpy(landmarks[:50])
     path.parent.mkdir(parents=True)
     TrainedNetwork("adapted", network, base.camera, 0.5, 0.0, base.training_range).save(path)

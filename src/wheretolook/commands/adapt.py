@@ -20,20 +20,19 @@ from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
 from wheretolook.mapping.config import FrameOptions, place_name
-from wheretolook.scorers.adapted.config import AdaptConfig
 from wheretolook.scorers.weights import load_scorer, resolve_weights
 from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError, MapError, OutOfRangeWarning, SceneError, TableError
 from wheretolook.utils.files import fingerprint, missing_folders, remove_if_empty, storage_errors, write_text
 from wheretolook.utils.locks import hold
-from wheretolook.utils.validation import reject
+from wheretolook.utils.validation import check_positive, check_range, reject
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from wheretolook.evaluation.adaptation import Gain
     from wheretolook.inputs.localization_map import LocalizationMap
-    from wheretolook.scorers.adapted.gp_correction import Adapted, LocalizedViews
+    from wheretolook.scorers.adapted.calibration import Adapted, LocalizedViews
     from wheretolook.visibility.occlusion import OcclusionModel
 
 FOLDER = "adapted"  # of a dataset: adapted weights, and what they have gained
@@ -42,6 +41,43 @@ MIN_LOCATIONS = 10
 MIN_OF_EACH_LABEL = 10
 _VIEWS_PER_TASK = 128  # the time is checked after each task
 _MAX_SIGNATURE = 256  # landmarks by which the scene is recognized
+
+
+@dataclass(frozen=True)
+class AdaptConfig:
+    """How weights are adapted to a scene.
+
+    Args:
+        scene: name of the scene; may be empty if the dataset has only one.
+        map: instead of a scene: folder of a COLMAP model, in metres with z up, whose photographs are held out.
+        images: folder of the map's photographs, to extract their features again.
+        database: features that the map was made from: COLMAP's `database.db`, or hloc's in HDF5. Empty for those next to
+            the map.
+        weights: file of weights of `set` to start from; empty for the bundled ones.
+        out: file of weights to write; empty for `<data>/<name>/adapted/<scene>.safetensors`, of a map
+            `<data>/checks/<map>/adapted.safetensors`.
+        minutes: time for labelling rendered views, if the scene has a mesh and its views have no labels yet.
+        seed: decides which locations are labelled first, and which views are held out together.
+    """
+
+    scene: str = ""
+    map: Path | None = None
+    images: Path | None = None
+    database: Path | None = None
+    weights: Path | None = None
+    out: Path | None = None
+    minutes: float = 10.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.scene and self.map is not None:
+            raise ConfigError("weights are adapted to a scene or to a map", value=self.scene, fix="Give one of them.")
+        if self.images is not None and self.database is not None:
+            raise ConfigError(
+                "features come from a database or from images", value=self.images, fix="Give one of them."
+            )
+        check_positive("minutes", self.minutes)
+        check_range("seed", self.seed, 0)
 
 
 @dataclass(frozen=True)
@@ -182,7 +218,7 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
     ) -> Path | None:
         """Adapt to localized views; keep the weights if they are better, report and log the gain."""
         from wheretolook.evaluation.adaptation import compare_log_odds, gain_markdown
-        from wheretolook.scorers.adapted.gp_correction import adapt as fit
+        from wheretolook.scorers.adapted.calibration import adapt as fit
 
         name = target.name
         path = target.path
@@ -222,7 +258,7 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         from wheretolook.tracking.runs import log, start_run
 
         params = {"dataset": target.dataset, "scene": target.name, "weights": target.weights, **_counts(views)}
-        params |= {"length_m": adapted.length_m, "amplitude": adapted.amplitude, "scale": adapted.adaptation.scale}
+        params |= {"scale": adapted.scale, "offset": adapted.offset}
         metrics = {**gain.after, **{f"{name}_before": value for name, value in gain.before.items()}}
         metrics |= {"better": float(is_better), "log_loss_less": gain.log_loss_less[0]}
         with start_run(self.tracking, target.name, "adapt", params) as (client, run):
@@ -300,7 +336,7 @@ def labelled_views(files: SceneFolder, scene: SceneEnvironment, table: pd.DataFr
     """Return the labelled views of a scene with the log-odds that the weights give them."""
     from wheretolook.dataset.viewpoint_table import is_good, poses
     from wheretolook.geometry.poses import camera_centers
-    from wheretolook.scorers.adapted.gp_correction import LocalizedViews
+    from wheretolook.scorers.adapted.calibration import LocalizedViews
     from wheretolook.scorers.adapted.score import log_odds_of
 
     cam_from_world = poses(table)
@@ -344,18 +380,9 @@ def _save(target: _Target, whole: LocalizationMap, adapted: Adapted, views: Loca
 
     base = for_map(TrainedNetwork.load(target.weights, SetNetwork, "set", device=whole.device), whole)
     points = whole.landmarks.points
-    correction = adapted.adaptation
     n_signature = min(_MAX_SIGNATURE, len(points))
-    arrays = {
-        "support_centers": correction.centers,
-        "support_axes": correction.axes,
-        "support_weights": correction.weights,
-        "place": points[np.arange(n_signature) * len(points) // max(1, n_signature)],
-    }
-    kernel = base.scale, base.offset, correction.length_m, correction.sharpness
-    network = AdaptedNetwork(base.network, *kernel, len(correction.weights), n_signature)
-    for name, values in arrays.items():
-        setattr(network, name, torch.from_numpy(np.array(values, dtype=np.float64)))
-    trained = TrainedNetwork("adapted", network, base.camera, correction.scale, correction.offset, base.training_range)
+    network = AdaptedNetwork(base.network, base.scale, base.offset, n_signature)
+    network.place[:] = torch.from_numpy(points[np.arange(n_signature) * len(points) // max(1, n_signature)])
+    trained = TrainedNetwork("adapted", network, base.camera, adapted.scale, adapted.offset, base.training_range)
     about = {"scene": target.name, **_counts(views), "weights_sha256": fingerprint(target.weights)}
     trained.save(target.path, {**about, "before": gain.before, "after": gain.after})

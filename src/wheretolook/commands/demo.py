@@ -6,30 +6,28 @@ import textwrap
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
 from tqdm.auto import tqdm
 
 from wheretolook.commands.evaluate import evaluate_methods, not_logged
 from wheretolook.commands.label import Label
 from wheretolook.commands.map import Map
 from wheretolook.commands.options import Experiment, Log, Progress, select_options
-from wheretolook.commands.preconditions import load_dataset, open_scene
+from wheretolook.commands.preconditions import load_dataset
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.scenes import Scenes
 from wheretolook.commands.train import Train
 from wheretolook.dataset.layout import STAGES, Dataset
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.scorers.registry import methods_named, scorers
 from wheretolook.scorers.train_config import TrainConfig
-from wheretolook.scorers.weights import load_scorer, resolve_weights
+from wheretolook.scorers.weights import resolve_weights
 from wheretolook.tracking.runs import ui_command
 from wheretolook.tracking.store import check_store
 from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.extras import reports
 from wheretolook.utils.files import fingerprint
 from wheretolook.utils.version import VERSION
 
@@ -37,7 +35,6 @@ SECONDS = {"scenes": 5.0, "map": 15.0, "sample": 1.0, "label": 75.0, "train": 25
 """Rough cost of a stage on two cores (the first four for each scene), from which the share done is estimated."""
 
 OVERVIEW = "overview.png"
-LEVEL_DEG = 25.0  # pitch at most of a camera held level
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +91,8 @@ class Demo(Experiment):
             own = self.root / "weights"
             drawn = (self.root / "results" / OVERVIEW).is_file()  # `compare` removes an outdated one
             if not drawn and (weights or any(own.glob("*.safetensors"))):
-                draw_overview(self, weights[-1] if weights else own)
+                for draw in reports("demo"):
+                    draw(self, weights[-1] if weights else own)
             bar.set_description_str("demo")
         _print_results(self)
 
@@ -128,7 +126,7 @@ def compare(options: Demo, log: Log, progress: Progress) -> None:
         key = cache_key("evaluate", dataset.fingerprint(), content, settings)
         return ArtifactCache(options.root, key, manifest="compared.json")
 
-    current = cache().is_current(*written, tracking.root / "mlflow.db") and not not_logged(dataset).exists()
+    current = cache().is_current(written[0], tracking.root / "mlflow.db") and not not_logged(dataset).exists()
     if not current:
         from wheretolook.evaluation.scoring import own_weights
 
@@ -141,52 +139,6 @@ def compare(options: Demo, log: Log, progress: Progress) -> None:
     progress(1)
 
 
-def draw_overview(options: Demo, weights: Path) -> None:
-    """Draw `<dataset>/results/overview.png`: the last scene's map, and the scores of all directions at one location.
-
-    The location is one where the direction matters (`wheretolook.dataset.viewpoint_table.instructive_location`); the
-    worst view is that of a camera held about level, if there is one, not of the bare ceiling. The weights are a file, or
-    a folder of which the best file is taken. Raises TableError if the last scene is not labelled, WeightsError if the
-    weights cannot be used.
-    """
-    from wheretolook.dataset.viewpoint_table import instructive_location, outcome_in_words, poses, shares_good
-    from wheretolook.figures.dollhouse import dollhouse
-    from wheretolook.figures.overview import Overview, overview_figure, rendered_views
-    from wheretolook.figures.style import save_figure, scene_label
-    from wheretolook.scorers.styles import method_style
-
-    scene = open_scene(options, Dataset.load(options.root).scenes[-1])
-    table = scene.files.read_table()
-    scorer = load_scorer(weights, scene.files.localization_map(scene.camera, scene.device))
-    ids, first = np.unique(table["location_id"], return_index=True)
-    locations = camera_centers(poses(table))[first]
-    chosen = instructive_location(table)
-    location = locations[np.searchsorted(ids, chosen)]
-    candidates = table[table["location_id"] == chosen]
-    cam_from_world = poses(candidates)
-    scores = scorer.score(cam_from_world)
-    level = np.abs(np.arcsin(np.clip(cam_from_world[:, 2, 2], -1, 1))) <= np.radians(LEVEL_DEG)
-    worst_row = np.argmin(np.where(level | ~level.any(), scores, np.inf))
-    shown_rows = [int(np.argmax(scores)), int(worst_row)]
-    best, worst = rendered_views(scene, candidates.iloc[shown_rows], scores[shown_rows], outcome_in_words)
-    directions = options.sample.axes()
-    by_height = np.argsort(np.abs(locations[:, 2] - location[2]), kind="stable")
-    shown = by_height[np.unique(locations[by_height, :2].round(2), axis=0, return_index=True)[1]]
-    drawn = Overview(
-        scene=scene_label(scene.name),
-        method=method_style(scorer.name).label,
-        plan=dollhouse(scene.mesh, elevation_deg=90, cut_m=float(location[2]), one_sided=False, device=scene.device),
-        locations=locations[shown],
-        share_good=shares_good(table)[1][shown],
-        place=location,
-        directions=directions,
-        scores=scorer.score(poses_looking_along(np.tile(location, (len(directions), 1)), directions)),
-        best=best,
-        worst=worst,
-    )
-    save_figure(overview_figure(drawn), options.root / "results" / OVERVIEW)
-
-
 def _write(step: str, text: str) -> None:
     tqdm.write(f"[{step}] {text}")
 
@@ -197,8 +149,14 @@ def _update(bar: tqdm, seconds: float, work: float) -> None:
 
 def _print_results(options: Demo) -> None:
     """Print which method chose best, and where the picture, tables and runs are."""
-    from wheretolook.evaluation.report import best_in_words
-    from wheretolook.evaluation.results import SCORES_CSV, SCORES_MD, SCORES_PNG, read_scores, results_folder
+    from wheretolook.evaluation.results import (
+        SCORES_CSV,
+        SCORES_MD,
+        SCORES_PNG,
+        best_in_words,
+        read_scores,
+        results_folder,
+    )
 
     results = results_folder(Dataset.load(options.root), options.evaluate)
     picture = options.root / "results" / OVERVIEW

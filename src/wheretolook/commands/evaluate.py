@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -16,6 +15,7 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import MapError
+from wheretolook.utils.extras import reports
 from wheretolook.utils.files import write_text
 from wheretolook.visibility.config import OcclusionConfig
 
@@ -24,13 +24,6 @@ if TYPE_CHECKING:
 
     from wheretolook.evaluation.scoring import HeldOutPhotographs
     from wheretolook.training.provenance import TrainedModel
-
-
-EXTENSIONS = "wheretolook.after_evaluation"
-"""Entry-point group of functions (dataset, config, tracking, device) that are called after an evaluation."""
-
-REPORTS = "wheretolook.score_reports"
-"""Entry-point group of functions (folder, table) that write further tables and figures of an evaluation's scores."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,8 +66,8 @@ class Evaluate(SceneOptions, LabelOptions):
         scores = evaluate_methods(
             dataset, config, self.tracking, device=self.warp_device, occlusion=self.occlusion, photographs=photographs
         )
-        for extension in entry_points(group=EXTENSIONS):
-            extension.load()(dataset, config, self.tracking, self.warp_device)
+        for report in reports("look_sets"):
+            report(dataset, config, self.tracking, self.warp_device)
         progress(1)
         return scores
 
@@ -118,16 +111,15 @@ def evaluate_methods(
 ) -> pd.DataFrame:
     """Compare all methods on the scenes of one split.
 
-    Writes the table as `<dataset>/results/scores.csv` and `scores.md`, a figure `scores.png`, the reliability curves of
-    learned methods as `calibration.csv`, and an MLflow run with one nested run for each method, occlusion model
-    and candidate set, each with a table of what was chosen at each location for each N, `locations.parquet`. With
-    several occlusion models `occlusion.png` compares them.
+    Writes the table as `<dataset>/results/scores.csv`, the reliability curves of learned methods as `calibration.csv`,
+    the reports of installed packages, and an MLflow run with one nested run for each method, occlusion model and
+    candidate set, each with a table of what was chosen at each location for each N, `locations.parquet`.
 
     The temperatures of learned methods are fitted on the labelled views of the val scenes, seen by the first occlusion
     model, and hold for all rows; without val scenes, or when these are evaluated, they are unknown.
 
     The scenes need not be of the dataset the models were trained on. `models` replace `config.weights`; `photographs`
-    that were held out of their maps are further views, with separate rows; `progress` shows a bar, and prints the table
+    that were held out of their maps are further views, with separate rows; `progress` shows a bar, and prints the reports
     at the end unless `show` is off; `occlusion` has the settings of the models that `config.occlusions` names. Returns
     the tables of
     `wheretolook.evaluation.results.score_table`, one below the other, with columns `occlusion` and `candidates`.
@@ -142,8 +134,7 @@ def evaluate_methods(
         TrackingError: the tracking store cannot be used. If it fails later, the results are kept, and a TrackingWarning
             says that they are not logged.
     """
-    from wheretolook.evaluation.report import score_markdown
-    from wheretolook.evaluation.results import log_evaluation, results_folder
+    from wheretolook.evaluation.results import best_in_words, log_evaluation, results_folder
     from wheretolook.evaluation.run import compare_methods
 
     title = f"Localization score on {dataset.name}" + (f", {config.split} scenes" if config.split != "test" else "")
@@ -151,11 +142,11 @@ def evaluate_methods(
     with reading(dataset.root, "evaluate", folder.name):
         check_store(tracking)
         found = compare_methods(dataset, config, models, progress, device, occlusion, photographs)
-        write_results(folder, found.table, found.calibration, title)
+        texts = write_results(folder, found.table, found.calibration, title)
         with kept_if_not_logged(f"the evaluation in {folder}", not_logged(dataset)):
             log_evaluation(dataset, found, config, tracking, occlusion, folder)
     if progress and show:
-        print(score_markdown(found.table, title))
+        print("\n".join(texts) or best_in_words(found.table))
     return found.table
 
 
@@ -164,22 +155,15 @@ def not_logged(dataset: Dataset) -> Path:
     return dataset.root / "evaluation_not_logged.json"
 
 
-def write_results(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, title: str) -> None:
-    """Write tables, report, calibration curves (if any) and figures; those of an earlier evaluation are removed."""
-    from wheretolook.evaluation import results
-    from wheretolook.evaluation.report import score_markdown
-    from wheretolook.figures.calibration import calibration_figure
-    from wheretolook.figures.scores import regret_figure, score_figure
-    from wheretolook.figures.style import save_figure
+def write_results(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, title: str) -> list[str]:
+    """Write tables, calibration curves (if any) and the reports of installed packages; return the reports' texts.
 
-    write_text(folder / results.SCORES_CSV, table.to_csv(index=False))
-    write_text(folder / results.SCORES_MD, score_markdown(table, title))
-    save_figure(score_figure(table), folder / results.SCORES_PNG)
-    save_figure(regret_figure(table), folder / results.REGRET_PNG)
-    for name in (results.CALIBRATION_CSV, results.CALIBRATION_PNG):
-        (folder / name).unlink(missing_ok=True)
+    The curves of an earlier evaluation are removed.
+    """
+    from wheretolook.evaluation.results import CALIBRATION_CSV, SCORES_CSV
+
+    write_text(folder / SCORES_CSV, table.to_csv(index=False))
+    (folder / CALIBRATION_CSV).unlink(missing_ok=True)
     if len(calibration):
-        write_text(folder / results.CALIBRATION_CSV, calibration.to_csv(index=False))
-        save_figure(calibration_figure(calibration), folder / results.CALIBRATION_PNG)
-    for extension in entry_points(group=REPORTS):
-        extension.load()(folder, table)
+        write_text(folder / CALIBRATION_CSV, calibration.to_csv(index=False))
+    return [report(folder, table, calibration, title) for report in reports("evaluate")]

@@ -30,12 +30,14 @@ from wheretolook.tracking.runs import start_run
 from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.errors import MapError, SceneError, TableError
+from wheretolook.utils.extras import reports
 from wheretolook.utils.files import read_json_object, write_json, write_text
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from wheretolook.localization.report import LabelSummary
+
+LABELS_CSV = "labels.csv"  # in `<dataset>/results/`: `label_shares`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,8 +66,6 @@ class Label(LabelOptions):
         Resumes after an interruption, see `wheretolook.localization.labeller.label_scenes`. The summary is
         `<dataset>/results/labels.*`. Raises SceneError if a mesh is missing, or a scene is known from photographs alone.
         """
-        from wheretolook.localization.report import LABELS_MD
-
         dataset = load_dataset(self, "sample")
         for files in dataset.scenes:
             if files.is_photographed:
@@ -81,7 +81,7 @@ class Label(LabelOptions):
                 progress(1)
             else:
                 to_label[files] = key
-        summary = dataset.root / "results" / LABELS_MD
+        summary = dataset.root / "results" / LABELS_CSV
         to_log = bool(to_label) or not summary.is_file() or _not_logged(dataset).is_file()
         if to_log:
             check_store(self.tracking)
@@ -157,41 +157,39 @@ def _report(files: SceneFolder, table: pd.DataFrame, log: Log) -> None:
 
 def log_labels(
     dataset: Dataset, tracking: TrackingConfig = TrackingConfig(), seconds: Mapping[str, float] | None = None
-) -> LabelSummary:
-    """Summarize the labels of a dataset, write `<dataset>/results/labels.csv`, `.md` and `.png`, and log an MLflow run.
+) -> pd.DataFrame:
+    """Summarize the labels of a dataset, write `<dataset>/results/labels.csv` and reports, and log an MLflow run.
 
-    The run's metrics are the numbers of `LabelSummary.shares` over all scenes and, prefixed with the split's name, over
+    Returns `label_shares`. The run's metrics are their numbers over all scenes and, prefixed with the split's name, over
     each split, and the seconds that each step took, `seconds_<name>`. Raises TableError if there is no scene, a scene
     has no viewpoints, or one of them has no label. If the run cannot be logged, the files are kept with the seconds,
     and a TrackingWarning announces that a later call logs it.
     """
-    from wheretolook.figures.labels import label_figure
-    from wheretolook.figures.style import save_figure
-    from wheretolook.localization import report
+    from wheretolook.dataset.viewpoint_table import label_shares, pooled_labels
 
     if not dataset.scenes:
         raise TableError("the dataset has no scene", path=dataset.root, fix="Run `wheretolook scenes`.")
     tables = {scene.name: _labelled_table(scene) for scene in dataset.scenes}
-    summary = report.label_summary(tables, {scene.name: scene.split for scene in dataset.scenes})
+    views = pooled_labels(tables, {scene.name: scene.split for scene in dataset.scenes})
+    shares = label_shares(views)
     folder = dataset.root / "results"
     note = _not_logged(dataset)
     if not seconds:
         with suppress(OSError, ValueError):
             seconds = read_json_object(note)
     metrics = {f"seconds_{name}": value for name, value in (seconds or {}).items()}
-    for row in summary.shares[summary.shares["scene"] == ALL].to_dict("records"):
+    for row in shares[shares["scene"] == ALL].to_dict("records"):
         prefix = "" if row["split"] == ALL else f"{row['split']}_"
         metrics |= {f"{prefix}{name}": value for name, value in row.items() if name not in ("scene", "split")}
     params = {"dataset": dataset.name, "dataset_fingerprint": dataset.fingerprint(), "scenes": " ".join(tables)}
     with kept_if_not_logged(f"the summary of labels in {folder}", note, seconds or {}):
-        write_text(folder / report.LABELS_CSV, summary.shares.to_csv(index=False))
-        save_figure(label_figure(summary), folder / report.LABELS_PNG)
-        write_text(folder / report.LABELS_MD, report.label_markdown(summary, f"Labels of {dataset.name}"))
+        written = [path for report in reports("label") for path in report(folder, views, f"Labels of {dataset.name}")]
+        write_text(folder / LABELS_CSV, shares.to_csv(index=False))  # the last file: where it is, nothing is missing
         with start_run(tracking, "all scenes", "label", params, tags={"dataset": dataset.name}) as (client, run):
             log_to_run(client, run, metrics=metrics)
-            for name in (report.LABELS_CSV, report.LABELS_MD, report.LABELS_PNG):
-                client.log_artifact(run, str(folder / name))
-    return summary
+            for path in (folder / LABELS_CSV, *written):
+                client.log_artifact(run, str(path))
+    return shares
 
 
 def _not_logged(dataset: Dataset) -> Path:

@@ -20,8 +20,10 @@ from wheretolook.tracking.runs import joined, start_run
 from wheretolook.tracking.runs import log as log_to_run
 from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.extras import reports
 from wheretolook.utils.files import write_text
 from wheretolook.utils.locks import hold
+from wheretolook.utils.texts import score_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -91,7 +93,9 @@ class Plan(SceneOrMapOptions):
         views[method] = path_views(path, scene.localization_map, renderer)
         folder = (config.out or files.folder / "path").resolve()  # "." gets a name, too
         with hold(folder.with_name(f".{folder.name}.lock"), "plan", wait_s=WAIT_S):
-            written = _draw(views, scene.landmarks.points, f"{scene.name}, {method}", folder, config.film)
+            written = []
+            for report in reports("plan"):
+                written += report(views, scene.landmarks.points, f"{scene.name}, {method}", folder, config.film)
             table = _table(path, scene.frame.world_from_map.inverse, stopping=config.stops.looks > 1)
             write_text(folder / "path.csv", table.to_csv(index=False, lineterminator="\n"))
             if config.rerun:
@@ -110,7 +114,6 @@ WAIT_S = 120.0  # for another plan to write its path into the same folder
 
 def _summary(path: PlannedPath) -> str:
     """Describe a path and its stops in a line."""
-    from wheretolook.figures.path_film import score_text
     from wheretolook.planning.routes import lengths_along
 
     text = f"{path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, views: {len(path.positions)}"
@@ -122,24 +125,6 @@ def _summary(path: PlannedPath) -> str:
         text += f", {n_further} further looks at stops at {', '.join(f'{at:.2f}' for at in along)} m"
         text += f": mean score {score_text(float(path.scores_with_stops.mean()))}"
     return text
-
-
-def _draw(views: dict[str, list[PathView]], landmarks: np.ndarray, title: str, folder: Path, film: str) -> list[str]:
-    """Draw the last of several methods' paths, and all side by side. Returns the names of the files written."""
-    from wheretolook.figures.animation import save_moving
-    from wheretolook.figures.path_film import FRAME_MS, film_frames, methods_figure, still_figure
-    from wheretolook.figures.style import save_figure
-
-    written = ["path.png"]
-    seen = list(views.values())[-1]
-    save_figure(still_figure(seen, landmarks, title), folder / "path.png")
-    if len(views) > 1:
-        save_figure(methods_figure(views, landmarks), folder / "methods.png")
-        written.append("methods.png")
-    if film != "none":
-        save_moving(film_frames(seen, landmarks), FRAME_MS, folder / f"path.{film}")
-        written.append(f"path.{film}")
-    return written
 
 
 def _log(options: Plan, dataset: str, scene: str, methods: list[str], path: PlannedPath, files: list[Path]) -> None:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wheretolook.commands.options import CameraOptions
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.extras import reports
 from wheretolook.utils.validation import reject
 
 if TYPE_CHECKING:
@@ -123,7 +122,11 @@ class View(CameraOptions, FrameOptions):
             record(viewed, self.record, state)
             print(f"{summary}, in {time.monotonic() - start:.0f} s: {self.record}")
         elif self.film is not None:
-            n_frames = film_writer()(viewed, self.film, state)
+            writers = reports("film")
+            if not writers:
+                fix = "Install wheretolook with its paper package."
+                raise ConfigError("no package that writes films is installed", fix=fix)
+            n_frames = writers[0](viewed, self.film, state)
             print(f"{summary}, {n_frames} pictures in {time.monotonic() - start:.0f} s: {self.film}")
         else:
             print(f"{summary}, open after {time.monotonic() - start:.1f} s", flush=True)
@@ -168,11 +171,3 @@ class View(CameraOptions, FrameOptions):
             return open_map(self.map, self.mesh, camera, self.weights, device, self.data, self.frame_options())
         assert self.scene is not None and not isinstance(camera, int)
         return open_scene(self.data, self.scene, self.name, camera, self.weights, device)
-
-
-def film_writer() -> Callable[[ViewedMap, Path, ViewState], int]:
-    """Return the installed writer of films, which returns the number of pictures. Raises ConfigError without one."""
-    for entry in entry_points(group="wheretolook.view", name="film"):
-        writer: Callable[[ViewedMap, Path, ViewState], int] = entry.load()
-        return writer
-    raise ConfigError("no package that writes films is installed", fix="Install wheretolook with its paper package.")

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from wheretolook.dataset.config import ALL, THRESHOLDS, Split, threshold_key
 from wheretolook.dataset.config import LOCALIZED as LOCALIZED
 from wheretolook.dataset.config import NO_POSE as NO_POSE
 from wheretolook.dataset.config import TOO_FEW_MATCHES as TOO_FEW_MATCHES
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.io.poses import POSE_COLUMNS, pose_values, poses_of_values
 from wheretolook.utils.errors import TableError
 
@@ -19,6 +23,13 @@ APPEARANCE = "appearance"  # optional column
 CHANGES = "changes"  # optional column
 
 UNLABELLED = "unlabelled"
+
+STATUSES = (LOCALIZED, TOO_FEW_MATCHES, NO_POSE)
+POSITIVE = tuple(f"positive_{threshold_key(threshold)}" for threshold in THRESHOLDS)
+"""Columns of the shares of positives, from the finest threshold (the label) to the coarsest.
+
+Positives at one threshold are positives at all coarser ones.
+"""
 
 LABELS = ("status", "error_m", "error_deg", "n_inliers")
 """Columns that labelling fills in."""
@@ -56,30 +67,71 @@ def by_first(table: pd.DataFrame) -> pd.DataFrame:
     return table.assign(**{str(name).removeprefix(FIRST): table[name] for name in table if str(name).startswith(FIRST)})
 
 
-def shares_good(table: pd.DataFrame) -> tuple[NDArray[np.int64], Float]:
-    """Ids (L,) of a table's locations, ascending, and the share of each one's viewpoints that localize, (L,)."""
-    ids, rows = np.unique(table["location_id"].to_numpy(np.int64), return_inverse=True)
-    return ids, np.bincount(rows, weights=is_good(table)) / np.bincount(rows)
+def pooled_labels(tables: Mapping[str, pd.DataFrame], splits: Mapping[str, Split]) -> pd.DataFrame:
+    """Pool the labels of scenes, whose viewpoints and split are given by name; at least one, none empty.
 
-
-def instructive_location(table: pd.DataFrame) -> int:
-    """The first location whose share of viewpoints that localize is nearest to 0.5: where to look matters there."""
-    ids, shares = shares_good(table)
-    return int(ids[np.argmin(np.abs(shares - 0.5))])
-
-
-def outcome_in_words(label: pd.Series, brief: bool = False) -> str:
-    """The result of localizing a row of a table, in words; `brief` gives only the pose's error, if one was found.
-
-    Empty if it was not tried.
+    Columns: `scene`, `split`, `location_id`, `n_visible`, `status`, `error_m`, `error_deg`; `height_m`, the camera's
+    height above its scene's lowest location; whether the view is within each threshold (`POSITIVE`) and, if all tables
+    have labels by the first RANSAC result, the same by these, with the prefix `FIRST`. Raises TableError if some
+    viewpoint has no label yet.
     """
-    status = str(label["status"])
-    if status == UNLABELLED:
-        return ""
-    if status != LOCALIZED:
-        return status.replace("_", " ")
-    error_m = float(label["error_m"])  # a row may hold it in single precision
-    right = error_m < 1
-    error = f"{100 * error_m:.1f} cm, " if right else f"{error_m:.1f} m, "
-    error += f"{label['error_deg']:.2f}° off" if right else f"{label['error_deg']:.0f}° off"
-    return error if brief else f"{'pose' if right else 'wrong pose'} found, {error}"
+    both = all(map(has_first, tables.values()))
+    return pd.concat([_views(name, table, splits[name], both) for name, table in tables.items()], ignore_index=True)
+
+
+def label_shares(views: pd.DataFrame) -> pd.DataFrame:
+    """Return shares of labels, in [0, 1], of `pooled_labels`: a row for each scene, then for each split, then for all.
+
+    `scene` and `split` are `ALL` in rows over several. Columns: `n_views`, `n_locations`; the share of viewpoints of each
+    status (`STATUSES`) and without any pose (`without_pose`); of positives at each threshold (`POSITIVE`);
+    `locations_positive`, the share of locations with a positive at the finest; `finest_of_coarsest`, the share of the
+    coarsest's positives that are positive at the finest; `same_label_share`, the share of viewpoints whose labels are
+    all equal; `spearman`, the rank correlation of the finest and the coarsest label; median errors of the poses found
+    for the coarsest's positives (`median_within_m`, `median_within_deg`) and for the others (`median_beyond_m`,
+    `median_beyond_deg`). NaN where there is nothing to count. With labels by the first RANSAC result, also the shares
+    of their positives, with the prefix `FIRST`.
+    """
+    by_scene = [(name, part["split"].iloc[0], part) for name, part in views.groupby("scene", sort=False)]
+    by_split = [(ALL, split, part) for split, part in views.groupby("split", sort=False)]
+    groups = [*by_scene, *by_split, (ALL, ALL, views)]
+    return pd.DataFrame([{"scene": scene, "split": split, **_shares(part)} for scene, split, part in groups])
+
+
+def _views(scene: str, table: pd.DataFrame, split: str, both: bool) -> pd.DataFrame:
+    """The columns that the summary needs, with heights and the label at each threshold."""
+    height = camera_centers(poses(table))[:, 2]
+    height = np.round(height - height.min(), 6)  # so that all views of a location fall into one band
+    labels = {name: is_good(table, *limits) for name, limits in zip(POSITIVE, THRESHOLDS, strict=True)}
+    if both:
+        first = by_first(table)
+        labels |= {f"{FIRST}{name}": is_good(first, *limits) for name, limits in zip(POSITIVE, THRESHOLDS, strict=True)}
+    columns = table[["location_id", "n_visible", "status", "error_m", "error_deg"]]
+    return columns.assign(scene=scene, split=split, height_m=height, **labels)
+
+
+def _shares(views: pd.DataFrame) -> dict[str, Any]:
+    finest, coarsest = (views[name].to_numpy() for name in (POSITIVE[0], POSITIVE[-1]))
+    by_location = views.groupby(["scene", "location_id"])[POSITIVE[0]].any()
+    positives = views[list(POSITIVE)].to_numpy()
+    medians: dict[str, float] = {}
+    for name, rows in (("within", coarsest), ("beyond", ~coarsest)):
+        medians |= {f"median_{name}_{unit}": views.loc[rows, f"error_{unit}"].median() for unit in ("m", "deg")}
+    return {
+        "n_views": len(views),
+        "n_locations": len(by_location),
+        **{status: (views["status"] == status).mean() for status in STATUSES},
+        "without_pose": views["error_m"].isna().mean(),
+        **{name: views[name].mean() for name in POSITIVE},
+        "locations_positive": by_location.mean(),
+        "finest_of_coarsest": (finest & coarsest).sum() / coarsest.sum() if coarsest.any() else np.nan,
+        "same_label_share": (positives == positives[:, :1]).all(axis=1).mean(),
+        "spearman": _correlation(finest, coarsest),
+        **medians,
+        **{str(name): views[name].mean() for name in views if str(name).startswith(FIRST)},
+    }
+
+
+def _correlation(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
+    """Correlation of two labels (B,). Of binary values, Spearman's and Pearson's are the same."""
+    spread = a.std() * b.std()
+    return float(((a & b).mean() - a.mean() * b.mean()) / spread) if spread > 0 else np.nan

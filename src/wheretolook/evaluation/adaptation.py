@@ -11,7 +11,7 @@ from sklearn.metrics import roc_auc_score
 
 from wheretolook.evaluation.statistics import ClusterBootstrap, expected_calibration_error
 from wheretolook.geometry.poses import Float
-from wheretolook.scorers.adapted.gp_correction import log_losses
+from wheretolook.scorers.adapted.calibration import log_losses
 from wheretolook.utils.texts import markdown_table
 
 RESAMPLES = 2000

@@ -31,7 +31,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.dataset.config import ALL, threshold_key
+from wheretolook.dataset.config import ALL, threshold_key, threshold_label
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_table import FIRST
 from wheretolook.evaluation.config import EvaluateConfig
@@ -47,7 +47,7 @@ from wheretolook.evaluation.ranking import (
 from wheretolook.evaluation.statistics import ClusterBootstrap, divide, expected_calibration_error, scale_probability
 from wheretolook.geometry.poses import Float
 from wheretolook.scorers.registry import find, is_probability, methods_named, scorers
-from wheretolook.scorers.styles import ORACLE
+from wheretolook.scorers.styles import ORACLE, method_group, method_style
 from wheretolook.tracking.runs import (
     ALL_METHODS,
     AUC,
@@ -113,6 +113,55 @@ def reference_of(scores: pd.DataFrame) -> str:
 def is_random(method: str) -> bool:
     """Whether a method chooses at random, so that its rows hold exact expectations."""
     return bool(getattr(find(method), "is_random_baseline", False))
+
+
+def best_in_words(scores: pd.DataFrame) -> str:
+    """Name the methods that chose good views most often, and state whether the first two differ significantly.
+
+    Uses the first N, threshold, occlusion model and set of candidates of a score table.
+    """
+    main = main_rows(scores)
+    key = threshold_keys(scores)[0]
+    pooled = main[(main["scene"] == ALL) & (main["top_n"] == main["top_n"].iloc[0])]
+    rows: dict[str, Mapping[str, Any]] = {row["method"]: row for row in pooled.to_dict("records")}
+    methods = [name for name in rows if name != ORACLE and method_group(name) != "probes"]
+    ranked = [name for name in methods if not is_random(name)]
+    ranked.sort(key=lambda name: -rows[name][f"raw_{key}"])
+    n_views, n_locations = (int(rows[ORACLE][name]) for name in ("n_views", "n_locations"))
+
+    def times(name: str) -> str:
+        return f"{method_style(name).label} {rows[name][f'raw_{key}'] * n_views:.1f}".removesuffix(".0")
+
+    others = [*ranked[1:2], *(name for name in methods if is_random(name)), ORACLE]
+    text = f"Views that localize within {threshold_label(key)}, among {n_views} chosen at {n_locations} locations: "
+    text += f"{'; '.join(map(times, [ranked[0], *others]))}."
+    return f"{text} {_significance_sentence(rows[ranked[0]], rows[ranked[1]], key)}" if len(ranked) > 1 else text
+
+
+def _significance_sentence(first: Mapping[str, Any], second: Mapping[str, Any], key: str) -> str:
+    """State whether the first of two rows is significantly better.
+
+    Decided by the interval of their difference where one is the reference, else by whether their intervals overlap.
+    """
+    names = (first["method"], second["method"])
+    if first["reference"] in names:
+        row, sign = (second, -1) if first["reference"] == names[0] else (first, 1)
+        low, high = sorted(sign * row[f"difference_{end}_{key}"] for end in ("low", "high"))
+        why = f"the 95 % interval of their difference is {signed_points(low)} to {signed_points(high)} points"
+    else:
+        low = first[f"raw_low_{key}"] - second[f"raw_high_{key}"]
+        high = low
+        why = f"their 95 % intervals {'do not overlap' if low > 0 else 'overlap'}"
+    if pd.isna(low) or pd.isna(high):
+        why = "there are too few for an interval"
+    if low > 0:
+        return f"The first is significantly better than the second: {why}."
+    return f"By {first['n_locations']} locations the first two do not differ significantly: {why}."
+
+
+def signed_points(value: float) -> str:
+    """Format a difference of shares in percentage points, with its sign."""
+    return f"{round(100 * value, 1) + 0.0:+.1f}"  # + 0.0 makes -0.0 positive
 
 
 def choose(views: RankedViews, scores: Mapping[str, Float], top_n: Sequence[int]) -> Choices:
@@ -258,10 +307,7 @@ def _calibration_metrics(method: str, good: NDArray[np.bool_], scores: Float, te
 SCORES_CSV = "scores.csv"
 SCORES_MD = "scores.md"
 SCORES_PNG = "scores.png"
-OCCLUSION_PNG = "occlusion.png"
 CALIBRATION_CSV = "calibration.csv"
-CALIBRATION_PNG = "calibration.png"
-REGRET_PNG = "regret.png"
 """Files of an evaluation, in `<dataset>/results/` and as artifacts of its run."""
 
 VARIANTS_CSV = "variants.csv"

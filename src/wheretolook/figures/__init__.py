@@ -1,3 +1,3 @@
-"""Figures of labels, scores, calibration, scenes and paths."""
+"""Style of figures, and floor plans."""
 
 KINDS = ("png", "pdf", "svg")  # file formats of figures

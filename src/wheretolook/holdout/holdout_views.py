@@ -15,7 +15,7 @@ from wheretolook.holdout.holdout import HoldoutResult
 from wheretolook.holdout.metrics import places_of
 from wheretolook.holdout.photo_map import MAX_ERROR_M, PhotographedMap
 from wheretolook.holdout.scores import Scoring, maps_without, score_views
-from wheretolook.scorers.adapted.gp_correction import LocalizedViews
+from wheretolook.scorers.adapted.calibration import LocalizedViews
 from wheretolook.scorers.adapted.score import log_odds_of
 from wheretolook.visibility.occlusion import OcclusionModel
 

@@ -1,14 +1,15 @@
-"""Optional packages, and pycolmap's log."""
+"""Optional packages, installed reports, and pycolmap's log."""
 
 from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from wheretolook.utils.errors import ConfigError, StorageError
 from wheretolook.utils.files import STORAGE_FIX
@@ -43,6 +44,14 @@ def require(module: str) -> None:
     """Raise ConfigError, with the command that installs it, if an optional module is missing."""
     if find_spec(module) is None:
         raise missing_package(module)
+
+
+def reports(stage: str) -> list[Callable[..., Any]]:
+    """Return the functions of installed packages that report on a stage: entry points of this name.
+
+    `label`, `evaluate`, `look_sets`, `plan`, `demo` and `film` are called by the commands where they import this function.
+    """
+    return [entry.load() for entry in entry_points(group="wheretolook.reports", name=stage)]
 
 
 @contextmanager

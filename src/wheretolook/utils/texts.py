@@ -24,6 +24,11 @@ def counted(number: float, noun: str) -> str:
     return f"{number:,.0f} {noun}{'s' * (round(number) != 1)}"
 
 
+def score_text(score: float) -> str:
+    """Format a score: two decimals for probabilities, three digits for the larger scores of other methods."""
+    return f"{score:.2f}" if abs(score) < 10 else f"{score:.3g}"
+
+
 LOG = logging.getLogger("wheretolook")
 """Of what the package finds out by itself, such as which files are used; the command line prints it."""
 

@@ -8,11 +8,11 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, invert_poses
 
 Rgb = NDArray[np.uint8]
 
@@ -130,10 +130,25 @@ def mesh_glb(mesh: TexturedMesh, cut_m: float | None) -> bytes:
     return glb_bytes(small if cut_m is None else cut_above(small, cut_m), 80)
 
 
+def frustum_corners(camera: Camera, cam_from_world: ArrayLike, depth_m: float) -> Float:
+    """Compute the frustum corners (B, 5, 3) m of poses (B, 3, 4): centre, then image corners at a depth, from top left."""
+    pixels = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (camera.width, camera.height)
+    rays = camera.unproject(pixels)
+    if isinstance(camera, PinholeCamera):  # corners of a fisheye can be behind it: they are at a distance
+        rays = rays / rays[:, 2:]
+    corners = np.concatenate([np.zeros((1, 3)), depth_m * rays])
+    world_from_cam = invert_poses(np.asarray(cam_from_world, dtype=np.float64).reshape(-1, 3, 4))
+    return corners @ np.swapaxes(world_from_cam[..., :3], -1, -2) + world_from_cam[:, None, :, 3]
+
+
+def frustum_segments(camera: Camera, cam_from_world: ArrayLike, depth_m: float) -> Float:
+    """Compute the eight edges (B, 8, 2, 3) m of camera frusta to a depth."""
+    edges = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
+    return frustum_corners(camera, cam_from_world, depth_m)[:, edges]
+
+
 def frusta(camera: Camera, cam_from_world: Float, depth_m: float) -> Float:
     """Return the edges (S, 2, 3) m of at most MAX_FRUSTA camera frusta, evenly chosen."""
-    from wheretolook.figures.dollhouse import frustum_segments
-
     n = len(cam_from_world)
     rows = np.unique(np.linspace(0, n - 1, min(n, MAX_FRUSTA)).astype(int))
     return frustum_segments(camera, cam_from_world[rows], depth_m).reshape(-1, 2, 3)

@@ -12,17 +12,17 @@ from matplotlib.style import context
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.figures.animation import pixels_of, save_moving
-from wheretolook.figures.dollhouse import Dollhouse, dollhouse, draw_house, draw_segments, frustum_segments
 from wheretolook.figures.style import BLUE, GREEN, RC, VERMILION, Style, frame, new_figure
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.planning.config import FORWARD
 from wheretolook.utils.errors import ConfigError
 from wheretolook.view import drawing
-from wheretolook.view.drawing import VisibleLandmarks
+from wheretolook.view.drawing import VisibleLandmarks, frustum_segments
 from wheretolook.view.state import RecordedPath, ViewState
 from wheretolook.view.viewed_map import ViewedMap
+from wheretolook_paper.figures.animation import pixels_of, save_moving
+from wheretolook_paper.figures.dollhouse import Dollhouse, dollhouse, draw_house, draw_segments
 
 FRAME_MS = 220
 LAST_MS = 2500  # the last frame

@@ -181,10 +181,10 @@ class Relocalize(SceneOptions):
     def _film(self, dataset: Dataset, table: pd.DataFrame, path: Path, log: Log) -> None:
         """Film the place where the last policy succeeds with the lowest probability of the first view's pose."""
         from wheretolook.dataset.viewpoint_table import is_good
-        from wheretolook.figures.animation import save_moving
-        from wheretolook.figures.dollhouse import dollhouse
         from wheretolook.geometry.poses import camera_centers
         from wheretolook_paper.evaluation.relocalization import Place
+        from wheretolook_paper.figures.animation import save_moving
+        from wheretolook_paper.figures.dollhouse import dollhouse
         from wheretolook_paper.figures.look_story import FRAME_MS, LAST_MS, film_frames, story_of_steps
 
         last = table[(table["policy"] == self.policies[-1]) & (table["hypothesis"] == 0)]

@@ -7,7 +7,9 @@ from functools import partial
 import pandas as pd
 
 from wheretolook.dataset.config import ALL, threshold_label
-from wheretolook.evaluation.report import (
+from wheretolook.evaluation.results import PHOTOGRAPHS, RELEASED_DIVISOR, main_rows, threshold_keys
+from wheretolook.scorers.styles import ORACLE, method_group
+from wheretolook_paper.evaluation.score_report import (
     Row,
     best_views,
     cross_table,
@@ -16,8 +18,6 @@ from wheretolook.evaluation.report import (
     score_text,
     share_text,
 )
-from wheretolook.evaluation.results import PHOTOGRAPHS, RELEASED_DIVISOR, main_rows, threshold_keys
-from wheretolook.scorers.styles import ORACLE, method_group
 
 _CANDIDATES = (
     "To choose from there are all labelled directions of a location, or those of them that are among its best K by the "

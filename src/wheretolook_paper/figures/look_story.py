@@ -13,8 +13,6 @@ from matplotlib.style import context
 from numpy.typing import ArrayLike
 
 from wheretolook.dataset.config import THRESHOLDS
-from wheretolook.figures.animation import Pixels, pixels_of
-from wheretolook.figures.dollhouse import Dollhouse, draw_house, draw_segments, frustum_segments
 from wheretolook.figures.style import BLUE, GREEN, RC, VERMILION, Style, new_figure
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, pose_error
@@ -22,6 +20,9 @@ from wheretolook.localization.confidence import ConfidenceModel
 from wheretolook.localization.localizer import JointLocalization, JointLocalizer, Localizer
 from wheretolook.localization.rig import Look, rig_of
 from wheretolook.utils.errors import PoseError
+from wheretolook.view.drawing import frustum_segments
+from wheretolook_paper.figures.animation import Pixels, pixels_of
+from wheretolook_paper.figures.dollhouse import Dollhouse, draw_house, draw_segments
 
 MAX_ERROR_M, MAX_ERROR_DEG = THRESHOLDS[0]
 FRAME_MS = 2200

@@ -13,13 +13,13 @@ from matplotlib.style import context
 from numpy.typing import NDArray
 
 from wheretolook.dataset.layout import Dataset
-from wheretolook.figures.path_film import PATH, draw_path
 from wheretolook.figures.style import BLUE, GREY, RC, VERMILION, frame, new_figure, scene_label
 from wheretolook.geometry.poses import Float
 from wheretolook.planning.routes import PathView, lengths_along
 from wheretolook.scorers.styles import method_style
 from wheretolook.utils.errors import MissingRunError
 from wheretolook.utils.texts import markdown_table
+from wheretolook_paper.figures.path_film import PATH, draw_path
 
 PATHS_CSV = "plan_photographs.csv"
 LANDMARKS_CSV = "plan_photographs_landmarks.csv"

@@ -13,14 +13,6 @@ from matplotlib.style import context
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from wheretolook.figures.dollhouse import (
-    Dollhouse,
-    draw_house,
-    draw_points,
-    draw_segments,
-    frustum_corners,
-    frustum_segments,
-)
 from wheretolook.figures.style import (
     BLUE,
     INK,
@@ -35,6 +27,8 @@ from wheretolook.figures.style import (
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float
+from wheretolook.view.drawing import frustum_corners, frustum_segments
+from wheretolook_paper.figures.dollhouse import Dollhouse, draw_house, draw_points, draw_segments
 
 _GLYPH = 32  # directions drawn of a location
 

@@ -12,9 +12,8 @@ import yaml
 
 from wheretolook.dataset.config import ALL, THRESHOLDS, threshold_key, threshold_label
 from wheretolook.dataset.layout import Dataset
-from wheretolook.evaluation.report import score_markdown
+from wheretolook.dataset.viewpoint_table import POSITIVE, label_shares, pooled_labels
 from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV, read_scores
-from wheretolook.localization.report import POSITIVE, label_summary
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.registry import learned
 from wheretolook.scorers.styles import method_style
@@ -24,6 +23,7 @@ from wheretolook.utils.files import read_json_object, sha256
 from wheretolook.utils.texts import markdown_table
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_paper.evaluation.comparisons import comparisons_markdown
+from wheretolook_paper.evaluation.score_report import score_markdown
 from wheretolook_paper.release.copy import read_about, size_text, sizes
 from wheretolook_paper.release.training_histories import records
 
@@ -54,7 +54,7 @@ def release_card(release: Dataset, defaults: Mapping[str, Any]) -> str:
     environment.filters |= {"pairs": _pairs, "thousands": "{:,}".format}
     about = read_about(release)
     tables = {scene.name: scene.read_table() for scene in release.scenes}
-    shares = label_summary(tables, {scene.name: scene.split for scene in release.scenes}).shares
+    shares = label_shares(pooled_labels(tables, {scene.name: scene.split for scene in release.scenes}))
     changed = _difference(about["settings"], defaults)
     text = environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
         about=about,

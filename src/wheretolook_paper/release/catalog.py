@@ -16,12 +16,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from wheretolook.dataset.layout import Dataset
-from wheretolook.evaluation.report import score_markdown
 from wheretolook.evaluation.results import CALIBRATION_CSV, SCORES_CSV, read_scores
 from wheretolook.evaluation.statistics import read_calibration
-from wheretolook.figures.calibration import calibration_figure
-from wheretolook.figures.path_film import methods_figure
-from wheretolook.figures.scores import regret_figure, score_figure
 from wheretolook.figures.style import save_figure
 from wheretolook.scorers.registry import learned
 from wheretolook.scorers.weights import load_scorer
@@ -33,18 +29,22 @@ from wheretolook.utils.files import write_text
 from wheretolook.utils.texts import markdown_table
 from wheretolook_paper.evaluation.comparisons import comparisons_markdown
 from wheretolook_paper.evaluation.looks import LOOKS_CSV
+from wheretolook_paper.evaluation.score_report import score_markdown
+from wheretolook_paper.figures.calibration import calibration_figure
 from wheretolook_paper.figures.config import FiguresConfig
 from wheretolook_paper.figures.inputs import inputs_figure
 from wheretolook_paper.figures.lattices import fibonacci_figure
 from wheretolook_paper.figures.looks import looks_figure
 from wheretolook_paper.figures.network_walkthrough import learning_figure
 from wheretolook_paper.figures.occlusion import occlusion_figure
+from wheretolook_paper.figures.path_film import methods_figure
 from wheretolook_paper.figures.paths import paths_figure
 from wheretolook_paper.figures.peaks import peaks_figure
 from wheretolook_paper.figures.photograph_paths import COMMAND, photograph_paths_figure, read_photograph_paths
 from wheretolook_paper.figures.pipeline import pipeline_figure
 from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
 from wheretolook_paper.figures.sampling import sampling_figure
+from wheretolook_paper.figures.scores import regret_figure, score_figure
 from wheretolook_paper.figures.top_n import top_n_figure
 from wheretolook_paper.figures.training import training_figure
 from wheretolook_paper.paths.path_report import PATHS_CSV

@@ -18,8 +18,7 @@ from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.environment import EnvironmentConfig, SceneEnvironment
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.sampling import free_locations
-from wheretolook.dataset.viewpoint_table import instructive_location, is_good
-from wheretolook.figures.dollhouse import Dollhouse, dollhouse
+from wheretolook.dataset.viewpoint_table import is_good
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
@@ -28,6 +27,8 @@ from wheretolook.utils.errors import SceneError
 from wheretolook.utils.validation import from_record
 from wheretolook.visibility.config import OcclusionConfig
 from wheretolook.visibility.occlusion import StoredOcclusion
+from wheretolook_paper.figures.dollhouse import Dollhouse, dollhouse
+from wheretolook_paper.figures.overview import instructive_location
 from wheretolook_paper.release.copy import read_about
 from wheretolook_rooms.generator import generate_scene
 

@@ -11,8 +11,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, outcome_in_words, poses
-from wheretolook.figures.overview import View, rendered_views
+from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses
 from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
 from wheretolook.inputs.channels import CHANNELS
 from wheretolook.planning.config import PlanConfig
@@ -23,6 +22,7 @@ from wheretolook.scorers.mlp.network import BinnedNetworkScorer
 from wheretolook.visibility.frustum import pixels_of
 from wheretolook.visibility.survey import Survey, SurveyOptions, survey
 from wheretolook_paper.figures.inputs import BinnedImage
+from wheretolook_paper.figures.overview import View, outcome_in_words, rendered_views
 from wheretolook_paper.figures.peaks import spread_extrema
 from wheretolook_paper.figures.pipeline import Pipeline
 from wheretolook_paper.figures.sampling import Sampling

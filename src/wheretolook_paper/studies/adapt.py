@@ -4,7 +4,7 @@
     python -m wheretolook_paper.studies.adapt data/test-90 --split test --out adapted.csv
 
 Prints a row for each scene and the means: regret in percentage points, AUC and calibration error of the bundled
-weights, of the adapted ones, and of bins.
+weights, calibrated as by `wheretolook adapt` and corrected by a Gaussian process besides, and of bins.
 """
 
 from __future__ import annotations
@@ -22,9 +22,10 @@ from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, poses
 from wheretolook.evaluation.adaptation import compare_log_odds
-from wheretolook.scorers.adapted.gp_correction import adapt
+from wheretolook.scorers.adapted.calibration import calibrate
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook_paper.scorers.gp_correction import adapt
 
 
 def main(
@@ -56,16 +57,19 @@ def main(
         training = np.isin(views.group, locations[: len(locations) // 2])
         start = time.monotonic()
         rest = views.rows(~training)
-        adapted = adapt(views.rows(training))
+        scale, offset = calibrate(views.rows(training))
+        corrected = adapt(views.rows(training))
         judged = rest.good, rest.group, rest.centers
-        gain = compare_log_odds(rest.log_odds, adapted.adaptation.log_odds(rest), *judged)
+        calibrated = compare_log_odds(rest.log_odds, scale * rest.log_odds + offset, *judged).after
+        gain = compare_log_odds(rest.log_odds, corrected.adaptation.log_odds(rest), *judged)
         by_bins = compare_log_odds(rest.log_odds, bins[~training], *judged).after
         row = {"scene": files.name, "views": int(training.sum())}
         row |= {"regret_bins": by_bins["regret"], "auc_bins": by_bins["auc"]}
         row |= {f"{name}_set": value for name, value in gain.before.items()}
-        row |= {f"{name}_adapted": value for name, value in gain.after.items()}
+        row |= {f"{name}_calibrated": value for name, value in calibrated.items()}
+        row |= {f"{name}_process": value for name, value in gain.after.items()}
         row |= dict(zip(("regret_less", "regret_low", "regret_high"), gain.regret_less, strict=True))
-        row |= {"length_m": adapted.length_m, "amplitude": adapted.amplitude, "seconds": time.monotonic() - start}
+        row |= {"length_m": corrected.length_m, "amplitude": corrected.amplitude, "seconds": time.monotonic() - start}
         rows.append(row)
         print(pd.Series(row).to_frame().T.round(3).to_string(header=len(rows) == 1), flush=True)
     found = pd.DataFrame(rows)

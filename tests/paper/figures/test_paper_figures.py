@@ -10,11 +10,11 @@ import pytest
 from matplotlib.figure import Figure
 
 from box_scenes import furnished_room
-from wheretolook.figures.dollhouse import dollhouse
 from wheretolook.figures.style import save_figure
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere, released_lattice
 from wheretolook.geometry.poses import poses_looking_along
+from wheretolook_paper.figures.dollhouse import dollhouse
 from wheretolook_paper.figures.lattices import covering_radius_deg, fibonacci_figure, nearest_angles_deg
 from wheretolook_paper.figures.look_story import Estimate, LookStory, film_frames, story_figure
 from wheretolook_paper.figures.peaks import spread_extrema

@@ -24,7 +24,6 @@ from wheretolook.dataset.config import RELEASE, RELEASE_FILE
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.report import score_markdown
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.tracking.store import TrackingConfig
 from wheretolook.training.data import load_views
@@ -32,6 +31,7 @@ from wheretolook.utils.errors import ConfigError, StorageError, WeightsError
 from wheretolook.utils.files import write_json
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_paper.commands.release import Release, release_settings
+from wheretolook_paper.evaluation.score_report import score_markdown
 from wheretolook_paper.release import copy as releases
 from wheretolook_paper.release.card import release_card
 from wheretolook_paper.release.copy import convert_to_float16

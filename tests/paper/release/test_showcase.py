@@ -15,7 +15,7 @@ from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.sampling import free_locations, sample_viewpoints
 from wheretolook.dataset.viewpoint_files import write_table
-from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, outcome_in_words, poses
+from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, poses
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
@@ -31,6 +31,7 @@ from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.visibility.config import OcclusionConfig
 from wheretolook.visibility.occlusion import MeshOcclusion
+from wheretolook_paper.figures.overview import outcome_in_words
 from wheretolook_paper.release.showcase import Showcase, open_showcase
 from wheretolook_paper.release.showcase_figures import learning_of, peaks_of, pipeline_of
 from wheretolook_rooms.generator import generate_apartment

@@ -8,7 +8,7 @@ METHODS = (
     Method(
         position=120,
         name="adapted",
-        about="The set network adapted to one scene: calibrated, and corrected by pose.",
+        about="The set network, calibrated to one scene.",
         style=MethodStyle("adapted to the scene", "#882255", "P", "-"),
         group="learned",
         build=imported("wheretolook.scorers.adapted.score:adapted_scorer"),

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from wheretolook.geometry.poses import Float, camera_centers, check_locations, check_poses
+from wheretolook.geometry.poses import Float, check_locations
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.scorers.adapted.kernel import Correction
 from wheretolook.scorers.adapted.network import AdaptedNetwork
 from wheretolook.scorers.adapted.place import MIN_SHARE, share_of_place
 from wheretolook.scorers.base import Scorer, ViewReport
@@ -40,7 +39,7 @@ def adapted_scorer(localization_map: LocalizationMap, options: BuildOptions) -> 
 
 
 class AdaptedScorer(Scorer):
-    """The set network with log-odds calibrated and corrected by localized views of one scene."""
+    """The set network with log-odds calibrated by localized views of one scene."""
 
     name = "adapted"
 
@@ -51,34 +50,26 @@ class AdaptedScorer(Scorer):
         of_base = network.network, trained.camera, network.base_scale, network.base_offset, trained.training_range
         known = replace(localization_map, photographs=False)  # the base is calibrated for this map already
         self.base = SetScorer(known, TrainedNetwork("set", *of_base))
-        poses = network.support_centers.numpy(), network.support_axes.numpy()
-        kernel = network.length_m, network.sharpness
-        self.correction = Correction(*poses, network.support_weights.numpy(), *kernel)
 
     def score(self, cam_from_world: Float) -> Float:
         """Return probabilities (B,) in [0, 1]."""
-        return self._corrected(self.base.score(cam_from_world), cam_from_world)
+        return self._adapted(self.base.score(cam_from_world))
 
     def score_directions(self, locations: Float, directions: Float) -> Float:
         """Return probabilities (L, D); see `SetScorer.score_directions`."""
-        probability = self.base.score_directions(check_locations(locations), directions)
-        return self._adapted(probability, self.correction.grid(locations, directions))
+        return self._adapted(self.base.score_directions(check_locations(locations), directions))
 
     def report(self, cam_from_world: Float) -> ViewReport:
-        """Return the base network's report with the corrected score."""
+        """Return the base network's report with the adapted score."""
         report = self.base.report(cam_from_world)
-        return replace(report, score=self._corrected(report.score, cam_from_world))
+        return replace(report, score=self._adapted(report.score))
 
     def in_range(self, cam_from_world: Float) -> NDArray[np.bool_]:
         """Return which poses (B, 3, 4) have views in the range of the training views, (B,)."""
         return self.base.in_range(cam_from_world)
 
-    def _corrected(self, probability: Float, cam_from_world: Float) -> Float:
-        poses = check_poses(cam_from_world)
-        return self._adapted(probability, self.correction.at(camera_centers(poses), poses[:, 2, :3]))
-
-    def _adapted(self, probability: Float, correction: Float) -> Float:
-        return np.asarray(expit(self.trained.scale * log_odds_of(probability) + self.trained.offset + correction))
+    def _adapted(self, probability: Float) -> Float:
+        return np.asarray(expit(self.trained.scale * log_odds_of(probability) + self.trained.offset))
 
 
 def log_odds_of(probability: Float) -> Float:

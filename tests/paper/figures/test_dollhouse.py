@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from box_scenes import CABINET, ROOM, furnished_room
-from wheretolook.figures.dollhouse import dollhouse, frustum_corners, frustum_segments
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.poses import poses_looking_along, transform
+from wheretolook_paper.figures.dollhouse import dollhouse
 
 
 def test_a_plan_has_x_to_the_right_and_y_up_and_knows_what_is_visible() -> None:
@@ -27,15 +25,3 @@ def test_near_walls_are_removed_unless_two_sided() -> None:
     options = {"elevation_deg": 45.0, "width_px": 200}
     assert dollhouse(furnished_room(ceiling=False), **options).shows(floor).all()
     assert not dollhouse(furnished_room(ceiling=False), one_sided=False, **options).shows(floor).any()
-
-
-def test_frustum_corners_project_to_image_corners() -> None:
-    camera = PinholeCamera(64, 48, 32.0)
-    poses = poses_looking_along([[1.0, 2.0, 3.0]] * 2, [[1.0, 0, 0], [0.3, -1, 0.2]])
-    corners = frustum_corners(camera, poses, 0.5)
-    np.testing.assert_allclose(corners[:, 0], [[1, 2, 3]] * 2)
-    for pose, four in zip(poses, corners[:, 1:], strict=True):
-        in_camera = transform(pose, four)
-        np.testing.assert_allclose(in_camera[:, 2], 0.5)
-        np.testing.assert_allclose(camera.project(in_camera), [[0, 0], [64, 0], [64, 48], [0, 48]], atol=1e-9)
-    assert frustum_segments(camera, poses, 0.5).shape == (2, 8, 2, 3)

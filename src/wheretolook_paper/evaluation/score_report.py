@@ -11,8 +11,15 @@ import pandas as pd
 
 from wheretolook.dataset.config import ALL, threshold_label
 from wheretolook.dataset.viewpoint_table import FIRST, by_first
-from wheretolook.evaluation.results import PHOTOGRAPHS, is_random, main_rows, methods_of, reference_of, threshold_keys
-from wheretolook.scorers.styles import ORACLE, method_group, method_style
+from wheretolook.evaluation.results import (
+    PHOTOGRAPHS,
+    main_rows,
+    methods_of,
+    reference_of,
+    signed_points,
+    threshold_keys,
+)
+from wheretolook.scorers.styles import method_group, method_style
 from wheretolook.utils.texts import markdown_table
 
 Row = Mapping[Any, Any]  # a row of a score table by its columns' names
@@ -60,50 +67,6 @@ def score_markdown(scores: pd.DataFrame, title: str = "Localization score") -> s
             method_table(probes, [*_score_columns(keys, 1), *_RANKING], "probe"),
         ]
     return "\n\n".join(parts) + "\n"
-
-
-def best_in_words(scores: pd.DataFrame) -> str:
-    """Name the methods that chose good views most often, and state whether the first two differ significantly.
-
-    Uses the first N, threshold, occlusion model and set of candidates of a score table.
-    """
-    main = main_rows(scores)
-    key = threshold_keys(scores)[0]
-    pooled = main[(main["scene"] == ALL) & (main["top_n"] == main["top_n"].iloc[0])]
-    rows: dict[str, Row] = {row["method"]: row for row in pooled.to_dict("records")}
-    methods = [name for name in rows if name != ORACLE and method_group(name) != "probes"]
-    ranked = [name for name in methods if not is_random(name)]
-    ranked.sort(key=lambda name: -rows[name][f"raw_{key}"])
-    n_views, n_locations = (int(rows[ORACLE][name]) for name in ("n_views", "n_locations"))
-
-    def times(name: str) -> str:
-        return f"{method_style(name).label} {rows[name][f'raw_{key}'] * n_views:.1f}".removesuffix(".0")
-
-    others = [*ranked[1:2], *(name for name in methods if is_random(name)), ORACLE]
-    text = f"Views that localize within {threshold_label(key)}, among {n_views} chosen at {n_locations} locations: "
-    text += f"{'; '.join(map(times, [ranked[0], *others]))}."
-    return f"{text} {_significance_sentence(rows[ranked[0]], rows[ranked[1]], key)}" if len(ranked) > 1 else text
-
-
-def _significance_sentence(first: Row, second: Row, key: str) -> str:
-    """State whether the first of two rows is significantly better.
-
-    Decided by the interval of their difference where one is the reference, else by whether their intervals overlap.
-    """
-    names = (first["method"], second["method"])
-    if first["reference"] in names:
-        row, sign = (second, -1) if first["reference"] == names[0] else (first, 1)
-        low, high = sorted(sign * row[f"difference_{end}_{key}"] for end in ("low", "high"))
-        why = f"the 95 % interval of their difference is {_signed(low)} to {_signed(high)} points"
-    else:
-        low = first[f"raw_low_{key}"] - second[f"raw_high_{key}"]
-        high = low
-        why = f"their 95 % intervals {'do not overlap' if low > 0 else 'overlap'}"
-    if pd.isna(low) or pd.isna(high):
-        why = "there are too few for an interval"
-    if low > 0:
-        return f"The first is significantly better than the second: {why}."
-    return f"By {first['n_locations']} locations the first two do not differ significantly: {why}."
 
 
 def _about(main: pd.DataFrame) -> str:
@@ -262,7 +225,7 @@ def _difference_text(row: Row, key: str, reference: str) -> str:
         return "reference"
     if pd.isna(row[f"difference_{key}"]):
         return "–"
-    text = f"{_signed(row[f'difference_{key}'])}{_ends(row, 'difference', key)}"
+    text = f"{signed_points(row[f'difference_{key}'])}{_ends(row, 'difference', key)}"
     p = row[f"p_{key}"]
     return text if pd.isna(p) else f"{text}, p {'< 0.001' if p < 0.001 else f'{p:.3f}'}"
 
@@ -280,16 +243,12 @@ def _counted_text(row: Row, key: str) -> str:
 def _ends(row: Row, name: str, key: str) -> str:
     """Interval of a share with a leading space; "" where it is unknown or has no width."""
     low, high = (row.get(f"{name}_{end}_{key}", np.nan) for end in ("low", "high"))  # the paper's shares have none
-    as_text = _signed if name == "difference" else _percent
+    as_text = signed_points if name == "difference" else _percent
     return f" [{as_text(low)}, {as_text(high)}]" if pd.notna(low) and low < high else ""
 
 
 def _percent(value: float) -> str:
     return "–" if pd.isna(value) else f"{100 * value:.1f}"
-
-
-def _signed(value: float) -> str:
-    return f"{round(100 * value, 1) + 0.0:+.1f}"  # + 0.0 makes -0.0 positive
 
 
 def number_text(value: float) -> str:

@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 from synthetic_scores import KEYS, make_scores
-from wheretolook.evaluation.report import best_in_words, score_markdown
 from wheretolook.evaluation.results import main_rows
 from wheretolook_paper.evaluation.comparisons import comparisons_markdown
+from wheretolook_paper.evaluation.score_report import score_markdown
 
 FINEST = KEYS[0]
 
@@ -72,17 +72,3 @@ def test_occlusion_models_and_candidates_are_compared(scores: pd.DataFrame) -> N
         row = one_row(table, "random")
         cell = table_below(report, heading)["random"][value]
         assert cell.startswith(f"{row['average_precision']:.3f}, {percent(row[f'normalized_{FINEST}'])} [")
-
-
-@pytest.mark.parametrize("reference", ["", "bins", "visible"])
-@pytest.mark.parametrize("good, significant", [(0.62, False), (0.8, True)])
-def test_summary_of_significance(reference: str, good: float, significant: bool) -> None:
-    """Against visible, whose share is 0.6; intervals reach 6 points, those of differences 3."""
-    table = make_scores(("random", "bins", "visible"), reference or None, (1,), ("a",)).assign(reference=reference)
-    shares = table["method"].map({"random": 0.4, "bins": good, "visible": 0.6, "oracle": 0.9})
-    difference = shares - {"": np.nan, "bins": good, "visible": 0.6}[reference]
-    for name, values, width in (("raw", shares, 0.06), ("difference", difference, 0.03)):
-        table[f"{name}_{FINEST}"] = values
-        table[f"{name}_low_{FINEST}"] = values - width
-        table[f"{name}_high_{FINEST}"] = values + width
-    assert ("significantly better" in best_in_words(table)) == significant

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from wheretolook.figures.animation import save_moving
-from wheretolook.figures.path_film import FRAME_MS, film_frames, still_figure
 from wheretolook.planning.routes import PathView
 from wheretolook.utils.errors import ConfigError
+from wheretolook_paper.figures.animation import save_moving
+from wheretolook_paper.figures.path_film import FRAME_MS, film_frames, still_figure
 
 RNG = np.random.default_rng(1)
 LANDMARKS = RNG.uniform((0, 0, 0), (4, 3, 2), (300, 3))

@@ -1,82 +1,76 @@
-"""Adapt a scorer to a scene: calibrate and correct its log-odds by localized views.
+"""Adapt a scorer to a scene by a Gaussian process over poses, as well as by calibration.
 
 The log-odds of a view become scale * log-odds + offset + g(pose), where g is a Gaussian process over poses with the
-kernel of `wheretolook.scorers.adapted.kernel` (Rasmussen and Williams, "Gaussian Processes for Machine Learning",
+kernel `nearness` (Rasmussen and Williams, "Gaussian Processes for Machine Learning",
 2006, Sec. 3.4: binary classification by the Laplace approximation and Newton's method). It corrects the scorer where it
 was wrong at nearby views; far from localized views g is 0.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import minimize
+from scipy.spatial import cKDTree
 from scipy.special import expit
 
 from wheretolook.geometry.poses import Float
-from wheretolook.scorers.adapted.kernel import Correction, nearness
+from wheretolook.scorers.adapted.calibration import MIN_SCALE, PRIOR, LocalizedViews, calibrate, log_losses, splits
 
 LENGTHS_M = (0.5, 1.0, 2.0)
 AMPLITUDES = (1.0, 3.0)
 SHARPNESS = 4.0
 """Kernels that are tried: lengths, and variances of g. Chosen on the val scenes of configs/cameras.yaml, as was the
 sharpness."""
-PRIOR = np.array([5.0, 0.1])  # precision of scale (about 1) and offset (about 0)
 MAX_SUPPORT = 2000  # views that support g, finally and while kernels are tried; evenly spread
 TRIED_SUPPORT = 800
-FOLDS = 5
-MIN_SCALE = 1e-3  # of log-odds: 0 or less would reverse the order of the views
+REACH = 4.0  # lengths beyond which the kernel, below 4e-4, is cut to zero
 STEPS = 30  # of Newton's method at most
 TOLERANCE = 1e-4  # smallest gain in log-likelihood of a step
 
 Kernel = tuple[float, float]  # length in metres and variance of g
 
 
-@dataclass(frozen=True, eq=False)
-class LocalizedViews:
-    """B views of a scene: the log-odds of a scorer, and whether each localized."""
+def nearness(
+    centers: Float, axes: Float, other_centers: Float, other_axes: Float, length_m: float, sharpness: float
+) -> Float:
+    """Return the kernel (B, N) between views (B, 3) m and (N, 3) m with unit optical axes, 1 for the same view.
 
-    log_odds: Float  # (B,) of the scorer to be adapted
-    good: NDArray[np.bool_]  # (B,)
-    centers: Float  # (B, 3) m, cameras in the map's frame
-    axes: Float  # (B, 3) unit optical axes
-    group: NDArray[np.int64]  # (B,) views of a group, such as a location, are held out together
-    # (B,) index of the view's photograph, which may be held out with several blocks; -1 for rendered views
-    photograph: NDArray[np.int64]
-    place: NDArray[np.int64]  # (B,) index of the view's location, of whose views one is chosen
+    A Gaussian of the distance between the cameras, with standard deviation `length_m`, times a von Mises-Fisher kernel
+    of the angle between their axes, exp(sharpness (cos - 1)); 0 beyond `REACH` lengths.
+    """
+    squared = ((centers[:, None] - other_centers[None]) ** 2).sum(-1) / length_m**2
+    kernel = np.exp(-squared / 2 + sharpness * (axes @ other_axes.T - 1))
+    return np.where(squared <= REACH**2, kernel, 0.0)
 
-    @classmethod
-    def rendered(
-        cls, log_odds: Float, good: NDArray[np.bool_], centers: Float, axes: Float, location: NDArray[np.int64]
-    ) -> LocalizedViews:
-        """Return rendered views, which are held out by location (B,)."""
-        return cls(log_odds, good, centers, axes, location, np.full(len(good), -1), location)
 
-    def __len__(self) -> int:
-        return len(self.good)
+class Correction:
+    """The sum over N views of their weights (N,), each times its kernel with the query view."""
 
-    @property
-    def blocks(self) -> NDArray[np.int64]:
-        """Index of the block that each photograph was held out with (B,), -1 for rendered views."""
-        return np.where(self.photograph >= 0, self.group, -1)
+    def __init__(self, centers: Float, axes: Float, weights: Float, length_m: float, sharpness: float) -> None:
+        self.centers = centers
+        self.axes = axes
+        self.weights = weights
+        self.length_m = length_m
+        self.sharpness = sharpness
+        self._tree = cKDTree(centers)
 
-    def rows(self, rows: NDArray[np.integer] | NDArray[np.bool_]) -> LocalizedViews:
-        """Return some of the views."""
-        return LocalizedViews(*(getattr(self, part.name)[rows] for part in fields(self)))
+    def at(self, centers: Float, axes: Float) -> Float:
+        """Return the correction (B,) of views at centers (B, 3) m with optical axes (B, 3)."""
+        values = np.zeros(len(centers))
+        locations, row, counts = np.unique(centers, axis=0, return_inverse=True, return_counts=True)
+        rows_by_location = np.split(np.argsort(row.reshape(-1), kind="stable"), np.cumsum(counts)[:-1])
+        for location, rows in zip(locations, rows_by_location, strict=False):
+            values[rows] = self._at_location(location, axes[rows])
+        return values
 
-    def joined(self, other: LocalizedViews) -> LocalizedViews:
-        """Return these views and others of the same scene, with separate groups and locations."""
-        parts = []
-        for part in fields(self):
-            values = getattr(self, part.name)
-            shift = int(values.max()) + 1 if part.name in ("group", "place") and len(self) else False
-            parts.append(np.concatenate([values, getattr(other, part.name) + shift]))
-        return LocalizedViews(*parts)
+    def _at_location(self, location: Float, axes: Float) -> Float:
+        near = np.array(self._tree.query_ball_point(location, REACH * self.length_m), dtype=np.int64)
+        squared = ((self.centers[near] - location) ** 2).sum(1) / self.length_m**2
+        by_distance = self.weights[near] * np.exp(-squared / 2)
+        return np.asarray(np.exp(self.sharpness * (axes @ self.axes[near].T - 1)) @ by_distance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,11 +100,11 @@ def fit(
     """
     if amplitude and len(views) > limit:
         views = views.rows(np.arange(limit, dtype=np.int64) * len(views) // limit)
+    if not amplitude or not len(views):
+        scale, offset = calibrate(views)
+        return Adaptation(scale, offset, length_m, sharpness, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
     y = views.good.astype(np.float64)
     fixed = np.column_stack([views.log_odds, np.ones(len(views))])
-    if not amplitude or not len(views):
-        scale, offset = _calibration(fixed, y)
-        return Adaptation(scale, offset, length_m, sharpness, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
     poses = views.centers, views.axes
     kernel = amplitude * nearness(*poses, *poses, length_m, sharpness)
     residual = _most_likely(fixed @ (1.0, 0.0), kernel + (fixed / PRIOR) @ fixed.T, y)
@@ -149,19 +143,6 @@ def _most_likely(mean: Float, covariance: Float, y: Float) -> Float:
     return a
 
 
-def _calibration(fixed: Float, y: Float) -> tuple[float, float]:
-    """Return scale and offset of log-odds (Platt scaling) with a prior."""
-    prior = np.array([1.0, 0.0])
-
-    def loss(at: Float) -> tuple[float, Float]:
-        log_odds = fixed @ at
-        value = np.logaddexp(0, log_odds).sum() - y @ log_odds + PRIOR @ (at - prior) ** 2 / 2
-        return float(value), fixed.T @ (expit(log_odds) - y) + PRIOR * (at - prior)
-
-    scale, offset = minimize(loss, prior, jac=True, bounds=((MIN_SCALE, None), (None, None))).x
-    return float(scale), float(offset)
-
-
 @dataclass(frozen=True, eq=False)
 class Adapted:
     """An adaptation, and its held-out predictions."""
@@ -173,11 +154,7 @@ class Adapted:
 
 
 def adapt(views: LocalizedViews, seed: int = 0) -> Adapted:
-    """Adapt with the kernel of least held-out log loss in cross-validation.
-
-    Photographs alone calibrate only: they are few, and a correction by pose did not improve held-out blocks
-    (docs/adapt.md).
-    """
+    """Adapt with the kernel of least held-out log loss in cross-validation; photographs alone calibrate only."""
     parts = list(splits(views, seed))
 
     def held_out(kernel: Kernel, limit: int = MAX_SUPPORT) -> Float:
@@ -191,24 +168,3 @@ def adapt(views: LocalizedViews, seed: int = 0) -> Adapted:
         kernels = [best, *product(LENGTHS_M, AMPLITUDES)]
         best = min(kernels, key=lambda kernel: log_losses(held_out(kernel, TRIED_SUPPORT), views.good).mean())
     return Adapted(fit(views, *best), *best, held_out(best))
-
-
-def splits(views: LocalizedViews, seed: int = 0) -> Iterator[tuple[NDArray[np.bool_], LocalizedViews]]:
-    """Yield held-out views (B,), each view once, and the training views.
-
-    Groups are held out in `FOLDS` parts; those of photographs alone, one after the other. A held-out photograph is not
-    in the training views, whatever its group.
-    """
-    names, row = np.unique(views.group, return_inverse=True)
-    n_folds = FOLDS if (views.photograph < 0).any() else len(views)
-    order = np.random.default_rng(seed).permutation(len(names))
-    fold = order[row.reshape(-1)] % min(n_folds, max(2, len(names)))
-    for number in np.unique(fold):
-        out = fold == number
-        again = (views.photograph >= 0) & np.isin(views.photograph, views.photograph[out])
-        yield out, views.rows(~out & ~again)
-
-
-def log_losses(log_odds: Float, good: NDArray[np.bool_]) -> Float:
-    """Return the negative log-likelihood (B,) of whether each view localizes."""
-    return np.asarray(np.logaddexp(0.0, np.where(good, -log_odds, log_odds)))

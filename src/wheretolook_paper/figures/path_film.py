@@ -9,12 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
-from wheretolook.figures.animation import Pixels, pixels_of
 from wheretolook.figures.style import INK, RC, Style, frame, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook.planning.routes import PathView, lengths_along
 from wheretolook.scorers.styles import method_style
-from wheretolook.utils.texts import counted
+from wheretolook.utils.texts import counted, score_text
+from wheretolook_paper.figures.animation import Pixels, pixels_of
 
 PATH = "#CC3311"
 LANDMARKS = "#EE9900"
@@ -75,11 +75,6 @@ def methods_figure(paths: Mapping[str, Sequence[PathView]], landmarks: Float) ->
             n_visible = np.mean([len(view.pixels) for view in views])
             axes.set_title(f"{method_style(name).label}\n{n_visible:,.0f} landmarks in view on average", fontsize=10)
         return figure
-
-
-def score_text(score: float) -> str:
-    """Format a score: two decimals for probabilities, three digits for the larger scores of other methods."""
-    return f"{score:.2f}" if abs(score) < 10 else f"{score:.3g}"
 
 
 def _draw_view(axes: Axes, view: PathView, prefix: str = "") -> None:

@@ -14,11 +14,11 @@ from matplotlib.patheffects import withStroke
 from matplotlib.style import context
 from numpy.typing import NDArray
 
-from wheretolook.dataset.viewpoint_table import poses
-from wheretolook.figures.dollhouse import Dollhouse, draw_house
+from wheretolook.dataset.viewpoint_table import LOCALIZED, UNLABELLED, is_good, poses
 from wheretolook.figures.style import BLUE, INK, RC, VERMILION, Style, frame, new_figure
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.poses import Float
+from wheretolook_paper.figures.dollhouse import Dollhouse, draw_house
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -26,6 +26,35 @@ if TYPE_CHECKING:
     from wheretolook.dataset.environment import SceneEnvironment
 
 SCORE_COLORS: Style = {"cmap": "cividis", "vmin": 0, "vmax": 1}
+
+
+def shares_good(table: pd.DataFrame) -> tuple[NDArray[np.int64], Float]:
+    """Ids (L,) of a table's locations, ascending, and the share of each one's viewpoints that localize, (L,)."""
+    ids, rows = np.unique(table["location_id"].to_numpy(np.int64), return_inverse=True)
+    return ids, np.bincount(rows, weights=is_good(table)) / np.bincount(rows)
+
+
+def instructive_location(table: pd.DataFrame) -> int:
+    """The first location whose share of viewpoints that localize is nearest to 0.5: where to look matters there."""
+    ids, shares = shares_good(table)
+    return int(ids[np.argmin(np.abs(shares - 0.5))])
+
+
+def outcome_in_words(label: pd.Series, brief: bool = False) -> str:
+    """The result of localizing a row of a table, in words; `brief` gives only the pose's error, if one was found.
+
+    Empty if it was not tried.
+    """
+    status = str(label["status"])
+    if status == UNLABELLED:
+        return ""
+    if status != LOCALIZED:
+        return status.replace("_", " ")
+    error_m = float(label["error_m"])  # a row may hold it in single precision
+    right = error_m < 1
+    error = f"{100 * error_m:.1f} cm, " if right else f"{error_m:.1f} m, "
+    error += f"{label['error_deg']:.2f}° off" if right else f"{label['error_deg']:.0f}° off"
+    return error if brief else f"{'pose' if right else 'wrong pose'} found, {error}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,22 +13,23 @@ from matplotlib.colors import to_hex
 from box_scenes import furnished_room
 from synthetic_dataset import make_dataset
 from synthetic_scores import EVERY_METHOD, FISHER, KEYS, make_scores
+from wheretolook.dataset.viewpoint_table import POSITIVE, pooled_labels
 from wheretolook.evaluation.statistics import calibration_rows
-from wheretolook.figures.calibration import calibration_figure
-from wheretolook.figures.dollhouse import dollhouse
-from wheretolook.figures.labels import SHADES, label_figure
-from wheretolook.figures.overview import Overview, View, overview_figure
-from wheretolook.figures.scores import regret_figure, score_figure
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import fibonacci_sphere
-from wheretolook.localization.report import POSITIVE, label_summary
 from wheretolook.scorers.styles import method_style
+from wheretolook_paper.evaluation.label_report import label_summary
+from wheretolook_paper.figures.calibration import calibration_figure
+from wheretolook_paper.figures.dollhouse import dollhouse
+from wheretolook_paper.figures.labels import SHADES, label_figure
+from wheretolook_paper.figures.overview import Overview, View, overview_figure
+from wheretolook_paper.figures.scores import regret_figure, score_figure
 
 
 def test_label_figure_draws_shares_and_errors(tmp_path: Path) -> None:
     dataset = make_dataset(tmp_path, ("test", "train", "val"), n_locations=6, n_directions=10, n_landmarks=200)
     tables = {scene.name: scene.read_table() for scene in dataset.scenes}
-    summary = label_summary(tables, {scene.name: scene.split for scene in dataset.scenes})
+    summary = label_summary(pooled_labels(tables, {scene.name: scene.split for scene in dataset.scenes}))
     figure: Any = label_figure(summary)
     scenes, errors = figure.axes
     names = [label.get_text() for label in scenes.get_yticklabels()]

@@ -9,33 +9,11 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
-from wheretolook.dataset.config import ALL, THRESHOLDS, Split, threshold_key, threshold_label
-from wheretolook.dataset.viewpoint_table import (
-    FIRST,
-    LOCALIZED,
-    NO_POSE,
-    TOO_FEW_MATCHES,
-    by_first,
-    has_first,
-    is_good,
-    poses,
-)
-from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.dataset.config import THRESHOLDS, threshold_key, threshold_label
+from wheretolook.dataset.viewpoint_table import FIRST, LOCALIZED, NO_POSE, POSITIVE, TOO_FEW_MATCHES, label_shares
+from wheretolook.geometry.poses import Float
 from wheretolook.utils.texts import markdown_table
-
-LABELS_CSV = "labels.csv"
-LABELS_MD = "labels.md"
-LABELS_PNG = "labels.png"
-"""Files of the report, in `<dataset>/results/` and as artifacts of its run."""
-
-STATUSES = (LOCALIZED, TOO_FEW_MATCHES, NO_POSE)
-POSITIVE = tuple(f"positive_{threshold_key(threshold)}" for threshold in THRESHOLDS)
-"""Columns of the shares of positives, from the finest threshold (the label) to the coarsest.
-
-Positives at one threshold are positives at all coarser ones.
-"""
 
 BINS_PER_DECADE = 5
 ERROR_EDGES_M = np.logspace(-4, 2, 6 * BINS_PER_DECADE + 1)
@@ -58,16 +36,7 @@ class LabelSummary:
     """Statistics of the labels of a dataset. Every share is in [0, 1].
 
     Attributes:
-        shares: one row for each scene; then, with `ALL` for the scene's name, one for each split and, with `ALL` for
-            the split too, one for all scenes. Columns: `scene`, `split`, `n_views`, `n_locations`; the share of
-            viewpoints of each status (`STATUSES`) and without any pose (`without_pose`); of positives at each threshold
-            (`POSITIVE`); `locations_positive`, the share of locations with a positive at the finest;
-            `finest_of_coarsest`, the share of the coarsest's positives that are positive at the finest;
-            `same_label_share`, the share of viewpoints whose labels are all equal; `spearman`, the rank correlation of
-            the finest and the coarsest label; median errors of the poses found for the coarsest's positives
-            (`median_within_m`, `median_within_deg`) and for the others (`median_beyond_m`, `median_beyond_deg`). NaN
-            where there is nothing to count. If all tables have labels by the first RANSAC result, also the shares of
-            their positives, with the prefix `FIRST`.
+        shares: see `label_shares`.
         by_height: one row for each band of the camera's height above its scene's lowest location: `low`, `high` in
             metres, `n_views`, shares of positives. Bands within the range may be empty.
         by_visible: the same by the number of landmarks in view; `high` is exclusive, infinite in the last.
@@ -88,66 +57,17 @@ class LabelSummary:
         return {str(name): value for name, value in self.shares.iloc[-1].items()}
 
 
-def label_summary(tables: Mapping[str, pd.DataFrame], splits: Mapping[str, Split]) -> LabelSummary:
-    """Summarize the labels of scenes: viewpoints and split of each by its name; at least one, none empty.
-
-    Raises TableError if some viewpoint has no label yet.
-    """
-    both = all(map(has_first, tables.values()))
-    views = pd.concat([_views(name, table, splits[name], both) for name, table in tables.items()], ignore_index=True)
-    groups = [(name, splits[name], views[views["scene"] == name]) for name in tables]
-    groups += [(ALL, split, views[views["split"] == split]) for split in dict.fromkeys(splits[name] for name in tables)]
-    shares = [{"scene": scene, "split": split, **_shares(part)} for scene, split, part in [*groups, (ALL, ALL, views)]]
-
+def label_summary(views: pd.DataFrame) -> LabelSummary:
+    """Summarize the labels of scenes, `pooled_labels` with at least one row."""
     height = views["height_m"].to_numpy()
     width = next((w for w in HEIGHT_BANDS_M if height.max() < w * MAX_HEIGHT_BANDS), HEIGHT_BANDS_M[-1])
     return LabelSummary(
-        shares=pd.DataFrame(shares),
+        shares=label_shares(views),
         by_height=_by_band(views, height, width * np.arange(height.max() // width + 2)),
         by_visible=_by_band(views, views["n_visible"].to_numpy(), np.array(VISIBLE_EDGES)),
         errors_m=_histogram(views, "error_m", ERROR_EDGES_M),
         errors_deg=_histogram(views, "error_deg", ERROR_EDGES_DEG),
     )
-
-
-def _views(scene: str, table: pd.DataFrame, split: str, both: bool) -> pd.DataFrame:
-    """The columns that the summary needs, with heights and the label at each threshold."""
-    height = camera_centers(poses(table))[:, 2]
-    height = np.round(height - height.min(), 6)  # so that all views of a location fall into one band
-    labels = {name: is_good(table, *limits) for name, limits in zip(POSITIVE, THRESHOLDS, strict=True)}
-    if both:
-        first = by_first(table)
-        labels |= {f"{FIRST}{name}": is_good(first, *limits) for name, limits in zip(POSITIVE, THRESHOLDS, strict=True)}
-    columns = table[["location_id", "n_visible", "status", "error_m", "error_deg"]]
-    return columns.assign(scene=scene, split=split, height_m=height, **labels)
-
-
-def _shares(views: pd.DataFrame) -> dict[str, Any]:
-    finest, coarsest = (views[name].to_numpy() for name in (POSITIVE[0], POSITIVE[-1]))
-    by_location = views.groupby(["scene", "location_id"])[POSITIVE[0]].any()
-    positives = views[list(POSITIVE)].to_numpy()
-    medians: dict[str, float] = {}
-    for name, rows in (("within", coarsest), ("beyond", ~coarsest)):
-        medians |= {f"median_{name}_{unit}": views.loc[rows, f"error_{unit}"].median() for unit in ("m", "deg")}
-    return {
-        "n_views": len(views),
-        "n_locations": len(by_location),
-        **{status: (views["status"] == status).mean() for status in STATUSES},
-        "without_pose": views["error_m"].isna().mean(),
-        **{name: views[name].mean() for name in POSITIVE},
-        "locations_positive": by_location.mean(),
-        "finest_of_coarsest": (finest & coarsest).sum() / coarsest.sum() if coarsest.any() else np.nan,
-        "same_label_share": (positives == positives[:, :1]).all(axis=1).mean(),
-        "spearman": _correlation(finest, coarsest),
-        **medians,
-        **{str(name): views[name].mean() for name in views if str(name).startswith(FIRST)},
-    }
-
-
-def _correlation(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
-    """Correlation of two labels (B,). Of binary values, Spearman's and Pearson's are the same."""
-    spread = a.std() * b.std()
-    return float(((a & b).mean() - a.mean() * b.mean()) / spread) if spread > 0 else np.nan
 
 
 def _by_band(views: pd.DataFrame, values: Float, edges: Float) -> pd.DataFrame:

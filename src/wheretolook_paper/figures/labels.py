@@ -12,8 +12,9 @@ from matplotlib.style import context
 from matplotlib.ticker import MaxNLocator, NullLocator
 
 from wheretolook.dataset.config import ALL, THRESHOLDS, threshold_key, threshold_label
+from wheretolook.dataset.viewpoint_table import POSITIVE
 from wheretolook.figures.style import INK, RC, Style, new_figure, scene_label
-from wheretolook.localization.report import POSITIVE, LabelSummary, threshold_sentence
+from wheretolook_paper.evaluation.label_report import LabelSummary, threshold_sentence
 
 SHADES = ("#08306b", "#86bcdc")
 """Colours of the finest and the coarsest threshold, distinct in greyscale."""

@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.camera import Camera, PinholeCamera
+from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import Float, invert_poses, poses_looking_along, rotation_looking_along, transform
+from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along, transform
 from wheretolook.rendering.registry import make_renderer
 from wheretolook.scenes.cutting import cut_above
 from wheretolook.utils.errors import SceneError
@@ -116,20 +116,3 @@ def draw_segments(axes: Axes, house: Dollhouse, segments: ArrayLike, **style: An
     lines = LineCollection(list(pixels), **{"capstyle": "round", **style})
     axes.add_collection(lines, autolim=False)
     return lines
-
-
-def frustum_corners(camera: Camera, cam_from_world: ArrayLike, depth_m: float) -> Float:
-    """Compute the frustum corners (B, 5, 3) m of poses (B, 3, 4): centre, then image corners at a depth, from top left."""
-    pixels = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (camera.width, camera.height)
-    rays = camera.unproject(pixels)
-    if isinstance(camera, PinholeCamera):  # corners of a fisheye can be behind it: they are at a distance
-        rays = rays / rays[:, 2:]
-    corners = np.concatenate([np.zeros((1, 3)), depth_m * rays])
-    world_from_cam = invert_poses(np.asarray(cam_from_world, dtype=np.float64).reshape(-1, 3, 4))
-    return corners @ np.swapaxes(world_from_cam[..., :3], -1, -2) + world_from_cam[:, None, :, 3]
-
-
-def frustum_segments(camera: Camera, cam_from_world: ArrayLike, depth_m: float) -> Float:
-    """Compute the eight edges (B, 8, 2, 3) m of camera frusta to a depth."""
-    edges = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
-    return frustum_corners(camera, cam_from_world, depth_m)[:, edges]

@@ -46,7 +46,6 @@ class EnvironmentConfig:
     free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)  # with a mesh or depth images
     mapped_space: MappedSpaceConfig = field(default_factory=MappedSpaceConfig)  # with photographs alone
     occlusion_cache_bytes: int = 0  # memory for lines of sight that are asked for again
-    renderer: str = "warp"  # name in `wheretolook.rendering.registry.RENDERERS`
 
 
 class Environment(ABC):
@@ -133,9 +132,9 @@ class Environment(ABC):
     @cached_property
     def renderer(self) -> Renderer:
         """Renders the mesh."""
-        from wheretolook.rendering.registry import make_renderer
+        from wheretolook.rendering.warp_renderer import WarpRenderer
 
-        return make_renderer(self.mesh, self.device, self.config.renderer)
+        return WarpRenderer(self.mesh, self.device)
 
     @property
     def raycaster(self) -> MeshRaycaster:

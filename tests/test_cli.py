@@ -49,9 +49,9 @@ def test_arguments_override_the_file() -> None:
 @pytest.mark.parametrize(
     ("command", "arguments", "name", "value"),
     [
-        ("scenes", ["--up", "-y", "--rgbd", "a"], "scenes.rgbd.up", "-y"),
         ("scenes", ["--scenes.meshes", "[{path: a/b.glb, up: y}]"], "scenes.meshes", (MeshSource(Path("a/b.glb"), up="y"),)),
         ("map", ["--mapping.camera.fov_deg", "60"], "mapping.camera.fov_deg", 60.0),
+        ("map", ["--up", "-y", "--model", "a"], "mapping.frame.up", "-y"),
         ("plan", ["--start", "[-4, -3, 1.4]"], "plan.start", (-4.0, -3.0, 1.4)),
         ("plan", ["--start", "-4,-3,1.4"], "plan.start", (-4.0, -3.0, 1.4)),
         ("plan", ["--goal", "0", "-3", "1.4"], "plan.goal", (0.0, -3.0, 1.4)),

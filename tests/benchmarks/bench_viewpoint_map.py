@@ -1,4 +1,4 @@
-"""Measure viewpoint maps: single and batch queries, building, updating, and the choice of views along a path.
+"""Measure viewpoint maps: single and batch queries, building, and the choice of views along a path.
 
     python tests/benchmarks/bench_viewpoint_map.py [--device cuda] [--weights data/release/weights/set.safetensors]
 
@@ -20,14 +20,12 @@ from common import points_on_surface, room_map, timed
 
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.planning.routes import TurnLimit, best_sequence
-from wheretolook.planning.scene_map import build_viewpoint_map, update_viewpoint_map
+from wheretolook.planning.scene_map import build_viewpoint_map
 from wheretolook.planning.stops import refine_directions
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.config import ApartmentConfig
-from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.space.free_space import FreeSpace
@@ -35,11 +33,6 @@ from wheretolook.utils.processes import cores
 from wheretolook.visibility.occlusion import MeshOcclusion
 from wheretolook_paper.paths.greedy import greedy_sequence
 from wheretolook_rooms.generator import generate_apartment
-
-
-def rows_of(landmarks: Landmarks, rows: slice) -> Landmarks:
-    """Return a slice of the landmarks."""
-    return Landmarks(**{name: None if value is None else value[rows] for name, value in vars(landmarks).items()})
 
 
 def queries(viewpoint_map: ViewpointMap, n: int, repeats: int) -> None:
@@ -100,28 +93,18 @@ def main() -> None:
     free_space = FreeSpace(mesh, device=args.device)
     free = np.flatnonzero(free_space.is_free(grid.centers()))[: args.voxels]
     points = points_on_surface(mesh, args.landmarks, np.random.default_rng(0))
-    points = points[np.argsort(-np.linalg.norm(points - points[0], axis=1))]  # the last ten are neighbours
     room = room_map(args.landmarks, grid.centers()[:1], args.device)  # its random attributes are used
     landmarks = replace(room.landmarks, points=points)
     occlusion = MeshOcclusion(MeshRaycaster(mesh, args.device), two_sided=free_space.two_sided)
     directions = fibonacci_sphere(args.directions)
 
-    def scorer_on(some: Landmarks) -> Scorer:
-        one = LocalizationMap(some, room.camera, occlusion, args.device)
-        return load_scorer(args.weights, one) if args.weights else make_scorer("bins", one)
-
-    scorer = scorer_on(landmarks)
+    mapped = LocalizationMap(landmarks, room.camera, occlusion, args.device)
+    scorer = load_scorer(args.weights, mapped) if args.weights else make_scorer("bins", mapped)
     print(f"{len(free)} voxels x {len(directions)} directions, {len(landmarks):,} landmarks, "
           f"{len(mesh.triangles):,} triangles, {scorer.name}, on {args.device}, "
           f"{cores()} cores")  # fmt: skip
     timed("build", lambda: build_viewpoint_map(scorer, grid, free, directions), args.builds)
-    before = build_viewpoint_map(scorer_on(rows_of(landmarks, slice(0, -10))), grid, free, directions)
-    viewpoint_map, changed = update_viewpoint_map(before, scorer)
-    timed(
-        f"update, 10 landmarks added that {len(changed)} voxels see",
-        lambda: update_viewpoint_map(before, scorer),
-        args.builds,
-    )
+    viewpoint_map = build_viewpoint_map(scorer, grid, free, directions)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map"
         timed("save", lambda: viewpoint_map.save(path), args.repeats, 1e3, "ms")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from depth_room import depth_images, room
-from wheretolook.geometry.camera import ColmapCamera
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.tsdf import DepthImage, TsdfConfig, TsdfVolume, estimate_blocks
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import ConfigError, SceneError
@@ -71,3 +71,9 @@ def test_scenes_without_a_surface(images: list[DepthImage]) -> None:
             TsdfVolume.from_images(seen, TsdfConfig(max_depth_m=0.1), progress=False)
     with pytest.raises(SceneError):
         TsdfVolume().surface()
+    one_reading = np.zeros((48, 64))
+    one_reading[0, 0] = 1.0
+    volume = TsdfVolume()
+    volume.integrate(DepthImage(one_reading, PinholeCamera(64, 48, 40.0), np.eye(4)[:3]))
+    with pytest.raises(SceneError):
+        volume.surface()

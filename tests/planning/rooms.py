@@ -46,23 +46,14 @@ def patiently(plan: Callable[[float], T], seconds: float = 0.6) -> T:
     return plan(40 * seconds)
 
 
-def room_landmarks(n: int, seed: int = 0, first_id: int = 0) -> Landmarks:
+def room_landmarks(n: int, seed: int = 0) -> Landmarks:
     """Return landmarks on the room's walls with random attributes; the cabinet occludes some."""
     rng = np.random.default_rng(seed)
     landmarks = make_landmarks(rng, n)
     points = rng.uniform(0, ROOM, (n, 3))
     wall = rng.integers(0, 2, n)
     points[np.arange(n), wall] = np.array(ROOM)[wall] * rng.integers(0, 2, n)
-    return replace(landmarks, ids=first_id + landmarks.ids, points=points)
-
-
-def joined(a: Landmarks, b: Landmarks) -> Landmarks:
-    """Return the landmarks of both, by id."""
-    values = {
-        name: None if value is None else np.concatenate([value, getattr(b, name)]) for name, value in vars(a).items()
-    }
-    order = np.argsort(values["ids"])
-    return Landmarks(**{name: None if value is None else value[order] for name, value in values.items()})
+    return replace(landmarks, points=points)
 
 
 @cache

@@ -13,7 +13,6 @@ from box_scenes import furnished_room, quads_mesh, random_texture, random_triang
 from twins.open3d_renderer import Open3DRenderer
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along, transform
-from wheretolook.rendering.registry import make_renderer
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.utils.errors import ConfigError, SceneError
 
@@ -157,7 +156,5 @@ def test_invalid_input() -> None:
         WarpRenderer(replace(furnished_room(), triangles=np.zeros((0, 3), np.int32)))
     with pytest.raises(ConfigError):
         WarpRenderer(furnished_room(), "cuda:99")
-    with pytest.raises(ConfigError):
-        make_renderer(furnished_room(), name="unknown")
     with pytest.raises(ValueError):
-        make_renderer(furnished_room()).render(PinholeCamera(8, 6, 4.0), np.full((1, 3, 4), np.nan))
+        WarpRenderer(furnished_room()).render(PinholeCamera(8, 6, 4.0), np.full((1, 3, 4), np.nan))

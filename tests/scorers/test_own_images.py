@@ -156,7 +156,6 @@ def test_all_scorers_of_a_map_use_it(tmp_path: Path) -> None:
     assert views is not None
     scorer = load_scorer(WEIGHTS / "set.safetensors", localization_map)
     plain = load_scorer(WEIGHTS / "set.safetensors", replace(localization_map, images=None))
-    assert not scorer.local  # an image that is added changes the offset of all views
     before, after = (one.report(views).expected_inliers for one in (plain, scorer))
     assert (after[before > 1] > 1.1 * before[before > 1]).all()
     load_scorer(WEIGHTS / "set.safetensors", localization_map.of_camera(NARROW))

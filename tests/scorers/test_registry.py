@@ -52,7 +52,6 @@ class LinearConfig:
 
 class Line(CountingScorer):
     name = "linear"
-    local = True
     slope = 1.0
     middle = 0.0
 
@@ -90,7 +89,6 @@ def build(localization_map, options):
 
 class Fewest(CountingScorer):
     name = "fewest"
-    local = True
 
     def score_counts(self, n_visible, n_filled):
         return 1 / (1.0 + n_visible)

@@ -16,7 +16,7 @@ from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import rotation_angle_deg, rotation_looking_along
 from wheretolook.io.poses import images_text, tum_text
-from wheretolook.scans.depth_images import read_depth_images
+from wheretolook.mapping.depth_images import read_depth_images
 from wheretolook.scenes.loading import save_glb
 from wheretolook.scorers.base import Scorer
 from wheretolook.select.waypoints import SelectionRequest, read_waypoints

@@ -54,12 +54,7 @@ class Demo(Experiment):
     """
 
     CONFIG: ClassVar = "demo"
-    SHORT: ClassVar = {
-        "engine": "label.engine",
-        "images": "mapping.photographs.images",
-        "rgbd": "scenes.rgbd.folder",
-        "up": "scenes.rgbd.up",
-    }
+    SHORT: ClassVar = {"engine": "label.engine", "images": "mapping.photographs.images"}
 
     train: TrainConfig = field(default_factory=TrainConfig)
     evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)

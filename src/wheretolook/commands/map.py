@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 import zlib
 from collections import Counter
 from collections.abc import Callable
@@ -34,13 +33,12 @@ from wheretolook.commands.preconditions import (
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, describe_camera, draw_camera
-from wheretolook.geometry.poses import Float
 from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, place_name
 from wheretolook.mapping.georeference import read_scale
 from wheretolook.mapping.map_frame import read_frame
 from wheretolook.mapping.mapped_images import source_of_map
 from wheretolook.utils.artifact_cache import cache_key
-from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError
+from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.utils.files import check_folder_name, fingerprint, path_within, size_and_time
 from wheretolook.utils.validation import reject
 
@@ -77,9 +75,9 @@ class Map(SceneOptions, LabelOptions):
     def run(self, log: Log = print, progress: Progress = ignore_progress) -> Dataset:
         """Write a COLMAP model of every scene with attributes of its landmarks, `<scene>/map/`.
 
-        Images are rendered along a walk, or for a scan at the poses of its frames. `mapping.photographs.images` makes one
-        scene of photographs, without a mesh; `mapping.existing.model` one of that model, with or without a mesh. Raises
-        SceneError or MapError if a mesh or a model cannot be read, or no landmark could be triangulated.
+        Images are rendered along a walk. `mapping.photographs.images` makes one scene of photographs, without a mesh;
+        `mapping.existing.model` one of that model, with or without a mesh. Raises SceneError or MapError if a mesh or a
+        model cannot be read, or no landmark could be triangulated.
         """
         if self.mapping.existing.model is None and self.mapping.photographs.images is None:
             dataset = load_dataset(self, "scenes")
@@ -112,8 +110,6 @@ def _map_mesh(options: Map, files: SceneFolder, log: Log) -> None:
         "draw_camera",
     )  # the mapping camera is a part of the key itself
     settings = {name: value for name, value in config.record().items() if name not in unused}
-    if files.is_scanned and config.vary:
-        warnings.warn(f"{files.name}: mapping.vary has no effect on the frames of a scan", MapWarning, stacklevel=2)
     scene = open_scene(options, files)
     seed = _seed(files)
     made_from = existing(files.mesh, SceneError, "scenes")
@@ -127,26 +123,15 @@ def _map_mesh(options: Map, files: SceneFolder, log: Log) -> None:
         return
     from wheretolook.mapping.rendered_map import PartOfFloor, build_map
 
-    poses = _poses_of_recording(files, config.n_images)
     with naming_file(files.mesh):
         space = PartOfFloor(scene.mesh_space, floor) if floor else scene.mesh_space
         shown = (scene.mesh, scene.renderer, space, camera)
         how = (scene.raycaster, options.n_workers, scene.device)
-        report = build_map(*shown, config, seed, files.map, *how, before_replace=cache.clear, poses=poses)
+        report = build_map(*shown, config, seed, files.map, *how, before_replace=cache.clear)
     cache.store()
     landmarks = f"{report.n_landmarks:,} landmarks from {report.n_registered} images"
     distance = f"median {report.median_distance_to_mesh_cm:.2f} cm from the mesh"
     log(f"{scene.name}: {landmarks}, {distance} -> {files.map}")
-
-
-def _poses_of_recording(scene: SceneFolder, limit: int) -> Float | None:
-    """Return at most `limit` poses (M, 3, 4), evenly spaced, of a scan's frames; the mesh is complete only there."""
-    if not scene.is_scanned:
-        return None
-    from wheretolook.mapping.colmap_model import colmap_poses
-
-    poses = colmap_poses(scene.frames)
-    return poses[np.unique(np.linspace(0, len(poses) - 1, min(len(poses), limit)).round().astype(int))]
 
 
 def _mapping_camera(config: MapConfig, looking: Camera, seed: int) -> PinholeCamera:

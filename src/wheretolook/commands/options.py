@@ -14,7 +14,6 @@ from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import Camera, CameraConfig
 from wheretolook.localization.config import LabelConfig
 from wheretolook.mapping.config import MapConfig
-from wheretolook.scans.config import RgbdConfig
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.tracking.store import TrackingConfig
@@ -67,10 +66,8 @@ class ScenesConfig:
             `vary` draw their sizes and difficulty from the seed.
         apartment: options of apartments, and the texture and light of all generated scenes.
         meshes: scenes from existing meshes, in addition to generated ones, such as [{path: scans/office.glb}].
-        rgbd: an RGB-D recording to make one scene of. With its folder no other scene is made; existing scenes of the
-            dataset remain.
         free_space: positions that a camera may take.
-        mapped_space: the same in a scene of photographs, which has no mesh, or in a scan, which is incomplete.
+        mapped_space: the same in a scene of photographs, which has no mesh.
     """
 
     train: int = 3
@@ -80,7 +77,6 @@ class ScenesConfig:
     kinds: tuple[SceneKind, ...] = ("apartment",)
     apartment: ApartmentConfig = field(default_factory=ApartmentConfig)
     meshes: tuple[MeshSource, ...] = ()
-    rgbd: RgbdConfig = field(default_factory=RgbdConfig)
     free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
     mapped_space: MappedSpaceConfig = field(default_factory=MappedSpaceConfig)
 
@@ -206,7 +202,7 @@ class SpaceOptions:
 
     Args:
         free_space: in a scene with a mesh.
-        mapped_space: in a scene of photographs, which has no mesh, or in a scan, which is in parts.
+        mapped_space: in a scene of photographs, which has no mesh.
     """
 
     free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)

@@ -39,8 +39,8 @@ class Sample(SceneOrMapOptions):
         """Write viewpoints and the landmarks that their locations see, `<scene>/viewpoints.parquet`, `occlusion.npz`.
 
         A camera looks in every direction from the centre of every free voxel, and visible landmarks are counted
-        exactly. In a scene of photographs or a scan, the camera stays near where these were taken; without a mesh,
-        hidden-point removal decides what is occluded. Raises SceneError if no location is free, MapError if there is no
+        exactly. In a scene of photographs, the camera stays near where these were taken; without a mesh, hidden-point
+        removal decides what is occluded. Raises SceneError if no location is free, MapError if there is no
         map, or one without a scale.
         """
         dataset = load_dataset(self, "map")
@@ -63,8 +63,6 @@ def _key(scene: SceneEnvironment, config: SampleConfig) -> str:
     if scene.is_photographed:
         space = asdict(scene.config.mapped_space)
         stage = "map"
-    elif files.is_scanned:
-        space = asdict(scene.config.mapped_space)
     chosen = {name: value for name, value in asdict(config).items() if name != "memory_gb"}
     for name in ("cameras", "near_map"):
         if not chosen[name]:  # keys of datasets that were sampled before this option existed

@@ -1,18 +1,16 @@
-"""`wheretolook scenes`: textured meshes, generated, loaded, or fused from a recording."""
+"""`wheretolook scenes`: textured meshes, generated or loaded."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import entry_points
 from tempfile import TemporaryFile
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 from wheretolook.commands.options import DatasetOptions, Log, MeshSource, Progress, ScenesConfig, ignore_progress
 from wheretolook.commands.preconditions import mesh_fingerprint, refuse_release
-from wheretolook.commands.rgbd_scene import fuse_recording
 from wheretolook.dataset.config import Split
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, MappedFloor, SceneFolder
@@ -31,17 +29,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Scenes(DatasetOptions):
-    """Make or load the textured meshes, or fuse one from colour and depth images: --rgbd.
+    """Make or load the textured meshes.
 
     Examples:
       wheretolook scenes --config configs/demo.yaml --scenes.train 5
-      wheretolook scenes --name kitchen --rgbd FOLDER
+      wheretolook scenes --config configs/own-meshes.yaml --scenes.meshes '[{path: scan.glb}]'
 
     Args:
         scenes: which scenes.
     """
-
-    SHORT: ClassVar = {"rgbd": "scenes.rgbd.folder", "up": "scenes.rgbd.up"}
 
     scenes: ScenesConfig = field(default_factory=ScenesConfig)
 
@@ -49,13 +45,10 @@ class Scenes(DatasetOptions):
     def run(self, log: Log = print, progress: Progress = ignore_progress) -> Dataset:
         """Write `<scene>/mesh.glb` for every scene, and the dataset's description. Finished meshes are reused.
 
-        With `scenes.rgbd.folder`, one scene is fused from the RGB-D recording and joins the dataset's others. Raises
-        SceneError if a mesh or the recording cannot be used or two scenes have the same name, ConfigError if the
-        dataset's folder holds a release, StorageError, before any work, if it cannot be written.
+        Raises SceneError if a mesh cannot be used or two scenes have the same name, ConfigError if the dataset's folder
+        holds a release, StorageError, before any work, if it cannot be written.
         """
         refuse_release(self.root)
-        if self.scenes.rgbd.folder is not None:
-            return fuse_recording(self, self.scenes.rgbd, log, progress)
         sources: dict[SceneFolder, tuple[MakeMesh, str]] = {}
         for scene, make, cache_inputs in [*self._generated(), *self._loaded()]:
             if scene.name in {other.name for other in sources}:
@@ -70,7 +63,7 @@ class Scenes(DatasetOptions):
             else:
                 save_scene(scene, make, key, log)
             progress(1)
-        dataset = self._with_scans(tuple(sources))
+        dataset = self._dataset(tuple(sources))
         dataset.save()
         return dataset
 
@@ -108,31 +101,28 @@ class Scenes(DatasetOptions):
             scene = SceneFolder(self.root / mesh.scene_name, mesh.split, self.camera.camera)
             yield scene, partial(_load, mesh), [mesh_fingerprint(mesh.path), mesh.up]
 
-    def _with_scans(self, made: tuple[SceneFolder, ...]) -> Dataset:
-        """Return the dataset of the scenes made and of the scans that it had; clear the sample cache of scenes whose camera changed.
+    def _dataset(self, scenes: tuple[SceneFolder, ...]) -> Dataset:
+        """Return the dataset of the scenes; clear the sample cache of those whose camera changed.
 
         A description that cannot be read, such as one of another version, is replaced.
         """
         try:
-            before = {scene.name: scene for scene in Dataset.load(self.root).scenes}
+            cameras = {scene.name: scene.camera for scene in Dataset.load(self.root).scenes}
         except TableError:
-            before = {}
-        names = {scene.name for scene in made}
-        scans = [scene for scene in before.values() if scene.is_scanned and scene.name not in names]
-        for scene in (*made, *scans):
-            if scene.name not in before or before[scene.name].camera != self.camera.camera:
+            cameras = {}
+        for scene in scenes:
+            if cameras.get(scene.name) != scene.camera:
                 scene.stage_cache("sample").clear()
-        return Dataset(self.root, (*made, *scans))
+        return Dataset(self.root, scenes)
 
 
 def save_scene(scene: SceneFolder, make: MakeMesh, key: str, log: Log) -> None:
-    """Make a scene's mesh and write it; results of an earlier mesh or recording are cleared first."""
+    """Make a scene's mesh and write it; results of an earlier mesh are cleared first."""
     from wheretolook.scenes.loading import save_glb
 
     mesh, mapped = make()
     scene.folder.mkdir(parents=True, exist_ok=True)
     scene.stage_cache("scenes").clear()
-    shutil.rmtree(scene.frames, ignore_errors=True)
     save_glb(mesh, scene.mesh)
     scene.save_mapped_floor(mapped)
     scene.stage_cache("scenes", key).store()

@@ -46,7 +46,6 @@ class EnvironmentConfig:
     free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)  # with a mesh or depth images
     mapped_space: MappedSpaceConfig = field(default_factory=MappedSpaceConfig)  # with photographs alone
     occlusion_cache_bytes: int = 0  # memory for lines of sight that are asked for again
-    renderer: str = "warp"  # name in `wheretolook.rendering.registry.RENDERERS`
 
 
 class Environment(ABC):
@@ -133,9 +132,9 @@ class Environment(ABC):
     @cached_property
     def renderer(self) -> Renderer:
         """Renders the mesh."""
-        from wheretolook.rendering.registry import make_renderer
+        from wheretolook.rendering.warp_renderer import WarpRenderer
 
-        return make_renderer(self.mesh, self.device, self.config.renderer)
+        return WarpRenderer(self.mesh, self.device)
 
     @property
     def raycaster(self) -> MeshRaycaster:
@@ -321,21 +320,10 @@ class SceneEnvironment(Environment):
         _ = self.frame  # an error if the map's unit is unknown
         return super().mapped_space
 
-    @cached_property
-    def scanned_space(self) -> MappedSpace:
-        """Where a camera can be according to a scan: near where the recording's was, clear of what it saw."""
-        from wheretolook.mapping.colmap_model import colmap_poses
-        from wheretolook.space.mapped_space import MappedSpace
-
-        centers = camera_centers(colmap_poses(self.files.frames))
-        return MappedSpace(self.mesh.vertices + self.mesh.origin, centers, self.config.mapped_space)
-
     @property
     def sampled_space(self) -> FreeSpace | MappedSpace:
         """Where viewpoints are sampled: the same for all occlusion models."""
-        if self.is_photographed:
-            return self.mapped_space
-        return self.scanned_space if self.files.is_scanned else self.mesh_space
+        return self.mapped_space if self.is_photographed else self.mesh_space
 
     @property
     def space(self) -> FreeSpace | MappedSpace:
@@ -357,7 +345,7 @@ class ColmapFiles:
 
     model: Path
     mesh: Path | None = None
-    depth: Path | None = None  # folder of depth images, see `wheretolook.scans.depth_images.read_depth_images`
+    depth: Path | None = None  # folder of depth images, see `wheretolook.mapping.depth_images.read_depth_images`
     depth_scale: float = 1000.0  # units of integer depth images in a metre
     database: Path | None = None  # COLMAP database or hloc features, for the landmarks' ambiguity
     max_reprojection_error_px: float | None = None  # landmarks with a larger mean error are dropped
@@ -401,7 +389,7 @@ class ColmapEnvironment(Environment):
         files = self.files
         depth_scale = None
         if files.depth is not None:
-            from wheretolook.scans.depth_images import metres_per_unit
+            from wheretolook.mapping.depth_images import metres_per_unit
 
             depth_scale = metres_per_unit(files.model, files.depth, files.depth_scale)
         limit_px = files.max_reprojection_error_px
@@ -459,7 +447,7 @@ class ColmapEnvironment(Environment):
     @cached_property
     def depth_images(self) -> DepthImages:  # type: ignore[override]
         """Depth images of the model's images."""
-        from wheretolook.scans.depth_images import read_depth_images
+        from wheretolook.mapping.depth_images import read_depth_images
 
         assert self.files.depth is not None
         images = read_depth_images(self.files.model, self.files.depth, self.files.depth_scale)

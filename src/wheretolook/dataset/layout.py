@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from wheretolook.dataset.config import Split
 from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of_record, read_cameras
 from wheretolook.geometry.poses import Float
-from wheretolook.mapping.colmap_model import CAMERAS_FILE, holds_model, load_mapping_poses
+from wheretolook.mapping.colmap_model import CAMERAS_FILE, load_mapping_poses
 from wheretolook.mapping.georeference import read_scale
 from wheretolook.utils.artifact_cache import ArtifactCache
 from wheretolook.utils.errors import ConfigError, TableError
@@ -100,16 +100,6 @@ class SceneFolder:
     def occlusion(self) -> Path:
         """Unoccluded landmarks of each sampled location."""
         return self.folder / "occlusion.npz"
-
-    @property
-    def frames(self) -> Path:
-        """COLMAP model of the frames of the recording that the mesh was fused from; only if it was."""
-        return self.folder / "frames"
-
-    @property
-    def is_scanned(self) -> bool:
-        """Whether the mesh was fused from a recording, and so shows what its camera saw, not a whole room."""
-        return self.mesh.is_file() and holds_model(self.frames)
 
     @property
     def is_photographed(self) -> bool:

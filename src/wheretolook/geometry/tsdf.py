@@ -23,7 +23,6 @@ from wheretolook.utils.validation import check_positive, check_range
 
 BLOCK_VOXELS = 8  # voxels along the side of a block
 BYTES_PER_BLOCK = 24 * 1024  # peak memory for each block, from fusion to ray casting: 19 to 23 KiB on three scenes
-_COLOR_BYTES_PER_BLOCK = 12 * 1024  # and with colours so much more
 MAX_BLOCKS = 1 << 20  # more are refused: Open3D's extraction of triangles numbers four entries of each voxel by 32 bits
 
 _TOUCH_STRIDE = 4  # Open3D looks for blocks at every fourth pixel
@@ -72,13 +71,12 @@ class DepthImage:
     depth_m: NDArray[Any]  # (H, W) floats, metres along the optical axis; 0, negative, NaN and infinite mean no reading
     camera: Camera  # intrinsics: a pinhole, or a COLMAP camera of the model SIMPLE_PINHOLE or PINHOLE
     cam_from_world: Float  # (3, 4)
-    rgb: NDArray[np.uint8] | None = None  # (H, W, 3), for a volume with colours
 
     def __post_init__(self) -> None:
         _ = self.camera.matrix  # raises if the camera has distortion
         size = (self.camera.height, self.camera.width)
-        if np.shape(self.depth_m) != size or (self.rgb is not None and np.shape(self.rgb) != (*size, 3)):
-            problem = f"a depth image and its colours must have the size of its camera, {size} (height, width)"
+        if np.shape(self.depth_m) != size:
+            problem = f"a depth image must have the size of its camera, {size} (height, width)"
             raise ConfigError(problem, value=np.shape(self.depth_m))
         dtype = np.asarray(self.depth_m).dtype
         if not np.issubdtype(dtype, np.floating):
@@ -119,39 +117,30 @@ class TsdfVolume:
     Use `from_images` where all images are at hand: it also checks the memory beforehand.
 
     It starts with room for `expected_blocks`; when they are used up, all are copied to more. Open3D works in single
-    precision, about `origin` (3,) m. If it is `colored`, it averages the colours of images, too.
+    precision, about `origin` (3,) m.
     """
 
     def __init__(
-        self,
-        config: TsdfConfig = TsdfConfig(),
-        expected_blocks: int = 1 << 13,
-        origin: ArrayLike = (0.0, 0.0, 0.0),
-        colored: bool = False,
+        self, config: TsdfConfig = TsdfConfig(), expected_blocks: int = 1 << 13, origin: ArrayLike = (0.0, 0.0, 0.0)
     ) -> None:
         import open3d as o3d
 
         self.config = config
         self.origin = np.asarray(origin, dtype=np.float64)
-        self.colored = colored
-        self._max_blocks = _max_blocks(colored)
-        sizes = {"tsdf": 1, "weight": 1} | ({"color": 3} if colored else {})
-        shapes = [o3d.core.SizeVector([size]) for size in sizes.values()]
-        layout = tuple(sizes), (o3d.core.float32,) * len(sizes), shapes
+        self._max_blocks = _max_blocks()
+        layout = ("tsdf", "weight"), (o3d.core.float32,) * 2, [o3d.core.SizeVector([1])] * 2
         self._grid: Any = o3d.t.geometry.VoxelBlockGrid(*layout, config.voxel_size_m, BLOCK_VOXELS, expected_blocks)
 
     @classmethod
-    def from_images(
-        cls, images: DepthImages, config: TsdfConfig = TsdfConfig(), progress: bool = True, colored: bool = False
-    ) -> TsdfVolume:
+    def from_images(cls, images: DepthImages, config: TsdfConfig = TsdfConfig(), progress: bool = True) -> TsdfVolume:
         """Fuse depth images, in any order. A sequence that reads each from disk when asked for it keeps memory low.
 
         Raises a ConfigError if the voxels would not fit the memory (found before the fusion, from a sample of the
         images), a SceneError if there is no image, or none of the sampled ones has a reading.
         """
         n_blocks = estimate_blocks(images, config)
-        _check_memory(n_blocks, config, _max_blocks(colored))
-        volume = cls(config, n_blocks, _origin_of(images), colored)
+        _check_memory(n_blocks, config, _max_blocks())
+        volume = cls(config, n_blocks, _origin_of(images))
         for i in tqdm(range(len(images)), desc="fuse depth", unit="image", disable=not progress):
             volume.integrate(images[i])
         return volume
@@ -173,17 +162,13 @@ class TsdfVolume:
         tensor: Any = core.Tensor
         limits = 1.0, float(self.config.max_depth_m), float(self.config.truncation_voxels)
         view = (tensor(image.camera.matrix), tensor(pose))
-        shown = [Image(tensor(np.ascontiguousarray(depth)))]
-        blocks = self._grid.compute_unique_block_coordinates(*shown, *view, *limits)
-        if self.colored:
-            shown.append(Image(tensor(np.asarray(image.rgb, dtype=np.float32) / np.float32(255))))
-        self._grid.integrate(blocks, *shown, *view, *limits)
+        shown = Image(tensor(np.ascontiguousarray(depth)))
+        blocks = self._grid.compute_unique_block_coordinates(shown, *view, *limits)
+        self._grid.integrate(blocks, shown, *view, *limits)
         _check_memory(len(self), self.config, self._max_blocks)
 
-    def surface(self, min_readings: float = 0.5) -> TexturedMesh:
-        """The zero crossing as triangles, whose fronts face the cameras that saw them; with colours if it has them.
-
-        Only voxels with at least `min_readings` count.
+    def surface(self) -> TexturedMesh:
+        """The zero crossing as triangles, whose fronts face the cameras that saw them, of all voxels with a reading.
 
         Several threads extract the triangles, so their order may differ from run to run; the triangles do not. Raises
         SceneError if there is none.
@@ -197,8 +182,8 @@ class TsdfVolume:
         values = self._grid.attribute("tsdf").numpy()  # shares its memory
         values -= shift
         try:
-            mesh = self._grid.extract_triangle_mesh(min_readings, -1)
-        except RuntimeError:  # Open3D cannot colour a mesh without vertices
+            mesh = self._grid.extract_triangle_mesh(0.5, -1)
+        except RuntimeError:  # Open3D fails for a mesh without vertices
             raise nothing from None
         finally:
             values += shift
@@ -208,10 +193,7 @@ class TsdfVolume:
         uvs = np.broadcast_to(np.float32(0), (len(triangles), 3, 2))  # takes no memory
         texture = np.broadcast_to(np.int32(0), (len(triangles),))
         white = (np.full((1, 1, 3), 255, np.uint8),)
-        colors = None
-        if self.colored:
-            colors = np.clip(np.rint(255 * mesh.vertex.colors.numpy()), 0, 255).astype(np.uint8)
-        return TexturedMesh(mesh.vertex.positions.numpy(), triangles, uvs, texture, white, colors, self.origin)
+        return TexturedMesh(mesh.vertex.positions.numpy(), triangles, uvs, texture, white, origin=self.origin)
 
 
 def estimate_blocks(images: DepthImages, config: TsdfConfig) -> int:
@@ -237,9 +219,9 @@ def _origin_of(images: DepthImages) -> Float:
     return local_origin(camera_centers(images[0].cam_from_world))
 
 
-def _max_blocks(colored: bool) -> int:
+def _max_blocks() -> int:
     """Number of blocks that fit into 80 % of the available memory."""
-    return min(fitting(BYTES_PER_BLOCK + colored * _COLOR_BYTES_PER_BLOCK), MAX_BLOCKS)
+    return min(fitting(BYTES_PER_BLOCK), MAX_BLOCKS)
 
 
 def _check_memory(n_blocks: int, config: TsdfConfig, max_blocks: int) -> None:

@@ -164,7 +164,7 @@ class ShardWorker:
     def _open(self, job: SceneJob) -> tuple[Renderer, Renderer | None, Localizer]:
         from wheretolook.localization.localizer import Localizer
         from wheretolook.mapping.landmarks import Landmarks
-        from wheretolook.rendering.registry import make_renderer
+        from wheretolook.rendering.warp_renderer import WarpRenderer
         from wheretolook.scenes.loading import load_mesh
 
         if self._scene is None or self._scene[0] != job:
@@ -174,8 +174,8 @@ class ShardWorker:
             device = job.device
             if device == "cuda":
                 device = f"cuda:{self.number % max(1, torch.cuda.device_count())}"
-            renderer = make_renderer(load_mesh(job.mesh), device)
-            changed = make_renderer(load_mesh(job.changed_mesh), device) if job.changed_mesh else None
+            renderer = WarpRenderer(load_mesh(job.mesh), device)
+            changed = WarpRenderer(load_mesh(job.changed_mesh), device) if job.changed_mesh else None
             landmarks = Landmarks.load(job.landmarks)
             map_dir = job.landmarks.parent
             localizer = Localizer(landmarks, job.camera, job.localizer, job.extractor, device, map_dir)

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
+from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.mapping.config import (
     CELL_M,
     COVERAGE,
@@ -275,26 +275,21 @@ def build_map(  # a scene has four parts, and the output and its resources are t
     device: str = "cpu",
     progress: bool = True,
     before_replace: Callable[[], None] = lambda: None,
-    poses: NDArray[np.floating[Any]] | None = None,
 ) -> RenderedMapReport:
     """Map a scene in metres, z up: walk, render, extract, match, triangulate with known poses, filter.
 
-    With `poses` (M, 3, 4), images are rendered there instead of along a walk. The result is a binary COLMAP model of
-    the filtered points, with `landmarks.npz`, `cameras.npz` and `report.json`, which is also returned. It replaces an
-    earlier map when all is done, after `before_replace`; a failed build changes nothing. The same seed gives the same
-    bytes. Several workers need `if __name__ == "__main__":` in the caller's script. Raises MapError if the images give
-    no landmark or `out_dir` holds something else, SceneError without floor to walk on.
+    The result is a binary COLMAP model of the filtered points, with `landmarks.npz`, `cameras.npz` and `report.json`,
+    which is also returned. It replaces an earlier map when all is done, after `before_replace`; a failed build changes
+    nothing. The same seed gives the same bytes. Several workers need `if __name__ == "__main__":` in the caller's script.
+    Raises MapError if the images give no landmark or `out_dir` holds something else, SceneError without floor to walk
+    on.
     """
     config = config or MapConfig()
     with replacing_map(config, out_dir, seed, workers, device, progress, before_replace) as (folder, run):
         clock = run.clock
         with clock("walk"):
-            if poses is None:
-                walk = _walk(free_space, mesh, config, seed)
-                poses = poses_looking_along(walk.positions, walk.directions)
-            else:
-                centers = np.asarray(camera_centers(poses), dtype=np.float64)
-                walk = Walk(centers, np.asarray(poses[:, 2, :3]), centers, 1.0, 0.0)
+            walk = _walk(free_space, mesh, config, seed)
+            poses = poses_looking_along(walk.positions, walk.directions)
         with clock("render_and_extract"):
             depth: list[NDArray[np.float32]] = []
             drawn = Appearance.of_views(poses, config.appearance, seed) if config.appearance else []

@@ -26,17 +26,12 @@ from wheretolook.scorers.registry import FALLBACK, is_probability, make_scorer, 
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.validation import check_range
-from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
 from wheretolook.visibility.survey import SurveyOptions, survey
 
 Text = str | None  # text of progress bars; None shows none
 
 VIEWS_AT_ONCE = 16_384
 """Views scored at a time, in whole locations: enough to fill a GPU, few enough for the progress bar to move."""
-
-SIGHT_BYTES = 1 << 28  # memory for lines of sight tested at a time in an update, one byte each
-
-SCORE_TOLERANCE = 1e-4  # absolute and relative, of scores computed again: networks may sum in another order
 
 
 def build_viewpoint_map(
@@ -71,49 +66,6 @@ def build_viewpoint_map(
     by_row = _score_and_count(scorer, grid.centers()[rows], axes, progress)
     digests = landmark_digests(landmarks)
     return ViewpointMap(grid, row_of_voxel, axes, *by_row, landmarks.ids, digests, _origin(scorer, lattice, digests))
-
-
-def update_viewpoint_map(
-    old: ViewpointMap, scorer: Scorer, progress: Text = None
-) -> tuple[ViewpointMap, NDArray[np.int64]]:
-    """Update a viewpoint map after landmarks were added: the same as building it again, for networks up to rounding.
-
-    Landmarks are compared by id. Voxels from which a new landmark, or one whose attributes have changed, is unoccluded
-    are scored again. Nothing else can change if a score depends only on landmarks in view (`Scorer.local`) and
-    landmarks do not hide one another (`OcclusionModel.landmarks_hide`). Otherwise, and if landmarks were removed or
-    moved, all voxels are scored again. The method, camera, occlusion and the scene's geometry must be the same. Returns the
-    new map, and the ids of the voxels that were scored again.
-
-    Raises:
-        ConfigError: the map was derived from another; the method, camera or occlusion model differs; or scores or
-            counts changed in a voxel where they cannot, so that weights or geometry must have changed.
-        SceneError, MapError: as in `build_viewpoint_map`.
-    """
-    landmarks = scorer.localization_map.landmarks
-    occlusion = scorer.localization_map.occlusion
-    if derived := old.origin.derived:
-        fix = "Update the one it was derived from, and derive it again."
-        raise ConfigError("a viewpoint map derived from another cannot be updated", value=derived, fix=fix)
-    digests = landmark_digests(landmarks)
-    origin = _origin(scorer, old.origin.lattice, digests)
-    for name in ("scorer", "camera", "occlusion"):
-        before = getattr(old.origin, name)
-        if getattr(origin, name) != before:
-            fix = f"Use {before!r}, or build it again."
-            raise ConfigError(f"the viewpoint map was built with another {name}", value=getattr(origin, name), fix=fix)
-    changed = _changed_landmarks(old, landmarks, digests)
-    if changed is None or occlusion.landmarks_hide or not scorer.local:
-        stale = np.ones(len(old.scores), dtype=bool)
-    else:
-        stale = _any_unoccluded(occlusion, landmarks.points, changed, old.locations)
-        _check_unchanged(old, scorer, np.flatnonzero(~stale)[:1])
-    by_row = {name: getattr(old, name).copy() for name in ("ranked", "scores", "n_visible")}
-    if stale.any():
-        again = _score_and_count(scorer, old.locations[stale], old.directions, progress)
-        for array, values in zip(by_row.values(), again, strict=True):
-            array[stale] = values
-    new = replace(old, **by_row, landmark_ids=landmarks.ids, landmark_digests=digests, origin=origin)
-    return new, old.voxel_of_row[stale]
 
 
 def landmark_digests(landmarks: Landmarks) -> NDArray[np.uint64]:
@@ -163,48 +115,6 @@ def _unit(directions: ArrayLike) -> Float:
     rotation_looking_along(axes)  # raises if one has no length or is not finite
     length = np.linalg.norm(axes, axis=1, keepdims=True)
     return np.where(np.abs(length - 1) < 1e-12, axes, axes / length)  # unit vectors stay the same to the bit
-
-
-def _changed_landmarks(
-    old: ViewpointMap, landmarks: Landmarks, digests: NDArray[np.uint64]
-) -> NDArray[np.int64] | None:
-    """Return rows of landmarks that are new or have other attributes; None if some were removed or moved."""
-    place = np.searchsorted(landmarks.ids, old.landmark_ids)
-    place = np.minimum(place, max(0, len(landmarks) - 1))
-    kept = len(landmarks) > 0 and np.array_equal(landmarks.ids[place], old.landmark_ids)
-    if not kept or not np.array_equal(digests[place, 0], old.landmark_digests[:, 0]):
-        return None
-    same = np.zeros(len(landmarks), dtype=bool)
-    same[place] = digests[place, 1] == old.landmark_digests[:, 1]
-    return np.flatnonzero(~same)
-
-
-def _any_unoccluded(
-    occlusion: OcclusionModel, points: Float, rows: NDArray[np.int64], locations: Float
-) -> NDArray[np.bool_]:
-    """Whether at least one of the landmarks at some rows of points (N, 3) m is unoccluded from locations (L, 3) m."""
-    unoccluded = np.zeros(len(locations), dtype=bool)
-    columns: Any = slice(None)
-    if isinstance(occlusion, StoredOcclusion):  # it holds results for all landmarks of its map
-        columns = rows
-    else:
-        points = points[rows]
-    step = max(1, SIGHT_BYTES // max(1, len(points)))
-    for begin in range(0, len(locations), step):
-        block = slice(begin, begin + step)
-        unoccluded[block] = occlusion.unoccluded(locations[block], points)[:, columns].any(axis=1)
-    return unoccluded
-
-
-def _check_unchanged(old: ViewpointMap, scorer: Scorer, rows: NDArray[np.int64]) -> None:
-    """Raise a ConfigError if voxels that see no new landmark have other scores or counts."""
-    if len(rows) == 0:
-        return
-    _, scores, n_visible = _score_and_count(scorer, old.locations[rows], old.directions, None)
-    same_scores = np.allclose(scores, old.scores[rows], rtol=SCORE_TOLERANCE, atol=SCORE_TOLERANCE)
-    if not (same_scores and np.array_equal(n_visible, old.n_visible[rows])):
-        problem = "weights or geometry have changed: scores differ in a voxel that sees no new landmark"
-        raise ConfigError(problem, value=old.locations[rows[0]].tolist(), fix="Build the map again.")
 
 
 def _origin(scorer: Scorer, lattice: str, digests: NDArray[np.uint64]) -> MapOrigin:
@@ -287,7 +197,7 @@ def fill_partially_free_voxels(viewpoint_map: ViewpointMap, space: Space) -> Vie
     """Give voxels with free space but an occupied centre the views of the nearest voxel in reach.
 
     A voxel is in reach if a camera can go straight to its centre, so no views are taken through walls. In the result, a
-    derived map (`MapOrigin.derived`), voxels share rows, so it can be neither saved nor updated.
+    derived map (`MapOrigin.derived`), voxels share rows, so it cannot be saved.
     """
     rows = viewpoint_map.row_of_voxel.copy()
     centers = viewpoint_map.grid.centers()

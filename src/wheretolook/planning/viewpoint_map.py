@@ -94,9 +94,9 @@ IN C++, the best direction at a point (for little-endian machines):
   int32_t row = values<int32_t>(row_of_voxel_npy)[voxel];
   return row < 0 ? -1 : values<uint16_t>(ranked_npy)[row * int64_t(D)];
 
-TO UPDATE
+LANDMARKS
   landmark_ids and landmark_digests (of each landmark's position, and of its attributes: the first 8 bytes of BLAKE2b)
-  let `update_viewpoint_map` know which landmarks were added; a planner has no use for them.
+  identify the landmarks that the map was built from; a planner has no use for them.
 """
 
 
@@ -240,7 +240,7 @@ class MapOrigin:
         occlusion: name of the occlusion model.
         landmarks: 16 hexadecimal digits that change with any landmark.
         derived: changes of the map since it was built, such as scores replaced by ranks. A derived map answers
-            queries, but cannot be saved or updated.
+            queries, but cannot be saved.
     """
 
     scorer: str

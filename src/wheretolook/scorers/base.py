@@ -56,7 +56,6 @@ class Scorer(ABC):
     """
 
     name: str
-    local: bool = False
 
     def __init__(self, localization_map: LocalizationMap) -> None:
         self.localization_map = localization_map

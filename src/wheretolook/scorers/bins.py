@@ -17,7 +17,6 @@ class BinsScorer(CountingScorer):
     """
 
     name = "bins"
-    local = True
 
     def score_counts(self, n_visible: NDArray[np.int32], n_filled: NDArray[np.int32]) -> Float:
         """(B,) in [0, 1)."""

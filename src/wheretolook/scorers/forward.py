@@ -26,7 +26,6 @@ class ForwardScorer(Scorer):
     """
 
     name = "forward"
-    local = True
 
     def __init__(self, localization_map: LocalizationMap, heading: ArrayLike | None = None, seed: int = 0) -> None:
         super().__init__(localization_map)

@@ -21,7 +21,6 @@ class RandomScorer(Scorer):
     """Uniform random scores, a function of pose and seed."""
 
     name = "random"
-    local = True
 
     def __init__(self, localization_map: LocalizationMap, seed: int = 0) -> None:
         super().__init__(localization_map)

@@ -157,7 +157,6 @@ class HiddenPointRemoval(OcclusionModel):
 
     name = "hidden-points"
     uses_all_cores = True
-    landmarks_hide = True
 
     def __init__(self, radius: float = DEFAULT_RADIUS, margin_m: float = 0.05, threads: int = 0) -> None:
         check_range("radius", radius, 1)

@@ -100,7 +100,6 @@ class OcclusionModel(ABC):
 
     name: str = "custom"  # as in `OcclusionConfig`
     uses_all_cores: bool = False  # `unoccluded` occupies all cores of a CPU by itself
-    landmarks_hide: bool = False  # landmarks occlude one another: added ones change the mask of the others
 
     @abstractmethod
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
@@ -278,7 +277,6 @@ class CachedOcclusion(OcclusionModel):
         self.max_bytes = max_bytes
         self.name = model.name
         self.uses_all_cores = model.uses_all_cores
-        self.landmarks_hide = model.landmarks_hide
         self._known: dict[tuple[float, ...], NDArray[np.uint8]] = {}
 
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:

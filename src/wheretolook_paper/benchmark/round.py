@@ -271,9 +271,9 @@ class SceneRound:
 
     @cached_property
     def _renderer(self) -> Renderer:
-        from wheretolook.rendering.registry import make_renderer
+        from wheretolook.rendering.warp_renderer import WarpRenderer
 
-        return make_renderer(self._mesh, self.config.device)
+        return WarpRenderer(self._mesh, self.config.device)
 
     @cached_property
     def _model_key(self) -> str:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along, transform
-from wheretolook.rendering.registry import make_renderer
+from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.cutting import cut_above
 from wheretolook.utils.errors import SceneError
 
@@ -90,7 +90,7 @@ def dollhouse(
     height_px = max(2, int(np.ceil(width_px * extent[1] / extent[0])))
     camera = PinholeCamera(width_px, height_px, float(focal_px))
     pose = poses_looking_along(center + distance * to_eye, -to_eye)
-    rendering = make_renderer(mesh, device).render(camera, pose[None])
+    rendering = WarpRenderer(mesh, device).render(camera, pose[None])
     rendering.rgb[rendering.depth_m == 0] = 255
     return Dollhouse(rendering.rgb[0], rendering.depth_m[0], camera, pose)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.rendered_map import build_map
-from wheretolook.rendering.registry import make_renderer
+from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh, save_glb
 from wheretolook.space.free_space import FreeSpace
@@ -36,6 +36,6 @@ def make_example_model(folder: str | Path) -> ExampleModel:
     mesh = load_mesh(example.scan)
     space = FreeSpace(mesh)
     config = MapConfig(n_images=30)
-    scene = (mesh, make_renderer(mesh), space)
+    scene = (mesh, WarpRenderer(mesh), space)
     build_map(*scene, PinholeCamera(), config, SEED, example.model, space.raycaster, workers=1, progress=False)
     return example

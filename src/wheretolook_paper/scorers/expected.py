@@ -96,7 +96,6 @@ class ExpectedScorer(LandmarkScorer):
         super().__init__(localization_map, trained.network.attributes, trained.training_range, trained.camera)
         self.kind = kind
         self.name = f"fisher-{kind}-expected" if kind in METRICS else f"expected-{kind}"
-        self.local = kind != "inliers"  # that share falls with every landmark that is added
 
     def score(self, cam_from_world: Float) -> Float:
         """Return (B,) in [0, 1]; metrics of information are not bounded by 1."""

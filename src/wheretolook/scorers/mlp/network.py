@@ -80,8 +80,6 @@ class BinnedNetworkScorer(BinnedScorer):
     field of view raises a CameraError. Views are in range if the mean depth of their bins is; `score` warns once if not.
     """
 
-    local = True
-
     def __init__(self, localization_map: LocalizationMap, trained: TrainedNetwork[Any]) -> None:
         network: BinnedNetwork = trained.network
         self.channels = network.statistics.names

@@ -199,7 +199,6 @@ training, small triangulation angles occur at landmarks that are hard to match, 
 class SetScorer(LandmarkScorer):
     """Network over the set of visible landmarks: their probabilities of detection and their information on the pose."""
 
-    local = True
     max_landmarks = MAX_LANDMARKS
 
     def __init__(self, localization_map: LocalizationMap, trained: TrainedNetwork[SetNetwork]) -> None:
@@ -208,8 +207,6 @@ class SetScorer(LandmarkScorer):
         trained.network.to(localization_map.device)
         self.trained = for_map(trained, localization_map)
         self.network = self.trained.network
-        if self.trained is not trained:
-            self.local = False  # calibrated by images all over the map
         self.accuracy = trained.accuracy
         signs = [NARROW.get(name, 0.0) for name in self.network.attributes]
         self._signs = torch.tensor(signs, device=localization_map.device)

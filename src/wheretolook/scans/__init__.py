@@ -1,1 +1,0 @@
-"""RGB-D recordings: read, checked, fused to a coloured mesh."""

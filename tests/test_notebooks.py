@@ -117,5 +117,5 @@ def test_execution_keeps_figures_and_text_and_names_what_fails(
     (picture,) = pictures(notebook)
     assert picture.width == WIDEST_PX and picture.height == pytest.approx(WIDEST_PX / 3, rel=0.05)
     assert texts(notebook)[0] == "1 < 2" and numbers(texts(notebook)[1])[-1] == 0.2
-    assert main(["01_one"]) == 0
+    assert main(["01_one"]) == 0 and main(["1_one"]) == 2
     assert (tmp_path / "01_one.ipynb").read_bytes() == once  # nothing differs between executions

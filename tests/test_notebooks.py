@@ -94,7 +94,7 @@ def test_outputs_are_those_of_todays_results(script: Path, store: Path, monkeypa
     if script.stem not in MEASURED:
         assert texts(today) == texts(stored), f"stale: make notebooks NOTEBOOKS={script.stem}"
     for new, old in zip(map(numbers, texts(today)), map(numbers, texts(stored)), strict=True):
-        assert new == pytest.approx(old, rel=0.05, abs=0.05), f"stale: make notebooks NOTEBOOKS={script.stem}"
+        assert new == pytest.approx(old, rel=0.05, abs=0.01), f"stale: make notebooks NOTEBOOKS={script.stem}"
 
 
 def test_execution_keeps_figures_and_text_and_names_what_fails(

@@ -8,13 +8,14 @@ import shutil
 import site
 import tempfile
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parent
 WATCHED = ("configs", "data", "docs", "mlruns", "notebooks", "src", "tests")
-"""Folders whose files no test may add, remove or change."""
+"""Folders in which, as beside them, no test may add, remove or change a file."""
 
 OF_THE_USER = ("XDG_CACHE_HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_STATE_HOME", "WHERETOLOOK_RELEASE")
 
@@ -46,19 +47,22 @@ CHECKOUT = pytest.StashKey[dict[str, tuple[int, int]]]()
 
 
 def checkout_files() -> dict[str, tuple[int, int]]:
-    """Return time of change and size of each watched file, and (0, 0) for folders and whatever is beside them.
+    """Return time of change and size of each file of the checkout, and (0, 0) for folders; of others, only their names.
 
-    Hidden files and bytecode are left out.
+    Bytecode, hidden folders, and hidden files beside the folders are left out.
     """
-    found = {path.name: (0, 0) for path in ROOT.iterdir() if not path.name.startswith(".")}
+    beside = [path for path in ROOT.iterdir() if path.name != "__pycache__" and not path.name.startswith(".")]
+    found = {path.name: (0, 0) for path in beside}
+    paths = [path for path in beside if path.is_file()]
     for folder in WATCHED:
         for where, folders, files in os.walk(ROOT / folder):
             folders[:] = [name for name in folders if name != "__pycache__" and not name.startswith(".")]
             found |= {os.path.relpath(os.path.join(where, name), ROOT): (0, 0) for name in folders}
-            for path in (Path(where, name) for name in files):
-                status = path.lstat()
-                found[str(path.relative_to(ROOT))] = (status.st_mtime_ns, status.st_size)
-    found.pop("__pycache__", None)
+            paths += [Path(where, name) for name in files]
+    for path in paths:
+        with suppress(FileNotFoundError):  # such as a lock that another process has released
+            status = path.lstat()
+            found[str(path.relative_to(ROOT))] = (status.st_mtime_ns, status.st_size)
     return found
 
 

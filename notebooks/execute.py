@@ -91,7 +91,11 @@ def _picture(content: bytes, shown_px: int) -> tuple[NotebookNode, NotebookNode]
 
 
 def main(names: list[str]) -> int:
-    """Execute the named notebooks, by default all, and write them; return 1 if one fails."""
+    """Execute the named notebooks, by default all, and write them; return 1 if one fails, 2 if there is none of a name."""
+    scripts = {script.stem: script for script in sorted(FOLDER.glob("[0-9]*.py"))}
+    if unknown := {*names} - {*scripts}:
+        print(f"no such notebook: {', '.join(sorted(unknown))}. Notebooks: {', '.join(scripts)}.", file=sys.stderr)
+        return 2
     failed = []
     with tempfile.TemporaryDirectory() as folder:
         if not os.environ.get("WHERETOLOOK_MLRUNS"):
@@ -100,9 +104,7 @@ def main(names: list[str]) -> int:
             from wheretolook_paper.release.notebook import open_store
 
             open_store()
-        for script in sorted(FOLDER.glob("[0-9]*.py")):
-            if names and script.stem not in names:
-                continue
+        for script in (scripts[name] for name in names or scripts):
             start = time.perf_counter()
             try:
                 notebook = execute(script)

@@ -40,8 +40,9 @@ CHANGES = """
     (DATA / "removed.txt").unlink()
     (DATA / "demo").mkdir()
     open(DATA.parent / "views.csv", "w")
+    open(DATA.parent / "README.md", "a").write("more")
 """
-CHANGED = "data/changed.txt, data/demo, data/removed.txt, views.csv"
+CHANGED = "README.md, data/changed.txt, data/demo, data/removed.txt, views.csv"
 
 
 @pytest.mark.parametrize(
@@ -54,6 +55,7 @@ def test_a_changed_checkout_fails_the_suite(code: str, changed: str, options: li
         (tmp_path / name).mkdir()
     for name in ("changed.txt", "removed.txt"):
         (tmp_path / "data" / name).touch()
+    (tmp_path / "README.md").touch()
     (tmp_path / "tests" / "test_writing.py").write_text(WRITING.format(code=code))
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
     environment["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"

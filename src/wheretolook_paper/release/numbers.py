@@ -17,8 +17,8 @@ import pandas as pd
 
 STRICT = "0.05m_0.4deg"
 
-Cells = Callable[[str], list[str] | None]
-"""Returns the cells of a row beside its first, given this one without emphasis and remarks; None if it is no method."""
+Cells = Callable[[str], list[str]]
+"""Returns the cells of a row beside its first, given this one without emphasis and remarks. Raises KeyError for others."""
 
 METHODS = {
     "set of landmarks": "set",
@@ -39,7 +39,10 @@ METHODS = {
     "MLP, 2d": "mlp-2d",
     "MLP, 2d + z": "mlp-2d+z",
     "MLP, 2d + 3d": "mlp-2d+3d",
+    "MLP, trained as the released code": "mlp-released",
     "the paper's network": "mlp-2d+z",
+    "set, adapted": "adapted",
+    "set, [adapted](adapt.md)": "adapted",
 }
 """Methods by their names in tables."""
 
@@ -92,17 +95,11 @@ class Numbers:
 
     # --- cells of tables
 
-    def readme_scores(self, label: str) -> list[str] | None:
-        method = METHODS.get(label)
-        if method is None:
-            return None
-        return [cell for file in ("scores.csv", "generalization.csv") for cell in self._best(method, file)[::2]]
+    def readme_scores(self, label: str) -> list[str]:
+        return [cell for file in ("scores.csv", "generalization.csv") for cell in self._best(METHODS[label], file)[::2]]
 
-    def all_scores(self, label: str) -> list[str] | None:
-        method = METHODS.get(label)
-        if method is None:
-            return None
-        return [cell for file in ("scores.csv", "generalization.csv") for cell in self._best(method, file)]
+    def all_scores(self, label: str) -> list[str]:
+        return [cell for file in ("scores.csv", "generalization.csv") for cell in self._best(METHODS[label], file)]
 
     def _best(self, method: str, file: str) -> list[str]:
         """Return share with interval, share through walls, AUC; from `variants.csv` what does not ship."""
@@ -119,13 +116,13 @@ class Numbers:
             f"{found['roc_auc']:.3f}",
         ]
 
-    def angles(self, label: str) -> list[str] | None:
+    def angles(self, label: str) -> list[str]:
         """Return regret and AUC of four methods on the six scenes, then on the apartments."""
         groups = ("all others'", "all apartment")
         cells = [self._ranked(f"test-{label.rstrip('°')}", group, method) for group in groups for method in RANKED]
         return [f"{row['regret']:.1f}; {row['auc']:.3f}" for row in cells]
 
-    def fisheye(self, label: str) -> list[str] | None:
+    def fisheye(self, label: str) -> list[str]:
         group = {"two apartments": "all apartment", "six other scenes": "all others'"}[label]
         cells = []
         for method in RANKED:
@@ -140,10 +137,16 @@ class Numbers:
         return self.row("cameras.csv", dataset=dataset, group=group, method=method)
 
     def photographs(self, scene: str) -> Cells:
-        def cells(label: str) -> list[str] | None:
-            found = self.row("photographs.csv", scene=scene, method=METHODS.get(label, ""))
-            if found is None:
-                return None
+        def cells(label: str) -> list[str]:
+            found = self.row("photographs.csv", scene=scene, method=METHODS[label])
+            if METHODS[label] == "adapted":
+                return [
+                    f"{found['auc']:.3f}",
+                    "",
+                    f"{found['regret']:.1f}".removesuffix(".0"),
+                    f"{found['ece']:.3f}",
+                    "",
+                ]
             ends = ("", "_low", "_high")
             auc, within, regret, ece = (
                 found[[name + end for end in ends]].astype(float)
@@ -157,10 +160,30 @@ class Numbers:
 
         return cells
 
+    def checked(self, label: str) -> list[str]:
+        """Return numbers of `check` with the set network and visible landmarks on a map of photographs."""
+        scene = "kitchen" if label.startswith("kitchen") else "fox"
+        ours, visible = (self.row("photographs.csv", scene=scene, method=method) for method in ("set", "visible"))
+        aucs = (f"{row['auc']:.3f} [{row['auc_low']:.2f}, {row['auc_high']:.2f}]" for row in (ours, visible))
+        above = interval(ours[[f"auc_above_visible{end}" for end in ("", "_low", "_high")]], 3)
+        within = (f"{row['auc_within_blocks']:.3f}" for row in (ours, visible))
+        found = f"{ours['real_over_expected_localized']:.2f}"
+        return [f"{ours['good']} of {ours['views']}", *aucs, above, *within, f"{ours['ece']:.2f}", found]
+
+    def inference(self, label: str) -> list[str]:
+        """Return the time of one step at a location, in s, and of one pose, in ms: median, quartiles and shortest."""
+        method = METHODS[label.partition(",")[0]]
+        cells = []
+        for what, unit, digits, per_s in (("location", "s", 2, 1), ("pose", "ms", 1, 1000)):
+            row = per_s * self.row("runtimes.csv", what=f"{method}, one {what}")[["median_s", "q1_s", "q3_s", "min_s"]]
+            median, low, high, least = (f"{float(time):.{digits}f}" for time in row)
+            cells += [f"{median} {unit} [{low}, {high}]", f"{least} {unit}"]
+        return cells
+
     def paths(self, task: str) -> Cells:
         """Return shares by group of scenes (weighted by views), that of all with interval and ratio, and the rest."""
 
-        def cells(label: str) -> list[str] | None:
+        def cells(label: str) -> list[str]:
             method = {"forward": "forward"}.get(label) or METHODS[label.removesuffix(", greedy")]
             table = self.table("paths.csv")
             table = table[table["task"] == task]
@@ -176,7 +199,7 @@ class Numbers:
 
         return cells
 
-    def relocalized(self, label: str) -> list[str] | None:
+    def relocalized(self, label: str) -> list[str]:
         row = self.row("relocalize.csv", policy=POLICIES[label])
         joint = [
             f"{100 * row[f'right_{n}']:.1f} [{100 * row[f'right_{n}_low']:.0f}, {100 * row[f'right_{n}_high']:.0f}]"
@@ -186,7 +209,7 @@ class Numbers:
         confident = f"{100 * row['confident']:.1f}, {100 * row['precision']:.1f}"
         return [f"{100 * row['right_1']:.1f}", *joint, *stopped, confident]
 
-    def looks(self, label: str) -> list[str] | None:
+    def looks(self, label: str) -> list[str]:
         rows = [self.row("looks.csv", split="test", strategy=LOOKS[label], n_looks=n) for n in (1, 2, 3, 5)]
         return [*(f"{100 * row['good']:.1f}" for row in rows), f"{100 * rows[-1]['any_good']:.1f}"]
 
@@ -218,6 +241,12 @@ def tables(numbers: Numbers) -> Mapping[tuple[str, str], Cells]:
             "| next view | first | two views | three | four | right at stop | views until stop | confident, right of "
             "these |",
         ): numbers.relocalized,
+        ("docs/results.md", "| | one location, 500 directions | shortest | one pose | shortest |"): numbers.inference,
+        (
+            "docs/check.md",
+            "| | positive views | AUC: set | visible | difference | within groups: set | visible | calibration error | "
+            "inliers / expected |",
+        ): numbers.checked,
         ("docs/looks.md", "| views | one | two | three | five | any of five alone |"): numbers.looks,
     }
 
@@ -288,7 +317,8 @@ def _range(values: pd.Series) -> list[str]:
 def updated(page: str, numbers: Numbers) -> str:
     """Return a page's text with the numbers that the results hold now.
 
-    Raises ValueError if a table or a pattern is not in the page, so that a rewritten page is noticed.
+    Raises ValueError if a table or a pattern is not in the page, KeyError if a table has a row of an unknown name, so that
+    a rewritten page is noticed.
     """
     lines = (numbers.root / page).read_text(encoding="utf-8").splitlines()
     for (where, header), cells in tables(numbers).items():
@@ -299,9 +329,8 @@ def updated(page: str, numbers: Numbers) -> str:
             if not lines[index].startswith("|"):
                 break
             first = lines[index].strip("|").split("|")[0].strip()
-            found = cells(re.sub(r" \((ships|MLP|\[).*\)$", "", first.replace("**", "")))
-            if found is not None:
-                lines[index] = re.sub(r"\|  (?=\|)", "| ", f"| {' | '.join([first, *found])} |")
+            found = cells(re.sub(r" \((ships|not kept|MLP).*\)$", "", first.replace("**", "")))
+            lines[index] = re.sub(r"\|  (?=\|)", "| ", f"| {' | '.join([first, *found])} |")
     text = "\n".join(lines) + "\n"
     for (where, pattern), values in prose(numbers).items():
         if where != page:

@@ -10,8 +10,16 @@ from importlib.metadata import entry_points
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from wheretolook.commands.options import DatasetOptions, Log, MeshSource, Progress, ScenesConfig, ignore_progress
-from wheretolook.commands.preconditions import mesh_fingerprint, refuse_release
+from wheretolook.commands.options import (
+    DatasetOptions,
+    Log,
+    MeshSource,
+    Progress,
+    ScenesConfig,
+    ignore_progress,
+    mesh_fingerprint,
+    refuse_release,
+)
 from wheretolook.commands.rgbd_scene import fuse_recording
 from wheretolook.dataset.config import Split
 from wheretolook.dataset.dataset_lock import changes_dataset

@@ -40,7 +40,7 @@ COMMANDS = {
     "plan": "wheretolook.commands.plan:Plan",
     "demo": "wheretolook.commands.demo:Demo",
     "select": "wheretolook.commands.select:Select",
-    "score": "wheretolook.commands.score:Score",
+    "score": "wheretolook.commands.select:Score",
     "localize": "wheretolook.commands.localize:Localize",
     "check": "wheretolook.commands.check:Check",
     "view": "wheretolook.commands.view:View",

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from common import free_points, open_scene, use_one_thread
 
-from wheretolook.commands.preconditions import extractor_of
+from wheretolook.commands.options import extractor_of
 from wheretolook.dataset.layout import SceneFolder
 from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.features import aliked_batch

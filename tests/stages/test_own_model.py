@@ -17,9 +17,8 @@ from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room, 
 from wheretolook.cli import main
 from wheretolook.commands.label import Label
 from wheretolook.commands.map import Map
-from wheretolook.commands.options import MapUseOptions, ScenesConfig, select_options
+from wheretolook.commands.options import MapUseOptions, ScenesConfig, extractor_of, select_options
 from wheretolook.commands.plan import Plan
-from wheretolook.commands.preconditions import extractor_of
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.viewpoint_map import BuildViewpointMap
 from wheretolook.dataset.config import SampleConfig

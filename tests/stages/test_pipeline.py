@@ -14,7 +14,7 @@ import pytest
 
 from mask_agreement import MaskAgreement
 from wheretolook.cli import main, parse_command
-from wheretolook.commands.preconditions import open_scene
+from wheretolook.commands.options import open_scene
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_files import read_table
 from wheretolook.dataset.viewpoint_table import by_first, is_good, poses

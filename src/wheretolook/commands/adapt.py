@@ -13,9 +13,18 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.commands.holdout_photos import check_name, hold_out_photographs, knows_photographs
-from wheretolook.commands.options import LabelOptions, Log, Progress, SceneOptions, ignore_progress
-from wheretolook.commands.preconditions import extractor_of, open_scene, refuse_release, scene_job
+from wheretolook.commands.check import check_name, hold_out_photographs, knows_photographs
+from wheretolook.commands.options import (
+    LabelOptions,
+    Log,
+    Progress,
+    SceneOptions,
+    extractor_of,
+    ignore_progress,
+    open_scene,
+    refuse_release,
+    scene_job,
+)
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera

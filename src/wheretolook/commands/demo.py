@@ -13,8 +13,7 @@ from tqdm.auto import tqdm
 from wheretolook.commands.evaluate import evaluate_methods, not_logged
 from wheretolook.commands.label import Label
 from wheretolook.commands.map import Map
-from wheretolook.commands.options import Experiment, Log, Progress, select_options
-from wheretolook.commands.preconditions import load_dataset
+from wheretolook.commands.options import Experiment, Log, Progress, load_dataset, select_options
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.scenes import Scenes
 from wheretolook.commands.train import Train

@@ -7,9 +7,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from wheretolook.commands.holdout_photos import check_name, hold_out_photographs, knows_photographs
-from wheretolook.commands.options import LabelOptions, Log, Progress, SceneOptions, ignore_progress
-from wheretolook.commands.preconditions import load_dataset, open_scene
+from wheretolook.commands.check import check_name, hold_out_photographs, knows_photographs
+from wheretolook.commands.options import (
+    LabelOptions,
+    Log,
+    Progress,
+    SceneOptions,
+    ignore_progress,
+    load_dataset,
+    open_scene,
+)
 from wheretolook.dataset.dataset_lock import reading, reads_dataset
 from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig

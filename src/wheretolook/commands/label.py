@@ -17,10 +17,14 @@ from wheretolook.commands.options import (
     MapUseOptions,
     Progress,
     ScenesConfig,
+    existing,
+    extractor_of,
     ignore_progress,
+    load_dataset,
+    naming_file,
+    scene_job,
     select_options,
 )
-from wheretolook.commands.preconditions import existing, extractor_of, load_dataset, naming_file, scene_job
 from wheretolook.commands.scenes import Scenes
 from wheretolook.dataset.config import ALL
 from wheretolook.dataset.dataset_lock import changes_dataset

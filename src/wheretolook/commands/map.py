@@ -19,16 +19,14 @@ from wheretolook.commands.options import (
     Log,
     Progress,
     SceneOptions,
-    ignore_progress,
-    select_options,
-)
-from wheretolook.commands.preconditions import (
     existing,
+    ignore_progress,
     load_dataset,
     mesh_fingerprint,
     naming_file,
     open_scene,
     refuse_release,
+    select_options,
 )
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder

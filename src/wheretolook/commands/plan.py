@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from wheretolook.commands.map import SceneOrMapOptions, imports_map
-from wheretolook.commands.options import Log, Progress, ignore_progress
-from wheretolook.commands.preconditions import load_dataset, open_scene
+from wheretolook.commands.options import Log, Progress, ignore_progress, load_dataset, open_scene
 from wheretolook.dataset.dataset_lock import reads_dataset
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import poses_looking_along

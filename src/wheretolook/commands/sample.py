@@ -8,8 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 import numpy as np
 
 from wheretolook.commands.map import SceneOrMapOptions, imports_map
-from wheretolook.commands.options import Log, Progress, ignore_progress
-from wheretolook.commands.preconditions import existing, load_dataset, naming_file, open_scene
+from wheretolook.commands.options import Log, Progress, existing, ignore_progress, load_dataset, naming_file, open_scene
 from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.environment import SceneEnvironment

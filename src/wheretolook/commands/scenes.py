@@ -9,8 +9,16 @@ from importlib.metadata import entry_points
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any
 
-from wheretolook.commands.options import DatasetOptions, Log, MeshSource, Progress, ScenesConfig, ignore_progress
-from wheretolook.commands.preconditions import mesh_fingerprint, refuse_release
+from wheretolook.commands.options import (
+    DatasetOptions,
+    Log,
+    MeshSource,
+    Progress,
+    ScenesConfig,
+    ignore_progress,
+    mesh_fingerprint,
+    refuse_release,
+)
 from wheretolook.dataset.config import Split
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, MappedFloor, SceneFolder

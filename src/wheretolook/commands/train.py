@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from wheretolook.commands.options import DatasetOptions, Log, Progress, ignore_progress
-from wheretolook.commands.preconditions import load_dataset
+from wheretolook.commands.options import DatasetOptions, Log, Progress, ignore_progress, load_dataset
 from wheretolook.dataset.dataset_lock import reading, reads_dataset
 from wheretolook.dataset.layout import Dataset
 from wheretolook.scorers.registry import Method

@@ -6,8 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar
 
 from wheretolook.commands.map import SceneOrMapOptions, imports_map
-from wheretolook.commands.options import Log, Progress, ignore_progress
-from wheretolook.commands.preconditions import load_dataset, naming_file, open_scene
+from wheretolook.commands.options import Log, Progress, ignore_progress, load_dataset, naming_file, open_scene
 from wheretolook.dataset.dataset_lock import reads_dataset
 from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.utils.errors import ConfigError

@@ -6,8 +6,16 @@ from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, ClassVar
 
-from wheretolook.commands.options import LabelOptions, Log, Progress, SceneOptions, ignore_progress
-from wheretolook.commands.preconditions import extractor_of, load_dataset, open_scene
+from wheretolook.commands.options import (
+    LabelOptions,
+    Log,
+    Progress,
+    SceneOptions,
+    extractor_of,
+    ignore_progress,
+    load_dataset,
+    open_scene,
+)
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.layout import Dataset
 from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged

@@ -7,8 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from wheretolook.commands.evaluate import Evaluate
-from wheretolook.commands.options import Experiment, Log, Progress, ignore_progress, select_options
-from wheretolook.commands.preconditions import load_dataset
+from wheretolook.commands.options import Experiment, Log, Progress, ignore_progress, load_dataset, select_options
 from wheretolook.dataset.config import RELEASE_FILE
 from wheretolook.dataset.dataset_lock import changing, reading, reads_dataset
 from wheretolook.evaluation.config import EvaluateConfig

@@ -8,8 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wheretolook.commands.options import Log, Progress, SceneOptions, ignore_progress
-from wheretolook.commands.preconditions import extractor_of, load_dataset, open_scene
+from wheretolook.commands.options import (
+    Log,
+    Progress,
+    SceneOptions,
+    extractor_of,
+    ignore_progress,
+    load_dataset,
+    open_scene,
+)
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged

@@ -274,7 +274,7 @@ def test_a_new_attribute_leaves_shipped_weights_as_they_are(tmp_path: Path) -> N
     changed = tmp_path / "changed"
     shutil.copytree(SOURCE, changed / "wheretolook", ignore=shutil.ignore_patterns("__pycache__"))
     for file, old, new in (
-        ("attribute_names.py", "MAP_ATTRIBUTES = (", 'MAP_ATTRIBUTES = (\n    "height",'),
+        ("landmarks.py", "MAP_ATTRIBUTES = (", 'MAP_ATTRIBUTES = (\n    "height",'),
         ("landmarks.py", '"track_length": np.log', '"height": self.points[:, 2],\n            "track_length": np.log'),
     ):
         path = changed / "wheretolook" / "mapping" / file

@@ -106,7 +106,7 @@ def draw_overview(options: Demo, weights: Path) -> None:
     weights cannot be used.
     """
     from wheretolook.commands.demo import OVERVIEW
-    from wheretolook.commands.preconditions import open_scene
+    from wheretolook.commands.options import open_scene
     from wheretolook.figures.style import save_figure, scene_label
     from wheretolook.geometry.poses import camera_centers, poses_looking_along
     from wheretolook.scorers.styles import method_style

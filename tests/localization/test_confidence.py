@@ -6,7 +6,7 @@ from scipy.stats import lognorm
 
 from wheretolook.dataset.config import ACCURACY
 from wheretolook.localization.confidence import RIGHT_PLACE, ConfidenceModel, ErrorModel, probabilities
-from wheretolook.localization.localizer import JointLocalization
+from wheretolook.localization.rig_localization import JointLocalization
 
 
 def pose(n_inliers: int, deviation_m: float, rivals: tuple[JointLocalization, ...] = ()) -> JointLocalization:

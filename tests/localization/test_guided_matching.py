@@ -11,8 +11,8 @@ from wheretolook.features.matches import Matches
 from wheretolook.geometry.poses import pose_error, poses_looking_along, transform
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator, match_under
-from wheretolook.localization.localizer import JointLocalizer
 from wheretolook.localization.rig import MAX_NEAREST_RATIO, Candidates, Look
+from wheretolook.localization.rig_localization import JointLocalizer
 
 
 def twin_rooms(n=1500, seed=0):

@@ -10,8 +10,8 @@ from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import camera_centers, compose_poses, pose_error, poses_looking_along
 from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.estimation import PoseEstimator, turn_errors
-from wheretolook.localization.localizer import JointLocalizer
 from wheretolook.localization.rig import Look, rig_of
+from wheretolook.localization.rig_localization import JointLocalizer
 from wheretolook.utils.errors import PoseError
 
 CAMERA = PinholeCamera()

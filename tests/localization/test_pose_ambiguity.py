@@ -8,8 +8,8 @@ import pytest
 from localization.test_joint import CAMERA, a_room
 from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.localization.estimation import PoseAmbiguity, PoseEstimator, most_likely, strongest_rival
-from wheretolook.localization.localizer import JointLocalizer
 from wheretolook.localization.rig import Look, rig_of
+from wheretolook.localization.rig_localization import JointLocalizer
 
 BEYOND = np.array([20.0, 0, 0])
 

@@ -10,8 +10,8 @@ from wheretolook import LocalizationMap, load_scorer
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import Float, poses_looking_along, rotation_angle_deg, rotation_looking_along
 from wheretolook.localization.confidence import RIGHT_PLACE, probabilities
-from wheretolook.localization.localizer import JointLocalization
 from wheretolook.localization.rig import Look
+from wheretolook.localization.rig_localization import JointLocalization
 from wheretolook.looks.next_look import MIN_ANGLE_DEG, N_DIRECTIONS, NextLookSelector, mean_scores_by_pitch
 from wheretolook.scorers.base import Scorer
 from wheretolook.utils.errors import PlanningError

@@ -25,7 +25,7 @@ from wheretolook.utils.files import read_json_object
 from wheretolook.utils.shipped import LogisticRegression
 
 if TYPE_CHECKING:
-    from wheretolook.localization.localizer import JointLocalization
+    from wheretolook.localization.rig_localization import JointLocalization
 
 FEATURE_NAMES = ("log_elsewhere", "log_share", "log_own", "log_deviation_deg")
 """log(1 + support of the best competing pose), log of the inlier ratio of the matches, log of the ratio of this pose's

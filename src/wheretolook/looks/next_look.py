@@ -19,7 +19,7 @@ from wheretolook.localization.confidence import RIGHT_PLACE, probabilities
 from wheretolook.utils.errors import PlanningError
 
 if TYPE_CHECKING:
-    from wheretolook.localization.localizer import JointLocalization
+    from wheretolook.localization.rig_localization import JointLocalization
     from wheretolook.scorers.base import Scorer
 
 

@@ -42,8 +42,13 @@ from wheretolook.geometry.similarity import Similarity
 from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator, SingleViewPoses
-from wheretolook.localization.localizer import POSES_OF_A_VIEW, POSES_OF_AN_IMAGE, JointLocalization, JointLocalizer
 from wheretolook.localization.rig import IDENTITY, Look, PosePrior, checked_turns, matches_among
+from wheretolook.localization.rig_localization import (
+    POSES_OF_A_VIEW,
+    POSES_OF_AN_IMAGE,
+    JointLocalization,
+    JointLocalizer,
+)
 from wheretolook.looks.next_look import DirectionScorer, NextLook, NextLookSelector
 from wheretolook.utils.errors import ConfigError
 

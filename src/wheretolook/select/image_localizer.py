@@ -22,8 +22,9 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.config import LocalizerConfig
-from wheretolook.localization.localizer import POSES_OF_A_VIEW, POSES_OF_AN_IMAGE, JointLocalizer, Localizer
+from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.rig import IDENTITY, Look, PosePrior, checked_turns, matches_among, read_turns
+from wheretolook.localization.rig_localization import POSES_OF_A_VIEW, POSES_OF_AN_IMAGE, JointLocalizer
 from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, observation_matrix, read_model
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.georeference import REPORT_FILE

@@ -16,7 +16,7 @@ from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of, camera
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation
 from wheretolook.io.poses import images_text
-from wheretolook.localization.localizer import JointLocalization
+from wheretolook.localization.rig_localization import JointLocalization
 from wheretolook.mapping.colmap_model import camera_of_model, registered_names
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame
 from wheretolook.mapping.photographs import read_photograph, reduce_photograph

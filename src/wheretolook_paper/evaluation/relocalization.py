@@ -21,8 +21,9 @@ from wheretolook.evaluation.statistics import ClusterBootstrap, precision_area
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.localization.config import LocalizerConfig
-from wheretolook.localization.localizer import JointLocalization, Localizer
+from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.rig import Look, rig_of
+from wheretolook.localization.rig_localization import JointLocalization
 from wheretolook.looks.next_look import NextLookSelector, angles_to_views, mean_scores_by_pitch
 from wheretolook.scorers.base import Scorer
 from wheretolook.utils.texts import markdown_table

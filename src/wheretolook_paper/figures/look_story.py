@@ -17,8 +17,9 @@ from wheretolook.figures.style import BLUE, GREEN, RC, VERMILION, Style, new_fig
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.localization.confidence import ConfidenceModel
-from wheretolook.localization.localizer import JointLocalization, JointLocalizer, Localizer
+from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.rig import Look, rig_of
+from wheretolook.localization.rig_localization import JointLocalization, JointLocalizer
 from wheretolook.utils.errors import PoseError
 from wheretolook.view.drawing import frustum_segments
 from wheretolook_paper.figures.animation import Pixels, pixels_of

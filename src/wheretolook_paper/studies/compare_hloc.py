@@ -55,8 +55,9 @@ from wheretolook.geometry.poses import Float, camera_centers, pose_error
 from wheretolook.io.poses import images_text
 from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.config import LabelConfig, LocalizerConfig
-from wheretolook.localization.localizer import POSES_OF_AN_IMAGE, Localizer
+from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.rig import Look
+from wheretolook.localization.rig_localization import POSES_OF_AN_IMAGE
 from wheretolook.mapping.colmap_model import colmap_poses, holds_model, read_model, registered_names
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.feature_files import read_features

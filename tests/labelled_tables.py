@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from wheretolook.dataset.config import Split
+from wheretolook.dataset.sampling_config import Split
 from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, pose_columns
 from wheretolook.geometry.poses import poses_looking_along
 

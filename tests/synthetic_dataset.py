@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from wheretolook.dataset.config import Split
 from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.dataset.sampling_config import Split
 from wheretolook.dataset.viewpoint_files import write_table
 from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, pose_columns
 from wheretolook.geometry.camera import PinholeCamera

@@ -43,7 +43,7 @@ POSES = poses_looking_along([(-0.5, 0.3, 1.2)] * 2, [(1, 0.2, 0), (0.3, 1, 0)])
 PLACES = [(-0.5, 0.3, 1.2), (0.4, -0.6, 1.5), (0.8, 0.8, 1.0)]
 RUN = """
 import sys
-blocked = ("torch", "warp", "onnx", "pycolmap", "pandas", "cv2", "wheretolook")
+blocked = ("torch", "warp", "onnx", "pycolmap", "pandas", "cv2", "psutil", "yaml", "wheretolook")
 sys.modules.update(dict.fromkeys(blocked, None))  # importing these fails
 import numpy as np
 from wheretolook_localization import RobotLocalizer

@@ -21,9 +21,9 @@ from wheretolook.commands.options import MapUseOptions, ScenesConfig, extractor_
 from wheretolook.commands.plan import Plan
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.viewpoint_map import BuildViewpointMap
-from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig, PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along

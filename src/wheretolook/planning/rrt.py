@@ -19,16 +19,8 @@ from wheretolook.geometry.poses import Float
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.map_frame import IDENTITY
 from wheretolook.planning.config import PathConfig
-from wheretolook.planning.routes import (
-    IMPROVEMENT,
-    SEARCH,
-    SHORT_ROUTE,
-    PlannedPath,
-    RouteSamples,
-    RouteViews,
-    between,
-    lengths_along,
-)
+from wheretolook.planning.routes import IMPROVEMENT, SEARCH, SHORT_ROUTE, PlannedPath, RouteSamples, RouteViews
+from wheretolook.planning.view_sequence import between, lengths_along
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.utils.errors import PlanningError
 

@@ -164,7 +164,7 @@ def set_graph(trained: TrainedNetwork[SetNetwork], accuracy: Accuracy) -> Any:
 
 
 PACKAGE = "wheretolook_localization"  # of the copies, so that an installed wheretolook does not replace them
-FIRST = "wheretolook.robot.localizer", "wheretolook.planning.routes"
+FIRST = "wheretolook.robot.localizer", "wheretolook.planning.view_sequence"
 ROOT = Path(wheretolook.__file__).parent
 
 
@@ -191,9 +191,7 @@ def export_localizer(landmarks: Landmarks, ids: NDArray[np.int64], mean_scores: 
         assert path is not None
         text = path.read_text(encoding="utf-8").replace("from wheretolook.", f"from {PACKAGE}.")
         write_text(folder / path.relative_to(ROOT), text)
-    exported = {"image_sequence": "ImageSequence", "localizer": "RobotLocalizer"}
-    lines = [f"from {PACKAGE}.robot.{module} import {name}\n" for module, name in exported.items()]
-    write_text(folder / "__init__.py", "".join(lines))
+    write_text(folder / "__init__.py", f"from {PACKAGE}.robot.localizer import ImageSequence, RobotLocalizer\n")
     copy_file(ROOT / "localization" / "confidence.json", folder / "localization" / "confidence.json")
 
 

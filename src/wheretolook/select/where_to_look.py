@@ -26,8 +26,9 @@ from wheretolook.looks.selection import best_views, separated
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.planning.config import StopConfig
-from wheretolook.planning.routes import PlannedPath, TurnLimit, best_sequence
+from wheretolook.planning.routes import PlannedPath
 from wheretolook.planning.stops import stops_along
+from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook.scorers.base import Scorer
 from wheretolook.select.views import SelectedViews, joined
 from wheretolook.select.waypoints import SelectionRequest, Waypoints, grid_waypoints, usable_waypoints

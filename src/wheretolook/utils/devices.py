@@ -8,8 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any, TypeVar
 
-import psutil
-
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.processes import cores
 from wheretolook.utils.texts import LOG
@@ -65,6 +63,8 @@ def _torch_gpus() -> int:
 
 def available_bytes() -> int:
     """Return the memory available without swapping, in bytes."""
+    import psutil  # a robot has none
+
     return int(psutil.virtual_memory().available)
 
 

@@ -15,8 +15,6 @@ from pathlib import Path, PurePath, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import yaml
-
 from wheretolook.utils.errors import ConfigError, StorageError
 
 STORAGE_FIX = "Free disk space, fix permissions or name another folder, then run again; finished work is kept."
@@ -263,20 +261,21 @@ def read_json_object(path: Path) -> dict[str, Any]:
     return parse_json_object(read_text(path))
 
 
-class _UniqueKeys(yaml.SafeLoader):
-    """Loads plain values and raises a YAMLError for a key that is given twice: the first value would be ignored."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys = [key.value for key, _ in node.value if isinstance(key.value, str) and key.value != "<<"]
-        for key in keys:
-            if keys.count(key) > 1:
-                raise yaml.YAMLError(f"the key {key} is given twice")
-        return super().construct_mapping(node, deep)
-
-
 def read_yaml(path: Path) -> Any:
     """Read a YAML file of plain values. Raises ValueError if it is none, or if a key is given twice."""
+    import yaml
+
+    class UniqueKeys(yaml.SafeLoader):
+        """Loads plain values and raises a YAMLError for a key that is given twice: the first value would be ignored."""
+
+        def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+            keys = [key.value for key, _ in node.value if isinstance(key.value, str) and key.value != "<<"]
+            for key in keys:
+                if keys.count(key) > 1:
+                    raise yaml.YAMLError(f"the key {key} is given twice")
+            return super().construct_mapping(node, deep)
+
     try:
-        return _UniqueKeys(read_text(path, MAX_YAML_BYTES)).get_single_data()
+        return UniqueKeys(read_text(path, MAX_YAML_BYTES)).get_single_data()
     except (yaml.YAMLError, RecursionError, TypeError, OverflowError) as error:
         raise ValueError(" ".join(str(error).split())) from error

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from wheretolook.dataset.layout import Dataset
 from wheretolook.figures.style import BLUE, GREY, RC, VERMILION, frame, new_figure, scene_label
 from wheretolook.geometry.poses import Float
-from wheretolook.planning.routes import PathView, lengths_along
+from wheretolook.planning.routes import PathView
+from wheretolook.planning.view_sequence import lengths_along
 from wheretolook.scorers.styles import method_style
 from wheretolook.utils.errors import MissingRunError
 from wheretolook.utils.texts import markdown_table

@@ -7,7 +7,14 @@ from numpy.typing import ArrayLike
 
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.poses import Float
-from wheretolook.planning.routes import TurnLimit, ViewSequence, between, check_reached, check_scores, lengths_along
+from wheretolook.planning.view_sequence import (
+    TurnLimit,
+    ViewSequence,
+    between,
+    check_reached,
+    check_scores,
+    lengths_along,
+)
 
 SPACING_M = 0.2  # distance of waypoints in the Active Localization Benchmark
 CELL_DEG = 20.0

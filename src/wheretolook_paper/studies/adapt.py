@@ -17,9 +17,9 @@ import pandas as pd
 from jsonargparse import auto_cli
 
 from wheretolook.commands.adapt import labelled_views
-from wheretolook.dataset.config import Split
 from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.sampling_config import Split
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, poses
 from wheretolook.evaluation.adaptation import compare_log_odds
 from wheretolook.scorers.adapted.calibration import calibrate

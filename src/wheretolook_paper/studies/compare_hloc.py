@@ -41,8 +41,9 @@ from wheretolook.commands.map import Map
 from wheretolook.commands.options import MeshSource, ScenesConfig
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.scenes import Scenes
-from wheretolook.dataset.config import Accuracy, SampleConfig
+from wheretolook.dataset.config import Accuracy
 from wheretolook.dataset.environment import SceneEnvironment
+from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.viewpoint_table import poses as poses_of_table
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.scoring import score_scenes

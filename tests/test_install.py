@@ -35,7 +35,7 @@ def test_every_extra_is_declared() -> None:
 
 
 def test_base_modules_import_no_extra() -> None:
-    modules = ("holdout.report", "view.server", "robot.graph", "localization.localizer", "select.where_to_look")
+    modules = ("holdout.report", "view.server", "robot.export", "localization.localizer", "select.where_to_look")
     text = "import sys; from importlib import import_module; from wheretolook.utils.extras import EXTRAS;"
     text += " sys.modules.update(dict.fromkeys(EXTRAS));"
     text += f" [import_module('wheretolook.' + name) for name in {modules}]"

@@ -7,7 +7,7 @@ import pytest
 from wheretolook.commands.options import Experiment
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.training.data import with_also
+from wheretolook.training.scenes import with_also
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.files import path_within, safe_child, write_json
 

@@ -76,8 +76,8 @@ def train_methods(
         TrackingError: the tracking store cannot be used. If it fails later, weights and records are kept, a
             TrackingWarning says that the training is not logged, and the next call logs it.
     """
-    from wheretolook.training.data import with_also
     from wheretolook.training.provenance import about_training, trained_before, weights_path
+    from wheretolook.training.scenes import with_also
 
     shared: Values = {"progress": progress, "kept": {}}
     models = []

@@ -14,7 +14,7 @@ from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.features.sift import SIFT
 from wheretolook.tracking.runs import AUC
 from wheretolook.training.config import DECIDING, SharedConfig
-from wheretolook.training.data import with_also
+from wheretolook.training.scenes import with_also
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.files import fingerprint, read_json_object, sha256
 from wheretolook.utils.version import VERSION

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -62,9 +63,11 @@ def _torch_gpus() -> int:
 
 
 def available_bytes() -> int:
-    """Return the memory available without swapping, in bytes."""
-    import psutil  # a robot has none
-
+    """Return the memory available without swapping, in bytes; a robot without psutil is taken for a Linux machine."""
+    try:
+        import psutil
+    except ImportError:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_AVPHYS_PAGES")
     return int(psutil.virtual_memory().available)
 
 

@@ -35,10 +35,10 @@ from wheretolook.scorers.set.learn import SetDataModule, learn_set
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.tracking.runs import start_run
 from wheretolook.tracking.store import TrackingConfig
-from wheretolook.training.data import with_also
 from wheretolook.training.fit import RunLog
 from wheretolook.training.learner import TrainingJob
 from wheretolook.training.provenance import weights_path
+from wheretolook.training.scenes import with_also
 
 METHODS = ("mlp-2d+z", "mlp-2d+3d+landmark", "conv", "trees", "set", "sphere")
 

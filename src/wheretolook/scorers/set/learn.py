@@ -11,10 +11,11 @@ from wheretolook.dataset.viewpoint_files import has_matches
 from wheretolook.scorers.matchability.network import MatchabilityNetwork
 from wheretolook.scorers.set.config import SetConfig
 from wheretolook.scorers.set.network import SetNetwork
-from wheretolook.training.data import check_classes, training_scenes
+from wheretolook.training.data import check_classes
 from wheretolook.training.landmark_views import LandmarkBatches, LandmarkDataModule
 from wheretolook.training.learner import TrainingJob, TrainingResult, train_network
 from wheretolook.training.provenance import weights_path
+from wheretolook.training.scenes import training_scenes
 from wheretolook.training.trained_network import TrainedNetwork
 
 WINDOWS = 2  # landmarks stored of a view, over those in a training step's window

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from wheretolook.training.data import check_classes, training_scenes, validation_views
+from wheretolook.training.data import check_classes, validation_views
 from wheretolook.training.fit import home_device
 from wheretolook.training.learner import TrainingJob, TrainingResult, train_network
+from wheretolook.training.scenes import training_scenes
 from wheretolook_paper.scorers.sphere.network import SphereNetwork
 from wheretolook_paper.scorers.sphere.views import SphereDataModule, load_sphere_views
 

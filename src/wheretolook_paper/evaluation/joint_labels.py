@@ -19,8 +19,7 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.localization.confidence import ConfidenceModel
 from wheretolook.localization.config import LocalizerConfig
-from wheretolook.localization.estimation import PoseEstimator
-from wheretolook.localization.localizer import SingleViewPoses
+from wheretolook.localization.estimation import PoseEstimator, SingleViewPoses
 from wheretolook.localization.rig import Look, rig_of
 from wheretolook.localization.rig_localization import JointLocalization, JointLocalizer
 from wheretolook.utils.errors import TableError

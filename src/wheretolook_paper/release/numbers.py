@@ -173,9 +173,11 @@ class Numbers:
     def inference(self, label: str) -> list[str]:
         """Return the time of one step at a location, in s, and of one pose, in ms: median, quartiles and shortest."""
         method = METHODS[label.partition(",")[0]]
+        device = "cuda" if label.endswith("H100") else "cpu"
         cells = []
-        for what, unit, digits, per_s in (("location", "s", 2, 1), ("pose", "ms", 1, 1000)):
-            row = per_s * self.row("runtimes.csv", what=f"{method}, one {what}")[["median_s", "q1_s", "q3_s", "min_s"]]
+        for what, unit, digits, per_s in (("location", "s", 3 if device == "cuda" else 2, 1), ("pose", "ms", 1, 1000)):
+            times = self.row("runtimes.csv", what=f"{method}, one {what}", device=device)
+            row = per_s * times[["median_s", "q1_s", "q3_s", "min_s"]]
             median, low, high, least = (f"{float(time):.{digits}f}" for time in row)
             cells += [f"{median} {unit} [{low}, {high}]", f"{least} {unit}"]
         return cells

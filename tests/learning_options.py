@@ -8,7 +8,7 @@ from typing import Any
 
 from synthetic_dataset import CAMERA
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.scorers.mlp.config import MlpConfig
+from wheretolook.scorers.mlp import MlpConfig
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.training.trained_network import StoredNetwork, TrainedNetwork
 

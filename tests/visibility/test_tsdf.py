@@ -11,8 +11,7 @@ from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.tsdf import DepthImage, TsdfVolume
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import SceneError
-from wheretolook.visibility.occlusion import MeshOcclusion
-from wheretolook.visibility.tsdf import TsdfOcclusion
+from wheretolook.visibility.occlusion import MeshOcclusion, TsdfOcclusion
 
 
 def lines_of_sight(mesh: TexturedMesh, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

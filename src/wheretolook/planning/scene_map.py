@@ -26,7 +26,7 @@ from wheretolook.scorers.registry import FALLBACK, is_probability, make_scorer, 
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.validation import check_range
-from wheretolook.visibility.survey import SurveyOptions, survey
+from wheretolook.visibility.counting import SurveyOptions, survey
 
 Text = str | None  # text of progress bars; None shows none
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from synthetic_dataset import make_landmarks
-from twins.fisher import information_matrices
+from paper.fisher.twins import information_matrices
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along

@@ -74,5 +74,5 @@ def test_the_stationary_axis_has_no_gradient() -> None:
 
 @pytest.mark.slow
 def test_the_benchmark_runs_small() -> None:
-    options = "--landmarks 300 --voxels 2 --directions 20 --repeats 1 --samples 10".split()
+    options = ["--landmarks", "300", "--voxels", "2", "--directions", "20", "--repeats", "1", "--samples", "10"]
     subprocess.run([sys.executable, str(Path(__file__).with_name("bench_fisher.py")), *options], check=True)

@@ -14,13 +14,13 @@ from scipy.special import expit
 
 from wheretolook.geometry.poses import Float, check_locations
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.scorers.adapted.calibration import finite_log_odds
 from wheretolook.scorers.base import Scorer, ViewReport
 from wheretolook.scorers.registry import BuildOptions
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.set.score import SetScorer
 from wheretolook.training.trained_network import StoredNetwork, TrainedNetwork, finite
 from wheretolook.utils.errors import WeightsError
-from wheretolook.utils.probability import finite_log_odds
 
 MAX_PLACE = 1_000_000  # landmarks: more are no weights of this program
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from math import inf
 
 from wheretolook.inputs.channels import ATTRIBUTES, OF_SIZE
-from wheretolook.scorers.registry import Method, MethodStyle, imported, network_scorer
+from wheretolook.scorers.registry import Learner, Method, imported, network_scorer
 from wheretolook.training.config import FittingConfig, check_range
 from wheretolook.utils.errors import ConfigError
 
@@ -84,32 +84,19 @@ class SetConfig(LandmarksConfig):
 
 METHODS = (
     Method(
-        position=70,
         name="matchability",
         about="The probability that a visible landmark is detected.",
-        style=MethodStyle("matchability", "#CC79A7", "8", (0, (1, 1))),
-        group="learned",
-        learn=imported("wheretolook.scorers.set.learn:learn_matchability"),
-        config=MatchabilityConfig,
-        folder="matchability",
+        learner=Learner(imported("wheretolook.scorers.set.learn:learn_matchability"), MatchabilityConfig),
     ),
     Method(
-        position=100,
         name="set",
         about="Network over the set of visible landmarks: their probabilities of detection and their information on "
         "the pose.",
-        style=MethodStyle("set of landmarks", "#CC3311", "o", "-"),
-        group="learned",
         build=network_scorer(
             "wheretolook.scorers.set.score:SetScorer", "wheretolook.scorers.set.network:SetNetwork", "set"
         ),
         weights="set",
         probability=True,
-        reference=2,
-        of_the_few=True,
-        learn=imported("wheretolook.scorers.set.learn:learn_set"),
-        config=SetConfig,
-        folder="set",
-        trained_unasked=True,
+        learner=Learner(imported("wheretolook.scorers.set.learn:learn_set"), SetConfig),
     ),
 )

@@ -19,8 +19,7 @@ from wheretolook.commands.options import Experiment, MeshSource
 from wheretolook.mapping.config import MapConfig
 from wheretolook.scorers.registry import describe_methods
 from wheretolook.utils import devices
-from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.validation import nearest
+from wheretolook.utils.errors import ConfigError, nearest
 from wheretolook_paper.release.catalog import ITEMS
 
 ROOT = Path(__file__).parents[1]

@@ -19,14 +19,11 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, get_type_hints
 
-from wheretolook.utils.errors import ConfigError, WhereToLookError
-from wheretolook.utils.extras import EXTRAS, missing_package
-from wheretolook.utils.images import MAX_PIXELS
+from wheretolook.utils.errors import ConfigError, WhereToLookError, did_you_mean
+from wheretolook.utils.files import MAX_PIXELS
+from wheretolook.utils.package import EXTRAS, VERSION, missing_package, or_shipped, shipped, shipped_configs
 from wheretolook.utils.processes import collect_less_garbage, in_main_thread, interrupt, on_sigterm
-from wheretolook.utils.shipped import or_shipped, shipped, shipped_configs
 from wheretolook.utils.texts import quiet_libraries
-from wheretolook.utils.validation import did_you_mean
-from wheretolook.utils.version import VERSION
 
 COMMANDS = {
     "scenes": "wheretolook.commands.scenes:Scenes",

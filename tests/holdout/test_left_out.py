@@ -24,7 +24,7 @@ from wheretolook.tracking.runs import finished_runs
 from wheretolook.tracking.store import TrackingConfig
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.weights import read_training
-from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.utils.package import WEIGHTS, shipped
 from wheretolook.visibility.occlusion import NoOcclusion
 from wheretolook_paper.evaluation.score_report import score_markdown
 

@@ -17,7 +17,7 @@ from wheretolook.mapping.feature_files import read_descriptors
 from wheretolook.mapping.mapped_images import choose_features, find_features, find_photographs, open_colmap
 from wheretolook.utils.errors import MapWarning
 from wheretolook.utils.files import sha256
-from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.utils.package import WEIGHTS, shipped
 
 h5py = pytest.importorskip("h5py", reason="hloc's features need h5py: pip install h5py")
 

@@ -23,7 +23,7 @@ from wheretolook.scorers.weights import load_scorer
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.weights import read_weights, write_weights
 from wheretolook.utils.errors import WeightsError
-from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.utils.package import WEIGHTS, shipped
 
 SET = shipped(WEIGHTS) / "set.safetensors"
 

@@ -15,7 +15,7 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.training.trained_network import TrainedNetwork
-from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.utils.package import WEIGHTS, shipped
 from wheretolook_paper.studies.calibrate_photographs import fitted_offset
 
 

@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from wheretolook.dataset.layout import SceneFolder
-from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
+from wheretolook.utils.files import ArtifactCache, cache_key
 
 
 def test_results_are_loaded_for_the_same_key_only(tmp_path: Path) -> None:

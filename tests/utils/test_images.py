@@ -13,7 +13,7 @@ import pytest
 from wheretolook.mapping.depth_images import read_depth
 from wheretolook.mapping.photographs import read_photograph
 from wheretolook.utils.errors import MapError
-from wheretolook.utils.images import image_size, read_image
+from wheretolook.utils.files import image_size, read_image
 
 
 def png(path: Path, side: int) -> Path:

@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 
 from wheretolook.utils.errors import InUseError, LockWarning
-from wheretolook.utils.locks import hold
+from wheretolook.utils.processes import hold
 
 HOLDER = """
 import sys
 from pathlib import Path
-from wheretolook.utils.locks import hold
+from wheretolook.utils.processes import hold
 with hold(Path(sys.argv[1]), sys.argv[2], shared=sys.argv[3] == "shared"):
     print("held", flush=True)
     sys.stdin.read()
@@ -66,7 +66,7 @@ def test_removing_the_file_lets_no_two_in(tmp_path: Path) -> None:
     script = """
 import sys
 from pathlib import Path
-from wheretolook.utils.locks import hold
+from wheretolook.utils.processes import hold
 number = Path(sys.argv[1]) / "number"
 for _ in range(100):
     with hold(Path(sys.argv[1]) / "lock", "count", wait_s=60):

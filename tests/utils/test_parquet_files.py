@@ -11,7 +11,7 @@ import pandas as pd
 import pyarrow as pa
 import pytest
 
-from wheretolook.utils.parquet_files import read_parquet
+from wheretolook.utils.files import read_parquet
 
 
 def _nested(path: Path, depth: int) -> None:

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from wheretolook.utils.files import MAX_TEXT_BYTES, read_json, read_json_object, read_yaml
-from wheretolook.utils.npz_files import load_npy, load_npz, save_npz
+from wheretolook.utils.files import MAX_TEXT_BYTES, load_npy, load_npz, read_json, read_json_object, read_yaml, save_npz
 
 
 def npz_bomb(path: Path) -> None:

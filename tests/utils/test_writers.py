@@ -21,8 +21,7 @@ from wheretolook.mapping.colmap_model import colmap_poses, write_model
 from wheretolook.scenes.loading import save_glb
 from wheretolook.training.weights import write_weights
 from wheretolook.utils.errors import StorageError
-from wheretolook.utils.files import copy_file, write_text
-from wheretolook.utils.npz_files import save_npy, save_npz
+from wheretolook.utils.files import copy_file, save_npy, save_npz, write_text
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_paper.figures.animation import save_moving
 

@@ -20,7 +20,7 @@ from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.tracking.store import TrackingConfig
 from wheretolook.utils.devices import check_device_name, usable_device
-from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError
+from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError, from_record, reject
 from wheretolook.utils.files import (
     check_folder_name,
     check_output,
@@ -31,7 +31,6 @@ from wheretolook.utils.files import (
 )
 from wheretolook.utils.processes import cores
 from wheretolook.utils.texts import LOG
-from wheretolook.utils.validation import from_record, reject
 from wheretolook.visibility.config import OcclusionConfig
 
 if TYPE_CHECKING:

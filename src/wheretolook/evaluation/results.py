@@ -66,8 +66,8 @@ from wheretolook.tracking.runs import (
     start_run,
 )
 from wheretolook.tracking.store import TrackingConfig
+from wheretolook.utils.errors import check_choice
 from wheretolook.utils.files import fingerprint, temporary_folder
-from wheretolook.utils.validation import check_choice
 from wheretolook.visibility.config import OcclusionConfig
 
 PHOTOGRAPHS = "photographs"  # value of the column `candidates` in rows of held-out photographs

@@ -15,10 +15,8 @@ from wheretolook.geometry.camera import Camera, PinholeCamera, cameras_by_id
 from wheretolook.geometry.poses import transform
 from wheretolook.geometry.tsdf import DepthImage
 from wheretolook.mapping.colmap_model import read_model
-from wheretolook.utils.errors import SceneError
-from wheretolook.utils.images import MAX_DEPTH_PIXELS, read_image
-from wheretolook.utils.npz_files import load_npy
-from wheretolook.utils.validation import check_positive
+from wheretolook.utils.errors import SceneError, check_positive
+from wheretolook.utils.files import MAX_DEPTH_PIXELS, load_npy, read_image
 
 MAX_MEASURED = 50  # images that the scale is measured in
 

@@ -203,7 +203,9 @@ class RobotScorer:
         firsts = [0, *(np.flatnonzero(moved) + 1).tolist(), len(poses)] if len(poses) else []
         parts = [self._views_at(centers[a], rotations[a:b], unoccluded) for a, b in pairwise(firsts)]
         parts = parts or [self._views_at(np.zeros(3), rotations, unoccluded)]
-        return ScoredViews(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(ScoredViews)))
+        return ScoredViews(
+            *(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(ScoredViews))
+        )
 
     def score_directions(self, locations: ArrayLike, directions: ArrayLike) -> Array:
         """Score views without roll at locations (L, 3) m in the world along each of directions (D, 3). Returns (L, D)."""

@@ -14,9 +14,8 @@ from pkgutil import resolve_name
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
-from wheretolook.utils.errors import CameraError, ConfigError, OutOfRangeWarning, WeightsError
-from wheretolook.utils.shipped import WEIGHTS, or_shipped
-from wheretolook.utils.validation import did_you_mean
+from wheretolook.utils.errors import CameraError, ConfigError, OutOfRangeWarning, WeightsError, did_you_mean
+from wheretolook.utils.package import WEIGHTS, or_shipped
 
 if TYPE_CHECKING:
     from wheretolook.geometry.camera import Camera

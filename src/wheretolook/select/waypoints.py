@@ -22,8 +22,7 @@ from wheretolook.geometry.pose_files import (
 )
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation, rotation_from_quaternion
 from wheretolook.looks.selection import MAX_VIEWS
-from wheretolook.utils.errors import ConfigError, SceneError, TableError
-from wheretolook.utils.validation import check_limits, check_pitch, check_range, reject
+from wheretolook.utils.errors import ConfigError, SceneError, TableError, check_limits, check_pitch, check_range, reject
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap

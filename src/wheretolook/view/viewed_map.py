@@ -24,7 +24,7 @@ from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.utils.errors import MapError, TableError, WhereToLookError
-from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped
+from wheretolook.utils.package import WEIGHTS, or_shipped, shipped
 from wheretolook.view import drawing
 from wheretolook.view.state import Paths, ViewState
 

@@ -21,7 +21,7 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.registry import Method, learned, scorers
 from wheretolook.utils.errors import ConfigError, StorageError, WeightsError
 from wheretolook.utils.files import read_json_object, safe_child, sha256, write_json
-from wheretolook.utils.version import VERSION
+from wheretolook.utils.package import VERSION
 from wheretolook.visibility.occlusion import StoredOcclusion
 
 CARD = "README.md"

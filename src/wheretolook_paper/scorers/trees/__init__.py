@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from wheretolook.scorers.registry import BuildOptions, Method, MethodStyle, imported
-from wheretolook.utils.validation import check_positive, check_range
+from wheretolook.utils.errors import check_positive, check_range
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap

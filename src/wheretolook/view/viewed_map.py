@@ -203,7 +203,7 @@ class AvailableWeights:
         usable = [
             name
             for name, method in scorers().items()
-            if method.group != "probes" and name != "random" and (not method.weights or method.weights in self.files)
+            if name != "random" and (not method.weights or method.weights in self.files)
         ]
         first = next(iter(self.files), "")
         return tuple(sorted(usable, key=lambda name: (scorers()[name].weights != first, name != first)))

@@ -200,7 +200,7 @@ class WhereToLook:
         here = environment.localization_map
         weights = resolve_weights(method, weights, here.landmarks.features)
         if not method:
-            return cls(load_scorer(weights, here, anywhere), axes, environment.space, files)
+            return cls(load_scorer(here, weights, anywhere), axes, environment.space, files)
         return cls(make_scorer(method, here, weights=weights, anywhere=anywhere), axes, environment.space, files)
 
     @property

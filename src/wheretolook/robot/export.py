@@ -36,7 +36,7 @@ from wheretolook.utils.package import VERSION
 
 OPSET = 17  # of 2022: onnxruntime 1.12 and later reads the file
 IR_VERSION = 8
-INPUTS = ("values", "taken", "n_visible", "axis_height")
+INPUTS = ("values", "taken", "n_visible")
 OUTPUTS = ("probability", "expected_inliers")
 
 
@@ -96,16 +96,13 @@ class RobotNetwork(nn.Module):
         single = np.where(single < exact, np.nextafter(single, np.float32(np.inf)), single)
         self.register_buffer("borders", torch.from_numpy(single))
 
-    def forward(
-        self, values: Tensor, n_sampled: Tensor, n_visible: Tensor, axis_height: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def forward(self, values: Tensor, n_sampled: Tensor, n_visible: Tensor) -> tuple[Tensor, Tensor]:
         """Score B views.
 
         Args:
             values: (B, K, A) float32, attributes of at most K landmarks of each view.
             n_sampled: (B,) int64, number of these landmarks that are the view's.
             n_visible: (B,) int64, number of visible landmarks.
-            axis_height: (B,) float32, z of the optical axis in the world.
 
         Returns:
             Probabilities to localize (B,) float64 and expected inliers (B,) float32.
@@ -144,7 +141,7 @@ def set_graph(trained: TrainedNetwork[SetNetwork], accuracy: Accuracy) -> Any:
     with warnings.catch_warnings(action="ignore"):  # the default exporter needs another package
         torch.onnx.export(
             RobotNetwork(trained, accuracy),
-            (*example, torch.zeros(2)),
+            example,
             file,
             dynamo=False,
             opset_version=OPSET,

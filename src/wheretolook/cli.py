@@ -311,7 +311,7 @@ def full_name(command: Any, name: str) -> str:
     for group, prefix in command.GROUPS.items():
         if name.startswith(f"{group}."):
             name = prefix + name.removeprefix(f"{group}.")
-    short: str = command.SHORT.get(name, name)
+    short: str = command.SHORT.get(name, command.SHORT.get(name.replace("_", "-"), name))
     return short
 
 

@@ -126,10 +126,8 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         tracking: where MLflow keeps its runs.
     """
 
-    SHORT: ClassVar = {
-        **{name: f"adapt.{name}" for name in ("scene", "map", "images", "database", "weights", "out", "minutes")},
-        "engine": "label.engine",
-    }
+    SHORT: ClassVar = {"engine": "label.engine"}
+    GROUPS: ClassVar = {"adapt": ""}
 
     adapt: AdaptConfig = field(default_factory=AdaptConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)

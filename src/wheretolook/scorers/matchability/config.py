@@ -7,7 +7,7 @@ from math import inf
 
 from wheretolook.inputs.channels import ATTRIBUTES, OF_SIZE
 from wheretolook.training.config import FittingConfig, check_range
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.errors import ConfigError, no_option
 
 
 @dataclass(frozen=True)
@@ -22,10 +22,10 @@ class LandmarksConfig(FittingConfig):
         enlarged: maximum factor by which scenes are scaled up or down in training; 1 does not scale them.
     """
 
-    landmarks: int = 64
-    width: int = 48
-    hidden: tuple[str, ...] = OF_SIZE
-    enlarged: float = 3.0
+    landmarks: int = no_option(64)
+    width: int = no_option(48)
+    hidden: tuple[str, ...] = no_option(OF_SIZE)
+    enlarged: float = no_option(3.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -41,5 +41,5 @@ class LandmarksConfig(FittingConfig):
 class MatchabilityConfig(LandmarksConfig):
     """Options of the probability that a visible landmark is detected."""
 
-    epochs: int = 6
-    batch_size: int = 256
+    epochs: int = no_option(6)
+    batch_size: int = no_option(256)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from wheretolook.scorers.matchability.config import LandmarksConfig
 from wheretolook.training.config import check_range
+from wheretolook.utils.errors import no_option
 
 
 @dataclass(frozen=True)
@@ -25,12 +26,12 @@ class SetConfig(LandmarksConfig):
     epochs: int = 8
     batch_size: int = 1024
     learning_rate: float = 3e-3
-    landmarks: int = 192
-    landmark_loss: float = 0.5
-    pooled: int = 0
-    head: int = 48
-    dropout: float = 0.1
-    from_matchability: bool = True
+    landmarks: int = no_option(192)
+    landmark_loss: float = no_option(0.5)
+    pooled: int = no_option(0)
+    head: int = no_option(48)
+    dropout: float = no_option(0.1)
+    from_matchability: bool = no_option(True)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -171,6 +171,7 @@ def draw_viewer(profile: Path) -> None:
                 done = r"(\d+) of \1 locations[\s\S]* landmarks in view"
                 tab.wait(lambda tab: re.search(done, tab.text) is not None, 4 * LOAD_S)  # scores the floor
                 time.sleep(2)
+                tab.evaluate("document.querySelectorAll('.mantine-Notification-root').forEach(e => e.remove())")
                 tab.save(Path("docs/images/viewer.webp"), 0, 0, *VIEWER_SIZE)
         finally:
             server.terminate()

@@ -145,9 +145,10 @@ def main(
     for root in datasets:
         table = summary(scored(root, split, methods, paths), list(methods))
         table.insert(0, "dataset", root.name)
+        table.insert(1, "split", split)
         print(f"\n{root.name}, {split}")
         shown = table[(table["group"] == "mean") | table["group"].str.startswith("all ")]
-        print(shown.drop(columns=["dataset"]).to_string(index=False, float_format=lambda x: f"{x:.3f}"))
+        print(shown.drop(columns=["dataset", "split"]).to_string(index=False, float_format=lambda x: f"{x:.3f}"))
         if out is not None:
             replace_rows(out, table.round(4), ["dataset"])
 

@@ -23,6 +23,7 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.landmark_features import LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.map import Map
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.matchability.config import MatchabilityConfig
 from wheretolook.scorers.matchability.network import MatchabilityNetwork
@@ -165,7 +166,7 @@ def test_views_outside_the_training_range_warn_once(
     far = views.copy()
     far[:, :, 3] *= 50
     farther = replace(landmarks, points=50 * landmarks.points, mapping_distance_m=50 * landmarks.mapping_distance_m)
-    scorer = make_scorer(name, LocalizationMap(farther, CAMERA), weights=weights)
+    scorer = make_scorer(name, LocalizationMap(Map(farther), CAMERA), weights=weights)
     assert scorer.in_range(far).mean() < 0.9
     assert len(warnings_of(scorer, far)) == 1 and not warnings_of(scorer, far)
 

@@ -19,8 +19,7 @@ from wheretolook.commands.options import Experiment, MeshSource
 from wheretolook.mapping.config import MapConfig
 from wheretolook.scorers.registry import describe_methods
 from wheretolook.utils import devices
-from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.validation import nearest
+from wheretolook.utils.errors import ConfigError, nearest
 from wheretolook_paper.release.catalog import ITEMS
 
 ROOT = Path(__file__).parents[1]
@@ -291,7 +290,7 @@ def test_listings_hold_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
 def test_help_explains_every_option(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([command, "--help"]) == 0
     text = capsys.readouterr().out
-    missing = [name for name in cli.option_types(cli.load_command(command)) if f"--{name}" not in text]
+    missing = [name for name in cli.command_options(cli.load_command(command)) if f"--{name}" not in text]
     assert missing == [] and f"wheretolook {command} " in text
 
 

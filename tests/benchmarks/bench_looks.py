@@ -23,7 +23,7 @@ from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.looks.selection import best_views
 from wheretolook.scorers.weights import load_scorer
-from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.utils.package import WEIGHTS, shipped
 
 
 def main() -> None:

@@ -19,10 +19,8 @@ from wheretolook.mapping.georeference import read_scale
 from wheretolook.mapping.landmarks import Landmarks, read_feature_name
 from wheretolook.mapping.map import Map
 from wheretolook.mapping.map_frame import read_frame
-from wheretolook.utils.artifact_cache import ArtifactCache
-from wheretolook.utils.errors import ConfigError, TableError
-from wheretolook.utils.files import fingerprint, read_json_object, safe_child, write_json
-from wheretolook.utils.validation import check_choice
+from wheretolook.utils.errors import ConfigError, TableError, check_choice
+from wheretolook.utils.files import ArtifactCache, fingerprint, read_json_object, safe_child, write_json
 
 if TYPE_CHECKING:
     import pandas as pd

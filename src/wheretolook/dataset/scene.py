@@ -22,8 +22,7 @@ from wheretolook.mapping.map import Map
 from wheretolook.mapping.map_frame import MapFrame, warn_of_mesh
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.utils.devices import usable_device
-from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.validation import check_positive
+from wheretolook.utils.errors import ConfigError, check_positive
 from wheretolook.visibility.config import OCCLUSION_MODELS, OcclusionConfig, check_occlusion_names
 
 if TYPE_CHECKING:  # pandas, torch and Warp are imported when first needed

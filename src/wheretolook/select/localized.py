@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 from wheretolook.dataset.config import CONTRADICTED, LOCALIZED, NO_POSE
 from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of, cameras_by_id, describe_camera
 from wheretolook.geometry.camera_turns import pan_tilt_angles
+from wheretolook.geometry.pose_files import images_text
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation
-from wheretolook.io.poses import images_text
 from wheretolook.localization.rig_localization import JointLocalization
 from wheretolook.mapping.colmap_model import find_camera, registered_names
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame
 from wheretolook.mapping.photographs import read_photograph, reduce_photograph
 from wheretolook.utils.errors import ConfigError, PoseError
-from wheretolook.utils.extras import quiet_colmap
 from wheretolook.utils.files import path_ends, write_json, write_text
+from wheretolook.utils.texts import quiet_colmap
 
 if TYPE_CHECKING:
     import pandas as pd

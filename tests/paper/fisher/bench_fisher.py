@@ -1,6 +1,6 @@
 """Measure Fisher information: building and querying fields, and exact sums over a grid of viewpoints.
 
-    python tests/benchmarks/bench_fisher.py [--device cuda]
+    python tests/paper/fisher/bench_fisher.py [--device cuda]
 
 Landmarks are on the walls of a room; a random half is occluded from each location. Prints the median and the range over
 repeats, and the time of each kernel's NumPy twin, extrapolated from a small part. On the CPU also the errors of the
@@ -10,9 +10,14 @@ approximations against the exact information, by the number of samples of the Ga
 from __future__ import annotations
 
 import argparse
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+
 from common import ROOM_M, room_landmarks, timed
 
 from wheretolook.geometry.camera import PinholeCamera

@@ -166,12 +166,13 @@ NUMBERS = Numbers(ROOT)
 @pytest.mark.parametrize("page", pages(NUMBERS))
 def test_numbers_are_those_of_the_results(page: str) -> None:
     assert (ROOT / page).read_text() == updated(page, NUMBERS), (
-        "python -m wheretolook_paper.studies.results --only pages"
+        "python -m wheretolook_paper.studies.results --only '[pages]'"
     )
 
 
 def test_a_changed_result_changes_the_page(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "data" / "release" / "results", tmp_path / "data" / "release" / "results")
+    shutil.copy(ROOT / "data" / "release" / "README.md", tmp_path / "data" / "release")
     shutil.copytree(ROOT / "docs", tmp_path / "docs")
     path = tmp_path / "data" / "release" / "results" / "looks.csv"
     table = pd.read_csv(path)

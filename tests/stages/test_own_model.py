@@ -21,9 +21,9 @@ from wheretolook.commands.options import MapUseOptions, ScenesConfig, extractor_
 from wheretolook.commands.plan import Plan
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.viewpoint_map import BuildViewpointMap
-from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.scene import Scene
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig, PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
@@ -109,7 +109,7 @@ def test_from_a_model_to_a_planned_path(tmp_path, with_mesh):
     (scene,) = Dataset.load(tmp_path / "data" / "mine").scenes
     assert scene.name == "flat" and scene.camera == LOOKS and scene.own_camera
     assert scene.is_photographed is not with_mesh and len(scene.read_landmarks()) == n_points
-    assert SceneEnvironment(scene).has_photographs  # of the model, whose mesh is not what was mapped
+    assert Scene(scene).map.has_photographs  # of the model, whose mesh is not what was mapped
     np.testing.assert_allclose(scene.mapping_poses(), colmap_poses(folder), atol=1e-6)
 
     run(Sample, experiment)

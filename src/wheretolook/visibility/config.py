@@ -13,7 +13,7 @@ DEFAULT_RADIUS = 50.0
 
 @dataclass(frozen=True)
 class OcclusionKind:
-    """What `Environment` needs to make an occlusion model."""
+    """What `Scene` needs to make an occlusion model."""
 
     model: str  # "module:class"; the class method `from_inputs` makes an instance
     needs: str = ""  # "mesh" or "depth images", if the landmarks are not enough

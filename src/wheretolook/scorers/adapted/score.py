@@ -102,7 +102,8 @@ class AdaptedScorer(Scorer):
         network = trained.network
         self.trained = trained
         of_base = network.network, trained.camera, network.base_scale, network.base_offset, trained.training_range
-        known = replace(localization_map, photographs=False)  # the base is calibrated for this map already
+        rendered = replace(localization_map.map, has_photographs=False)
+        known = replace(localization_map, map=rendered)  # the base is calibrated for this map already
         self.base = SetScorer(known, TrainedNetwork("set", *of_base))
 
     def score(self, cam_from_world: Float) -> Float:

@@ -14,8 +14,6 @@ from wheretolook.scorers.registry import BuildOptions, rule
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
 
-POSE_DECIMALS = 6  # poses that agree to this many decimals (of a metre, and in the rotation matrix) get the same score
-
 
 class RandomScorer(Scorer):
     """Uniform random scores, a function of pose and seed."""
@@ -32,8 +30,8 @@ class RandomScorer(Scorer):
 
 
 def uniform(values: Float, seed: int) -> Float:
-    """Return uniform numbers (B,) in [0, 1), a function of rows (B, K), up to `POSE_DECIMALS`, and the seed."""
-    numbers = np.round(values * 10**POSE_DECIMALS).astype(np.int64)
+    """Return uniform numbers (B,) in [0, 1), a function of rows (B, K), to six decimals, and the seed."""
+    numbers = np.round(values * 1e6).astype(np.int64)
     state = np.full(len(numbers), seed, dtype=np.uint64)
     for column in numbers.T:
         state = _splitmix64(state ^ column.astype(np.uint64))

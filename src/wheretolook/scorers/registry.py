@@ -79,15 +79,15 @@ def imported(reference: str) -> Callable[..., Any]:
     return lambda *arguments: resolve_name(reference)(*arguments)
 
 
-def network_scorer(scorer: str, network: str, *methods: str) -> Callable[[LocalizationMap, BuildOptions], Scorer]:
-    """Return a function that builds a scorer from weights of these methods; both classes as in `imported`."""
+def network_scorer(scorer: str, network: str, method: str) -> Callable[[LocalizationMap, BuildOptions], Scorer]:
+    """Return a function that builds a scorer from weights of a method; both classes as in `imported`."""
 
     def build(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
         from wheretolook.training.trained_network import TrainedNetwork
 
         assert options.weights is not None
         network_class: Any = resolve_name(network)
-        trained = TrainedNetwork.load(options.weights, network_class, *methods, device=localization_map.device)
+        trained = TrainedNetwork.load(options.weights, network_class, method, device=localization_map.device)
         built: Scorer = resolve_name(scorer)(localization_map, trained)
         return built
 

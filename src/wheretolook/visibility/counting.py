@@ -34,15 +34,13 @@ from wheretolook.visibility.occlusion import DevicePoints, OcclusionModel, Store
 ROUNDING = 1e-5  # least relative distance of a cell's corners from a plane, since rounding may move landmarks into it
 
 
-MOST_CELLS = 1 << 28  # of all orientations together, a byte each while they are classified
-
-
 def choose_size(n_points: int, n_rotations: int = 1) -> int:
     """Cells along a side of the map, an even number. About six landmarks a cell were fastest on CPU and GPU.
 
     Fewer where the cells of very many orientations would take too much memory.
     """
-    most = min(256, 2 * int(np.sqrt(MOST_CELLS / max(n_rotations, 1)) / 2))
+    # 2^28 cells of all orientations together: a byte each while they are classified
+    most = min(256, 2 * int(np.sqrt((1 << 28) / max(n_rotations, 1)) / 2))
     return int(np.clip(2 * round(np.sqrt(n_points / 6) / 2), 8, max(8, most)))
 
 
@@ -103,10 +101,6 @@ def _runs(classes: Any, size: int) -> tuple[CellRuns, CellRuns]:
     return CellRuns(starts[: n_rows + 1], cells), CellRuns(starts[n_rows:], cells)
 
 
-GPU_LANES = 16  # threads that share a location and an orientation on a GPU
-UNSURE_BYTES = 20  # of a landmark on the list of those that the table of a field of view cannot decide
-
-
 class FrustumCounter:
     """Counts the landmarks in view from any location, for a fixed set of orientations.
 
@@ -133,7 +127,8 @@ class FrustumCounter:
         self.rotations = np.asarray(rotations, dtype=np.float32)
         self.device = start_warp(device)
         wp.load_module(counting_kernel, device=self.device)  # only one thread may do that
-        self.lanes = GPU_LANES if wp.get_device(self.device).is_cuda else 1
+        # threads that share a location and an orientation
+        self.lanes = 16 if wp.get_device(self.device).is_cuda else 1
         self._field = tabulate(camera) if isinstance(camera, ColmapCamera) else None
         self.size = size or choose_size(n_points, len(self.rotations))
         self.cells = SphereCells.of(camera, rotations, self.size, self.device)
@@ -213,7 +208,7 @@ class FrustumCounter:
         shared = [self._axes, self._depth, self._field.size, landmarks]
         views = counts.flatten()
         n_views = counts.shape[0] * counts.shape[1]
-        capacity = max(1, self.scratch_bytes // UNSURE_BYTES)
+        capacity = max(1, self.scratch_bytes // 20)  # bytes of an entry of both lists
         first = 0
         block = n_views
         number: Any = wp.empty(1, dtype=wp.int32, device=device)
@@ -352,10 +347,6 @@ class FrustumLister(FrustumCounter):
         wp.launch(counting_kernel.list_kernel, len(views), inputs, outputs, device=self.device)
 
 
-BYTES_TO_RANK = 4  # of every direction at every location, for those who ask which rank it has
-CPU_BLOCK_BYTES = 1 << 24  # on a CPU a block of locations should fit into the cache
-
-
 @dataclass(frozen=True, eq=False)
 class Survey:
     """What L locations see in D directions."""
@@ -452,7 +443,7 @@ def _counter(
 
 def _check_counts(n_locations: int, n_directions: int) -> None:
     """Raise ConfigError if the counts of all views do not fit into memory."""
-    most = fitting(4 + 4 + BYTES_TO_RANK)
+    most = fitting(4 + 4 + 4)  # its count, its place among the best, and its rank for those who ask for it
     if n_locations * n_directions > most:
         problem = f"{n_directions:,} directions at {n_locations:,} locations do not fit into memory"
         raise ConfigError(problem, fix=f"{most // n_locations:,} directions would fit, or fewer locations.")
@@ -470,7 +461,7 @@ def _workers_and_block(
     workers = min(workers, memory_bytes // required)
     share = memory_bytes // workers - counter.fixed_bytes
     if counter.device == "cpu" and not occlusion.uses_all_cores:
-        share = min(share, CPU_BLOCK_BYTES)
+        share = min(share, 1 << 24)  # a block of locations should fit into the cache
     block = min(max(1, share // per_location), counter.max_locations(n_points), -(-n_locations // workers))
     if occlusion.uses_all_cores:
         block = min(block, 16 * cores())  # enough for all cores, and the progress bar moves

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.registry import BuildOptions, rule
+from wheretolook.scorers.registry import rule
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
@@ -46,8 +46,4 @@ def _splitmix64(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return state ^ (state >> np.uint64(31))
 
 
-def _build(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
-    return RandomScorer(localization_map, options.seed)
-
-
-METHODS = (rule(RandomScorer, build=_build),)
+METHODS = (rule(RandomScorer, build=lambda map, options: RandomScorer(map, options.seed)),)

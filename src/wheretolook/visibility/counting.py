@@ -52,37 +52,31 @@ class CellRuns:
     cells: Any  # (n,) pairs of int32: the first cell of a run, and the one after its last
 
 
-@dataclass(frozen=True, eq=False)
-class SphereCells:
-    """The cells of D orientations, on a device."""
+def cells_in_view(camera: Camera, rotations: Float, size: int, device: str) -> tuple[CellRuns, CellRuns]:
+    """Classify the cells, `size` along a side of the map, for rotations (D, 3, 3) cam_from_world, on a Warp device.
 
-    size: int  # cells along a side of the map; there are size * size
-    inside: CellRuns  # runs of cells wholly in view
-    border: CellRuns  # runs of cells that are partly in view, or may be
+    Returns the runs of cells wholly in view, and of those that are partly in view, or may be.
+    """
+    shape = (len(rotations), size * size)
+    classes: Any = wp.empty(shape, dtype=wp.uint8, device=device)
 
-    @classmethod
-    def of(cls, camera: Camera, rotations: Float, size: int, device: str) -> SphereCells:
-        """Classify the cells, `size` along a side, for rotations (D, 3, 3) cam_from_world, on a Warp device."""
-        shape = (len(rotations), size * size)
-        classes: Any = wp.empty(shape, dtype=wp.uint8, device=device)
+    def upload(values: Float, dtype: Any) -> Any:
+        return wp.array(np.asarray(values, dtype=np.float32), dtype=dtype, device=device)
 
-        def upload(values: Float, dtype: Any) -> Any:
-            return wp.array(np.asarray(values, dtype=np.float32), dtype=dtype, device=device)
-
-        if isinstance(camera, ColmapCamera):
-            field = tabulate(camera)
-            centers, radii = cell_centers(size)
-            arrays = [upload(rotations, wp.mat33), upload(centers, wp.vec3), upload(field.depth_rad, wp.float32)]
-            inputs = [*arrays, field.size, float(radii.max()) + ROUNDING]
-            wp.launch(counting_kernel.classify_field_kernel, shape, inputs, [classes], device=device)
-        else:
-            edge = np.arange(size + 1) / size * 2 - 1
-            corners = octahedral_directions(edge[None, :], edge[:, None]).reshape(-1, 3)
-            sides = frustum_sides(camera, rotations)
-            margin = float(ROUNDING * np.linalg.norm(sides, axis=-1).max(initial=0))
-            inputs = [upload(sides, wp.vec3), upload(corners, wp.vec3), size, margin]
-            wp.launch(counting_kernel.classify_pinhole_kernel, shape, inputs, [classes], device=device)
-        return cls(size, *_runs(classes, size))
+    if isinstance(camera, ColmapCamera):
+        field = tabulate(camera)
+        centers, radii = cell_centers(size)
+        arrays = [upload(rotations, wp.mat33), upload(centers, wp.vec3), upload(field.depth_rad, wp.float32)]
+        inputs = [*arrays, field.size, float(radii.max()) + ROUNDING]
+        wp.launch(counting_kernel.classify_field_kernel, shape, inputs, [classes], device=device)
+    else:
+        edge = np.arange(size + 1) / size * 2 - 1
+        corners = octahedral_directions(edge[None, :], edge[:, None]).reshape(-1, 3)
+        sides = frustum_sides(camera, rotations)
+        margin = float(ROUNDING * np.linalg.norm(sides, axis=-1).max(initial=0))
+        inputs = [upload(sides, wp.vec3), upload(corners, wp.vec3), size, margin]
+        wp.launch(counting_kernel.classify_pinhole_kernel, shape, inputs, [classes], device=device)
+    return _runs(classes, size)
 
 
 def _runs(classes: Any, size: int) -> tuple[CellRuns, CellRuns]:
@@ -104,7 +98,7 @@ def _runs(classes: Any, size: int) -> tuple[CellRuns, CellRuns]:
 class FrustumCounter:
     """Counts the landmarks in view from any location, for a fixed set of orientations.
 
-    The landmarks around a location are sorted into cells of the sphere of directions (`SphereCells`). A cell wholly in
+    The landmarks around a location are sorted into cells of the sphere of directions (`cells_in_view`). A cell wholly in
     view counts with all its landmarks; landmarks are tested one by one only in cells on the border of the view.
 
     `rotations` (D, 3, 3) are cam_from_world; `device` is "cpu" or a CUDA device. `n_points`, about how many landmarks
@@ -131,7 +125,7 @@ class FrustumCounter:
         self.lanes = 16 if wp.get_device(self.device).is_cuda else 1
         self._field = tabulate(camera) if isinstance(camera, ColmapCamera) else None
         self.size = size or choose_size(n_points, len(self.rotations))
-        self.cells = SphereCells.of(camera, rotations, self.size, self.device)
+        self.inside, self.border = cells_in_view(camera, rotations, self.size, self.device)
         self._axes: Any = wp.array(self.rotations, dtype=wp.mat33, device=self.device)
         self._near = 0.0
         if isinstance(camera, PinholeCamera):
@@ -196,10 +190,10 @@ class FrustumCounter:
         landmarks.size = self.size
         landmarks.starts = starts
         landmarks.offsets = offsets
-        landmarks.inside_starts = self.cells.inside.starts
-        landmarks.inside = self.cells.inside.cells
-        landmarks.border_starts = self.cells.border.starts
-        landmarks.border = self.cells.border.cells
+        landmarks.inside_starts = self.inside.starts
+        landmarks.inside = self.inside.cells
+        landmarks.border_starts = self.border.starts
+        landmarks.border = self.border.cells
         return landmarks, places
 
     def _count_by_field(self, landmarks: Any, counts: Any) -> Any:
@@ -284,10 +278,6 @@ class FrustumLister(FrustumCounter):
 
     Views (V, 2) are given by rows of the locations and of the rotations.
     """
-
-    def __init__(self, camera: Camera, rotations: Float, n_points: int, device: str = "cpu", **options: Any) -> None:
-        super().__init__(camera, rotations, n_points, device, **options)
-        wp.load_module(counting_kernel, device=self.device)  # only one thread may do that
 
     def surroundings(self, locations: ArrayLike, points: Any, unoccluded: Any | None) -> Surroundings:
         """What is unoccluded from locations (L, 3) m.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -31,7 +33,7 @@ def views() -> pd.DataFrame:
 def expected(room: MappedRoom, views: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The file of their labels that every engine must produce."""
     localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
-    labelled = label_rows(views, WarpRenderer(load_mesh(room.mesh)), localizer, CAMERA)
+    labelled = label_rows(views, room.job, localizer, WarpRenderer(load_mesh(room.mesh)))
     assert labelled["status"].nunique() > 1
     return file_bytes(labelled, tmp_path_factory.mktemp("expected"))
 
@@ -40,7 +42,7 @@ def expected(room: MappedRoom, views: pd.DataFrame, tmp_path_factory: pytest.Tem
 def matched(room: MappedRoom, views: pd.DataFrame) -> pd.DataFrame:
     """Their labels with the landmarks that were matched."""
     localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
-    return label_rows(views, WarpRenderer(load_mesh(room.mesh)), localizer, CAMERA, store_matches=True)
+    return label_rows(views, replace(room.job, store_matches=True), localizer, WarpRenderer(load_mesh(room.mesh)))
 
 
 @pytest.fixture(scope="session")

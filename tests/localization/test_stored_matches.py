@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -81,7 +82,7 @@ def test_pixels_are_kept_in_the_order_of_the_landmarks(
     localizer = Localizer(landmarks, CAMERA)
     renderer = WarpRenderer(load_mesh(room.mesh))
     some = views.iloc[rows].reset_index(drop=True)
-    kept = label_rows(some, renderer, localizer, CAMERA, store_pixels=True)
+    kept = label_rows(some, replace(room.job, store_pixels=True), localizer, renderer)
     write_table(kept, tmp_path / "viewpoints.parquet")
     back = read_table(tmp_path / "viewpoints.parquet", pixels=True)
     assert "matched_pixels" not in read_table(tmp_path / "viewpoints.parquet", matches=True)

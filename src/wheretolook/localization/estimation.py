@@ -12,6 +12,7 @@ import numpy as np
 import poselib
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.pose_information import N_NUMBERS, bearing_numbers, information_matrices
@@ -131,8 +132,6 @@ def refine_rotations(
     on the keypoints and a quadratic prior on the rotations, whose standard deviation about each axis is `noise_rad`.
     Rotations start as in `cams_from_world`; points (M, 3) m and masks (M,) are given for each view.
     """
-    from scipy.spatial.transform import Rotation
-
     cam_from_rig = np.stack([look.cam_from_rig for look in looks])
     rig = rig_from_world
     turns = cams_from_world[:, :, :3] @ rig[:, :3].T @ cam_from_rig[:, :, :3].swapaxes(1, 2)
@@ -155,8 +154,6 @@ def _solve(
     noise_rad: float,
 ) -> Float:
     """Gauss-Newton step (6 + 3 N,): left perturbations of rig_from_world (rotation, translation), then of rotations."""
-    from scipy.spatial.transform import Rotation
-
     normal = np.zeros((6 + 3 * len(looks), 6 + 3 * len(looks)))
     right = np.zeros(len(normal))
     for k, look in enumerate(looks):

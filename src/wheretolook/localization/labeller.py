@@ -23,6 +23,7 @@ from wheretolook.dataset.viewpoint_files import SCHEMA, read_table, write_table
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, LABELS
 from wheretolook.localization.config import LabelConfig, versions
 from wheretolook.localization.shard import LabelledShard, SceneJob, Shard, ShardWorker, run_local
+from wheretolook.rendering.warp_renderer import method_on
 from wheretolook.utils.errors import ConfigError, TableError, WhereToLookError, WorkerError
 from wheretolook.utils.files import atomic_write, fingerprint, sha256, write_json
 from wheretolook.utils.package import require
@@ -156,8 +157,6 @@ class _SceneInProgress:
 
 def _renderer_name(device: str) -> str:
     """Kind of device and rendering method, which round some pixels differently."""
-    from wheretolook.rendering.warp_renderer import method_on
-
     kind = device.partition(":")[0]
     return f"{kind} {method_on(kind)}"
 

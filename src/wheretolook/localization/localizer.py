@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +22,11 @@ from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.geometry.similarity import poses_from
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator
+from wheretolook.localization.lightglue import LightGlueMatcher
 from wheretolook.localization.rig import Look
 from wheretolook.localization.rig_localization import POSES_OF_AN_IMAGE, JointLocalizer
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import MapError
-
-if TYPE_CHECKING:
-    from wheretolook.localization.lightglue import LightGlueMatcher
-
 
 Matcher = DescriptorMatcher | DescriptorIndex | SimilarityMatcher
 
@@ -90,8 +87,6 @@ class Localizer:
         self._matcher = DescriptorIndex(self._descriptors) if indexed else self._matcher_of(self._descriptors)
         self._guided: LightGlueMatcher | None = None
         if config.lightglue:
-            from wheretolook.localization.lightglue import LightGlueMatcher
-
             self._guided = LightGlueMatcher(landmarks, map_dir, config.lightglue, device, features)
         self.camera = camera
         self.estimator = PoseEstimator(landmarks.points, config)

@@ -5,22 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from wheretolook.features.matches import Matches
 from wheretolook.geometry.camera import Camera, field_of_view_deg
 from wheretolook.geometry.poses import Float, as_numbers, camera_centers, compose_poses, invert_poses, rigid_poses
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.io.poses import NAME_COLUMNS, QUATERNION_COLUMNS, NamedRows, poses_of_rows, read_named_rows
 from wheretolook.utils.errors import ConfigError, PoseError, TableError
 from wheretolook.utils.files import path_ends
-
-if TYPE_CHECKING:
-    from wheretolook.features.matches import Matches
-
 
 IDENTITY: Float = np.eye(3, 4)
 
@@ -86,8 +82,6 @@ def checked_turns(turns: ArrayLike, n_views: int) -> Float:
 
     Raises PoseError if one is not rigid, or there are more or fewer than views.
     """
-    from scipy.spatial.transform import Rotation
-
     poses = as_numbers(turns)
     if poses.shape[1:] == (3, 3):
         poses = np.pad(poses, ((0, 0), (0, 0), (0, 1)))

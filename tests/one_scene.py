@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.localization.config import LabelConfig
 from wheretolook.localization.labeller import LabelTask, label_scenes

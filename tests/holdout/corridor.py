@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from wheretolook.features.extractor import DescriptorKind
-from wheretolook.features.sift import SIFT
+from wheretolook.features.extractor import SIFT, DescriptorKind
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.mapping.triangulation import fill_database
 

@@ -13,7 +13,7 @@ import pytest
 from localization.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, file_bytes, label, times
 from wheretolook.dataset.viewpoint_files import MATCH_FIELDS, SCHEMA, read_table, write_table
 from wheretolook.dataset.viewpoint_table import TOO_FEW_MATCHES, is_good, poses
-from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.poses import transform
 from wheretolook.localization.config import LocalizerConfig, versions
 from wheretolook.localization.labeller import MANIFEST

@@ -12,9 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.features.extractor import Keypoints
+from wheretolook.features.extractor import EXTRACTORS, KINDS, Keypoints
 from wheretolook.features.learned import kornia_feature, load_state, one_thread
-from wheretolook.features.registry import all_extractors, all_kinds
 from wheretolook.mapping.colmap_model import model_arrays, read_model
 from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import Landmarks
@@ -53,9 +52,7 @@ class LightGlueMatcher:
         device: str = "cpu",
         features: Path | None = None,
     ) -> None:
-        supported = {
-            record.descriptors.name: record.lightglue for record in all_extractors().values() if record.lightglue
-        }
+        supported = {record.descriptors.name: record.lightglue for record in EXTRACTORS.values() if record.lightglue}
         if landmarks.features not in supported:
             fix = f"Leave LightGlue out, or map with one of {', '.join(supported)}."
             raise ConfigError("LightGlue does not support these features", value=landmarks.features, fix=fix)
@@ -67,7 +64,7 @@ class LightGlueMatcher:
         self.map_dir = map_dir
         self.features = features
         self.device = torch.device(device)
-        self.kind = all_kinds()[landmarks.features]
+        self.kind = KINDS[landmarks.features]
         self._network = _network(supported[landmarks.features], weights).to(self.device)
 
     def match(

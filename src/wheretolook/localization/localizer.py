@@ -12,11 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.dataset.config import LOCALIZED, NO_POSE, TOO_FEW_MATCHES
-from wheretolook.features.config import ExtractorConfig, KeypointExtractor
-from wheretolook.features.extractor import Keypoints
+from wheretolook.features.extractor import KINDS, ExtractorConfig, KeypointExtractor, Keypoints, kind_of
 from wheretolook.features.matches import Matches, match
 from wheretolook.features.matching import MAX_NEAREST, DescriptorIndex, DescriptorMatcher, SimilarityMatcher, has_index
-from wheretolook.features.registry import all_kinds, kind_of
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.geometry.similarity import poses_from
@@ -77,7 +75,7 @@ class Localizer:
             raise MapError("landmarks without descriptors cannot be matched", fix="Build the map with its database.")
         self.landmarks = landmarks
         self.config = config
-        self.kind = all_kinds()[landmarks.features]
+        self.kind = KINDS[landmarks.features]
         self._extractor = extractor or ExtractorConfig()
         if extractor is not None:
             self._check_extractor()

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from wheretolook.dataset.viewpoint_files import FIRST_FIELDS, MATCH_FIELDS
 from wheretolook.dataset.viewpoint_table import APPEARANCE, CAMERA_ID, CHANGES, FIRST, PIXELS, poses
-from wheretolook.features.config import ExtractorConfig
-from wheretolook.features.extractor import Keypoints
+from wheretolook.features.extractor import ExtractorConfig, Keypoints
 from wheretolook.features.matches import Matches
 from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.poses import Float

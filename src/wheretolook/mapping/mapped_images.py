@@ -10,8 +10,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.features.extractor import DescriptorKind
-from wheretolook.features.sift import SIFT
+from wheretolook.features.extractor import SIFT, DescriptorKind
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import (

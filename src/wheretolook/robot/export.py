@@ -21,7 +21,7 @@ from tqdm.auto import tqdm
 
 import wheretolook
 from wheretolook.dataset.config import Accuracy, checked_accuracy
-from wheretolook.features.sift import SIFT
+from wheretolook.features.extractor import SIFT
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera, describe_camera
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap

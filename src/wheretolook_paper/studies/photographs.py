@@ -26,7 +26,7 @@ import pycolmap
 from jsonargparse import auto_cli
 from tqdm.auto import tqdm
 
-from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, camera_centers, invert_poses, pose_error
 from wheretolook.holdout.photo_map import open_map

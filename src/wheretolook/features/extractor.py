@@ -126,24 +126,41 @@ XFEAT = DescriptorKind("xfeat", 64, "float16", min_similarity=0.82)
 SUPERPOINT = DescriptorKind("superpoint", 256, "float16", min_similarity=0.755)
 KINDS = {kind.name: kind for kind in (SIFT, ALIKED, DISK, XFEAT, SUPERPOINT)}
 
-_OF_ALIKED = (
-    "https://huggingface.co/kornia/aliked/resolve/main/aliked-n16rot.pth",
-    "https://github.com/Shiaoming/ALIKED/raw/main/models/aliked-n16rot.pth",
-)
-_OF_DISK = (
-    "https://huggingface.co/kornia/disk/resolve/main/depth-save.pth",
-    "https://raw.githubusercontent.com/cvlab-epfl/disk/master/depth-save.pth",
-)
-_OF_XFEAT = ("https://github.com/verlab/accelerated_features/raw/main/weights/xfeat.pt",)
-_ALL = (
-    Extractor("opencv", SIFT, "sift:opencv_or_gpu"),
-    Extractor("colmap", SIFT, "sift:ColmapSift"),
-    Extractor("aliked", ALIKED, "learned:Aliked", "aliked-n16rot.pth", _OF_ALIKED, lightglue="aliked"),
-    Extractor("disk", DISK, "learned:Disk", "depth-save.pth", _OF_DISK, lightglue="disk"),
-    Extractor("xfeat", XFEAT, "learned:XFeat", "xfeat.pt", _OF_XFEAT, lightglue="xfeat"),
-    Extractor("superpoint", SUPERPOINT, lightglue="superpoint"),
-)
-EXTRACTORS = {extractor.name: extractor for extractor in _ALL}
+EXTRACTORS = {
+    "opencv": Extractor("opencv", SIFT, "sift:opencv_or_gpu"),
+    "colmap": Extractor("colmap", SIFT, "sift:ColmapSift"),
+    "aliked": Extractor(
+        "aliked",
+        ALIKED,
+        build="learned:Aliked",
+        weights="aliked-n16rot.pth",
+        urls=(
+            "https://huggingface.co/kornia/aliked/resolve/main/aliked-n16rot.pth",
+            "https://github.com/Shiaoming/ALIKED/raw/main/models/aliked-n16rot.pth",
+        ),
+        lightglue="aliked",
+    ),
+    "disk": Extractor(
+        "disk",
+        DISK,
+        build="learned:Disk",
+        weights="depth-save.pth",
+        urls=(
+            "https://huggingface.co/kornia/disk/resolve/main/depth-save.pth",
+            "https://raw.githubusercontent.com/cvlab-epfl/disk/master/depth-save.pth",
+        ),
+        lightglue="disk",
+    ),
+    "xfeat": Extractor(
+        "xfeat",
+        XFEAT,
+        build="learned:XFeat",
+        weights="xfeat.pt",
+        urls=("https://github.com/verlab/accelerated_features/raw/main/weights/xfeat.pt",),
+        lightglue="xfeat",
+    ),
+    "superpoint": Extractor("superpoint", SUPERPOINT, lightglue="superpoint"),
+}
 
 
 def runnable_extractors() -> tuple[str, ...]:

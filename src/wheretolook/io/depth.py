@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.utils.errors import SceneError
-from wheretolook.utils.files import MAX_DEPTH_PIXELS, load_npy, read_image
+from wheretolook.utils.files import load_npy, read_image
 
 NO_READING = np.iinfo(np.uint16).max  # in 16-bit images of several cameras, as 0 in all
 
@@ -21,7 +21,7 @@ def read_depth(path: Path, scale: float = 1000.0) -> NDArray[np.float32]:
     Raises OSError or ValueError if the file is missing or damaged, SceneError if its values are no depths.
     """
     is_array = path.suffix.lower() == ".npy"
-    image = load_npy(path) if is_array else read_image(path, cv2.IMREAD_UNCHANGED, MAX_DEPTH_PIXELS)
+    image = load_npy(path) if is_array else read_image(path, cv2.IMREAD_UNCHANGED, 25_000_000)  # phones have half of it
     if image.ndim != 2 or image.dtype.kind not in "fui" or image.dtype.itemsize == 1:
         value = f"{image.dtype}, shape {image.shape}"
         raise SceneError("this is no depth image", path=path, value=value, fix="Write one channel of 16 bits as PNG.")

@@ -1,11 +1,9 @@
 """Mip pyramids and texel gradients against averages and differences taken by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from box_scenes import random_texture, random_triangles
-from wheretolook.rendering.textures import build_pyramids, texel_gradients
+from wheretolook.rendering.warp_renderer import build_pyramids, texel_gradients
 
 
 def level_of(pyramids, texture, level):

@@ -1,16 +1,13 @@
 """Log-odds of maps of photographs have the offset of the weights once; those of maps of renders have none."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.special import expit, logit
 
 from selection.room import write_room
-from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
+from wheretolook.dataset.scene import ColmapFiles, Scene
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.weights import load_scorer
@@ -20,7 +17,7 @@ from wheretolook_paper.studies.calibrate_photographs import fitted_offset
 
 
 @pytest.mark.parametrize("rendered", [True, False])
-def test_the_offset_is_added_once_and_only_for_photographs(rendered: bool, tmp_path: Path) -> None:
+def test_the_offset_is_added_once_and_only_for_photographs(rendered, tmp_path):
     folder = write_room(tmp_path / "sparse", metric=rendered)  # whose report then states that it is rendered
     trained = replace(
         TrainedNetwork.load(shipped(WEIGHTS) / "set.safetensors", SetNetwork, "set"), photograph_offset=0.7
@@ -31,7 +28,7 @@ def test_the_offset_is_added_once_and_only_for_photographs(rendered: bool, tmp_p
     expected = 0.0 if rendered else 0.7
     for localization_map in (
         LocalizationMap.from_colmap(folder),
-        ColmapEnvironment(ColmapFiles(folder)).localization_map,
+        Scene.of_colmap(ColmapFiles(folder)).localization_map,
     ):
         views = localization_map.mapping_poses
         assert views is not None
@@ -42,7 +39,7 @@ def test_the_offset_is_added_once_and_only_for_photographs(rendered: bool, tmp_p
             np.testing.assert_allclose(logit(scorer.score(views)) - logit(plain.score(views)), expected, atol=1e-6)
 
 
-def test_the_offset_of_several_places_is_fitted_with_equal_weights() -> None:
+def test_the_offset_of_several_places_is_fitted_with_equal_weights():
     """Probabilities that are too low by 1 in log-odds on one place and by 0 on one of ten times the views."""
     rng = np.random.default_rng(0)
     places = []

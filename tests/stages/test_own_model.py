@@ -21,13 +21,13 @@ from wheretolook.commands.options import MapUseOptions, ScenesConfig, extractor_
 from wheretolook.commands.plan import Plan
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.viewpoint_map import BuildViewpointMap
-from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.scene import Scene
 from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig, PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
-from wheretolook.io.poses import read_poses
+from wheretolook.geometry.views import Views
 from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, MarkerConfig, PhotographsConfig
 from wheretolook.mapping.imported_map import map_existing
@@ -109,7 +109,7 @@ def test_from_a_model_to_a_planned_path(tmp_path, with_mesh):
     (scene,) = Dataset.load(tmp_path / "data" / "mine").scenes
     assert scene.name == "flat" and scene.camera == LOOKS and scene.own_camera
     assert scene.is_photographed is not with_mesh and len(scene.read_landmarks()) == n_points
-    assert SceneEnvironment(scene).has_photographs  # of the model, whose mesh is not what was mapped
+    assert Scene(scene).map.has_photographs  # of the model, whose mesh is not what was mapped
     np.testing.assert_allclose(scene.mapping_poses(), colmap_poses(folder), atol=1e-6)
 
     run(Sample, experiment)
@@ -159,7 +159,7 @@ def test_one_command_plans_a_path_in_the_folder_of_a_model(tmp_path, capsys, uni
     path = pd.read_csv(tmp_path / "way" / "path.csv")
     np.testing.assert_allclose(path.iloc[[0, -1], :3], [start, goal], atol=1e-6)
     np.testing.assert_allclose(
-        camera_centers(read_poses(tmp_path / "way" / "path.csv").cam_from_world), path.iloc[:, :3], atol=1e-5
+        camera_centers(Views.read(tmp_path / "way" / "path.csv").cam_from_world), path.iloc[:, :3], atol=1e-5
     )
     assert "320 x 240" in capsys.readouterr().out  # the model's camera
     out = ["--out", str(tmp_path / "flat.map"), "--method", "visible"]

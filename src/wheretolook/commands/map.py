@@ -33,8 +33,8 @@ from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, describe_camera, draw_camera
 from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, place_name
 from wheretolook.mapping.georeference import read_scale
+from wheretolook.mapping.map import source_of_map
 from wheretolook.mapping.map_frame import read_frame
-from wheretolook.mapping.mapped_images import source_of_map
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, reject
 from wheretolook.utils.files import cache_key, check_folder_name, fingerprint, path_within, size_and_time
 
@@ -187,7 +187,7 @@ def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     Returns the scene, and the dataset with it. Raises what `map_existing` does, and SceneError if the mesh cannot be used.
     """
     from wheretolook.mapping.colmap_model import read_model
-    from wheretolook.mapping.mapped_images import choose_features
+    from wheretolook.mapping.map import choose_features
 
     settings = options.mapping.existing
     photographs = options.mapping.photographs
@@ -253,23 +253,26 @@ def _new_scene(options: Map, source: Path, name: str) -> SceneFolder:
 
 def _with_mapping_camera(options: Map, scene: SceneFolder) -> SceneFolder:
     """Return the scene with the camera that took most of its photographs, unless the options configure one."""
-    from wheretolook.mapping.colmap_model import camera_of_model, read_model
+    from wheretolook.geometry.camera import cameras_by_id
+    from wheretolook.mapping.colmap_model import read_model
 
     if options.camera != CameraConfig():
         return scene
     model = read_model(scene.map)
     taken = Counter(image.camera_id for image in model.images.values() if image.has_pose)
     ((number, _),) = taken.most_common(1)
-    return replace(scene, camera=camera_of_model(model, scene.map, number), own_camera=True)
+    return replace(scene, camera=cameras_by_id(model.cameras, scene.map)[number], own_camera=True)
 
 
 def _with_own_camera(scene: SceneFolder, model: Any, settings: ExistingModelConfig) -> SceneFolder:
     """Return the scene with the model's camera."""
-    from wheretolook.mapping.colmap_model import camera_of_model
+    from wheretolook.geometry.camera import cameras_by_id
+    from wheretolook.mapping.colmap_model import find_camera
 
     assert settings.model is not None
     try:
-        return replace(scene, camera=camera_of_model(model, settings.model, settings.camera_id), own_camera=True)
+        camera = find_camera(cameras_by_id(model.cameras, settings.model), settings.model, settings.camera_id)
+        return replace(scene, camera=camera, own_camera=True)
     except MapError as error:
         fix = "Name one of the model's, such as --camera-id 1, or describe another, such as --camera.fov_deg 70."
         raise MapError(error.problem, path=error.path, value=error.value, fix=fix) from error

@@ -34,8 +34,8 @@ from wheretolook.utils.texts import LOG
 from wheretolook.visibility.config import OcclusionConfig
 
 if TYPE_CHECKING:
-    from wheretolook.dataset.environment import SceneEnvironment
     from wheretolook.dataset.layout import Dataset, SceneFolder
+    from wheretolook.dataset.scene import Scene
     from wheretolook.localization.shard import SceneJob
 
 
@@ -161,6 +161,8 @@ class Command:
     """Bundled configuration that is read unless `--config` names another, such as demo."""
     SHORT: ClassVar[Mapping[str, str]] = {}
     """Shorter names of options, as the command line writes them, without `--`."""
+    GROUPS: ClassVar[Mapping[str, str]] = {}
+    """What precedes the names of options in a field that is a dataclass, if it is not the field's name and a point."""
     POSITIONAL: ClassVar[str] = "config"
     """Option of the values before the first option."""
     WRITES: ClassVar[str] = ""
@@ -377,13 +379,13 @@ def load_dataset(
     return dataset
 
 
-def open_scene(options: SceneOptions, files: SceneFolder) -> SceneEnvironment:
+def open_scene(options: SceneOptions, files: SceneFolder) -> Scene:
     """Return a scene of the dataset with a command's occlusion, free space and device; nothing is read yet."""
-    from wheretolook.dataset.environment import EnvironmentConfig, SceneEnvironment
+    from wheretolook.dataset.scene import Scene, SceneConfig
 
     scenes = options.scenes
-    config = EnvironmentConfig(options.occlusion, scenes.free_space, scenes.mapped_space)
-    scene = SceneEnvironment(files, config=config, device=options.device)
+    config = SceneConfig(options.occlusion, scenes.free_space, scenes.mapped_space)
+    scene = Scene(files, config=config, device=options.device)
     if files.own_camera:
         camera = f"the camera of its map, {describe_camera(files.camera)}"
         LOG.info("%s: %s", files.name, "; ".join((camera, *scene.frame.doubts)))

@@ -67,7 +67,7 @@ class BuildViewpointMap(SceneOrMapOptions):
         built: dict[str, ViewpointMap] = {}
         for files in scenes:
             scene = open_scene(self, files)
-            with naming_file(scene.source):
+            with naming_file(scene.folder.source):
                 scorer = scene_scorer(scene, config.method, config.weights, config.anywhere, config.accuracy)
                 viewpoint_map = scene_viewpoint_map(scene, config, scorer)
             folder = config.out or files.folder / "viewpoint-map"

@@ -121,8 +121,13 @@ class MapFrame:
 
     def of_arrays(self, arrays: ModelArrays) -> ModelArrays:
         """Return arrays of the model in the world."""
-        centers = self.world_from_map.apply(arrays.image_centers)
-        return replace(arrays, points=self.world_from_map.apply(arrays.points), image_centers=centers)
+        to_world = self.world_from_map
+        return replace(
+            arrays,
+            points=to_world.apply(arrays.points),
+            image_poses=to_world.apply_to_poses(arrays.image_poses),
+            image_centers=to_world.apply(arrays.image_centers),
+        )
 
     def record(self) -> dict[str, Any]:
         """Return the frame as JSON values, from which `read_frame` makes it."""

@@ -13,7 +13,7 @@ DEFAULT_RADIUS = 50.0
 
 @dataclass(frozen=True)
 class OcclusionKind:
-    """What `Environment` needs to make an occlusion model."""
+    """What `Scene` needs to make an occlusion model."""
 
     model: str  # "module:class"; the class method `from_inputs` makes an instance
     needs: str = ""  # "mesh" or "depth images", if the landmarks are not enough
@@ -23,7 +23,7 @@ class OcclusionKind:
 OCCLUSION_MODELS = {
     "mesh": OcclusionKind("wheretolook.visibility.occlusion:MeshOcclusion", "mesh", ("margin_m",)),
     "tsdf": OcclusionKind(
-        "wheretolook.visibility.tsdf:TsdfOcclusion", "depth images", ("margin_m", "voxel_m", "max_depth_m")
+        "wheretolook.visibility.occlusion:TsdfOcclusion", "depth images", ("margin_m", "voxel_m", "max_depth_m")
     ),
     "hidden-points": OcclusionKind(
         "wheretolook.visibility.hidden_points:HiddenPointRemoval", settings=("margin_m", "radius")

@@ -42,16 +42,16 @@ from wheretolook.commands.options import MeshSource, ScenesConfig
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.scenes import Scenes
 from wheretolook.dataset.config import Accuracy
-from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.viewpoint_table import poses as poses_of_table
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.scoring import score_scenes
 from wheretolook.evaluation.statistics import precision_area, precision_over_coverage
 from wheretolook.features.extractor import KINDS, ExtractorConfig, KeypointExtractor, Keypoints, kind_of
 from wheretolook.geometry.camera import Camera, camera_of, write_cameras
+from wheretolook.geometry.pose_files import images_text
 from wheretolook.geometry.poses import Float, camera_centers, pose_error
-from wheretolook.io.poses import images_text
 from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.config import LabelConfig, LocalizerConfig
 from wheretolook.localization.localizer import Localizer
@@ -196,7 +196,7 @@ def render_set(source: str, locations: int, images: int, work: Path, workers: in
     names = [*registered_names(model).values()]
     shutil.copytree(scene.map / IMAGES_FOLDER, out / "images", dirs_exist_ok=True)
     queries = {f"query-{row:05d}.png": pose for row, pose in zip(rows, poses_of_table(table)[rows], strict=True)}
-    renderer = SceneEnvironment(scene, device=device).renderer
+    renderer = Scene(scene, device=device).renderer
     for name, pose in tqdm(queries.items(), desc="render queries"):
         (rgb,) = renderer.render(scene.camera, pose[None]).rgb
         write_bytes(out / "images" / name, cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1].tobytes())

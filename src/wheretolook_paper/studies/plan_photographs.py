@@ -31,7 +31,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import pdist, squareform
 
-from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, Environment
+from wheretolook.dataset.scene import ColmapFiles, Scene
 from wheretolook.figures.style import save_figure
 from wheretolook.geometry.camera import field_of_view_deg
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
@@ -95,7 +95,7 @@ def localize_held_out(source: PhotographedMap, rows: NDArray[np.intp], work: Pat
 
 
 def plan_on(
-    scene: Environment, source: PhotographedMap, methods: tuple[str, ...], config: PlanConfig, work: Path, workers: int
+    scene: Scene, source: PhotographedMap, methods: tuple[str, ...], config: PlanConfig, work: Path, workers: int
 ) -> pd.DataFrame:
     """Plan between the ends in `config`, in the model's own frame, and return the table without the column `scene`."""
     assert config.start is not None and config.goal is not None
@@ -165,7 +165,7 @@ def main(
     """
     model, features = features_of(map, None, database, work, workers, device)
     source = open_map(model, features, name, frame)
-    scene = ColmapEnvironment(ColmapFiles(model, frame=frame), device=device)
+    scene = Scene.of_colmap(ColmapFiles(model, frame=frame), device=device)
     if ends is None:
         reach_m = 2 * scene.config.mapped_space.max_camera_distance_m
         rows = farthest_ends(scene.space, camera_centers(source.poses), reach_m)

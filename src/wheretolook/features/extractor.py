@@ -13,7 +13,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.utils.errors import ConfigError, check_choice, check_positive, check_range
+from wheretolook.utils.errors import ConfigError, check_choice, check_positive, check_range, no_option
 from wheretolook.utils.files import sha256
 from wheretolook.utils.processes import WorkerPool
 
@@ -201,9 +201,9 @@ class ExtractorConfig:
     """
 
     method: str = "opencv"
-    first_octave: int = -1
+    first_octave: int = no_option(-1)
     max_keypoints: int = 2048
-    peak_threshold: float = 0.02 / 3
+    peak_threshold: float = no_option(0.02 / 3)
     weights: str = ""
     edge_threshold: float = field(default=10.0, init=False)
 

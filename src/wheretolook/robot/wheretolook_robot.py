@@ -113,7 +113,7 @@ class RobotScorer:
             self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
             shapes = {value.name: value.shape for value in self._session.get_inputs()}
             outputs = {value.name for value in self._session.get_outputs()}
-            inputs = {"values", "taken", "n_visible", "axis_height"}
+            inputs = {"values", "taken", "n_visible"}
             if {*shapes} != inputs or shapes["values"][-1] != len(self._names) or not {*OUTPUTS} <= outputs:
                 raise ValueError("it is of another network")
         except Exception as error:  # onnxruntime raises errors of many kinds
@@ -280,7 +280,6 @@ class RobotScorer:
                 if len(rows):
                     distance_m[view] = np.exp(own[:, distance].mean())
             inputs = {"values": padded, "taken": counts, "n_visible": n_visible[block]}
-            inputs["axis_height"] = rotations[block, 2, 2].astype(np.float32)
             score[block], inliers[block] = self._session.run(OUTPUTS, inputs)
         in_range = self._serves_camera & self._within("distance_m", distance_m)
         in_range &= (n_visible == 0) | self._within("in_view", n_visible)

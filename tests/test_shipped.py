@@ -11,7 +11,7 @@ import pytest
 
 import wheretolook
 from synthetic_dataset import CAMERA, make_landmarks
-from wheretolook import LocalizationMap, load_scorer, poses_looking_along
+from wheretolook import LocalizationMap, Map, load_scorer, poses_looking_along
 from wheretolook.cli import parse_command
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import fingerprint
@@ -29,7 +29,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def localization_map() -> LocalizationMap:
-    return LocalizationMap(make_landmarks(np.random.default_rng(0), 200), CAMERA)
+    return LocalizationMap(Map(make_landmarks(np.random.default_rng(0), 200)), CAMERA)
 
 
 def test_what_ships_is_what_lies_in_the_project() -> None:
@@ -63,12 +63,9 @@ def test_a_map_is_scored_by_the_weights_that_ship(localization_map: Localization
     views = poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (20, 3)), rng.normal(size=(20, 3)))
     scorer = load_scorer(localization_map)
     assert scorer.name == "set"
-    expected = load_scorer(ROOT / WEIGHTS / "set.safetensors", localization_map).score(views)
-    for same in (scorer, load_scorer(None, localization_map), load_scorer(WEIGHTS, localization_map)):
+    expected = load_scorer(localization_map, ROOT / WEIGHTS / "set.safetensors").score(views)
+    for same in (scorer, load_scorer(localization_map, WEIGHTS)):
         np.testing.assert_array_equal(same.score(views), expected)
-    assert load_scorer(localization_map=localization_map).name == "set"
-    with pytest.raises(ConfigError, match="needs a map"):
-        load_scorer(WEIGHTS)  # type: ignore[call-overload]
 
 
 def test_public_names_are_there_and_cost_nothing_until_they_are_used() -> None:

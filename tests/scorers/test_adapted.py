@@ -12,6 +12,7 @@ from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.map import Map
 from wheretolook.scorers.adapted.calibration import LocalizedViews, adapt, calibrate, log_losses, splits
 from wheretolook.scorers.adapted.score import AdaptedNetwork
 from wheretolook.scorers.set.network import SetNetwork
@@ -70,7 +71,7 @@ def test_photographs_are_judged_by_blocks_that_share_none_with_those_trained_on(
 def place(tmp_path_factory):
     """A map, and weights adapted to it."""
     scene = make_dataset(tmp_path_factory.mktemp("data") / "place", ("test",)).scenes[0]
-    localization_map = LocalizationMap(scene.read_landmarks(), scene.camera)
+    localization_map = LocalizationMap(Map(scene.read_landmarks()), scene.camera)
     base = TrainedNetwork.load(SET, SetNetwork, "set")
     network = AdaptedNetwork(base.network, base.scale, base.offset, 50)
     network.place = torch.from_numpy(localization_map.landmarks.points[:50].copy())
@@ -81,8 +82,8 @@ def place(tmp_path_factory):
 
 def test_a_file_of_adapted_weights_scores_as_it_says(place):
     localization_map, path = place
-    adapted = load_scorer(path, localization_map)
-    base = load_scorer(SET, localization_map)
+    adapted = load_scorer(localization_map, path)
+    base = load_scorer(localization_map, SET)
     locations = np.array([[0.0, 0, 1], [0.5, 0.5, 1]])
     directions = fibonacci_sphere(20)
     poses = poses_looking_along(np.repeat(locations, 20, axis=0), np.tile(directions, (2, 1)))
@@ -99,10 +100,10 @@ def test_they_are_refused_in_another_scene_unless_forced(place):
     localization_map, path = place
     landmarks = localization_map.landmarks
     moved = Landmarks(**{**landmarks.__dict__, "points": landmarks.points + np.array([0.5, 0, 0])})
-    other = LocalizationMap(moved, localization_map.camera)
+    other = LocalizationMap(Map(moved), localization_map.camera)
     with pytest.raises(WeightsError):
-        load_scorer(path, other)
-    assert load_scorer(path, other, anywhere=True).name == "adapted"
+        load_scorer(other, path)
+    assert load_scorer(other, path, anywhere=True).name == "adapted"
 
 
 def test_weights_with_a_gaussian_process_are_refused_by_name(place):
@@ -112,5 +113,5 @@ def test_weights_with_a_gaussian_process_are_refused_by_name(place):
     process = {"kernel": {"length_m": 1.0, "sharpness": 4.0}, "support": 0}
     write_weights(older, "adapted", tensors, {**header, **process})
     with pytest.raises(WeightsError, match="adapt") as raised:
-        load_scorer(older, localization_map)
+        load_scorer(localization_map, older)
     assert raised.value.path == older

@@ -14,10 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
 from wheretolook.dataset.config import ACCURACY, Accuracy, checked_accuracy
-from wheretolook.features.config import ExtractorConfig
-from wheretolook.features.extractor import Keypoints
+from wheretolook.features.extractor import ExtractorConfig, Keypoints, kind_of, runnable_extractors
 from wheretolook.features.matches import Matches
-from wheretolook.features.registry import kind_of, runnable_extractors
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.confidence import probabilities
@@ -29,9 +27,9 @@ from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, observat
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.georeference import REPORT_FILE
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
+from wheretolook.mapping.map import find_features
 from wheretolook.mapping.map_folder import LANDMARKS_FILE
 from wheretolook.mapping.map_frame import MapFrame, find_frame
-from wheretolook.mapping.mapped_images import find_features
 from wheretolook.select.localized import Localized, QueryImage, QueryImages, distinct_names
 from wheretolook.utils.errors import ConfigError, MapError, PoseError, TableError, from_record
 from wheretolook.utils.files import path_ends, read_json_object, read_text

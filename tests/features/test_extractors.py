@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from features.textures import color_texture
 from twins.features import mutual_matches
 from wheretolook.features.aliked_batch import detect_and_describe
 from wheretolook.features.config import ExtractorConfig, KeypointExtractor
@@ -14,6 +15,7 @@ from wheretolook.features.registry import all_kinds, kind_of
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.utils.errors import WeightsError
 
+IMAGES = [color_texture(seed, 100, 140) for seed in range(4)]
 LEARNED = ("aliked", "disk", "xfeat")
 
 
@@ -86,21 +88,12 @@ def untrained(method, folder):
     return path
 
 
-def image(seed=0):
-    from scipy.ndimage import gaussian_filter
-
-    rng = np.random.default_rng(seed)
-    return np.clip(128 + 120 * gaussian_filter(rng.normal(size=(100, 140, 3)), (1.5, 1.5, 0)) * 3, 0, 255).astype(
-        np.uint8
-    )
-
-
 @pytest.mark.parametrize("method", LEARNED)
 def test_learned_extractors_give_unit_descriptors_within_the_image(method, tmp_path):
     weights = untrained(method, tmp_path)
     extractor = KeypointExtractor(ExtractorConfig(method, max_keypoints=50, weights=str(weights)))
-    both = extractor.extract_batch([image(0), image(1)])
-    for found, rgb in zip(both, (image(0), image(1)), strict=True):
+    both = extractor.extract_batch(IMAGES[:2])
+    for found, rgb in zip(both, IMAGES[:2], strict=True):
         alone = extractor.extract(rgb)
         np.testing.assert_array_equal(found.pixels, alone.pixels)
         np.testing.assert_array_equal(found.descriptors, alone.descriptors)
@@ -124,7 +117,7 @@ def test_aliked_finds_in_a_batch_what_kornia_finds_image_by_image(least, tmp_pat
     network = KeypointExtractor(ExtractorConfig("aliked", weights=str(weights)))._extraction._network
     reference = kornia.ALIKED("aliked-n16rot").eval()
     reference.load_state_dict(state, strict=False)
-    whole = np.stack([image(seed) for seed in range(4)])
+    whole = np.stack(IMAGES)
     whole[2] = 128  # two images with flat parts, one has nothing else
     whole[3, :50] = 40
     images = torch.from_numpy(whole).permute(0, 3, 1, 2) / 255

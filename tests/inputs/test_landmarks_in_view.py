@@ -97,16 +97,3 @@ def test_views_share_locations_in_whatever_order_they_come():
         locations, rows = shared_locations(poses)
         assert len(locations) == len(set(order))
         np.testing.assert_allclose(locations[rows], places[order], atol=1e-6)
-
-
-def test_one_view_is_described_and_thinned_as_it_is_among_others(localization_map):
-    poses = some_views()
-    describer = LandmarkDescriber(localization_map)
-    ((_, together, seen),) = describer.in_blocks(poses, 20)
-    assert int(seen.max()) > 20 == int(together.counts.max())
-    for view, pose in enumerate(poses):
-        ((_, alone, alone_seen),) = describer.in_blocks(pose[None], 20)
-        mine = together.views == view
-        assert alone.rows.tolist() == together.rows[mine].tolist()
-        torch.testing.assert_close(alone.values, together.values[mine], rtol=1e-5, atol=1e-5, equal_nan=True)
-        assert int(alone_seen[0]) == int(seen[view])

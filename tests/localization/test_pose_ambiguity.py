@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from localization.test_joint import CAMERA, a_room
+from localization.test_joint import CAMERA, a_room, in_view
 from wheretolook.geometry.poses import pose_error, poses_looking_along
-from wheretolook.localization.estimation import PoseAmbiguity, PoseEstimator, most_likely, strongest_rival
+from wheretolook.localization.estimation import PoseAmbiguity, PoseEstimator
 from wheretolook.localization.rig import Look, rig_of
 from wheretolook.localization.rig_localization import JointLocalizer
 
@@ -21,13 +21,6 @@ def two_rooms():
     column = np.column_stack([np.full((40, 2), (2.0, 0.5)), np.linspace(-1, 1, 40)])
     points = np.concatenate([room, room + BEYOND, column])
     return points, np.split(np.arange(len(points)), [2000, 4000])
-
-
-def in_image(points, rows, pose):
-    there = points[rows] @ pose[:, :3].T + pose[:, 3]
-    pixels = CAMERA.project(np.where(there[:, 2:] > 0.1, there, (0, 0, 1)))
-    seen = (there[:, 2] > 0.1) & CAMERA.in_image(pixels)
-    return rows[seen], pixels[seen]
 
 
 def test_unique_support_counts_landmarks_that_the_other_location_lacks():
@@ -56,25 +49,15 @@ def test_unique_support_outweighs_inliers_that_both_rooms_explain(n_column):
     rng = np.random.default_rng(1)
     looks = []
     for number, (pose, cam_from_rig) in enumerate(zip(poses, rig_of(poses), strict=True)):
-        rows, pixels = in_image(points, room, pose)
+        rows, pixels = in_view(points[room], pose)
         chosen = rng.choice(len(rows), 90, replace=False)
         landmarks = np.where(np.arange(90) < 60, rows[chosen] + len(room), rows[chosen])
-        own, at = in_image(points, column, pose) if number == 0 else (column[:0], np.zeros((0, 2)))
+        own, at = in_view(points[column], pose) if number == 0 else (column[:0], np.zeros((0, 2)))
         seen = np.concatenate([pixels[chosen], at[:n_column]])
-        looks.append(Look(cam_from_rig, seen, np.concatenate([landmarks, own[:n_column]]), CAMERA))
+        looks.append(Look(cam_from_rig, seen, np.concatenate([landmarks, own[:n_column] + column[0]]), CAMERA))
     found = JointLocalizer(PoseEstimator(points)).localize(looks)
     right = poses if n_column else poses_looking_along(np.tile((20.4, -0.7, 0.1), (3, 1)), np.array(axes))
     assert pose_error(found.cams_from_world, right)[0].max() < 1e-3
     assert found.n_inliers == (90 + 12 if n_column else 180)
     assert found.unique_support[1] == 0 and (found.unique_support[0] > 0) == (n_column > 0)
     assert found.rival_support == pytest.approx(180 if n_column else 90, abs=1)
-
-
-def test_the_pose_with_the_weakest_strongest_rival_is_selected():
-    """The second beats the first, the third beats the second, and the first beats the third by far."""
-    own = np.array([[0, 10, 50], [14, 0, 12], [12, 14, 0]])
-    support = [300.0, 230.0, 33.0]
-    assert [strongest_rival(own, support, k) for k in range(3)] == [1, 0, 0]
-    assert most_likely(own, support) == 1
-    assert most_likely(own[:1, :1], support[:1]) == 0 == most_likely(np.array([[0, 0], [50, 0]]), [300.0, 29.0])
-    assert most_likely(np.array([[0, 0], [50, 0]]), [300.0, 31.0]) == 1

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mapping.marker_rooms import rolled
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping.gravity import estimate_gravity, rotation_to_z
 
@@ -16,8 +17,7 @@ def looking(yaw_deg, pitch_deg, roll_deg):
     pitch = np.radians(pitch_deg)
     axes = np.stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)], axis=1)
     poses = poses_looking_along(np.zeros((len(yaw), 3)), axes)
-    roll = Rotation.from_euler("z", np.asarray(roll_deg)[:, None], degrees=True).as_matrix()
-    poses[:, :, :3] = roll @ poses[:, :, :3] @ TURN.T
+    poses[:, :, :3] = rolled(poses, roll_deg)[:, :, :3] @ TURN.T
     return poses
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from mapping.marker_rooms import hand_held_poses
 from mapping.test_landmarks import hand_written_model, random_descriptors, write_database
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
@@ -18,14 +19,6 @@ from wheretolook.mapping.map_frame import scale_warning, up_axis_warning
 from wheretolook.utils.errors import MapError, MapWarning
 
 pytestmark = pytest.mark.filterwarnings("error::wheretolook.utils.errors.MapWarning")
-
-
-def walk_in_a_room(n=40):
-    """Poses (n, 3, 4) of a camera that is carried along a room and turned, 1.5 m above the floor."""
-    along = np.linspace(0, 1, n)
-    heading = 6 * np.pi * along
-    centers = np.column_stack([5 * along, 1 + 0.3 * np.sin(heading), np.full(n, 1.5)])
-    return poses_looking_along(centers, np.column_stack([np.cos(heading), np.sin(heading), -0.1 * np.ones(n)]))
 
 
 def written(model, folder, text=False):
@@ -190,12 +183,12 @@ def test_features_in_hdf5_of_hloc(tmp_path):
 
 
 def test_scale_and_axes_are_doubted_where_they_are_implausible():
-    poses = walk_in_a_room()
+    poses = hand_held_poses(40)
     centers = camera_centers(poses)
     for distance_m in (0.5, 2.5, 30.0):
         assert scale_warning(np.full(100, distance_m), centers) == ""
     assert scale_warning(np.full(100, 37 * 2.5), 37 * centers) and scale_warning(np.full(100, 2.5 / 37), centers / 37)
-    assert scale_warning(np.full(100, 20.0), 50 * centers)  # cameras 7.6 m apart
+    assert scale_warning(np.full(100, 20.0), 50 * centers)  # cameras metres apart
     assert scale_warning(np.full(100, 2.5), centers[:1]) == ""  # one camera has no distance from others
     assert up_axis_warning(poses) == ""
     for turn in ([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.diag([1, -1, -1])):

@@ -6,7 +6,6 @@ import warnings
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pycolmap
 import pytest
 from scipy.stats import lognorm
@@ -29,7 +28,6 @@ from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.training.weights import read_header
 from wheretolook.utils.errors import ConfigError, MapWarning, OutOfRangeWarning, WeightsError
 from wheretolook.utils.package import WEIGHTS, shipped
-from wheretolook_paper.studies import fit_accuracy
 
 ACCURACIES = ((1e-9, 1e-9), (0.01, 0.1), ACCURACY, (0.1, 1.0), (0.25, 2.0), (math.inf, math.inf))
 DISTANCE_M = read_header(shipped(WEIGHTS) / "set.safetensors")["range"]["distance_m"]  # of the training views
@@ -96,26 +94,6 @@ def test_errors_and_limits_scale_with_the_unit():
     assert MODEL.expected_errors(larger) == pytest.approx(MODEL.expected_errors(statistics) * (10, 1))
     median_m = np.exp(MODEL.log_errors(statistics)[:, 0])
     assert MODEL.expected_errors(statistics)[:, 0] == pytest.approx(lognorm(0.9, scale=median_m).mean())
-
-
-def test_the_fit_finds_the_model_that_errors_are_drawn_from(monkeypatch):
-    rng = np.random.default_rng(3)
-    statistics = views(20_000)
-    own = rng.uniform(0.01, 0.99, len(statistics))
-    place = rng.uniform(size=len(own)) < MODEL.p_right_place(own, statistics)
-    noise = rng.normal(size=(len(own), 1)) * [error.deviation for error in MODEL.errors]
-    # shrunk, so that no error at the right place exceeds its limits
-    errors = np.exp(MODEL.log_errors(statistics) + noise - 12)
-    errors[~place] = np.inf
-    table = pd.DataFrame(statistics, columns=ALL_STATISTICS).assign(
-        own=own, scene="one", error_m=errors[:, 0], error_deg=errors[:, 1]
-    )
-    monkeypatch.setattr(fit_accuracy, "LEAST", (0.0, 0.0))
-    found = fit_accuracy.fit(table)
-    assert [*found.weights, found.bias] == pytest.approx([*MODEL.weights, MODEL.bias], abs=0.1)
-    for error, known in zip(found.errors, MODEL.errors, strict=True):
-        assert error.weights == pytest.approx(known.weights, abs=0.03)
-        assert (error.bias + 12, error.deviation) == pytest.approx((known.bias, known.deviation), abs=0.1)
 
 
 def test_the_bundled_file_is_the_model_and_damage_is_found(tmp_path):
@@ -201,19 +179,6 @@ def test_the_depth_that_is_in_range_depends_on_the_accuracy(radius_m):
         is_inside = radius_m < farthest and radius_m / accuracy_m < farthest / 0.05
         assert (at.in_range(views) == is_inside).all() and (at.report(views).in_range == is_inside).all()
         assert (at.at_accuracy(ACCURACY).in_range(views) == scorer.in_range(views)).all()
-
-
-def test_it_warns_once_of_depth_relative_to_the_accuracy():
-    scorer = sphere(6.0)
-    views = poses_looking_along(np.zeros((8, 3)), direction_lattice(8))
-    for accuracy in (ACCURACY, (0.02, 0.2), (0.25, 2.0)):
-        assert not warnings_of(scorer.at_accuracy(accuracy), views)
-    (warned,) = warnings_of(scorer.at_accuracy((0.01, 0.1)), views)
-    assert warned.startswith("set 0.01m_0.1deg: 8 of 8 views")
-    assert f"6 m (in range: {DISTANCE_M[0]:.3g} to {DISTANCE_M[1] / 5:.3g})" in warned
-    assert not warnings_of(scorer.at_accuracy((0.01, 0.1)), views)
-    (warned,) = warnings_of(sphere(35.0), views)
-    assert f"35 m (in range: {DISTANCE_M[0]:.3g} to {DISTANCE_M[1]:.3g})" in warned
 
 
 def test_depth_over_accuracy_does_not_depend_on_an_unknown_unit(tmp_path):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.special import expit, logit
+from scipy.special import logit
 
 from selection.room import write_room
 from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
@@ -13,7 +13,6 @@ from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.package import WEIGHTS, shipped
-from wheretolook_paper.studies.calibrate_photographs import fitted_offset
 
 
 @pytest.mark.parametrize("rendered", [True, False])
@@ -37,14 +36,3 @@ def test_the_offset_is_added_once_and_only_for_photographs(rendered, tmp_path):
         )
         for scorer in others:
             np.testing.assert_allclose(logit(scorer.score(views)) - logit(plain.score(views)), expected, atol=1e-6)
-
-
-def test_the_offset_of_several_places_is_fitted_with_equal_weights():
-    """Probabilities that are too low by 1 in log-odds on one place and by 0 on one of ten times the views."""
-    rng = np.random.default_rng(0)
-    places = []
-    for shift, n in ((1.0, 20_000), (0.0, 200_000)):
-        log_odds = rng.normal(size=n)
-        places.append((log_odds, rng.random(n) < expit(log_odds + shift)))
-    assert fitted_offset(places[:1]) == pytest.approx(1.0, abs=0.05)
-    assert fitted_offset(places) == pytest.approx(0.5, abs=0.05)

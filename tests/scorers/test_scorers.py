@@ -11,8 +11,8 @@ from synthetic_dataset import CAMERA, make_landmarks, make_mapping_poses
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.bins import BinnedViews
-from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
-from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber
+from wheretolook.inputs.channels import CHANNELS
+from wheretolook.inputs.landmark_features import ATTRIBUTES
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.scorers.adapted.network import AdaptedNetwork
@@ -25,12 +25,6 @@ from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.visible import VisibleScorer
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.errors import CameraError, ConfigError, PoseError, WeightsError
-from wheretolook_paper.scorers.conv.network import ConvNetwork, ConvSpec
-from wheretolook_paper.scorers.pooled_features import pool
-from wheretolook_paper.scorers.sphere import SphereConfig
-from wheretolook_paper.scorers.sphere.network import SphereNetwork
-from wheretolook_paper.scorers.trees import TreesConfig
-from wheretolook_paper.scorers.trees.learn import PooledViews, fit_trees
 
 
 @pytest.fixture
@@ -48,30 +42,16 @@ def views():
 NO_STATISTICS = FeatureStatistics(ATTRIBUTES, (0.0,) * len(ATTRIBUTES), (1.0,) * len(ATTRIBUTES))
 
 
-def some_trees(localization_map):
-    """Trees whose scores differ from view to view."""
-    rng = np.random.default_rng(2)
-    directions = poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (300, 3)), rng.normal(size=(300, 3)))
-    values = pool(LandmarkDescriber(localization_map).describe(directions), directions, CAMERA).numpy()
-    labels = np.nan_to_num(values[:, 0] + values[:, 10]) + rng.normal(size=300) > 3
-    views = PooledViews(values, labels, np.zeros(300, int), np.arange(300), np.zeros((300, 6)))
-    return fit_trees(views, views, CAMERA, TreesConfig(max_trees=10, max_leaves=15, min_leaf=3))[0]
-
-
 def weights_of(method, path, localization_map):
     """Write untrained weights of a method, whose scores differ from view to view."""
-    if method == "trees":
-        some_trees(localization_map).save(path, {})
-        return path
     torch.manual_seed(0)
-    mean = (80.0, 60.0, 0.0, 0.0, 2.0, *[0.5] * (len(ALL_CHANNELS) - 5))
-    std = (40.0, 30.0, *[1.0] * (len(ALL_CHANNELS) - 2))
     if method.startswith("mlp"):
-        network = ViewpointNetwork(NetworkSpec(FeatureStatistics(CHANNELS, mean[:5], std[:5]), hidden=(16,)))
-    elif method == "conv":
-        network = ConvNetwork(ConvSpec(FeatureStatistics(ALL_CHANNELS, mean, std), 30, (8, 8), 0.0))
-    elif method == "sphere":
-        network = SphereNetwork(SphereConfig())
+        statistics = FeatureStatistics(CHANNELS, (80.0, 60.0, 0.0, 0.0, 2.0), (40.0, 30.0, 1.0, 1.0, 1.0))
+        network = ViewpointNetwork(NetworkSpec(statistics, hidden=(16,)))
+    elif method in ("conv", "sphere", "trees"):
+        from paper.scorers.untrained import save_untrained
+
+        return save_untrained(method, path, localization_map)
     elif method == "matchability":
         network = MatchabilityNetwork(NO_STATISTICS)
     else:

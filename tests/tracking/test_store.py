@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 
 import pytest
-from tests.disks import fill, read_only, small_disk
 
+from disks import fill, read_only, small_disk
 from wheretolook.tracking.runs import artifact, experiment_id, finished_runs, start_run
 from wheretolook.tracking.store import TrackingConfig, check_store, client
 from wheretolook.utils.errors import TrackingError

@@ -34,7 +34,7 @@ from pathlib import Path
 import numpy as np
 
 from wheretolook.scorers.base import CountingScorer
-from wheretolook.scorers.registry import Method, MethodStyle
+from wheretolook.scorers.registry import Learner, Method
 
 
 @dataclass(frozen=True)
@@ -93,10 +93,9 @@ class Fewest(CountingScorer):
 
 
 METHODS = (
-    Method("linear", "A line through the number of landmarks in view.", MethodStyle("line", "#123456", "o", "-"),
-           "learned", build, "linear", probability=True, learn=learn, config=LinearConfig, folder="linear"),
-    Method("fewest", "The fewest landmarks in view.", MethodStyle("fewest landmarks", "#654321", "s", ":"),
-           build=lambda localization_map, options: Fewest(localization_map)),
+    Method("linear", "A line through the number of landmarks in view.", build, "linear", probability=True,
+           learner=Learner(learn, LinearConfig)),
+    Method("fewest", "The fewest landmarks in view.", lambda localization_map, options: Fewest(localization_map)),
 )
 '''
 
@@ -138,7 +137,7 @@ table = evaluate_methods(dataset, EvaluateConfig(("random", "bins", "linear", "f
 assert {*table["method"]} == {"random", "bins", "linear", "fewest", "oracle"}
 assert (table["reference"] == "linear").all() and table.loc[table["method"] == "linear", "ece"].notna().all()
 labels = [text.get_text() for text in score_figure(table).axes[0].get_yticklabels()]
-assert sorted(labels) == ["fewest landmarks", "line", "random", "reprojections with bins"], labels
+assert sorted(labels) == ["fewest", "linear", "random", "reprojections with bins"], labels
 options = ["--data", str(folder), "--name", "tiny", "--tracking.folder", tracking.folder, "--device", "cpu",
            "--camera.width", "160", "--camera.height", "120", "--camera.focal_px", "80",
            "--scene", dataset.split("test")[0].name, "--start", "[-1, -1, 1]", "--goal", "[1, 1, 1]",

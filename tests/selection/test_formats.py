@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from selection.room import POINTS
-from wheretolook.select.views import SelectedViews
+from wheretolook.geometry.views import Views
 from wheretolook.select.waypoints import read_waypoints
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import ConfigError, StorageError
@@ -19,7 +19,7 @@ IDS = ("3", "1", "20", "7")
 
 
 @pytest.fixture(scope="module")
-def views(look: WhereToLook) -> SelectedViews:
+def views(look: WhereToLook) -> Views:
     return look.best(POINTS, ids=IDS)
 
 
@@ -52,7 +52,7 @@ def test_csv(look: WhereToLook, tmp_path: Path) -> None:
     assert np.loadtxt(tmp_path / "poses.txt", dtype=str)[2][0] == "a_b"
 
 
-def test_json(views: SelectedViews, tmp_path: Path) -> None:
+def test_json(views: Views, tmp_path: Path) -> None:
     views.save(tmp_path / "views.json")
     content = json.loads((tmp_path / "views.json").read_text())
     assert content["camera"] == {"model": "SIMPLE_PINHOLE", "width": 640, "height": 480, "params": [320, 320, 240]}
@@ -62,7 +62,7 @@ def test_json(views: SelectedViews, tmp_path: Path) -> None:
     np.testing.assert_array_equal([view["quaternion_xyzw"] for view in content["views"]], views.quaternions_xyzw)
 
 
-def test_tum(views: SelectedViews, tmp_path: Path) -> None:
+def test_tum(views: Views, tmp_path: Path) -> None:
     views.save(tmp_path / "views.tum")
     rows = np.loadtxt(tmp_path / "views.tum")
     np.testing.assert_array_equal(rows[:, 0], [3, 1, 20, 7])  # the waypoints' names are numbers
@@ -70,7 +70,7 @@ def test_tum(views: SelectedViews, tmp_path: Path) -> None:
     np.testing.assert_allclose(read_waypoints(tmp_path / "views.tum").points, POINTS, atol=1e-8)
 
 
-def test_benchmark(views: SelectedViews, tmp_path: Path) -> None:
+def test_benchmark(views: Views, tmp_path: Path) -> None:
     views.save(tmp_path / "selected_poses.txt", "benchmark")
     header, *lines = (tmp_path / "selected_poses.txt").read_text().splitlines()
     assert header == "# id qw qx qy qz tx ty tz" and tuple(line.split()[0] for line in lines) == IDS
@@ -92,7 +92,7 @@ def test_colmap_reads_the_folder(look: WhereToLook, n: int, tmp_path: Path) -> N
     assert list(model.cameras[1].params) == [320, 320, 240]
 
 
-def test_invalid_targets_are_rejected(views: SelectedViews, look: WhereToLook, sparse: Path, tmp_path: Path) -> None:
+def test_invalid_targets_are_rejected(views: Views, look: WhereToLook, sparse: Path, tmp_path: Path) -> None:
     for target in ((tmp_path / "views.txt",), (tmp_path / "views.csv", "xml"), (sparse,), (tmp_path, "csv")):
         with pytest.raises(ConfigError):
             views.save(*target)

@@ -161,6 +161,8 @@ class Command:
     """Bundled configuration that is read unless `--config` names another, such as demo."""
     SHORT: ClassVar[Mapping[str, str]] = {}
     """Shorter names of options, as the command line writes them, without `--`."""
+    GROUPS: ClassVar[Mapping[str, str]] = {}
+    """What precedes the names of options in a field that is a dataclass, if it is not the field's name and a point."""
     POSITIONAL: ClassVar[str] = "config"
     """Option of the values before the first option."""
     WRITES: ClassVar[str] = ""

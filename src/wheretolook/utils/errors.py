@@ -182,6 +182,11 @@ def nearest(name: str, names: Iterable[str]) -> str | None:
     return matches[0] if matches else None
 
 
+def no_option(default: Any) -> Any:
+    """Return a dataclass field with a default that Python may change and the command line may not."""
+    return dataclasses.field(default=default, metadata={"option": False})
+
+
 T = TypeVar("T", bound="DataclassInstance")
 
 

@@ -1,10 +1,9 @@
 """Choosing viewpoints by what they see."""
 
-from dataclasses import replace
-
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from synthetic_dataset import make_landmarks
 from wheretolook.dataset.sampling import sample_viewpoints
@@ -26,7 +25,7 @@ def landmarks():
     """A wall at x = 5."""
     rng = np.random.default_rng(0)
     points = np.column_stack([np.full(300, 5.0), rng.uniform(-3, 3, 300), rng.uniform(0, 2, 300)])
-    return replace(make_landmarks(rng, 300), points=points)
+    return make_landmarks(rng, 300, points=points)
 
 
 def sampled(landmarks, **options):
@@ -40,8 +39,8 @@ def test_rows_say_what_their_viewpoint_sees(landmarks):
     seen = transform(poses(table), landmarks.points)
     inside = (seen[..., 2] > 1e-3) & CAMERA.in_image(CAMERA.project(seen))
     assert np.abs(inside.sum(1) - table["n_visible"]).max() <= 1  # single precision at the border
-    np.testing.assert_allclose(camera_centers(poses(table)), GRID.centers()[table["location_id"]], atol=1e-12)
-    np.testing.assert_allclose(poses(table)[:, 2, :3], fibonacci_sphere(100)[table["direction_id"]], atol=1e-12)
+    assert_allclose(camera_centers(poses(table)), GRID.centers()[table["location_id"]], atol=1e-12)
+    assert_allclose(poses(table)[:, 2, :3], fibonacci_sphere(100)[table["direction_id"]], atol=1e-12)
     assert (table["viewpoint_id"] == table["location_id"] * 100 + table["direction_id"]).all()
 
 
@@ -93,7 +92,7 @@ def test_each_location_looks_with_one_of_several_cameras(landmarks):
         alone, same = sample_viewpoints(GRID, ids, landmarks, camera, NoOcclusion(), config)
         rows = (table["camera_id"] == number).to_numpy()
         pd.testing.assert_frame_equal(table[rows].drop(columns="camera_id"), alone[rows])
-        np.testing.assert_array_equal(occlusion.packed, same.packed)
+        assert_array_equal(occlusion.packed, same.packed)
 
 
 def test_the_best_directions_are_kept_and_ranked(landmarks):

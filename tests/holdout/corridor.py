@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from colmap_models import camera, colmap_model
+from colmap_models import camera, model_of
 from wheretolook.features.sift import SIFT
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping.triangulation import fill_database
@@ -58,7 +58,7 @@ def write_corridor(folder, noise_px=0.2, photographs=N, scale=1.0, rotation=np.e
             tracks[point].append((row, keypoint))
     moved = scale * points @ rotation.T
     seen = [(xyz, track) for xyz, track in zip(moved, tracks, strict=True) if len(track) > 1]
-    model = colmap_model(cameras, images, seen)
+    model = model_of(cameras, images, seen)
     model.update_point_3d_errors()
     sparse = folder / "sparse"
     database = folder / ("features.db" if kind is SIFT else f"{kind.name}.db")

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from box_scenes import furnished_room
-from colmap_models import camera, colmap_model
+from colmap_models import camera, model_of
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping.colmap_model import write_model
@@ -25,4 +25,4 @@ def write_rendered_room(folder):
     ):
         cv2.imwrite(str(folder / "photographs" / f"{row:02}.png"), rgb[..., ::-1])
         images.append((f"{row:02}.png", 1, pose, []))
-    write_model(colmap_model([camera(1, "PINHOLE", 320, 240, 200, 200, 160, 120)], images), folder / "sparse")
+    write_model(model_of([camera(1, "PINHOLE", 320, 240, 200, 200, 160, 120)], images), folder / "sparse")

@@ -1,14 +1,19 @@
 """Joint localization recovers known poses in spite of outliers, noise, and similar rooms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
+from wheretolook.features.matches import Matches
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import camera_centers, compose_poses, pose_error, poses_looking_along, transform
 from wheretolook.localization.confidence import probabilities
-from wheretolook.localization.estimation import PoseEstimator, turn_errors
-from wheretolook.localization.rig import Look, rig_of
+from wheretolook.localization.config import LocalizerConfig
+from wheretolook.localization.estimation import PoseAmbiguity, PoseEstimator, match_under, turn_errors
+from wheretolook.localization.rig import MAX_NEAREST_RATIO, Candidates, Look, rig_of
 from wheretolook.localization.rig_localization import JointLocalizer
 from wheretolook.utils.errors import PoseError
 
@@ -69,7 +74,7 @@ def test_a_rig_whose_parts_are_apart_is_localized_as_one():
         look_at(points, pose, m, rng, camera=c)[0] for pose, m, c in zip(poses, cams_from_rig, cameras, strict=True)
     ]
     found = JointLocalizer(PoseEstimator(points)).localize(looks)
-    np.testing.assert_allclose(found.cams_from_world, poses, atol=1e-5)
+    assert_allclose(found.cams_from_world, poses, atol=1e-5)
 
 
 def test_outliers_are_separated_from_inliers():
@@ -109,8 +114,8 @@ def test_one_look_is_localized_exactly_as_a_single_image():
         _, (look, *_), _ = looks_from(points, seed=seed, outliers=0.6, noise_px=1.0)
         pose, inliers = estimator.estimate(look.pixels, look.rows, CAMERA)
         joint = JointLocalizer(estimator, turn_noise_deg=1.0).localize([look])
-        np.testing.assert_allclose(joint.cams_from_world[0], pose, atol=1e-12)
-        np.testing.assert_array_equal(joint.inliers[0], inliers)
+        assert_allclose(joint.cams_from_world[0], pose, atol=1e-12)
+        assert_array_equal(joint.inliers[0], inliers)
 
 
 def test_turns_that_are_known_to_a_degree_are_refined():
@@ -192,25 +197,13 @@ def test_views_of_a_small_part_of_the_image_do_not_contradict_rotations():
     assert sum(contradicted) == 0
 
 
-def test_wrong_poses_of_views_do_not_contradict_rotations():
+def test_wrong_poses_of_views_do_not_contradict_rotations(rng):
     """Matches of the second view are of landmarks at random."""
     points = a_room()
     _, looks, _ = looks_from(points, noise_px=1.0)
-    rng = np.random.default_rng(0)
     looks[1] = Look(looks[1].cam_from_rig, looks[1].pixels, rng.permutation(looks[1].rows), CAMERA)
     found = JointLocalizer(PoseEstimator(points), 0.2, check_turns=True).localize(looks)
     assert found.turn_error_deg == 0 and found.status == "localized"
-
-
-def test_a_map_in_national_coordinates_gives_the_same():
-    points = a_room()
-    far = np.array([4_512_300.0, 5_402_100.0, 300.0])
-    _, looks, _ = looks_from(points, outliers=0.3, noise_px=0.5)
-    near = JointLocalizer(PoseEstimator(points)).localize(looks)
-    away = JointLocalizer(PoseEstimator(points + far)).localize(looks)
-    centers = camera_centers(away.cams_from_world) - far
-    np.testing.assert_allclose(centers, camera_centers(near.cams_from_world), atol=1e-5)
-    assert away.n_inliers == near.n_inliers
 
 
 def test_invalid_rigs():
@@ -223,3 +216,121 @@ def test_invalid_rigs():
     ):
         with pytest.raises(PoseError):
             call()
+
+
+# Two rooms alike: the pose with evidence of its own is chosen, though a wrong one has more inliers.
+
+BEYOND = np.array([20.0, 0, 0])
+
+
+def two_rooms():
+    """Points (N, 3) of a room of 8 x 6 x 3 m and its copy 20 m off, and of a column that only the first has.
+
+    Also rows of each: room, copy, column.
+    """
+    room = a_room(2000)
+    column = np.column_stack([np.full((40, 2), (2.0, 0.5)), np.linspace(-1, 1, 40)])
+    points = np.concatenate([room, room + BEYOND, column])
+    return points, np.split(np.arange(len(points)), [2000, 4000])
+
+
+def test_unique_support_counts_landmarks_that_the_other_location_lacks():
+    points, (room, copy, column) = two_rooms()
+    here = poses_looking_along([[0.4, -0.7, 0.1]], [[1.0, 0.4, 0.0]])[0]
+    there = poses_looking_along([[20.4, -0.7, 0.1]], [[1.0, 0.4, 0.0]])[0]
+    ambiguity = PoseAmbiguity(points)
+    assert ambiguity.unique_support(room, here, there) == ambiguity.unique_support(copy, there, here) == 0
+    # 2 m of the column, in cubes of 0.25 m whose corners lie at multiples of that: the last point is in a ninth
+    assert ambiguity.unique_support(column, here, there) == ambiguity.count_voxels(column) == 9
+    # a turn of half a circle: the room is alike, the column is where there is nothing
+    turned = poses_looking_along([[-0.4, 0.7, 0.1]], [[-1.0, -0.4, 0.0]])[0]
+    assert ambiguity.unique_support(column, here, turned) == 9
+    # 20 cm off a thing is the same thing
+    near = poses_looking_along([[0.6, -0.7, 0.1]], [[1.0, 0.4, 0.0]])[0]
+    assert ambiguity.unique_support(column, here, near) == 0
+
+
+@pytest.mark.parametrize("n_column", [0, 12])
+def test_unique_support_outweighs_inliers_that_both_rooms_explain(n_column):
+    """Each of three looks matches 60 landmarks of the copy and 30 of the room that it sees. Without the
+    column the rooms are indistinguishable and the copy has more inliers; a dozen matches of the column decide."""
+    points, (room, _, column) = two_rooms()
+    axes = [(1.0, 0.4, 0.0), (0.0, 1.0, 0.2), (-1.0, 0.3, -0.1)]
+    poses = poses_looking_along(np.tile((0.4, -0.7, 0.1), (3, 1)), np.array(axes))
+    rng = np.random.default_rng(1)
+    looks = []
+    for number, (pose, cam_from_rig) in enumerate(zip(poses, rig_of(poses), strict=True)):
+        rows, pixels = in_view(points[room], pose)
+        chosen = rng.choice(len(rows), 90, replace=False)
+        landmarks = np.where(np.arange(90) < 60, rows[chosen] + len(room), rows[chosen])
+        own, at = in_view(points[column], pose) if number == 0 else (column[:0], np.zeros((0, 2)))
+        seen = np.concatenate([pixels[chosen], at[:n_column]])
+        looks.append(Look(cam_from_rig, seen, np.concatenate([landmarks, own[:n_column] + column[0]]), CAMERA))
+    found = JointLocalizer(PoseEstimator(points)).localize(looks)
+    right = poses if n_column else poses_looking_along(np.tile((20.4, -0.7, 0.1), (3, 1)), np.array(axes))
+    assert pose_error(found.cams_from_world, right)[0].max() < 1e-3
+    assert found.n_inliers == (90 + 12 if n_column else 180)
+    assert found.unique_support[1] == 0 and (found.unique_support[0] > 0) == (n_column > 0)
+    assert found.rival_support == pytest.approx(180 if n_column else 90, abs=1)
+
+
+# Matching again under a pose finds the landmarks that the pose predicts, and none that it does not.
+
+
+def twin_rooms(n=1500, seed=0):
+    """Two rooms 20 m apart with the same landmarks: points (2n, 3) and descriptors (2n, 128)."""
+    room = a_room(n, seed)
+    descriptors = np.random.default_rng(seed).integers(0, 90, (n, 128), dtype=np.uint8)
+    return np.concatenate([room, room + np.array((20, 0, 0))]), np.concatenate([descriptors, descriptors])
+
+
+def view_of(points, descriptors, pose, n_matched=12, noise=6, seed=1):
+    """A view whose keypoints are landmarks of the first room, of which a few are matched already."""
+    rng = np.random.default_rng(seed)
+    rows, pixels = in_view(points[: len(points) // 2], pose)
+    seen = descriptors[rows] + rng.integers(-noise, noise + 1, (len(rows), 128))
+    squared = ((seen[:, None] - descriptors[None].astype(np.int64)) ** 2).sum(2)
+    near = np.argsort(squared, axis=1)[:, :5]
+    at = pixels + rng.normal(0, 0.5, (len(rows), 2))
+    few = np.sort(rng.choice(len(rows), n_matched, replace=False))
+    matches = Matches(few, rows[few], near, np.take_along_axis(squared, near, 1).astype(np.float32))
+    return Look(
+        np.eye(3, 4), at[few] + rng.normal(0, 2, (n_matched, 2)), rows[few], CAMERA, Candidates.of(at, matches)
+    ), rows
+
+
+def test_matches_are_those_of_a_search_over_all_pairs():
+    rng = np.random.default_rng(3)
+    points = a_room(400)
+    pose = poses_looking_along([(0.0, 0, 0)], [(1.0, 0.1, 0)])[0]
+    pixels = rng.uniform(0, (640, 480), (300, 2))
+    squared = rng.uniform(1, 1.5, (300, 400))
+    near = np.argsort(squared, axis=1)
+    matches = Matches.none(300)._replace(near=near, squared=np.take_along_axis(squared, near, 1))
+    candidates = Candidates.of(pixels, matches)
+    look = Look(np.eye(3, 4), pixels[:0], near[0, :0], CAMERA, candidates)
+    found = match_under(look, points[candidates.landmarks], pose, 30.0)
+    in_camera = transform(pose, points)
+    near_px = np.linalg.norm(CAMERA.project(in_camera) - pixels[:, None], axis=2) < 30
+    allowed = near_px & (in_camera[:, 2] > 0) & (squared <= MAX_NEAREST_RATIO**2 * squared.min(1)[:, None])
+    best = {}
+    for keypoint in range(300):
+        if allowed[keypoint].any():
+            landmark = int(np.where(allowed[keypoint], squared[keypoint], np.inf).argmin())
+            if landmark not in best or squared[keypoint, landmark] < squared[best[landmark], landmark]:
+                best[landmark] = keypoint
+    assert len(best) > 30
+    expected = sorted((landmark, *pixels[keypoint]) for landmark, keypoint in best.items())
+    np.testing.assert_allclose(sorted(zip(found.rows, *found.pixels.T, strict=True)), expected)
+
+
+def test_a_pose_from_few_matches_becomes_more_accurate():
+    points, descriptors = twin_rooms()
+    pose = poses_looking_along([(0.4, -0.7, 0.1)], [(1, 0.2, 0)])[0]
+    look, _ = view_of(points, descriptors, pose)
+    localizer = JointLocalizer(PoseEstimator(points, LocalizerConfig(method="hypotheses")))
+    alone = localizer.localize([replace(look, candidates=None)])
+    guided = localizer.localize([look])
+    assert guided.n_inliers > 10 * alone.n_inliers
+    error, error_alone = (pose_error(result.rig_from_world, pose)[0] for result in (guided, alone))
+    assert error < 0.3 * error_alone and error < 0.01

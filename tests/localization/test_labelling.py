@@ -1,29 +1,31 @@
 """Labels of a room whose answers are known: a plain wall never localizes, a poster wall in the map always does."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose
 
 from localization.rooms import CAMERA, PLAIN, POSTER, facing, file_bytes, label, labelled, map_room, times
 from localization.test_joint import in_view
 from wheretolook.commands.options import MeshSource, ScenesConfig
 from wheretolook.commands.scenes import Scenes
-from wheretolook.dataset.viewpoint_files import FIRST_FIELDS, SCHEMA, read_table, write_table
-from wheretolook.dataset.viewpoint_table import LOCALIZED, by_first, is_good, poses
+from wheretolook.dataset.viewpoint_files import FIRST_FIELDS, MATCH_FIELDS, SCHEMA, read_table, write_table
+from wheretolook.dataset.viewpoint_table import LOCALIZED, TOO_FEW_MATCHES, by_first, is_good, poses
 from wheretolook.features.extractor import Keypoints
 from wheretolook.features.matches import Matches
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
-from wheretolook.geometry.poses import pose_error
+from wheretolook.geometry.poses import pose_error, transform
 from wheretolook.localization.config import LabelConfig, LocalizerConfig
-from wheretolook.localization.labeller import LabelTask, label_scenes
+from wheretolook.localization.labeller import MANIFEST, LabelTask, label_scenes
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.shard import label_rows
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh, save_glb
-from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.errors import ConfigError, SceneError, TableError
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -76,7 +78,7 @@ def test_a_repeated_texture_localizes_at_the_wrong_copy_and_is_labelled_so(tmp_p
     table = labelled(facing(POSTER, 12, distance_m=1.1), room, tmp_path / "shards", workers=1)
     wrong = table["error_m"] > 0.1
     assert 0 < wrong.sum() < 12
-    np.testing.assert_allclose(table["error_m"][wrong], 2.5, atol=0.02)
+    assert_allclose(table["error_m"][wrong], 2.5, atol=0.02)
     assert table["n_inliers"][wrong].min() > 50 and not is_good(table)[wrong].any()
 
 
@@ -112,8 +114,8 @@ def test_errors_are_measured_against_the_true_pose(room):
             return super().render(camera, yaw @ moved)
 
     found = label_rows(table, Elsewhere(load_mesh(room.mesh)), localizer, CAMERA)
-    np.testing.assert_allclose(found["error_m"], 0.1, atol=0.02)
-    np.testing.assert_allclose(found["error_deg"], 3.0, atol=0.2)
+    assert_allclose(found["error_m"], 0.1, atol=0.02)
+    assert_allclose(found["error_deg"], 3.0, atol=0.2)
 
 
 @pytest.mark.parametrize(
@@ -138,7 +140,7 @@ def test_a_pose_is_found_with_every_camera(room, camera):
     keypoints = replace(Keypoints.none(), pixels=found.astype(np.float32))
     matches = Matches.none(len(rows))._replace(keypoints=np.arange(len(rows)), landmarks=matched)
     estimate = Localizer(landmarks, CAMERA).estimate(keypoints, matches, camera)
-    assert estimate.cam_from_world is not None and estimate.status == LOCALIZED
+    assert estimate.status == LOCALIZED
     (error_m,), (error_deg,) = pose_error(estimate.cam_from_world[None], pose[None])
     assert error_m < 0.02 and error_deg < 0.3 and len(estimate.inlier_rows) >= 0.4 * len(rows)
 
@@ -216,3 +218,65 @@ def test_scenes_from_files_do_not_change(room, tmp_path):
 def test_strengths_beyond_0_and_1_are_refused(name, strength):
     with pytest.raises(ConfigError, match=rf"label\.{name}"):
         LabelConfig(**{name: strength})
+
+
+# Matched landmarks stored with the labels: their rows, and that nothing else changes.
+
+
+def test_matched_rows_agree_with_the_labels(room, matched):
+    n = len(Landmarks.load(room.landmarks))
+    assert list(matched.columns) == [*SCHEMA.names, *MATCH_FIELDS.names]
+    for view in matched.itertuples():
+        assert view.matched_rows.dtype == view.inlier_rows.dtype == np.int32
+        assert len(view.inlier_rows) == view.n_inliers <= len(view.matched_rows)
+        assert (len(view.matched_rows) < 4) == (view.status == TOO_FEW_MATCHES)
+        assert np.isin(view.inlier_rows, view.matched_rows).all()
+        for rows in (view.matched_rows, view.inlier_rows):
+            assert (np.diff(rows) > 0).all() and ((rows >= 0) & (rows < n)).all()
+    lengths = matched["matched_rows"].map(len)
+    assert lengths.min() == 0 and (lengths > matched["n_inliers"]).any() and matched["n_inliers"].max() > 50
+
+
+def test_labels_are_the_same_with_and_without(views, matched, expected, tmp_path):
+    assert file_bytes(matched.drop(columns=MATCH_FIELDS.names), tmp_path / "bare") == expected
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_shards_with_and_without_matches_have_names_of_their_own(room, tmp_path):
+    """Shards without matches have the names and the manifest of versions that could not store matches."""
+    table = pd.concat([facing(POSTER, 3, 1.5), facing(PLAIN, 1, 1.1)], ignore_index=True)
+    shards = tmp_path / "shards"
+    label(table, room, shards, shard_size=4)
+    (without,) = times(shards)
+    settings = json.loads((shards / MANIFEST).read_text())
+    assert settings["shards"] == {without.name: 4} and "store_matches" not in settings
+    label(table, room, shards, shard_size=4, store_matches=True)
+    both = times(shards)
+    (stored,) = both.keys() - {without}
+    expected = {**settings, "store_matches": True, "shards": {stored.name: 4}}
+    assert json.loads((shards / MANIFEST).read_text()) == expected
+    label(table, room, shards, shard_size=4)
+    assert times(shards) == both
+
+
+def test_pixels_are_kept_in_the_order_of_the_landmarks(room, views, matched, tmp_path):
+    """Inliers of a good view are within RANSAC's limit of their projection at the true pose."""
+    landmarks = Landmarks.load(room.landmarks)
+    rows = np.flatnonzero(is_good(matched))[:4]
+    localizer = Localizer(landmarks, CAMERA)
+    renderer = WarpRenderer(load_mesh(room.mesh))
+    some = views.iloc[rows].reset_index(drop=True)
+    kept = label_rows(some, renderer, localizer, CAMERA, store_pixels=True)
+    write_table(kept, tmp_path / "viewpoints.parquet")
+    back = read_table(tmp_path / "viewpoints.parquet", pixels=True)
+    assert "matched_pixels" not in read_table(tmp_path / "viewpoints.parquet", matches=True)
+    for row, pose in enumerate(poses(some)):
+        np.testing.assert_array_equal(back["matched_rows"][row], matched["matched_rows"][rows[row]])
+        pixels = back["matched_pixels"][row].reshape(-1, 2)
+        assert pixels.dtype == np.float32 and len(pixels) == len(back["matched_rows"][row])
+        inlier = np.isin(back["matched_rows"][row], back["inlier_rows"][row])
+        at = CAMERA.project(transform(pose, landmarks.points[back["matched_rows"][row][inlier]]))
+        assert np.linalg.norm(at - pixels[inlier], axis=1).max() < 10
+    with pytest.raises(TableError):
+        write_table(matched, tmp_path / "matches.parquet")
+        read_table(tmp_path / "matches.parquet", pixels=True)

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from localization.rooms import CAMERA
@@ -45,7 +46,6 @@ def localizer(room):
 
 
 def assert_near(poses, expected):
-    assert poses is not None
     error_m, error_deg = pose_error(poses, expected)
     assert (error_m < 0.05).all() and (error_deg < 0.4).all()
 
@@ -182,7 +182,6 @@ def test_results_are_in_the_maps_own_frame_and_unit(room, photos, tmp_path):
     (tmp_path / "landmarks.npz").write_bytes(room.landmarks.read_bytes())
     localizer = ImageLocalizer.open(tmp_path, frame=FrameOptions(scale=0.01, up="-y"))
     result = localizer.localize(photos / "a.png", prior=(250, -140, 200, 180))
-    assert result.cam_from_world is not None
     assert_near(centimetres.inverse.apply_to_poses(result.cam_from_world), POSES[:1])
     assert 0.001 < result.deviation[0] < 5
     figure = figure_of(result, localizer.landmarks.points)
@@ -224,7 +223,7 @@ def test_invalid_requests(localizer, images, option, values, text):
 def test_the_probability_is_that_of_the_accuracy(localizer, photos):
     coarse, fine = (localizer.localize(photos / "a.png", accuracy=limits) for limits in ((0.5, 5.0), (0.0005, 0.005)))
     assert coarse.probability > 0.9 and fine.probability < coarse.probability / 2
-    np.testing.assert_array_equal(coarse.cam_from_world, fine.cam_from_world)
+    assert_array_equal(coarse.cam_from_world, fine.cam_from_world)
 
 
 def test_where_to_look_localizes_in_the_map_that_it_opened(room, photos):
@@ -245,7 +244,7 @@ def test_the_next_view_of_a_rig(room, photos, capsys):
     limits = ["--pitch", "20", "40", "--pan", "90", "180"]
     assert main(["localize", "--map", model, "--images", str(photos / "a.png"), *given, "--next", *limits]) == 0
     found = re.search(r"turn (\d+) degrees to the left, to a pitch of (\d+) degrees", capsys.readouterr().out)
-    assert found is not None and 90 <= int(found[1]) <= 180 and 20 <= int(found[2]) <= 40
+    assert 90 <= int(found[1]) <= 180 and 20 <= int(found[2]) <= 40
     assert main(["localize", "--map", model, "--images", str(photos), *given, "--next"]) != 0
     assert "--turns" in capsys.readouterr().err
 
@@ -274,14 +273,14 @@ def test_turns_of_odometry_and_tables(tmp_path):
     half = np.sqrt(0.5)
     path.write_text(f"10.0 1 2 0 0 0 0 1\n10.5 1 2 0 0 0 {half} {half}\n")
     along = read_turns(path, ["10.001.png", "10.5.png"])[:, 2, :3]  # optical axes in the rig
-    np.testing.assert_allclose(along, [(1, 0, 0), (0, 1, 0)], atol=1e-9)
+    assert_allclose(along, [(1, 0, 0), (0, 1, 0)], atol=1e-9)
     table = tmp_path / "turns.csv"
     table.write_text("image,yaw,pitch,roll\na.png,0,0,90\nb.png,90,30,0\n")
     turned, level = read_turns(table, ["x/a.png", "x/b.png"])
-    np.testing.assert_allclose(turned[:, :3], [(0, 0, -1), (0, 1, 0), (1, 0, 0)], atol=1e-9)  # x down, y to the left
-    np.testing.assert_allclose(level[2, :3], (0, np.sqrt(0.75), 0.5), atol=1e-9)
+    assert_allclose(turned[:, :3], [(0, 0, -1), (0, 1, 0), (1, 0, 0)], atol=1e-9)  # x down, y to the left
+    assert_allclose(level[2, :3], (0, np.sqrt(0.75), 0.5), atol=1e-9)
     table.write_text("id,yaw,pitch\n0,0,0\n1,90,0\n")
-    np.testing.assert_allclose(read_turns(table, ["a.png", "b.png"])[1, 2, :3], (0, 1, 0), atol=1e-9)
+    assert_allclose(read_turns(table, ["a.png", "b.png"])[1, 2, :3], (0, 1, 0), atol=1e-9)
     no_rotation = "no rotation of this image"
     for text, images, problem in (
         ("yaw,pitch\na.png,0,0\nb.png,90,30", ["a.png", "c.png"], no_rotation),
@@ -297,5 +296,5 @@ def test_turns_of_odometry_and_tables(tmp_path):
 def test_rounded_rotations_are_made_orthonormal():
     exact = Rotation.from_euler("yx", [33.7, 10], degrees=True).as_matrix()
     poses = checked_turns(np.round([np.eye(3), exact], 4), 2)
-    np.testing.assert_allclose(poses[:, :, :3] @ poses[:, :, :3].swapaxes(1, 2), [np.eye(3)] * 2, atol=1e-12)
-    np.testing.assert_allclose(poses[1, :, :3], exact, atol=1e-4)
+    assert_allclose(poses[:, :, :3] @ poses[:, :, :3].swapaxes(1, 2), [np.eye(3)] * 2, atol=1e-12)
+    assert_allclose(poses[1, :, :3], exact, atol=1e-4)

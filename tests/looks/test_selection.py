@@ -4,6 +4,7 @@ from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from selection.room import POINTS, WEIGHTS, write_room
 from twins.looks import best_of_all_sets, joint_sums
@@ -48,16 +49,16 @@ def random_views(seed=0, d=9, u=30):
 def test_sums_of_a_set():
     views = random_views()
     for rows in ([0], [1, 4], [2, 3, 8]):
-        np.testing.assert_allclose(views.joint_sums(rows), joint_sums(views, rows), rtol=1e-5, atol=1e-6)
+        assert_allclose(views.joint_sums(rows), joint_sums(views, rows), rtol=1e-5, atol=1e-6)
     with_each = views.sums_with_each([1, 4])
     for row in range(len(views)):
-        np.testing.assert_allclose(with_each[row], views.joint_sums([1, 4, row]), rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(log_position_variance(np.zeros((2, 16))), np.log(3 / 1e-3))  # the prior alone
+        assert_allclose(with_each[row], views.joint_sums([1, 4, row]), rtol=1e-4, atol=1e-4)
+    assert_allclose(log_position_variance(np.zeros((2, 16))), np.log(3 / 1e-3))  # the prior alone
 
 
 def test_a_single_view_is_expected_to_detect_what_the_scorer_reports(scorer, views):
     poses = poses_looking_along(np.tile(POINTS[0], (len(AXES), 1)), AXES)
-    np.testing.assert_allclose(views.sums_with_each()[:, 0], scorer.report(poses).expected_inliers, rtol=1e-5)
+    assert_allclose(views.sums_with_each()[:, 0], scorer.report(poses).expected_inliers, rtol=1e-5)
 
 
 def test_certain_detection_gives_the_exact_information_of_two_opposite_views(scorer):
@@ -66,7 +67,7 @@ def test_certain_detection_gives_the_exact_information_of_two_opposite_views(sco
     poses = poses_looking_along(np.tile(POINTS[0], (2, 1)), AXES[opposite])
     seen = scorer.localization_map.landmarks_in_view(poses)
     offsets = scorer.localization_map.landmarks.points[np.concatenate([seen[0], seen[1]])] - POINTS[0]
-    np.testing.assert_allclose(certain.joint_sums(opposite)[1:], bearing_numbers(offsets).sum(0), rtol=1e-5, atol=1e-5)
+    assert_allclose(certain.joint_sums(opposite)[1:], bearing_numbers(offsets).sum(0), rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("set_score", [MODEL, lambda sums, p_none: np.asarray(sums)[..., 0]])

@@ -3,7 +3,6 @@
 import json
 import math
 import warnings
-from dataclasses import replace
 
 import numpy as np
 import pycolmap
@@ -142,7 +141,7 @@ def test_views_have_an_accuracy_and_expected_errors(scorer):
     own = look.best(place)
     coarse = look.best(place, accuracy=(0.25, 2))
     assert coarse.score[0] >= own.score[0] and coarse.method == "set 0.25m_2deg"
-    assert coarse.expected_error_m is not None and coarse.expected_error_deg is not None
+    assert coarse.expected_error_deg is not None
     assert look.at_accuracy((0.25, 2)).score(coarse.cam_from_world) == pytest.approx(coarse.score, abs=1e-6)
     with pytest.raises(ConfigError, match="joint scores"):
         look.best(place, accuracy=(0.25, 2), looks=2)
@@ -157,14 +156,12 @@ def test_views_have_an_accuracy_and_expected_errors(scorer):
 
 def sphere(radius_m):
     """The bundled scorer of landmarks on a sphere around the origin."""
-    landmarks = make_landmarks(np.random.default_rng(0), 2000)
-    points = fibonacci_sphere(2000) * radius_m
-    of_map = {
-        "triangulation_angle_deg": np.full(2000, 8.0, np.float32),
-        "mapping_distance_m": np.full(2000, radius_m, np.float32),
-        "mapping_direction": -fibonacci_sphere(2000).astype(np.float32),
-    }
-    scorer = load_scorer(LocalizationMap(replace(landmarks, points=points, **of_map), PinholeCamera(400, 300, 200.0)))
+    points = fibonacci_sphere(2000)
+    landmarks = make_landmarks(
+        np.random.default_rng(0), 2000, points=points * radius_m, triangulation_angle_deg=8,
+        mapping_distance_m=radius_m, mapping_direction=-points,
+    )  # fmt: skip
+    scorer = load_scorer(LocalizationMap(landmarks, PinholeCamera(400, 300, 200.0)))
     assert isinstance(scorer, SetScorer)
     return scorer
 
@@ -211,12 +208,10 @@ def warnings_of(scorer, views):
 
 def test_landmarks_mapped_from_one_place_are_out_of_range(poses):
     def seen_and_in_range(angle_deg, error_px, spread):
-        of_map = {
-            "triangulation_angle_deg": np.full(400, angle_deg, np.float32),
-            "reprojection_error_px": np.full(400, error_px, np.float32),
-            "mapping_distance_spread": np.full(400, spread, np.float32),
-        }
-        landmarks = replace(make_landmarks(np.random.default_rng(0), 400), **of_map)
+        landmarks = make_landmarks(
+            np.random.default_rng(0), 400, triangulation_angle_deg=angle_deg, reprojection_error_px=error_px,
+            mapping_distance_spread=spread,
+        )  # fmt: skip
         report = load_scorer(LocalizationMap(landmarks, PinholeCamera(400, 300, 200.0))).report(poses)
         return report.in_range & (report.n_visible > 0)
 

@@ -7,10 +7,12 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.special import logit
 
 from selection.room import WEIGHTS, write_room
 from synthetic_dataset import make_landmarks
+from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -114,7 +116,6 @@ def test_maps_that_do_not_show_it():
     """Stored occlusion is of all landmarks at other locations; no third image observes what two do."""
     localization_map = observed_map(0.6)
     images = localization_map.images
-    assert images is not None
     stored = StoredOcclusion.from_mask(np.zeros((1, 3)), np.ones((1, len(images.landmarks)), dtype=bool))
     trained = replace(bundled(), network=constant_network())
     for occlusion in (stored, CachedOcclusion(stored)):
@@ -141,44 +142,64 @@ def test_it_is_added_for_photographs_only_and_to_a_copy():
     assert calibrated.offset == trained.offset + trained.photograph_offset and calibrated.photograph_offset == 0
     values = torch.zeros(5, len(trained.network.attributes))
     before, after = (one.network.matchability(values).sigmoid().numpy() for one in (trained, calibrated))
-    np.testing.assert_allclose(before, PREDICTED, rtol=1e-5)
-    np.testing.assert_allclose(after, 0.6, atol=0.03)
+    assert_allclose(before, PREDICTED, rtol=1e-5)
+    assert_allclose(after, 0.6, atol=0.03)
 
 
 def test_all_scorers_of_a_map_use_it(tmp_path):
     """Of single poses, of directions, and on the robot."""
     localization_map = observed_map(0.6)
     views = localization_map.mapping_poses
-    assert views is not None
     scorer = load_scorer(WEIGHTS / "set.safetensors", localization_map)
     plain = load_scorer(WEIGHTS / "set.safetensors", replace(localization_map, images=None))
     before, after = (one.report(views).expected_inliers for one in (plain, scorer))
     assert (after[before > 1] > 1.1 * before[before > 1]).all()
     load_scorer(WEIGHTS / "set.safetensors", localization_map.of_camera(NARROW))
-    assert localization_map.images is not None and len(localization_map.images.offsets) == 1  # estimated once
+    assert len(localization_map.images.offsets) == 1  # estimated once
     axes = views[:1, 2, :3]
     center = camera_centers(views[:1])
     expected = scorer.score(poses_looking_along(center, axes))
-    np.testing.assert_allclose(scorer.score_directions(center, axes)[0], expected, atol=0.02)
+    assert_allclose(scorer.score_directions(center, axes)[0], expected, atol=0.02)
     folder = export_robot(localization_map, WEIGHTS / "set.safetensors", tmp_path, progress=False)
-    np.testing.assert_allclose(RobotScorer(folder).score(views), scorer.score(views), atol=1e-5)
+    assert_allclose(RobotScorer(folder).score(views), scorer.score(views), atol=1e-5)
 
 
 def test_landmarks_without_an_image_are_those_of_the_smaller_model(tmp_path):
     folder = write_room(tmp_path / "sparse", metric=False)
     images = LocalizationMap.from_colmap(folder, scale=1.0, up="z").images
-    assert images is not None and len(images) == 12
+    assert len(images) == 12
     model = pycolmap.Reconstruction(str(folder))
     for number in (2, 3, 7, 8, 12):
         model.deregister_frame(model.images[number].frame_id)
     expected = load_colmap_landmarks(folder, reconstruction=model)
     found = images.without(np.array([1, 2, 6, 7, 11]))
     few = MappedImages.of(first_of(images.landmarks, 100), images.arrays, images.poses, images.cameras)
-    np.testing.assert_array_equal(
-        few.without(np.array([1, 2, 6, 7, 11])).ids, expected.ids[expected.ids <= few.landmarks.ids[-1]]
-    )
+    assert_array_equal(few.without(np.array([1, 2, 6, 7, 11])).ids, expected.ids[expected.ids <= few.landmarks.ids[-1]])
     assert len(expected) < len(images.landmarks)
-    np.testing.assert_array_equal(found.ids, expected.ids)
-    np.testing.assert_array_equal(found.track_length, expected.track_length)
+    assert_array_equal(found.ids, expected.ids)
+    assert_array_equal(found.track_length, expected.track_length)
     for name in ("triangulation_angle_deg", "mapping_direction", "mapping_distance_m", "mapping_distance_spread"):
-        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-4)
+        assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-4)
+
+
+# Log-odds of maps of photographs have the offset of the weights once; those of maps of renders have none.
+
+
+@pytest.mark.parametrize("rendered", [True, False])
+def test_the_offset_is_added_once_and_only_for_photographs(rendered, tmp_path):
+    folder = write_room(tmp_path / "sparse", metric=rendered)  # whose report then states that it is rendered
+    trained = replace(TrainedNetwork.load(WEIGHTS / "set.safetensors", SetNetwork, "set"), photograph_offset=0.7)
+    trained.save(tmp_path / "with.safetensors")
+    replace(trained, photograph_offset=0.0).save(tmp_path / "without.safetensors")
+    TrainedNetwork.load(tmp_path / "with.safetensors", SetNetwork, "set").save(tmp_path / "again.safetensors")
+    expected = 0.0 if rendered else 0.7
+    for localization_map in (
+        LocalizationMap.from_colmap(folder),
+        ColmapEnvironment(ColmapFiles(folder)).localization_map,
+    ):
+        views = localization_map.mapping_poses
+        plain, *others = (
+            load_scorer(tmp_path / f"{name}.safetensors", localization_map) for name in ("without", "with", "again")
+        )
+        for scorer in others:
+            np.testing.assert_allclose(logit(scorer.score(views)) - logit(plain.score(views)), expected, atol=1e-6)

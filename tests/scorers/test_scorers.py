@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
 from learning_options import save_network
 from synthetic_dataset import CAMERA, make_landmarks, make_mapping_poses
@@ -83,11 +84,11 @@ def test_scorers_keep_their_contract(name, localization_map, views, weights, mon
     order = np.random.default_rng(0).permutation(40)
     # networks compute in single precision, which a determinant or least eigenvalue of what they weigh magnifies
     rtol = 2e-5 if "expected" in name else 1e-6
-    np.testing.assert_allclose(scorer.score(views[order]), scores[order], rtol=rtol)  # a pose's score is its own
-    np.testing.assert_allclose(scorer.score(views[7:8]), scores[7:8], rtol=rtol)
-    np.testing.assert_array_equal(scorer.score_binned(views, localization_map.bin_views(views)), scores)
+    assert_allclose(scorer.score(views[order]), scores[order], rtol=rtol)  # a pose's score is its own
+    assert_allclose(scorer.score(views[7:8]), scores[7:8], rtol=rtol)
+    assert_array_equal(scorer.score_binned(views, localization_map.bin_views(views)), scores)
     monkeypatch.setattr("wheretolook.scorers.base.BLOCK", 7)
-    np.testing.assert_allclose(scorer.score(views), scores, rtol=rtol)
+    assert_allclose(scorer.score(views), scores, rtol=rtol)
     assert scorer.score(views[:0]).shape == (0,)
     unknown = replace(localization_map.landmarks, ambiguity=np.full(200, np.nan, np.float32))
     without_ambiguity = replace(localization_map, landmarks=unknown)
@@ -109,18 +110,15 @@ def _binned(counts):
 
 def test_counting_scorers_on_hand_counted_bins(localization_map):
     binned = _binned([[0, 0, 0, 0], [9, 0, 0, 0], [1, 1, 0, 0], [1, 2, 0, 0], [1, 1, 1, 1], [50, 50, 50, 50]])
-    np.testing.assert_allclose(
-        VisibleScorer(localization_map, bins=2).score_bins(binned) * 200, [0, 9, 2, 3, 4, 200], rtol=1e-12
-    )
+    assert_allclose(VisibleScorer(localization_map, bins=2).score_bins(binned) * 200, [0, 9, 2, 3, 4, 200], rtol=1e-12)
     by_bins = BinsScorer(localization_map, bins=2).score_bins(binned)
     # one bin with nine landmarks loses to two bins with one each; landmarks decide between equal bins
-    np.testing.assert_array_equal(np.argsort(by_bins), [0, 1, 2, 3, 4, 5])
-    np.testing.assert_array_equal(np.floor(by_bins * 5), [0, 1, 2, 2, 4, 4])
+    assert_array_equal(np.argsort(by_bins), [0, 1, 2, 3, 4, 5])
+    assert_array_equal(np.floor(by_bins * 5), [0, 1, 2, 2, 4, 4])
     assert by_bins.max() < 1
 
 
-def test_random_scores_are_uniform_and_depend_on_the_seed(localization_map):
-    rng = np.random.default_rng(0)
+def test_random_scores_are_uniform_and_depend_on_the_seed(rng, localization_map):
     views = poses_looking_along(np.zeros((20000, 3)), rng.normal(size=(20000, 3)))
     a, b = (make_scorer("random", localization_map, seed=seed).score(views) for seed in (0, 1))
     assert np.abs(np.histogram(a, 20, (0, 1))[0] - 1000).max() < 6 * np.sqrt(1000)
@@ -139,13 +137,13 @@ def test_learned_scores_equal_the_network_by_hand(localization_map, views, weigh
     last = network.layers[-1]
     hidden = np.maximum(values @ first.weight.numpy().T + first.bias.numpy(), 0)
     logits = hidden @ last.weight.numpy().T + last.bias.numpy()
-    np.testing.assert_allclose(scorer.score(views), 1 / (1 + np.exp(-logits[:, 0])), rtol=1e-5)
+    assert_allclose(scorer.score(views), 1 / (1 + np.exp(-logits[:, 0])), rtol=1e-5)
 
 
 def test_another_resolution_of_the_same_field_of_view_scores_the_same(localization_map, views, weights):
     double = PinholeCamera(2 * CAMERA.width, 2 * CAMERA.height, 2 * CAMERA.focal_px)
     scores = load_scorer(weights, LocalizationMap(localization_map.landmarks, double)).score(views)
-    np.testing.assert_allclose(scores, load_scorer(weights, localization_map).score(views), rtol=1e-5)
+    assert_allclose(scores, load_scorer(weights, localization_map).score(views), rtol=1e-5)
 
 
 @pytest.mark.parametrize(

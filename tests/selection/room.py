@@ -1,37 +1,29 @@
 """A small COLMAP model: landmarks on the walls of a room of 6 x 5 x 3 m, seen by twelve images."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
 import numpy as np
 
-from colmap_models import camera, colmap_model
+from colmap_models import colmap_model
+from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 
 WEIGHTS = Path(__file__).parents[2] / "data" / "release" / "weights"
 POINTS = np.array([(1.5, 2.0, 1.5), (2.0, 2.2, 1.4), (2.6, 2.4, 1.5), (3.2, 2.5, 1.6)])
 
 
-def write_room(folder: Path, text: bool = False, n: int = 400, metric: bool = True) -> Path:
+def write_room(folder, text=False, n=400, metric=True):
     rng = np.random.default_rng(0)
     points = rng.uniform((0, 0, 0.2), (6, 5, 2.8), (n, 3))
     wall = rng.integers(0, 2, n)
     points[np.arange(n), wall] = np.where(rng.random(n) < 0.8, 0.0, np.array([6.0, 5.0])[wall])
     centers = rng.uniform((1.5, 1.5, 1), (4.5, 3.5, 2), (12, 3))
     axes = np.column_stack([np.cos(np.arange(12)), np.sin(np.arange(12)), np.zeros(12)])
-    seen_by = np.argsort(rng.random((n, 12)), axis=1)[:, :4]
-    images = []
-    tracks = [[] for _ in points]
-    for row, pose in enumerate(poses_looking_along(centers, axes)):
-        seen = np.flatnonzero((seen_by == row).any(axis=1))
-        images.append((f"{row:03}.jpg", 1, pose, np.full((len(seen), 2), 100.0)))
-        for keypoint, point in enumerate(seen):
-            tracks[point].append((row, keypoint))
-    model = colmap_model(
-        [camera(1, "PINHOLE", 640, 480, 320, 320, 320, 240)], images, zip(points, tracks, strict=True), 0.3
-    )
+    seen = np.zeros((12, n), dtype=bool)
+    seen[np.argsort(rng.random((n, 12)), axis=1)[:, :4].T, np.arange(n)] = True
+    poses = poses_looking_along(centers, axes)
+    model = colmap_model(points, poses, seen, (PinholeCamera(640, 480, 320.0),), project=False)
     folder.mkdir(parents=True)
     if metric:  # as the report of a rendered map states
         (folder / "report.json").write_text(json.dumps({"n_landmarks": n}))

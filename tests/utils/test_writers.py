@@ -10,7 +10,7 @@ import torch
 from matplotlib.figure import Figure
 
 from box_scenes import furnished_room
-from colmap_models import camera, colmap_model
+from colmap_models import camera, model_of
 from disks import file_limit, fill, read_only, small_disk
 from synthetic_dataset import make_mapping_poses
 from wheretolook.dataset.viewpoint_files import SCHEMA, write_table
@@ -83,7 +83,7 @@ def test_a_writer_that_fails_names_the_file_and_leaves_no_part(name, disk, tmp_p
 
 def test_a_model_that_colmap_wrote_in_part_is_an_error(tmp_path):
     images = [(f"{row:05d}.png", 1, pose, []) for row, pose in enumerate(make_mapping_poses(0, 400))]
-    model = colmap_model([camera(1, "PINHOLE", 160, 120, 80, 80, 80, 60)], images)
+    model = model_of([camera(1, "PINHOLE", 160, 120, 80, 80, 80, 60)], images)
     write_model(model, tmp_path / "whole")
     assert len(colmap_poses(tmp_path / "whole")) == 400
     with file_limit(LIMIT), pytest.raises(StorageError) as raised:

@@ -24,5 +24,5 @@ def write_rendered_room(folder):
         zip(poses, WarpRenderer(furnished_room()).render(CAMERA, poses).rgb, strict=True)
     ):
         cv2.imwrite(str(folder / "photographs" / f"{row:02}.png"), rgb[..., ::-1])
-        images.append((f"{row:02}.png", 1, pose, []))
+        images.append((f"{row:02}.png", 1, pose, np.zeros((0, 2))))
     write_model(model_of([camera(1, "PINHOLE", 320, 240, 200, 200, 160, 120)], images), folder / "sparse")

@@ -147,23 +147,22 @@ def test_rotations_that_the_images_contradict_are_reported_and_do_no_harm(apart_
     """The second camera is turned by another angle than stated, and may be apart from the first."""
     points = a_room()
     estimator = PoseEstimator(points)
-    right = np.column_stack([Rotation.from_euler("y", 60, degrees=True).as_matrix(), np.zeros(3)])
-    right[:, 3] = right[:, :3] @ (-apart_m, 0, 0)
-    stated = Rotation.from_euler("y", error_deg, degrees=True).as_matrix() @ right
+    turned, other = (
+        np.column_stack([Rotation.from_euler("y", angle, degrees=True).as_matrix(), np.zeros(3)]) for angle in (60, -80)
+    )
+    turned[:, 3] = turned[:, :3] @ (-apart_m, 0, 0)
+    stated = Rotation.from_euler("y", error_deg, degrees=True).as_matrix() @ turned
     rig = poses_looking_along([(0.4, -0.7, 0.1)], [(1, 0, 0)])[0]
-    poses = [rig, compose_poses(right, rig)]
+    poses = [rig, compose_poses(turned, rig), compose_poses(other, rig)]
     for seed in range(5):
         rng = np.random.default_rng(seed)
         looks = [look_at(points, pose, given, rng, noise_px=1.0, outliers=0.4)[0]
-                 for pose, given in zip(poses, (np.eye(3, 4), stated), strict=True)]  # fmt: skip
+                 for pose, given in zip(poses, (np.eye(3, 4), stated, other), strict=True)]  # fmt: skip
         found = JointLocalizer(estimator, 0.2, check_turns=True).localize(looks)
         assert found.status == ("contradicted" if error_deg else "localized")
         assert found.turn_error_deg == pytest.approx(error_deg, abs=0.6)
         error_m, angle = pose_error(found.cams_from_world, poses)
         assert error_m.max() < 0.05 and angle.max() < 0.4
-        if error_deg:
-            believed = JointLocalizer(estimator, 0.2).localize(looks)
-            assert pose_error(believed.cams_from_world, poses)[1].max() > 1
 
 
 def test_rotations_of_the_wrong_sign_are_reported_and_the_pose_is_uncertain():

@@ -183,15 +183,15 @@ def test_half_of_the_locations_show_the_changed_mesh(room, tmp_path):
     plain = replace(mesh, textures=tuple(np.full_like(texture, 128) for texture in mesh.textures))
     save_glb(plain, tmp_path / "changed.glb")
     job = replace(room.job, changes=0.4, changed_mesh=tmp_path / "changed.glb")
-    one, other = (
+    (one,), (other,) = (
         label_scenes(
             [LabelTask("room", job, table, tmp_path / str(size))], LabelConfig(workers=1, shard_size=size), False
         )
         for size in (5, 24)
     )
-    assert one[0].manifest["changes"] == 0.4 and "changed_mesh" in one[0].manifest
-    both = one[0].table
-    pd.testing.assert_frame_equal(both, other[0].table)
+    assert one.manifest["changes"] == 0.4 and "changed_mesh" in one.manifest
+    both = one.table
+    pd.testing.assert_frame_equal(both, other.table)
     is_changed = both["changes"] > 0
     assert set(both["changes"]) == {np.float32(0), np.float32(0.4)} and 4 <= is_changed.sum() <= 20
     assert (both.groupby("location_id")["changes"].nunique() == 1).all()

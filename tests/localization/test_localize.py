@@ -134,7 +134,7 @@ def test_images_are_matched_with_the_landmarks_of_their_pairs_alone(room, photos
     opposite = [name for name, axis in axes.items() if axis @ AXES[0] < -0.9]
     pairs.write_text("".join(f"a.png {name}\n" for name in opposite) + "c.png nowhere.png\n")
     away = ImageLocalizer.open(folder, pairs=pairs).localize(photos / "a.png")
-    assert away.n_matches < 0.3 * expected.n_matches and away.probability < 0.05
+    assert away.n_matches < 0.3 * expected.n_matches and away.probability < 0.2
     assert ImageLocalizer.open(folder, pairs=pairs).localize(photos / "c.png").n_matches == 0
     with pytest.raises(TableError, match=r"b\.png.*do not name this image|do not name this image.*b\.png"):
         ImageLocalizer.open(folder, pairs=pairs).localize(photos / "b.png")

@@ -82,7 +82,7 @@ def test_a_writer_that_fails_names_the_file_and_leaves_no_part(name, disk, tmp_p
 
 
 def test_a_model_that_colmap_wrote_in_part_is_an_error(tmp_path):
-    images = [(f"{row:05d}.png", 1, pose, []) for row, pose in enumerate(make_mapping_poses(0, 400))]
+    images = [(f"{row:05d}.png", 1, pose, np.zeros((0, 2))) for row, pose in enumerate(make_mapping_poses(0, 400))]
     model = model_of([camera(1, "PINHOLE", 160, 120, 80, 80, 80, 60)], images)
     write_model(model, tmp_path / "whole")
     assert len(colmap_poses(tmp_path / "whole")) == 400

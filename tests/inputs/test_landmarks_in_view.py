@@ -18,6 +18,7 @@ from wheretolook.inputs.landmark_features import LandmarkDescriber, ReasonCounte
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
 from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
 from wheretolook.scenes.loading import save_glb
+from wheretolook.mapping.map import Map
 from wheretolook.visibility.occlusion import StoredOcclusion
 
 COLMAP = ColmapCamera("OPENCV", 160, 120, (80.0, 80.0, 80.0, 60.0, -0.1, 0.01, 1e-3, -1e-3))
@@ -35,7 +36,7 @@ def localization_map(request, device):
     landmarks = make_landmarks(rng, 400)
     centers = np.unique(-np.einsum("bji,bj->bi", some_views()[:, :, :3], some_views()[:, :, 3]).round(6), axis=0)
     occlusion = StoredOcclusion.from_mask(centers, rng.random((len(centers), 400)) < 0.7)
-    return LocalizationMap(landmarks, request.param, occlusion, device)
+    return LocalizationMap(Map(landmarks), request.param, occlusion, device)
 
 
 def test_each_landmark_by_hand(localization_map):
@@ -116,7 +117,7 @@ def test_counts_by_the_definitions(tmp_path):
     mapped_along = np.roll(room.landmarks.mapping_direction, 1, axis=0)  # and some oblique
     ambiguity = np.linspace(0.9, 1.0, len(room.landmarks), dtype=np.float32)
     changed = {"mapping_distance_m": mapped_m, "mapping_direction": mapped_along, "ambiguity": ambiguity}
-    room = replace(room, landmarks=replace(room.landmarks, **changed))
+    room = replace(room, map=replace(room.map, landmarks=replace(room.landmarks, **changed)))
     axes = direction_lattice(12)
     poses = poses_looking_along(np.repeat(POINTS, 12, axis=0), np.tile(axes, (4, 1)))
     counts = ReasonCounter(room).count(poses)

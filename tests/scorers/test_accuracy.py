@@ -18,6 +18,7 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import write_model
+from wheretolook.mapping.map import Map
 from wheretolook.scorers.registry import find, make_scorer
 from wheretolook.scorers.set.accuracy import STATISTICS, AccuracyModel, LogError
 from wheretolook.scorers.set.network import ALL_STATISTICS
@@ -110,7 +111,7 @@ def test_the_bundled_file_is_the_model_and_damage_is_found(tmp_path):
 
 @pytest.fixture(scope="module")
 def scorer():
-    scorer = load_scorer(LocalizationMap(make_landmarks(np.random.default_rng(0), 400), CAMERA))
+    scorer = load_scorer(LocalizationMap(Map(make_landmarks(np.random.default_rng(0), 400)), CAMERA))
     assert isinstance(scorer, SetScorer)
     return scorer
 
@@ -161,7 +162,7 @@ def sphere(radius_m):
         np.random.default_rng(0), 2000, points=points * radius_m, triangulation_angle_deg=8,
         mapping_distance_m=radius_m, mapping_direction=-points,
     )  # fmt: skip
-    scorer = load_scorer(LocalizationMap(landmarks, PinholeCamera(400, 300, 200.0)))
+    scorer = load_scorer(LocalizationMap(Map(landmarks), PinholeCamera(400, 300, 200.0)))
     assert isinstance(scorer, SetScorer)
     return scorer
 
@@ -212,7 +213,7 @@ def test_landmarks_mapped_from_one_place_are_out_of_range(poses):
             np.random.default_rng(0), 400, triangulation_angle_deg=angle_deg, reprojection_error_px=error_px,
             mapping_distance_spread=spread,
         )  # fmt: skip
-        report = load_scorer(LocalizationMap(landmarks, PinholeCamera(400, 300, 200.0))).report(poses)
+        report = load_scorer(LocalizationMap(Map(landmarks), PinholeCamera(400, 300, 200.0))).report(poses)
         return report.in_range & (report.n_visible > 0)
 
     assert seen_and_in_range(8.0, 0.1, 0.1).sum() > 10

@@ -14,10 +14,16 @@ from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good, poses
 from wheretolook.geometry import pose_information as information
 from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
 from wheretolook.inputs.statistics import FeatureStatistics
-from wheretolook.scorers.matchability.network import MatchabilityNetwork, expected_parts
-from wheretolook.scorers.set.config import SetConfig
+from wheretolook.scorers.set import SetConfig
 from wheretolook.scorers.set.learn import of_size
-from wheretolook.scorers.set.network import EXPECTED, SetNetwork, expected_cells, expected_statistics
+from wheretolook.scorers.set.network import (
+    EXPECTED,
+    MatchabilityNetwork,
+    SetNetwork,
+    expected_cells,
+    expected_parts,
+    expected_statistics,
+)
 from wheretolook.training.data import labelled_rows
 from wheretolook.training.landmark_views import LandmarkBatches, load_landmark_views
 from wheretolook.training.scenes import training_scenes

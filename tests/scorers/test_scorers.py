@@ -16,13 +16,13 @@ from wheretolook.inputs.channels import CHANNELS
 from wheretolook.inputs.landmark_features import ATTRIBUTES
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.inputs.statistics import FeatureStatistics
-from wheretolook.scorers.adapted.network import AdaptedNetwork
+from wheretolook.mapping.map import Map
+from wheretolook.scorers.adapted.score import AdaptedNetwork
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.bins import BinsScorer
-from wheretolook.scorers.matchability.network import MatchabilityNetwork
 from wheretolook.scorers.mlp.network import NetworkSpec, ViewpointNetwork
 from wheretolook.scorers.registry import make_scorer, scorers
-from wheretolook.scorers.set.network import SetNetwork
+from wheretolook.scorers.set.network import MatchabilityNetwork, SetNetwork
 from wheretolook.scorers.visible import VisibleScorer
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.errors import CameraError, ConfigError, PoseError, WeightsError
@@ -31,7 +31,7 @@ from wheretolook.utils.errors import CameraError, ConfigError, PoseError, Weight
 @pytest.fixture
 def localization_map():
     landmarks = make_landmarks(np.random.default_rng(0), 200)
-    return LocalizationMap(landmarks, CAMERA, mapping_poses=make_mapping_poses(0))
+    return LocalizationMap(Map(landmarks, mapping_poses=make_mapping_poses(0)), CAMERA)
 
 
 @pytest.fixture
@@ -91,7 +91,7 @@ def test_scorers_keep_their_contract(name, localization_map, views, weights, mon
     assert_allclose(scorer.score(views), scores, rtol=rtol)
     assert scorer.score(views[:0]).shape == (0,)
     unknown = replace(localization_map.landmarks, ambiguity=np.full(200, np.nan, np.float32))
-    without_ambiguity = replace(localization_map, landmarks=unknown)
+    without_ambiguity = replace(localization_map, map=replace(localization_map.map, landmarks=unknown))
     assert np.isfinite(make_scorer(name, without_ambiguity, seed=3, weights=weights).score(views)).all()
     invalid = views.copy()
     invalid[3, 1, 2] = np.nan
@@ -142,7 +142,7 @@ def test_learned_scores_equal_the_network_by_hand(localization_map, views, weigh
 
 def test_another_resolution_of_the_same_field_of_view_scores_the_same(localization_map, views, weights):
     double = PinholeCamera(2 * CAMERA.width, 2 * CAMERA.height, 2 * CAMERA.focal_px)
-    scores = load_scorer(weights, LocalizationMap(localization_map.landmarks, double)).score(views)
+    scores = load_scorer(weights, LocalizationMap(Map(localization_map.landmarks), double)).score(views)
     assert_allclose(scores, load_scorer(weights, localization_map).score(views), rtol=1e-5)
 
 

@@ -8,8 +8,7 @@ from depth_room import CAMERA, depth_images, free_points, room
 from wheretolook.geometry.tsdf import DepthImage, TsdfVolume
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import SceneError, TableError
-from wheretolook.visibility.occlusion import MeshOcclusion, StoredOcclusion
-from wheretolook.visibility.tsdf import TsdfOcclusion
+from wheretolook.visibility.occlusion import MeshOcclusion, StoredOcclusion, TsdfOcclusion
 
 
 def screen():

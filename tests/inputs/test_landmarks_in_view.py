@@ -17,8 +17,8 @@ from wheretolook.inputs.channels import ATTRIBUTES, POSE_ATTRIBUTES
 from wheretolook.inputs.landmark_features import LandmarkDescriber, ReasonCounter
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
 from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
-from wheretolook.scenes.loading import save_glb
 from wheretolook.mapping.map import Map
+from wheretolook.scenes.loading import save_glb
 from wheretolook.visibility.occlusion import StoredOcclusion
 
 COLMAP = ColmapCamera("OPENCV", 160, 120, (80.0, 80.0, 80.0, 60.0, -0.1, 0.01, 1e-3, -1e-3))

@@ -6,7 +6,7 @@ import pytest
 from scipy.special import expit
 
 from scorers.test_accuracy import MODEL, views
-from wheretolook.scorers.set.network import ALL_STATISTICS
+from wheretolook.scorers.set.network import VIEW_STATISTICS
 from wheretolook_paper.studies import fit_accuracy
 from wheretolook_paper.studies.calibrate_photographs import fitted_offset
 
@@ -20,7 +20,7 @@ def test_the_fit_finds_the_model_that_errors_are_drawn_from(monkeypatch):
     # shrunk, so that no error at the right place exceeds its limits
     errors = np.exp(MODEL.log_errors(statistics) + noise - 12)
     errors[~place] = np.inf
-    table = pd.DataFrame(statistics, columns=ALL_STATISTICS).assign(
+    table = pd.DataFrame(statistics, columns=VIEW_STATISTICS).assign(
         own=own, scene="one", error_m=errors[:, 0], error_deg=errors[:, 1]
     )
     monkeypatch.setattr(fit_accuracy, "LEAST", (0.0, 0.0))

@@ -13,8 +13,7 @@ from box_scenes import furnished_room, quads_mesh, random_texture, random_triang
 from twins.open3d_renderer import Open3DRenderer
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along, transform
-from wheretolook.rendering.warp_renderer import build_pyramids, texel_gradients
-from wheretolook.rendering.warp_renderer import WarpRenderer
+from wheretolook.rendering.warp_renderer import WarpRenderer, build_pyramids, texel_gradients
 from wheretolook.utils.errors import ConfigError, SceneError
 
 TRACING = partial(WarpRenderer, method="rays")

@@ -119,10 +119,10 @@ def test_damaged_weights(change, trained, dataset, tmp_path):
     localization_map = dataset.scenes[0].localization_map(CAMERA)
     save_file(tensors, path, metadata={METADATA_KEY: json.dumps(header | (change or {}))})
     with pytest.raises(WeightsError):
-        load_scorer(path, localization_map)
+        load_scorer(localization_map, path)
     path.write_bytes(whole.read_bytes()[:-7])
     with pytest.raises(WeightsError):
-        load_scorer(path, localization_map)
+        load_scorer(localization_map, path)
 
 
 def warnings_of(scorer, cam_from_world):
@@ -159,7 +159,7 @@ def test_matches_must_be_stored(tmp_path, tracking):
     ("name", "options"),
     [
         ("set", {"hidden": ("colour",)}),
-        ("set", {"pooled": -1}),
+        ("set", {"landmark_loss": -1}),
         ("set", {"epochs": 0}),
         ("matchability", {"width": 0}),
         ("matchability", {"enlarged": 0.5}),

@@ -3,7 +3,7 @@
 import numpy as np
 
 from colmap_models import camera, model_of
-from wheretolook.features.sift import SIFT
+from wheretolook.features.extractor import SIFT
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping.triangulation import fill_database
 

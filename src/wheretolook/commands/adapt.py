@@ -28,8 +28,13 @@ from wheretolook.commands.options import (
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
 from wheretolook.dataset.scene import ColmapFiles, Scene
+from wheretolook.geometry.poses import camera_centers
+from wheretolook.mapping.colmap_model import read_model
 from wheretolook.mapping.config import FrameOptions, place_name
+from wheretolook.mapping.map_frame import find_frame
 from wheretolook.scorers.weights import load_scorer, resolve_weights
+from wheretolook.tracking.runs import log as log_to_run
+from wheretolook.tracking.runs import start_run
 from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import (
     ConfigError,
@@ -184,8 +189,6 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
     def _adapt_map(self, model: Path, log: Log, progress: Progress) -> Path | None:
         """Adapt to a COLMAP map by its photographs only."""
         from wheretolook.holdout.photo_map import folder_of_check
-        from wheretolook.mapping.colmap_model import read_model
-        from wheretolook.mapping.map_frame import find_frame
 
         name = place_name(model)
         target = self._target(name, folder_of_check(self.data, name) / "adapted.safetensors")
@@ -270,14 +273,12 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         return path if is_better else None
 
     def _log_gain(self, target: _Target, adapted: Adapted, views: LocalizedViews, gain: Gain, is_better: bool) -> None:
-        from wheretolook.tracking.runs import log, start_run
-
         params = {"dataset": target.dataset, "scene": target.name, "weights": target.weights, **_counts(views)}
         params |= {"scale": adapted.scale, "offset": adapted.offset}
         metrics = {**gain.after, **{f"{name}_before": value for name, value in gain.before.items()}}
         metrics |= {"better": float(is_better), "log_loss_less": gain.log_loss_less[0]}
         with start_run(self.tracking, target.name, "adapt", params) as (client, run):
-            log(client, run, metrics=metrics)
+            log_to_run(client, run, metrics=metrics)
             for path in (target.path.with_suffix(".md"), *([target.path] if is_better else [])):
                 client.log_artifact(run, str(path))
 
@@ -348,7 +349,6 @@ def _scene(dataset: Dataset, name: str) -> SceneFolder:
 def labelled_views(files: SceneFolder, scene: Scene, table: pd.DataFrame, weights: Path) -> LocalizedViews:
     """Return the labelled views of a scene with the log-odds that the weights give them."""
     from wheretolook.dataset.viewpoint_table import is_good, poses
-    from wheretolook.geometry.poses import camera_centers
     from wheretolook.scorers.adapted.calibration import LocalizedViews
     from wheretolook.scorers.adapted.score import log_odds_of
 

@@ -29,6 +29,7 @@ from wheretolook.commands.scenes import Scenes
 from wheretolook.dataset.config import ALL
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.localization.confidence import RIGHT_PLACE_LIMITS
 from wheretolook.tracking.runs import log as log_to_run
 from wheretolook.tracking.runs import start_run
 from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
@@ -147,7 +148,6 @@ def _shards(files: SceneFolder) -> Path:
 
 def _report(files: SceneFolder, table: pd.DataFrame, log: Log) -> None:
     from wheretolook.dataset.viewpoint_table import by_first, has_first, is_good
-    from wheretolook.localization.confidence import RIGHT_PLACE_LIMITS
 
     text = f"{is_good(table).mean():.0%} of {len(table):,} viewpoints localize within 5 cm and 0.4 degrees"
     if has_first(table):

@@ -30,11 +30,15 @@ from wheretolook.commands.options import (
 )
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, describe_camera, draw_camera
+from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, cameras_by_id, describe_camera, draw_camera
+from wheretolook.mapping.colmap_model import find_camera, read_model
 from wheretolook.mapping.config import FrameOptions, ImportConfig, MapConfig, PhotographsConfig, place_name
 from wheretolook.mapping.georeference import read_scale
-from wheretolook.mapping.map import source_of_map
-from wheretolook.mapping.map_frame import read_frame
+from wheretolook.mapping.imported_map import map_existing
+from wheretolook.mapping.map import choose_features, source_of_map
+from wheretolook.mapping.map_frame import read_frame, warn_of_mesh
+from wheretolook.mapping.photograph_map import map_photographs
+from wheretolook.mapping.photographs import list_photographs
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, reject
 from wheretolook.utils.files import cache_key, check_folder_name, fingerprint, path_within, size_and_time
 
@@ -213,8 +217,6 @@ def _map_photographs(options: BuildMap, log: Log) -> SceneFolder:
 
     Returns the scene, with the camera of most photographs unless one is configured. Raises what `map_photographs` does.
     """
-    from wheretolook.mapping.photographs import list_photographs
-
     settings = options.photographs_config
     folder = settings.images
     assert folder is not None
@@ -231,7 +233,6 @@ def _map_photographs(options: BuildMap, log: Log) -> SceneFolder:
     if cache.is_current(scene.landmarks, scene.mapping_cameras):
         log(f"{scene.name}: reusing {scene.map}")
         return _with_mapping_camera(options, scene)
-    from wheretolook.mapping.photograph_map import map_photographs
 
     report = map_photographs(
         settings,
@@ -255,9 +256,6 @@ def _import_model(options: BuildMap, log: Log) -> tuple[SceneFolder, Dataset]:
 
     Returns the scene, and the dataset with it. Raises what `map_existing` does, and SceneError if the mesh cannot be used.
     """
-    from wheretolook.mapping.colmap_model import read_model
-    from wheretolook.mapping.map import choose_features
-
     settings = options.import_config
     folder = settings.model
     scene = _new_scene(options, folder)
@@ -279,8 +277,6 @@ def _import_model(options: BuildMap, log: Log) -> tuple[SceneFolder, Dataset]:
     if cache.is_current(scene.landmarks, scene.mapping_cameras, *([scene.mesh] if mesh else [])):
         log(f"{scene.name}: reusing {scene.map}")
         return scene, dataset
-    from wheretolook.mapping.imported_map import map_existing
-    from wheretolook.mapping.map_frame import warn_of_mesh
     from wheretolook.rendering.raycasting import MeshRaycaster
     from wheretolook.scenes.loading import load_mesh, save_glb
 
@@ -327,9 +323,6 @@ def _new_scene(options: BuildMap, source: Path) -> SceneFolder:
 
 def _with_mapping_camera(options: BuildMap, scene: SceneFolder) -> SceneFolder:
     """Return the scene with the camera that took most of its photographs, unless the options configure one."""
-    from wheretolook.geometry.camera import cameras_by_id
-    from wheretolook.mapping.colmap_model import read_model
-
     if options.camera != CameraConfig():
         return scene
     model = read_model(scene.map)
@@ -340,9 +333,6 @@ def _with_mapping_camera(options: BuildMap, scene: SceneFolder) -> SceneFolder:
 
 def _with_own_camera(scene: SceneFolder, model: Any, folder: Path, camera_id: int | None) -> SceneFolder:
     """Return the scene with a camera of the model in a folder."""
-    from wheretolook.geometry.camera import cameras_by_id
-    from wheretolook.mapping.colmap_model import find_camera
-
     try:
         camera = find_camera(cameras_by_id(model.cameras, folder), folder, camera_id)
         return replace(scene, camera=camera, own_camera=True)

@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, get_args
 
 from wheretolook.dataset.config import RELEASE_FILE
+from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.scene import Scene, SceneConfig
 from wheretolook.features.config import ExtractorConfig
-from wheretolook.geometry.camera import Camera, CameraConfig, describe_camera
+from wheretolook.geometry.camera import Camera, CameraConfig, describe_camera, parse_camera
 from wheretolook.localization.config import LabelConfig
 from wheretolook.mapping.config import MapConfig
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
@@ -312,8 +314,6 @@ class CameraOptions(Command):
 
     def named_camera(self) -> Camera | int | None:
         """Return the camera asked for: one, a camera_id of the map, or None for the map's own."""
-        from wheretolook.geometry.camera import parse_camera
-
         if self.camera is not None and self.camera_id is not None:
             raise ConfigError("the camera is described in several ways", value=self.camera, fix="Give one of them.")
         return self.camera_id if self.camera is None else parse_camera(self.camera)
@@ -359,8 +359,6 @@ def load_dataset(
     Raises ConfigError if it was made with another camera, or is a release where meshes and maps are needed; TableError
     if it does not exist, or the stage has not been run.
     """
-    from wheretolook.dataset.layout import Dataset
-
     _ = options.warp_device  # a missing GPU is an error now, not after hours of other work
     dataset = Dataset.load(options.root)
     if required_stage != "label":
@@ -381,8 +379,6 @@ def load_dataset(
 
 def open_scene(options: SceneOptions, files: SceneFolder) -> Scene:
     """Return a scene of the dataset with a command's occlusion, free space and device; nothing is read yet."""
-    from wheretolook.dataset.scene import Scene, SceneConfig
-
     scenes = options.scenes
     config = SceneConfig(options.occlusion, scenes.free_space, scenes.mapped_space)
     scene = Scene(files, config=config, device=options.device)

@@ -15,12 +15,13 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.planning.config import PlanConfig
+from wheretolook.planning.view_sequence import lengths_along
 from wheretolook.tracking.runs import joined, start_run
 from wheretolook.tracking.runs import log as log_to_run
 from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import write_text
-from wheretolook.utils.package import reports
+from wheretolook.utils.package import reports, require
 from wheretolook.utils.processes import hold
 from wheretolook.utils.texts import score_text
 
@@ -68,7 +69,6 @@ class Plan(SceneOrMapOptions):
             TrackingError: the tracking store cannot be used.
         """
         from wheretolook.planning.method_paths import path_views, plan_by_methods
-        from wheretolook.utils.package import require
 
         dataset = load_dataset(self, "map")
         config = self.plan
@@ -110,8 +110,6 @@ WAIT_S = 120.0  # for another plan to write its path into the same folder
 
 def _summary(path: PlannedPath) -> str:
     """Describe a path and its stops in a line."""
-    from wheretolook.planning.view_sequence import lengths_along
-
     text = f"{path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, views: {len(path.positions)}"
     if not np.isnan(path.scores).any():
         text += f", mean score {score_text(float(np.mean(path.scores)))}"

@@ -14,6 +14,7 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.scene import Scene
 from wheretolook.geometry.camera import Camera, draw_camera, write_cameras
+from wheretolook.mapping.colmap_model import colmap_poses
 from wheretolook.utils.errors import MapError, SceneError
 from wheretolook.utils.files import cache_key
 
@@ -83,7 +84,6 @@ def _cameras(scene: Scene, config: SampleConfig) -> Camera | dict[int, Camera]:
 def _sample(scene: Scene, config: SampleConfig, log: Log) -> None:
     from wheretolook.dataset.sampling import sample_viewpoints
     from wheretolook.dataset.viewpoint_files import write_table
-    from wheretolook.mapping.colmap_model import colmap_poses
 
     files = scene.folder
     with naming_file(files.source):

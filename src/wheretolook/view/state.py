@@ -11,10 +11,14 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 from numpy.typing import NDArray
 
+from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.geometry.similarity import Similarity
+from wheretolook.geometry.views import Views
 from wheretolook.mapping.map_frame import IDENTITY
+from wheretolook.planning.config import FORWARD
 from wheretolook.utils.errors import ConfigError, TableError
+from wheretolook.utils.files import read_parquet
 
 MAX_VIEWS = 20
 MAX_NUMBER = 1e9
@@ -131,9 +135,6 @@ def read_paths(path: Path, pair: int = 0, world_from_map: Similarity = IDENTITY.
     Poses are moved from the map's own frame to the world. A single path is accompanied by `FORWARD`: the same locations
     seen by a camera that looks ahead. Raises TableError if the file is missing or has no valid poses.
     """
-    from wheretolook.geometry.views import Views
-    from wheretolook.planning.config import FORWARD
-
     if path.is_dir():
         path = next((path / name for name in ("path.csv", "views.parquet") if (path / name).is_file()), path)
     if path.suffix == ".parquet":
@@ -168,9 +169,6 @@ def looking_ahead(positions: Float) -> Float:
 
 def _compared_paths(path: Path, pair: int) -> Paths:
     """Read the paths that every method planned, or its views along the given path if any method planned none."""
-    from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses
-    from wheretolook.utils.files import read_parquet
-
     try:
         table = read_parquet(path)
         all_scenes = path.parent.parent / path.name  # has labels, too

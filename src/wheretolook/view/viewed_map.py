@@ -11,13 +11,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from scipy.spatial import cKDTree
 
+from wheretolook.dataset.layout import Dataset, find_scene
 from wheretolook.dataset.scene import ColmapFiles, Scene, SceneConfig
+from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.mapping.config import FrameOptions
+from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.mapping.map_frame import IDENTITY, mesh_warning, warn_of_mesh
+from wheretolook.scorers.adapted.score import MIN_SHARE, share_of_place
+from wheretolook.scorers.registry import check_method, make_scorer, scorers
+from wheretolook.scorers.weights import resolve_weights, weights_by_method
+from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import MapError, TableError, WhereToLookError
 from wheretolook.utils.package import WEIGHTS, or_shipped, shipped
 from wheretolook.view import drawing
@@ -89,8 +97,6 @@ class Floor:
 
     def raster(self) -> Float:
         """Return scores (rows, columns), NaN outside free space; cells not yet scored have the nearest one's score."""
-        from scipy.spatial import cKDTree
-
         values = np.full(self.shape, np.nan)
         if self.n_scored:
             _, nearest = cKDTree(self.points[: self.n_scored]).query(self.points)
@@ -173,8 +179,6 @@ class AvailableWeights:
     """
 
     def __init__(self, features: str, own: Mapping[str, Path | None]) -> None:
-        from wheretolook.scorers.weights import weights_by_method
-
         self.files: dict[str, Path] = {}
         self.origins: dict[str, str] = {}
         for origin, place in {**own, "bundled with wheretolook": shipped(WEIGHTS)}.items():
@@ -185,16 +189,12 @@ class AvailableWeights:
 
     def describe(self, method: str) -> str:
         """Describe the weights that a method scores with; empty for a method without weights."""
-        from wheretolook.scorers.registry import scorers
-
         kind = scorers()[method].weights
         return f"weights {self.origins[kind]}: {self.files[kind].name}" if kind in self.files else ""
 
     @property
     def methods(self) -> tuple[str, ...]:
         """Methods that can score with these weights or without any, the preferred one first."""
-        from wheretolook.scorers.registry import scorers
-
         usable = [
             name
             for name, method in scorers().items()
@@ -209,9 +209,6 @@ def scene_weights(files: SceneFolder, landmarks: Landmarks) -> dict[str, Path | 
     root = files.folder.parent
     trained = None
     if any((root / "weights").glob("*.safetensors")):
-        from wheretolook.dataset.layout import Dataset
-        from wheretolook.scorers.weights import resolve_weights
-
         trained = resolve_weights(dataset=Dataset.load(root))
         if trained is not None and not trained.is_relative_to(root):
             trained = None
@@ -221,8 +218,6 @@ def scene_weights(files: SceneFolder, landmarks: Landmarks) -> dict[str, Path | 
 
 def map_weights(model: Path, data: Path, landmarks: Landmarks) -> dict[str, Path | None]:
     """Find weights adapted to a COLMAP model by `wheretolook adapt --map`."""
-    from wheretolook.mapping.config import place_name
-
     path = data / "checks" / place_name(model) / "adapted.safetensors"
     return {"adapted to this scene": _if_adapted_to(path, landmarks)}
 
@@ -231,9 +226,6 @@ def _if_adapted_to(path: Path, landmarks: Landmarks) -> Path | None:
     """Return the path if the file has weights adapted to a scene with these landmarks."""
     if not path.is_file():
         return None
-    from safetensors import SafetensorError, safe_open
-
-    from wheretolook.scorers.adapted.score import MIN_SHARE, share_of_place
 
     try:
         with safe_open(path, framework="np") as file:
@@ -295,8 +287,6 @@ class ViewedMap:
 
     def is_probability(self, method: str) -> bool:
         """Test whether a method's scores are probabilities, which a threshold applies to."""
-        from wheretolook.scorers.registry import check_method
-
         return check_method(method).probability
 
     def score_range(self, method: str, scores: Float) -> tuple[float, float]:
@@ -312,9 +302,6 @@ class ViewedMap:
         Scorers cache what depends on the directions, so each number of directions has its own. Raises ConfigError for
         an unknown method or occlusion model, WeightsError if the weights cannot be used.
         """
-        from wheretolook.scorers.registry import check_method, make_scorer
-        from wheretolook.select.where_to_look import WhereToLook
-
         weights = self.weights.files.get(check_method(method).weights)
         scorer = make_scorer(method, self._localization_map(occlusion), weights=weights)
         return WhereToLook(scorer, direction_lattice(directions), self.space)
@@ -411,9 +398,6 @@ def open_scene(
     `dataset.layout.find_scene`, MapError or TableError if the scene has not been mapped, WeightsError if the weights
     cannot be used.
     """
-    from wheretolook.dataset.layout import find_scene
-    from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED
-
     if not data.is_dir():
         fix = "Make a scene first, such as by `wheretolook demo`, or name a model: --map SPARSE."
         raise TableError("there is no such folder of datasets", path=data, fix=fix)

@@ -58,11 +58,8 @@ if TYPE_CHECKING:
     from wheretolook.visibility.occlusion import OcclusionModel
 
 FOLDER = "adapted"  # of a dataset: adapted weights, and what they have gained
-MIN_VIEWS = 100
-MIN_LOCATIONS = 10
 MIN_OF_EACH_LABEL = 10
 _VIEWS_PER_TASK = 128  # the time is checked after each task
-_MAX_SIGNATURE = 256  # landmarks by which the scene is recognized
 
 
 @dataclass(frozen=True)
@@ -226,8 +223,9 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         from wheretolook.holdout.scores import whole_map
 
         log(f"{name}: holding out blocks of photographs")
-        given = (self.adapt.images, self.adapt.database)
-        photographs, held_out = hold_out_photographs(self, "adapt", model, name, self.frame_options(), given)
+        photographs, held_out = hold_out_photographs(
+            self, "adapt", model, name, self.frame_options(), self.adapt.images, self.adapt.database
+        )
         views = photographed_views(photographs, held_out, weights, occlusion, self.warp_device)
         return views, whole_map(photographs, occlusion, self.warp_device)
 
@@ -249,8 +247,9 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
 
         def gain_of(rows: NDArray[np.bool_]) -> Gain:
             some = views.rows(rows)
-            labels = some.good, some.place, some.centers, seed, some.blocks
-            return compare_log_odds(some.log_odds, adapted.held_out[rows], *labels)
+            return compare_log_odds(
+                some.log_odds, adapted.held_out[rows], some.good, some.place, some.centers, seed, some.blocks
+            )
 
         gain = gain_of(np.ones(len(views), dtype=bool))
         text = gain_markdown(gain)
@@ -370,10 +369,12 @@ def _check_enough(views: LocalizedViews, source: Path) -> None:
     n_good = int(views.good.sum())
     rendered = bool((views.photograph < 0).any())
     counts = (len(views), len(np.unique(views.group)), n_good, len(views) - n_good)
-    needed = (rendered * MIN_VIEWS, rendered * MIN_LOCATIONS, MIN_OF_EACH_LABEL, MIN_OF_EACH_LABEL)
+    needed = (rendered * 100, rendered * 10, MIN_OF_EACH_LABEL, MIN_OF_EACH_LABEL)
     if np.less(counts, needed).any():
-        problem = "adapting needs {} views at {} locations or blocks, of which {} localize and {} do not".format(
-            *needed
+        views_needed, places_needed, good_needed, bad_needed = needed
+        problem = (
+            f"adapting needs {views_needed} views at {places_needed} locations or blocks, of which {good_needed} "
+            f"localize and {bad_needed} do not"
         )
         fix = "Sample more viewpoints, or give more minutes." if rendered else "Use the bundled weights."
         raise TableError(problem, path=source, value=counts, fix=fix)
@@ -393,7 +394,8 @@ def _save(target: _Target, whole: LocalizationMap, adapted: Adapted, views: Loca
 
     base = for_map(TrainedNetwork.load(target.weights, SetNetwork, "set", device=whole.device), whole)
     points = whole.landmarks.points
-    n_signature = min(_MAX_SIGNATURE, len(points))
+    # the scene is recognized by as many landmarks
+    n_signature = min(256, len(points))
     network = AdaptedNetwork(base.network, base.scale, base.offset, n_signature)
     network.place[:] = torch.from_numpy(points[np.arange(n_signature) * len(points) // max(1, n_signature)])
     trained = TrainedNetwork("adapted", network, base.camera, adapted.scale, adapted.offset, base.training_range)

@@ -48,11 +48,12 @@ def hold_out_photographs(
     model: Path,
     name: str,
     frame: FrameOptions = FrameOptions(),
-    given: tuple[Path | None, Path | None] = (None, None),
+    images: Path | None = None,
+    database: Path | None = None,
 ) -> tuple[PhotographedMap, list[HoldoutResult]]:
     """Return a map and its photographs, held out in blocks; finished blocks are shared with `wheretolook check`.
 
-    `given` are the folder of the photographs and the database, if they are not next to the map. See
+    The folder of the photographs and the database are given if they are not next to the map. See
     `wheretolook.holdout.photo_map.open_map` for the other arguments and errors.
     """
     from wheretolook.holdout.holdout import hold_out_blocks
@@ -62,7 +63,7 @@ def hold_out_photographs(
     workers = options.n_workers
     device = options.warp_device
     with hold(out / ".lock", stage):
-        folder, features = features_of(model, *given, out / WORK, workers, device)
+        folder, features = features_of(model, images, database, out / WORK, workers, device)
         source = open_map(folder, features, name, frame, model)
         return source, hold_out_blocks(source, out / WORK, workers=workers, device=device)
 
@@ -200,8 +201,7 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
             problem = "neither the features nor the photographs of this map are known"
             fix = "Map the scene again with `wheretolook map --mapping.keep_database true`, which keeps the features."
             raise MapError(problem, path=model, fix=fix)
-        given = (self.images, self.database)
-        folder, features = features_of(model, *given, work, workers, device, self._extractor())
+        folder, features = features_of(model, self.images, self.database, work, workers, device, self._extractor())
         name = self.scene or place_name(model)
         photographs = replace(open_map(folder, features, name, frame, model), fov_deg=self.fov)
         files = ColmapFiles(model, mesh=mesh, frame=frame)

@@ -152,9 +152,10 @@ def _report(files: SceneFolder, table: pd.DataFrame, log: Log) -> None:
     text = f"{is_good(table).mean():.0%} of {len(table):,} viewpoints localize within 5 cm and 0.4 degrees"
     if has_first(table):
         first = by_first(table)
-        places = [is_good(labels, *RIGHT_PLACE_LIMITS).mean() for labels in (table, first)]
+        limit_m, limit_deg = RIGHT_PLACE_LIMITS
+        near, near_first = (is_good(labels, limit_m, limit_deg).mean() for labels in (table, first))
         text += f" ({is_good(first).mean():.0%} by the first RANSAC result), "
-        text += "{:.0%} ({:.0%}) at the right place".format(*places)
+        text += f"{near:.0%} ({near_first:.0%}) at the right place"
     log(f"{files.name}: {text} -> {files.table}")
 
 

@@ -435,8 +435,16 @@ def scene_job(files: SceneFolder, label: LabelConfig, extractor: ExtractorConfig
     from wheretolook.localization.shard import SceneJob
 
     cameras = tuple(files.cameras().items()) if files.cameras_file.is_file() else ()
-    made_from = files.mesh, files.landmarks, files.camera, label.localizer, extractor, device
-    return SceneJob(*made_from, cameras=cameras, appearance=label.appearance)
+    return SceneJob(
+        files.mesh,
+        files.landmarks,
+        files.camera,
+        label.localizer,
+        extractor,
+        device,
+        cameras=cameras,
+        appearance=label.appearance,
+    )
 
 
 def existing(path: Path, error: type[SceneError] | type[MapError], stage: str) -> str:

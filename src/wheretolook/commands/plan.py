@@ -88,7 +88,8 @@ class Plan(SceneOrMapOptions):
         renderer = None if scene.is_photographed else scene.renderer
         views[method] = path_views(path, scene.localization_map, renderer)
         folder = (config.out or files.folder / "path").resolve()  # "." gets a name, too
-        with hold(folder.with_name(f".{folder.name}.lock"), "plan", wait_s=WAIT_S):
+        # another plan may be writing its path into the same folder
+        with hold(folder.with_name(f".{folder.name}.lock"), "plan", wait_s=120.0):
             written = []
             for report in reports("plan"):
                 written += report(views, scene.landmarks.points, f"{scene.name}, {method}", folder, config.film)
@@ -105,7 +106,7 @@ class Plan(SceneOrMapOptions):
         return path
 
 
-WAIT_S = 120.0  # for another plan to write its path into the same folder
+WAIT_S = 120.0  # another plan may be writing its path into the same folder
 
 
 def _summary(path: PlannedPath) -> str:

@@ -89,11 +89,12 @@ def _sample(scene: Scene, config: SampleConfig, log: Log) -> None:
     with naming_file(files.source):
         grid, free = scene.free_voxels(config, scene.sampled_space)
         cameras = _cameras(scene, config)
-        visible = (scene.landmarks, cameras, scene.occlusion)
         title = f"sample {scene.name}"
         config = replace(config, max_directions=config.directions_of(files.split))
         mapped = colmap_poses(files.map) if config.near_map else None
-        table, occlusion = sample_viewpoints(grid, free, *visible, config, scene.device, title, mapped)
+        table, occlusion = sample_viewpoints(
+            grid, free, scene.landmarks, cameras, scene.occlusion, config, scene.device, title, mapped
+        )
     files.stage_cache("sample").clear()
     files.cameras_file.unlink(missing_ok=True)
     if isinstance(cameras, dict):

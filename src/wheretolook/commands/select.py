@@ -224,9 +224,6 @@ class Select(SelectionRequest, SelectorOptions):
         return parse_points(self.at) if self.at else None
 
 
-BODY_PITCH_DEG = 60.0  # of all poses, from which on they seem to be of a robot whose z is up
-
-
 @dataclass(frozen=True, kw_only=True)
 class Score(SelectorOptions):
     """Score poses of your own in a COLMAP model; needs no dataset.
@@ -260,7 +257,8 @@ class Score(SelectorOptions):
         poses = Views.read(self.poses)
         selector = self.open_map()
         views = selector.report(poses.cam_from_world, poses.waypoint_id, self.skip)
-        if (views.pitch_deg > BODY_PITCH_DEG).all():
+        # cameras do not all look up this steeply: the poses seem to be of a robot whose z is up
+        if (views.pitch_deg > 60.0).all():
             text = (
                 "every camera looks up; are these a robot's orientations, x ahead and z up? Give its camera's, z ahead"
             )

@@ -76,7 +76,7 @@ def line_ends(colors: Any) -> Rgb:
 
 def legend(low: float, high: float, quantity: str = "score") -> str:
     """Return the colour scale of a quantity as HTML."""
-    stops = ",".join("rgb({},{},{})".format(*color) for color in score_colors(np.linspace(0, 1, 18)))
+    stops = ",".join(f"rgb({red},{green},{blue})" for red, green, blue in score_colors(np.linspace(0, 1, 18)))
     bar = f"height:10px;border-radius:3px;background:linear-gradient(to right,{stops})"
     row = "display:flex;justify-content:space-between;font-size:12px;opacity:.8"
     ends = f"<span>{low:.3g}</span><span>{quantity}</span><span>{high:.3g}</span>"

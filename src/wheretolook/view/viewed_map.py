@@ -41,20 +41,14 @@ if TYPE_CHECKING:  # torch and Warp are imported when first needed: the page ope
     from wheretolook.scorers.base import Scorer
     from wheretolook.select.where_to_look import WhereToLook
 
-FLOOR_CELLS = 1200  # approximate number of cells in a floor's rectangle
-MIN_CELL_M = 0.1
 FLOOR_DIRECTIONS = 96
 """Directions per cell of a floor, 19 degrees apart: the best score is within 0.02 of that of 500 directions, in a third
 of the time."""
 
 FIRST_CELLS = 12  # scored before a floor is drawn
-ABOVE_GROUND_M = 0.03  # above carpets
 BLOCK = 1 << 10  # labelled views scored per step
 
 MAX_SCORERS = 8  # kept in memory; those of large maps take 100 MB each
-MAX_FLOORS = 64
-MAX_MESHES = 4
-DIRECTIONS = 500  # scored at a location, as by `wheretolook select`
 OCCLUSION_BYTES = 1 << 26  # memory for cached lines of sight
 
 
@@ -111,7 +105,8 @@ def floor_at(selector: WhereToLook, height_m: float) -> Floor:
     """
     space = selector.space
     low, high = np.asarray(space.bounds, dtype=np.float64)[:, :2]
-    cell = max(MIN_CELL_M, float(np.sqrt(np.prod(high - low) / FLOOR_CELLS)))
+    # about 1,200 cells in a floor's rectangle
+    cell = max(0.1, float(np.sqrt(np.prod(high - low) / 1200)))
     columns, rows = (max(1, ceil(length)) for length in (high - low) / cell)
     lower = (low + high) / 2 - np.array([columns, rows]) * cell / 2
     floor = Floor(selector, height_m, lower, cell, (rows, columns), np.arange(rows * columns), height_m)
@@ -120,7 +115,8 @@ def floor_at(selector: WhereToLook, height_m: float) -> Floor:
     cells = np.flatnonzero(free)
     drawn_m = height_m
     if len(cells) and hasattr(space, "floor_below"):
-        drawn_m = float(np.median(space.floor_below(floor.points[cells]))) + ABOVE_GROUND_M
+        # above carpets
+        drawn_m = float(np.median(space.floor_below(floor.points[cells]))) + 0.03
     order = farthest_first(np.stack(np.divmod(cells, columns), axis=1))
     return Floor(selector, height_m, lower, cell, (rows, columns), cells[order], drawn_m)
 
@@ -296,7 +292,7 @@ class ViewedMap:
     # caches are shared by all maps of a process: usually it shows one
 
     @lru_cache(MAX_SCORERS)  # noqa: B019
-    def selector(self, method: str, occlusion: str, directions: int = DIRECTIONS) -> WhereToLook:
+    def selector(self, method: str, occlusion: str, directions: int = 500) -> WhereToLook:
         """Return the view selector of a method and an occlusion model.
 
         Scorers cache what depends on the directions, so each number of directions has its own. Raises ConfigError for
@@ -311,12 +307,12 @@ class ViewedMap:
         opened = self.scene.with_occlusion(self.scene.occlusion_model(occlusion))
         return replace(opened, map=replace(opened.map, frame=IDENTITY))  # the viewer selects in the world
 
-    @lru_cache(MAX_FLOORS)  # noqa: B019
+    @lru_cache(64)  # noqa: B019
     def floor(self, method: str, occlusion: str, height_m: float) -> Floor:
         """Return the floor at a height, one object for all clients."""
         return floor_at(self.selector(method, occlusion, FLOOR_DIRECTIONS), height_m)
 
-    @lru_cache(MAX_MESHES)  # noqa: B019
+    @lru_cache(4)  # noqa: B019
     def mesh_glb(self, cut_m: float | None) -> bytes | None:
         """Return the mesh below a height as GLB; None without a mesh."""
         return None if self.mesh is None else drawing.mesh_glb(self.mesh, cut_m)

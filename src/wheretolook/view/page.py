@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wheretolook.dataset.viewpoint_table import is_good, poses
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import axes_of_angles
 from wheretolook.geometry.poses import (
@@ -326,6 +325,8 @@ class Scenery:
             self.scene.remove_by_name("/labels")
             self.controls.label_summary.content = ""
             return
+
+        from wheretolook.dataset.viewpoint_table import is_good, poses
 
         cam_from_world = poses(table)
         good = is_good(table, *LIMITS[self.controls.limits.value])

@@ -11,7 +11,6 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.geometry.views import Views
@@ -165,6 +164,8 @@ def looking_ahead(positions: Float) -> Float:
 
 def _compared_paths(path: Path, pair: int) -> Paths:
     """Read the paths that every method planned, or its views along the given path if any method planned none."""
+    from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses
+
     try:
         table = read_parquet(path)
         all_scenes = path.parent.parent / path.name  # has labels, too

@@ -16,16 +16,13 @@ from scipy.spatial import cKDTree
 
 from wheretolook.dataset.layout import Dataset, find_scene
 from wheretolook.dataset.scene import ColmapFiles, Scene, SceneConfig
-from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.mapping.map_frame import IDENTITY, mesh_warning, warn_of_mesh
-from wheretolook.scorers.adapted.score import MIN_SHARE, share_of_place
 from wheretolook.scorers.registry import check_method, make_scorer, scorers
 from wheretolook.scorers.weights import resolve_weights, weights_by_method
-from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import MapError, TableError, WhereToLookError
 from wheretolook.utils.package import WEIGHTS, or_shipped, shipped
 from wheretolook.view import drawing
@@ -222,12 +219,13 @@ def _if_adapted_to(path: Path, landmarks: Landmarks) -> Path | None:
     """Return the path if the file has weights adapted to a scene with these landmarks."""
     if not path.is_file():
         return None
-
     try:
         with safe_open(path, framework="np") as file:
             place = file.get_tensor("place")
     except (SafetensorError, OSError):
         return None
+    from wheretolook.scorers.adapted.score import MIN_SHARE, share_of_place  # loads PyTorch
+
     return path if share_of_place(place, landmarks.points) >= MIN_SHARE else None
 
 
@@ -300,6 +298,8 @@ class ViewedMap:
         """
         weights = self.weights.files.get(check_method(method).weights)
         scorer = make_scorer(method, self._localization_map(occlusion), weights=weights)
+        from wheretolook.select.where_to_look import WhereToLook  # loads PyTorch: the page opens before it does
+
         return WhereToLook(scorer, direction_lattice(directions), self.space)
 
     @lru_cache(MAX_SCORERS)  # noqa: B019
@@ -408,6 +408,8 @@ def open_scene(
     labels = None
     if camera is None and files.table.is_file():
         table = files.read_table()
+        from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED
+
         shown = table["status"] != UNLABELLED
         if CAMERA_ID in table:
             shown &= table[CAMERA_ID] == number

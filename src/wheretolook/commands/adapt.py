@@ -315,7 +315,7 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         ids, row = np.unique(table["location_id"].to_numpy(), return_inverse=True)
         order = np.random.default_rng(self.adapt.seed).permutation(len(ids))[row.reshape(-1)]
         table = table.iloc[np.argsort(order, kind="stable")].reset_index(drop=True)
-        job = scene_job(files, self.label, extractor_of(files, self.mapping.extractor), scene.device)
+        job = scene_job(files, self.label, extractor_of(files, self.extractor), scene.device)
         tasks = []
         for begin in range(0, len(table), _VIEWS_PER_TASK):
             part = table.iloc[begin : begin + _VIEWS_PER_TASK]

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, ClassVar
 from wheretolook.commands.options import (
     LabelOptions,
     Log,
-    MapUseOptions,
     Progress,
     ScenesConfig,
     existing,
@@ -29,6 +28,7 @@ from wheretolook.commands.scenes import Scenes
 from wheretolook.dataset.config import ALL
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.localization.confidence import RIGHT_PLACE_LIMITS
 from wheretolook.tracking.runs import log as log_to_run
 from wheretolook.tracking.runs import start_run
@@ -52,14 +52,15 @@ class Label(LabelOptions):
       wheretolook label --config configs/paper.yaml --engine ray
 
     Args:
-        mapping: where the weights of the map's extractor are, if they have moved.
+        extractor: where the weights of the map's extractor are, if they have moved since it was made.
         scenes: the generated scenes that `label.changes` changes, as for the scenes command.
         tracking: where MLflow keeps its runs.
     """
 
     SHORT: ClassVar = {"engine": "label.engine"}
+    GROUPS: ClassVar = {"extractor": "mapping.extractor."}
 
-    mapping: MapUseOptions = field(default_factory=MapUseOptions)
+    extractor: ExtractorConfig = field(default_factory=ExtractorConfig)
     scenes: ScenesConfig = field(default_factory=ScenesConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 
@@ -98,7 +99,7 @@ class Label(LabelOptions):
         return dataset
 
     def _key(self, files: SceneFolder) -> str:
-        extractor = extractor_of(files, self.mapping.extractor)
+        extractor = extractor_of(files, self.extractor)
         settings = [self.label.localizer.record(), extractor.record(), files.camera.record()]
         made_from = [existing(files.mesh, SceneError, "scenes"), existing(files.landmarks, MapError, "map")]
         changes = [name for name in ("store_matches", "store_pixels") if getattr(self.label, name)]
@@ -116,7 +117,7 @@ class Label(LabelOptions):
         scenes = {files.name: files for files in to_label}
         tasks = []
         for files in to_label:
-            job = scene_job(files, config, extractor_of(files, self.mapping.extractor), self.warp_device)
+            job = scene_job(files, config, extractor_of(files, self.extractor), self.warp_device)
             job = replace(job, store_matches=config.store_matches, store_pixels=config.store_pixels)
             if config.changes:
                 changed_mesh = select_options(Scenes, self).change(files, config.changes)

@@ -30,6 +30,7 @@ from wheretolook.commands.options import (
 )
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, cameras_by_id, describe_camera, draw_camera
 from wheretolook.mapping.colmap_model import find_camera, read_model
 from wheretolook.mapping.config import FrameOptions, ImportConfig, MapConfig, PhotographsConfig, place_name
@@ -78,7 +79,7 @@ class BuildMap(SceneOptions, LabelOptions, FrameOptions):
     }
     GROUPS: ClassVar = {"photographs": "mapping.photographs."}
 
-    mapping: MapConfig = field(default_factory=MapConfig)  # type: ignore[assignment]
+    mapping: MapConfig = field(default_factory=MapConfig)
     photographs: PhotographsConfig = field(default_factory=PhotographsConfig)
     model: Path | None = None
     mesh: Path | None = None
@@ -101,6 +102,11 @@ class BuildMap(SceneOptions, LabelOptions, FrameOptions):
             ),
             (is_rendered and frame != FrameOptions(), "scale and up belong to --model or --images", vars(frame)),
             (self.model is None and bool(of_model), "these belong to --model", of_model),
+            (
+                self.mapping.extractor != ExtractorConfig(),
+                "the extractor is given beside mapping: BuildMap(extractor=...)",
+                self.mapping.extractor.method,
+            ),
         )
         if self.model is not None:
             _ = self.import_config
@@ -129,7 +135,7 @@ class BuildMap(SceneOptions, LabelOptions, FrameOptions):
 
     @property
     def _kept(self) -> dict[str, Any]:
-        return {"extractor": self.mapping.extractor, "keep_database": self.mapping.keep_database}
+        return {"extractor": self.extractor, "keep_database": self.mapping.keep_database}
 
     @changes_dataset("map")
     def run(self, log: Log = print, progress: Progress = ignore_progress) -> Dataset:
@@ -161,7 +167,7 @@ class BuildMap(SceneOptions, LabelOptions, FrameOptions):
 
 def _map_mesh(options: BuildMap, files: SceneFolder, log: Log) -> None:
     """Map a scene by renders of its mesh, unless its map is current."""
-    config = options.mapping
+    config = replace(options.mapping, extractor=options.extractor)
     scene = open_scene(options, files)
     seed = _seed(files)
     made_from = existing(files.mesh, SceneError, "scenes")
@@ -401,8 +407,7 @@ def imports_map(run: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(run)
     def run_on_scene(command: Any, log: Log = print, progress: Progress = ignore_progress) -> Any:
         if command.map is not None:
-            mapping = MapConfig(extractor=command.mapping.extractor)
-            select_options(BuildMap, command, mapping=mapping, model=command.map).run(log)
+            select_options(BuildMap, command, model=command.map).run(log)
         return run(command, log, progress)
 
     return run_on_scene

@@ -135,7 +135,7 @@ class Relocalize(SceneOptions):
 
         scene = open_scene(self, files)
         weights = resolve_weights(self.method, self.weights, dataset=dataset, log=log)
-        extractor = extractor_of(files, self.mapping.extractor)
+        extractor = extractor_of(files, self.extractor)
         return SimulatedRobot(scene, scene_scorer(scene, self.method, weights), extractor)
 
     def _places(self, files: SceneFolder) -> dict[int, Float]:

@@ -12,7 +12,7 @@ from wheretolook.commands.options import LabelOptions, OcclusionOptions, ScorerO
 from wheretolook.dataset.config import LOCK, checked_accuracy
 from wheretolook.dataset.layout import find_scene
 from wheretolook.dataset.scene import ColmapFiles, Scene
-from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.mapping.colmap_model import holds_model, model_suffix
 from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.mapping.map import find_features, find_photographs

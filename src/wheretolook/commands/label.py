@@ -28,7 +28,7 @@ from wheretolook.commands.scenes import Scenes
 from wheretolook.dataset.config import ALL
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.localization.confidence import RIGHT_PLACE_LIMITS
 from wheretolook.tracking.runs import log as log_to_run
 from wheretolook.tracking.runs import start_run

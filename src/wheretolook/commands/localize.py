@@ -12,7 +12,7 @@ from tqdm.auto import tqdm
 
 from wheretolook.commands.options import CameraOptions
 from wheretolook.dataset.config import checked_accuracy
-from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.figures import KINDS
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.photographs import SUFFIXES

@@ -30,7 +30,7 @@ from wheretolook.commands.options import (
 )
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, cameras_by_id, describe_camera, draw_camera
 from wheretolook.mapping.colmap_model import find_camera, read_model
 from wheretolook.mapping.config import FrameOptions, ImportConfig, MapConfig, PhotographsConfig, place_name

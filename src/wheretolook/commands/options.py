@@ -14,7 +14,7 @@ from wheretolook.dataset.config import RELEASE_FILE
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.scene import Scene, SceneConfig
-from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import Camera, CameraConfig, describe_camera, parse_camera
 from wheretolook.localization.config import LabelConfig
 from wheretolook.mapping.config import MapConfig

@@ -14,9 +14,8 @@ from PIL import Image, ImageDraw
 from scipy.spatial import ConvexHull
 
 from wheretolook.geometry.camera import Camera, PinholeCamera
-from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.mesh import TexturedMesh, cut_above
 from wheretolook.geometry.poses import Float, invert_poses
-from wheretolook.scenes.cutting import cut_above
 from wheretolook.scenes.loading import glb_bytes
 
 Rgb = NDArray[np.uint8]

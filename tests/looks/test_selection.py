@@ -23,7 +23,7 @@ from wheretolook.looks.selection import (
     select_views,
 )
 from wheretolook.utils.errors import ConfigError, PlanningError
-from wheretolook_paper.evaluation.look_strategies import count_score, information_score
+from wheretolook_paper.evaluation.looks import count_score, information_score
 from wheretolook_paper.fisher.exact import exact_information
 
 AXES = direction_lattice(24)

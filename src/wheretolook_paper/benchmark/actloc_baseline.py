@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import MapError
-from wheretolook_paper.benchmark.folder import CAMERA
+from wheretolook_paper.benchmark.files import CAMERA
 
 ACTLOC = "max-visibility-shipped"
 ACTLOC_FIXED = "max-visibility"

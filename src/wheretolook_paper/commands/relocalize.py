@@ -191,7 +191,7 @@ class Relocalize(SceneOptions):
         from wheretolook_paper.evaluation.relocalization import Place
         from wheretolook_paper.figures.animation import save_moving
         from wheretolook_paper.figures.dollhouse import dollhouse
-        from wheretolook_paper.figures.look_story import FRAME_MS, LAST_MS, film_frames, story_of_steps
+        from wheretolook_paper.figures.looks import FRAME_MS, LAST_MS, film_frames, story_of_steps
 
         last = table[(table["policy"] == self.policies[-1]) & (table["hypothesis"] == 0)]
         right = last[is_good(last) & (last["n_looks"] == self.views)].set_index(["scene", "location_id"]).index

@@ -49,9 +49,7 @@ def report_scores(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, 
     from wheretolook.figures.style import save_figure
     from wheretolook_paper.evaluation.paper_tables import write_paper_tables
     from wheretolook_paper.evaluation.score_report import score_markdown
-    from wheretolook_paper.figures.calibration import calibration_figure
-    from wheretolook_paper.figures.occlusion import occlusion_figure
-    from wheretolook_paper.figures.scores import regret_figure, score_figure
+    from wheretolook_paper.figures.scores import calibration_figure, occlusion_figure, regret_figure, score_figure
     from wheretolook_paper.styles import in_table_order
 
     table = in_table_order(table)
@@ -85,7 +83,7 @@ def draw_path(views: dict[str, list[PathView]], landmarks: Float, title: str, fo
     """
     from wheretolook.figures.style import save_figure
     from wheretolook_paper.figures.animation import save_moving
-    from wheretolook_paper.figures.path_film import FRAME_MS, film_frames, methods_figure, still_figure
+    from wheretolook_paper.figures.paths import FRAME_MS, film_frames, methods_figure, still_figure
 
     written = ["path.png"]
     seen = list(views.values())[-1]
@@ -214,8 +212,7 @@ def compare_looks(scene: SceneFolder, scorer: Scorer, config: LookConfig, progre
     Raises a TableError if the labels lack the pixels of their matches.
     """
     from wheretolook.looks.selection import SetScoreModel, candidate_views, score_of_set
-    from wheretolook_paper.evaluation.joint_labels import label_sets
-    from wheretolook_paper.evaluation.look_strategies import choose_set
+    from wheretolook_paper.evaluation.looks import choose_set, label_sets
 
     table = read_table(scene.table, pixels=True)
     cam_from_world = poses(table)

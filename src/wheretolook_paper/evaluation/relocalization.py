@@ -27,11 +27,11 @@ from wheretolook.localization.rig_localization import JointLocalization
 from wheretolook.looks.next_look import NextLookSelector, angles_to_views, mean_scores_by_pitch
 from wheretolook.scorers.base import Scorer
 from wheretolook.utils.texts import markdown_table
-from wheretolook_paper.evaluation.joint_labels import SET_COLUMNS, set_label
+from wheretolook_paper.evaluation.looks import SET_COLUMNS, set_label
 
 COLUMNS = ("location_id", "policy", "n_looks", "hypothesis", *SET_COLUMNS[2:-1])
 """Columns of `simulate`: `hypothesis` is 0 for the chosen pose, and counts its rivals; others are those of
-`wheretolook_paper.evaluation.joint_labels`."""
+`wheretolook_paper.evaluation.looks`."""
 
 
 class Place:

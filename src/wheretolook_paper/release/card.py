@@ -21,8 +21,7 @@ from wheretolook.utils.errors import TableError, WeightsError
 from wheretolook.utils.files import read_json_object, sha256
 from wheretolook.utils.texts import markdown_table
 from wheretolook.visibility.occlusion import StoredOcclusion
-from wheretolook_paper.evaluation.comparisons import comparisons_markdown
-from wheretolook_paper.evaluation.score_report import score_markdown
+from wheretolook_paper.evaluation.score_report import comparisons_markdown, score_markdown
 from wheretolook_paper.release.copy import read_about, size_text, sizes
 from wheretolook_paper.release.training_histories import records
 from wheretolook_paper.styles import PAPER_NETWORKS, method_style

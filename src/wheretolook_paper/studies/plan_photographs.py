@@ -46,7 +46,7 @@ from wheretolook.planning.rrt import Space
 from wheretolook.planning.scene_map import scene_scorer
 from wheretolook.scorers.weights import resolve_weights
 from wheretolook.utils.errors import PlanningError
-from wheretolook_paper.figures.photograph_paths import (
+from wheretolook_paper.figures.paths import (
     AXIS,
     LANDMARKS_CSV,
     POSITION,

@@ -31,9 +31,9 @@ from wheretolook.utils.files import copy_file, read_json_object, sha256, write_j
 from wheretolook.utils.package import VERSION
 from wheretolook_paper.evaluation.looks import LOOKS_CSV
 from wheretolook_paper.paths.path_report import PATHS_CSV, pooled_paths
-from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV
 from wheretolook_paper.release.card import GENERALIZATION_CSV, GENERALIZATION_MD
 from wheretolook_paper.release.numbers import Numbers, pages, updated
+from wheretolook_paper.release.runs import RUNTIMES_CSV
 from wheretolook_paper.studies.tables import replace_rows
 
 RELEASE = Path("data/release")

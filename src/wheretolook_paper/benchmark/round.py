@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +15,14 @@ from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import PinholeCamera, cameras_by_id
 from wheretolook.geometry.lattices import Lattice
+from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, pose_error
-from wheretolook.localization.config import LocalizerConfig
-from wheretolook.mapping.colmap_model import colmap_poses, read_model
+from wheretolook.localization.config import LocalizerConfig, versions
+from wheretolook.localization.localizer import Localizer
+from wheretolook.mapping.colmap_model import MODEL_FILES, colmap_poses, model_arrays, read_model
 from wheretolook.mapping.config import PARTNERS, MapConfig
-from wheretolook.mapping.map_folder import DATABASE_FILE, MapDraft, MapRun, finish_map
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.map_folder import DATABASE_FILE, LANDMARKS_FILE, MapDraft, MapRun, finish_map
 from wheretolook.mapping.triangulation import (
     choose_pairs,
     extract_with_colors,
@@ -28,7 +31,12 @@ from wheretolook.mapping.triangulation import (
     surface_overlap,
     triangulate_model,
 )
+from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.rendering.warp_renderer import Renderer, WarpRenderer
+from wheretolook.scenes.loading import load_mesh
+from wheretolook.scorers.weights import resolve_weights
 from wheretolook.select.waypoints import Waypoints, read_waypoints
+from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import MapError, SceneError, StorageError, TableError
 from wheretolook.utils.files import ArtifactCache, atomic_folder, cache_key, fingerprint, read_image, write_bytes
 from wheretolook.utils.package import VERSION
@@ -46,12 +54,6 @@ from wheretolook_paper.benchmark.files import (
     write_poses,
 )
 from wheretolook_paper.benchmark.report import Scores
-
-if TYPE_CHECKING:
-    from wheretolook.geometry.mesh import TexturedMesh
-    from wheretolook.localization.localizer import Localizer
-    from wheretolook.rendering.warp_renderer import Renderer
-
 
 POSES = "selected_gt_poses.txt"
 IMAGES = "images"
@@ -144,7 +146,6 @@ class SceneRound:
         return read_poses(path)
 
     def _selection_key(self, method: str) -> str:
-        from wheretolook.scorers.weights import resolve_weights
 
         config = self.config
         parts: list[Any] = [VERSION, self._model_key, fingerprint(self.scene.mesh), fingerprint(self.scene.waypoints)]
@@ -155,14 +156,12 @@ class SceneRound:
         return cache_key("select", method, *parts)
 
     def _actloc_selection(self) -> tuple[Sequence[str], Float]:
-        from wheretolook.mapping.colmap_model import model_arrays, read_model
 
         arrays = model_arrays(read_model(self.scene.model))
         self._check_frame(arrays.points)
         return self.waypoints.ids, actloc_views(arrays.points[arrays.errors_px < MAX_ERROR_PX], self.waypoints.points)
 
     def _selection(self, method: str) -> tuple[Sequence[str], Float]:
-        from wheretolook.select.where_to_look import WhereToLook
 
         config = self.config
         baseline = method == ACTLOC_FIXED
@@ -187,8 +186,6 @@ class SceneRound:
 
     def _check_frame(self, points: Float) -> None:
         """Raise a SceneError if most landmarks (N, 3) m are far from the mesh."""
-        from wheretolook.rendering.raycasting import MeshRaycaster
-
         low, high = self._mesh.bounds
         some = points[:: max(1, len(points) // 2000)]
         max_distance_m = float(np.linalg.norm(high - low) + np.abs(some - low).max())
@@ -249,7 +246,6 @@ class SceneRound:
 
     def _estimates(self, files: list[Path]) -> list[Float | None]:
         """Return the estimated poses (3, 4) of images; like the benchmark, any pose counts."""
-
         images = []
         for path in files:
             image = read_rgb(path)
@@ -272,9 +268,6 @@ class SceneRound:
 
     @cached_property
     def _localizer(self) -> Localizer:
-        from wheretolook.localization.localizer import Localizer
-        from wheretolook.mapping.landmarks import Landmarks
-        from wheretolook.mapping.map_folder import LANDMARKS_FILE
 
         folder = self.folder / MAP_FOLDER
         device = self.config.device
@@ -286,26 +279,22 @@ class SceneRound:
 
     @cached_property
     def _mesh(self) -> TexturedMesh:
-        from wheretolook.scenes.loading import load_mesh
 
         return load_mesh(self.scene.mesh)
 
     @cached_property
     def _renderer(self) -> Renderer:
-        from wheretolook.rendering.warp_renderer import WarpRenderer
 
         return WarpRenderer(self._mesh, self.config.device)
 
     @cached_property
     def _model_key(self) -> str:
-        from wheretolook.mapping.colmap_model import MODEL_FILES
 
         paths = [self.scene.model / (name + suffix) for name in MODEL_FILES for suffix in (".bin", ".txt")]
         return cache_key("model", [(path.name, fingerprint(path)) for path in paths if path.is_file()])
 
     @cached_property
     def _map_key(self) -> str:
-        from wheretolook.localization.config import versions
 
         return cache_key("map", self._model_key, fingerprint(self.scene.mesh), versions())
 

@@ -13,6 +13,7 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.viewpoint_files import MATCH_FIELDS
@@ -26,7 +27,7 @@ from wheretolook.localization.estimation import PoseEstimator, SingleViewPoses
 from wheretolook.localization.rig import Look, rig_of
 from wheretolook.localization.rig_localization import JointLocalization, JointLocalizer
 from wheretolook.looks.selection import CandidateViews, Rotations, SetScoreModel, select_views
-from wheretolook.tracking.runs import BEST_TAG
+from wheretolook.tracking.runs import BEST_TAG, NestedRun, log, log_nested, start_run
 from wheretolook.tracking.store import TrackingConfig
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import write_text
@@ -138,8 +139,6 @@ def log_looks(
 
     The run has the metrics of the best strategy for the largest sets.
     """
-    from wheretolook.tracking.runs import NestedRun, log, log_nested, start_run
-
     numbers = [name for name in _NUMBERS if name in table]
     best = table[table["n_looks"] == table["n_looks"].max()].nlargest(1, "good").iloc[0]
     run_tags = {**(tags or {}), "dataset": str(params["dataset"]), BEST_TAG: str(best["strategy"])}
@@ -325,7 +324,6 @@ def _noisy(cam_from_rig: Float, turn_noise_deg: float, rng: np.random.Generator)
     """Perturb the rotations of all views but the first, which defines the rig."""
     if turn_noise_deg == 0:
         return cam_from_rig
-    from scipy.spatial.transform import Rotation
 
     noise = Rotation.from_rotvec(np.radians(rng.normal(0, turn_noise_deg, (len(cam_from_rig), 3)))).as_matrix()
     noise[0] = np.eye(3)

@@ -16,7 +16,9 @@ from wheretolook.dataset.viewpoint_table import POSITIVE, label_shares, pooled_l
 from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV, read_scores
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.registry import learned
+from wheretolook.scorers.weights import resolve_weights
 from wheretolook.training.config import DECIDING
+from wheretolook.training.provenance import training_fingerprint
 from wheretolook.utils.errors import TableError, WeightsError
 from wheretolook.utils.files import read_json_object, sha256
 from wheretolook.utils.texts import markdown_table
@@ -80,7 +82,6 @@ def _weight_files(release: Dataset) -> list[Path]:
 
 
 def _best(release: Dataset) -> Path:
-    from wheretolook.scorers.weights import resolve_weights
 
     best = resolve_weights(path=release.root / "weights")
     assert best is not None
@@ -219,7 +220,6 @@ def _table(
 
 
 def _fingerprints(release: Dataset, about: Mapping[str, Any]) -> str:
-    from wheretolook.training.provenance import training_fingerprint
 
     rows = [
         ["dataset", release.fingerprint()],

@@ -43,6 +43,7 @@ from wheretolook_paper.figures.sampling import Sampling
 from wheretolook_paper.paths.config import PathsConfig
 from wheretolook_paper.paths.path_comparison import draw_pairs
 from wheretolook_paper.release.copy import read_about
+from wheretolook_paper.release.mlp_architecture import activations
 from wheretolook_rooms.generator import generate_scene
 
 EYE_M = 1.45  # height of the shown locations above the floor, about that of the mapping cameras
@@ -268,8 +269,6 @@ def binned_image_of(showcase: Showcase, cam_from_world: ArrayLike, bins: int = 3
 
 def learning_of(showcase: Showcase, scorer: BinnedNetworkScorer, location_id: int, best: bool = True) -> Learning:
     """Return the activations of the paper's network for the best, or the worst, labelled view of a location."""
-    from wheretolook_paper.release.mlp_architecture import activations
-
     candidates = showcase.viewpoints(location_id)
     row = int((np.argmax if best else np.argmin)(scorer.score(poses(candidates))))
     pose = poses(candidates.iloc[[row]])

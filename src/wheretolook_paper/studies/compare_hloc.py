@@ -31,6 +31,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, get_args
 
+import cv2
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pycolmap
@@ -51,6 +53,7 @@ from wheretolook.evaluation.statistics import precision_area, precision_over_cov
 from wheretolook.features.config import ExtractorConfig, KeypointExtractor
 from wheretolook.features.extractor import Keypoints
 from wheretolook.features.registry import all_kinds, kind_of
+from wheretolook.figures.style import save_figure
 from wheretolook.geometry.camera import Camera, camera_of, write_cameras
 from wheretolook.geometry.pose_files import images_text
 from wheretolook.geometry.poses import Float, camera_centers, pose_error
@@ -168,8 +171,6 @@ def render_set(source: str, locations: int, images: int, work: Path, workers: in
 
     Raises ConfigError if the source is neither.
     """
-    import cv2
-
     kind, _, seed = source.rpartition("-")
     if Path(source).is_file():
         scenes = ScenesConfig(train=0, test=0, meshes=(MeshSource(Path(source)),))
@@ -231,10 +232,6 @@ def summarize(table: pd.DataFrame) -> pd.DataFrame:
 
 def draw(tables: list[Path], figure: Path, accuracy: str = "5 cm, 0.4 deg") -> None:
     """Draw precision over coverage of the poses in tables of `main`: a panel for each set and features."""
-    import matplotlib.pyplot as plt
-
-    from wheretolook.figures.style import save_figure
-
     table = pd.concat([pd.read_csv(path) for path in tables], ignore_index=True)
     limit_m, limit_deg = ACCURACIES[accuracy]
     table["right"] = (table["error_m"] <= limit_m) & (table["error_deg"] <= limit_deg)

@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+from lightgbm import Booster
 from numpy.typing import NDArray
 from scipy.special import expit
+from sklearn.metrics import average_precision_score, log_loss, roc_auc_score
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
@@ -32,9 +34,6 @@ from wheretolook.training.weights import check_method_of_weights, read_weights, 
 from wheretolook.utils.errors import ConfigError, WeightsError
 from wheretolook_paper.scorers.pooled_features import POOLED, pool
 from wheretolook_paper.scorers.trees import TreesConfig
-
-if TYPE_CHECKING:
-    from lightgbm import Booster
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +160,6 @@ def fit_trees(
     The seed decides which views LightGBM samples to choose bins.
     """
     import lightgbm
-    from sklearn.metrics import average_precision_score, log_loss, roc_auc_score
 
     leaves = {"num_leaves": config.max_leaves, "min_data_in_leaf": config.min_leaf, "lambda_l2": config.l2}
     options = {"objective": "binary", "learning_rate": config.learning_rate, **leaves, "seed": seed, "verbosity": -1}

@@ -17,7 +17,6 @@ from wheretolook.utils.errors import MapError, SceneError, TableError, WhereToLo
 from wheretolook.utils.files import write_text
 
 IMAGE_ENDING = ".png"
-_UNIT_TOLERANCE = 1e-5  # of a quaternion's length, as numpy.isclose's in evaluate_plan.py
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +46,8 @@ def write_poses(path: Path, ids: Sequence[str], cam_from_world: ArrayLike) -> No
 def read_poses(path: Path) -> PoseFile:
     """Read a file of poses. Raises a TableError if it is missing, a line is not a pose, or ids repeat."""
     ids, values = _read(path, "id qw qx qy qz tx ty tz")
-    is_unit = np.abs(np.linalg.norm(values[:, :4], axis=1) - 1) <= _UNIT_TOLERANCE
+    # the tolerance of numpy.isclose in evaluate_plan.py
+    is_unit = np.abs(np.linalg.norm(values[:, :4], axis=1) - 1) <= 1e-5
     invalid = np.flatnonzero(~(is_unit & np.isfinite(values).all(axis=1)))
     if len(invalid):
         fix = "Write finite numbers and quaternions of length 1, or omit the pose."

@@ -66,7 +66,6 @@ MAP_FOLDER = "map"
 CACHE = "made-from.json"
 STEPS = ("select", "localize")
 BATCH = 16  # images rendered, or localized, at a time
-MAX_OFFSET_M = 0.25  # median distance of landmarks from the mesh above which their frames differ
 LOCALIZER = LocalizerConfig(max_error_px=12.0)  # RANSAC's threshold in match_and_localize.py
 
 
@@ -190,7 +189,7 @@ class SceneRound:
         some = points[:: max(1, len(points) // 2000)]
         max_distance_m = float(np.linalg.norm(high - low) + np.abs(some - low).max())
         offset_m = float(np.median(MeshRaycaster(self._mesh).distance_to_surface(some, max_distance_m)))
-        if not offset_m <= MAX_OFFSET_M:
+        if not offset_m <= 0.25:  # median distance of landmarks from the mesh above which their frames differ
             problem = f"mesh and map have different frames: half of the landmarks are {offset_m:.3g} m from the mesh"
             raise SceneError(problem, path=self.scene.mesh, fix="Give the mesh in the frame of the map: --mesh FILE.")
 

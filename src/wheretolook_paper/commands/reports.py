@@ -52,8 +52,6 @@ from wheretolook_paper.figures.paths import FRAME_MS, film_frames, methods_figur
 from wheretolook_paper.figures.scores import calibration_figure, occlusion_figure, regret_figure, score_figure
 from wheretolook_paper.styles import in_table_order, method_style
 
-LEVEL_DEG = 25.0  # pitch at most of a camera held level
-
 
 def report_labels(folder: Path, views: pd.DataFrame, title: str) -> tuple[Path, ...]:
     """Write `labels.md` and `labels.png` of a dataset's `pooled_labels`; return their paths."""
@@ -128,7 +126,8 @@ def draw_overview(options: Demo, weights: Path) -> None:
     candidates = table[table["location_id"] == chosen]
     cam_from_world = poses(candidates)
     scores = scorer.score(cam_from_world)
-    level = np.abs(np.arcsin(np.clip(cam_from_world[:, 2, 2], -1, 1))) <= np.radians(LEVEL_DEG)
+    # a camera is held level up to a pitch of 25 degrees
+    level = np.abs(np.arcsin(np.clip(cam_from_world[:, 2, 2], -1, 1))) <= np.radians(25.0)
     worst_row = np.argmin(np.where(level | ~level.any(), scores, np.inf))
     shown_rows = [int(np.argmax(scores)), int(worst_row)]
     best, worst = rendered_views(scene, candidates.iloc[shown_rows], scores[shown_rows], outcome_in_words)

@@ -6,9 +6,9 @@ Sets are localized jointly from the stored matches of single views (`--label.sto
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -27,11 +27,12 @@ from wheretolook.localization.estimation import PoseEstimator, SingleViewPoses
 from wheretolook.localization.rig import Look, rig_of
 from wheretolook.localization.rig_localization import JointLocalization, JointLocalizer
 from wheretolook.looks.selection import CandidateViews, Rotations, SetScoreModel, select_views
-from wheretolook.tracking.runs import BEST_TAG, NestedRun, log, log_nested, start_run
+from wheretolook.tracking.runs import BEST_TAG, NestedRun
 from wheretolook.tracking.store import TrackingConfig
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.texts import markdown_table
+from wheretolook_paper.evaluation.comparison import interval_text, log_comparison
 from wheretolook_paper.fisher.metrics import metric_of
 
 LOOKS_CSV = "looks.csv"
@@ -52,8 +53,6 @@ STRATEGIES = {
 
 TOGETHER = "together"
 """The product's strategy."""
-
-_NUMBERS = ("good", "gain", "any_good", "sure", "sure_right")
 
 
 def look_table(sets: pd.DataFrame, resamples: int = 2000, seed: int = 0) -> pd.DataFrame:
@@ -108,24 +107,20 @@ def write_looks(folder: Path, sets: pd.DataFrame, title: str) -> pd.DataFrame:
     stopping = stopping_table(sets)
     write_text(folder / LOOKS_CSV, table.to_csv(index=False))
     shares = [
-        [row.strategy, str(row.n_looks), str(row.n_locations), _share(row.good, row.good_low, row.good_high),
-         _share(row.gain, row.gain_low, row.gain_high), f"{100 * row.any_good:.1f}", f"{100 * row.sure:.1f}",
-         "" if np.isnan(row.sure_right) else f"{100 * row.sure_right:.1f}"]
-        for row in cast("Iterable[Any]", table.itertuples())
+        [row["strategy"], str(row["n_looks"]), str(row["n_locations"]), interval_text(row, "good"),
+         interval_text(row, "gain"), f"{100 * row['any_good']:.1f}", f"{100 * row['sure']:.1f}",
+         "" if np.isnan(row["sure_right"]) else f"{100 * row['sure_right']:.1f}"]
+        for row in table.to_dict("records")
     ]  # fmt: skip
     head = ["looks", "N", "places", "localized together", "over one look", "any alone", "sure", "of these right"]
     stops = [
-        [f"{r.asked:.2f}", f"{r.looks:.2f}", f"{100 * r.good:.1f}", f"{100 * r.of_most:.1f}"]
-        for r in cast("Iterable[Any]", stopping.itertuples())
+        [f"{row['asked']:.2f}", f"{row['looks']:.2f}", f"{100 * row['good']:.1f}", f"{100 * row['of_most']:.1f}"]
+        for row in stopping.to_dict("records")
     ]
     parts = [f"# {title}", markdown_table(head, shares)]
     parts += ["## When to stop", markdown_table(["asked", "looks", "localized", "of all looks' share"], stops)]
     write_text(folder / LOOKS_MD, "\n\n".join(parts) + "\n")
     return table
-
-
-def _share(value: float, low: float, high: float) -> str:
-    return f"{100 * value:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
 
 
 def log_looks(
@@ -139,23 +134,19 @@ def log_looks(
 
     The run has the metrics of the best strategy for the largest sets.
     """
-    numbers = [name for name in _NUMBERS if name in table]
+    numbers = [name for name in ("good", "gain", "any_good", "sure", "sure_right") if name in table]
     best = table[table["n_looks"] == table["n_looks"].max()].nlargest(1, "good").iloc[0]
-    run_tags = {**(tags or {}), "dataset": str(params["dataset"]), BEST_TAG: str(best["strategy"])}
-    with start_run(tracking, "all sets", "looks", dict(params), tags=run_tags) as (client, run):
-        log(client, run, metrics={name: float(best[name]) for name in numbers})
-        for file in files:
-            client.log_artifact(run, str(file))
-        runs = (
-            NestedRun(
-                f"{row['strategy']}, {row['n_looks']} looks",
-                {**params, "strategy": row["strategy"], "n_looks": row["n_looks"]},
-                {name: float(row[name]) for name in numbers},
-            )
-            for row in table.to_dict("records")
+    nested = [
+        NestedRun(
+            f"{row['strategy']}, {row['n_looks']} looks",
+            {**params, "strategy": row["strategy"], "n_looks": row["n_looks"]},
+            {name: float(row[name]) for name in numbers},
         )
-        log_nested(tracking, run, "looks", runs, dict(tags or {}))
-    return run
+        for row in table.to_dict("records")
+    ]
+    metrics = {name: float(best[name]) for name in numbers}
+    about = {"dataset": str(params["dataset"]), BEST_TAG: str(best["strategy"])}
+    return log_comparison(tracking, "all sets", "looks", params, metrics, nested, files, tags, about)
 
 
 def information_score(sums: Float, p_none: Float) -> Float:

@@ -23,7 +23,6 @@ from wheretolook.inputs.channels import PAPER_VARIANTS
 from wheretolook_paper.figures.overview import View
 
 _COLUMNS = 12  # of a hidden layer's values
-_WIDE = 10  # letters below the score
 
 
 def learning_figure(image: BinnedImage, activations: Sequence[Float], channels: Sequence[str], outcome: str) -> Figure:
@@ -99,7 +98,7 @@ def _draw_score(axes: Axes, score: float, outcome: str) -> None:
     inside = score >= 0.2  # the bar is long enough for its number
     place: Style = {"va": "top", "color": "white"} if inside else {"va": "bottom", "color": INK}
     axes.text(0, score - 0.03 if inside else score + 0.03, f"{score:.2f}", ha="center", fontsize=7, **place)
-    axes.set_xlabel("\n".join(textwrap.wrap(outcome, _WIDE)))
+    axes.set_xlabel("\n".join(textwrap.wrap(outcome, 10)))  # letters below the score
 
 
 UNITS = {"u": "px", "v": "px", "x": "m", "y": "m", "z": "m"}
@@ -189,9 +188,6 @@ def draw_channel(axes: Axes, image: BinnedImage, name: str) -> None:
     frame(axes)
 
 
-_GLOBE = 27  # letters below a view
-
-
 def spread_extrema(
     directions: ArrayLike, scores: ArrayLike, n: int, apart_deg: float = 40.0, highest: bool = True
 ) -> NDArray[np.int64]:
@@ -232,7 +228,7 @@ def peaks_figure(
                 axes.imshow(view.rgb)
                 frame(axes, color, 1.4)
                 axes.set_title(f"{mark}  predicted {view.score:.2f}", loc="left")
-                axes.set_xlabel("\n".join(textwrap.wrap(view.outcome, _GLOBE)), labelpad=2)
+                axes.set_xlabel("\n".join(textwrap.wrap(view.outcome, 27)), labelpad=2)  # letters below a view
                 azimuth, elevation = map(float, pan_tilt_angles(view.direction))
                 look: Style = {"color": color, "fontsize": 8, "fontweight": "bold", "ha": "center", "va": "center"}
                 disc = {"boxstyle": "circle,pad=0.18", "facecolor": "white", "edgecolor": color}

@@ -78,8 +78,6 @@ def paths_figure(summary: pd.DataFrame) -> Figure:
 PATH = "#CC3311"
 LANDMARKS = "#EE9900"
 FRAME_MS = 125
-N_STILLS = 5
-N_ARROWS = 12
 
 _STOP: Style = {"marker": "o", "color": "white", "markeredgecolor": PATH, "markeredgewidth": 1.6, "linestyle": "none"}
 _ARROW: Style = {"arrowstyle": "-|>", "color": INK, "linewidth": 0.9, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 8}
@@ -107,7 +105,7 @@ def still_figure(views: Sequence[PathView], landmarks: Float, title: str = "") -
     `landmarks` (N, 3) m are those of the map; there is at least one view.
     """
     own = np.array([number for number, view in enumerate(views) if view.look == 1])
-    shown = own[np.unique(np.linspace(0, len(own) - 1, N_STILLS).round().astype(int))].tolist()
+    shown = own[np.unique(np.linspace(0, len(own) - 1, 5).round().astype(int))].tolist()
     with context(RC):
         figure = new_figure(2.5 * max(4, len(shown)), 5.8)
         grid = figure.add_gridspec(2, 1, height_ratios=(1.6, 1.0))
@@ -162,7 +160,7 @@ def draw_path(
     stops = xy[[view.look == 1 < view.n_looks for view in views]]
     axes.plot(*stops.T, markersize=7, zorder=3.5, **_STOP)
     along = lengths_along(positions)
-    arrows = np.unique(np.searchsorted(along, np.linspace(0, along[-1], N_ARROWS) - 1e-9)).tolist()
+    arrows = np.unique(np.searchsorted(along, np.linspace(0, along[-1], 12) - 1e-9)).tolist()
     length = margin = 0.07 * float(np.max(high - low))
     if number is not None:
         arrows = [number]
@@ -206,7 +204,6 @@ LANDMARKS_CSV = "plan_photographs_landmarks.csv"
 same maps from above."""
 
 COMMAND = "python -m wheretolook_paper.studies.plan_photographs --map MODEL --work FOLDER --out TABLE"
-N_SHOWN = 3  # views of a path whose photographs are shown
 POSITION = ["x", "y", "z"]
 AXIS = ["axis_x", "axis_y", "axis_z"]
 Pictures = Mapping[str, NDArray[np.uint8]]
@@ -248,7 +245,8 @@ def _draw_scene(figure: Any, table: pd.DataFrame, landmarks: Float, pictures: Pi
     most = 1.1 * max(1, table["visible"].max())
     for column, (method, rows) in enumerate(methods.items()):
         axes = figure.add_subplot(grid[0, column])
-        shown = np.unique(np.linspace(0, len(rows) - 1, N_SHOWN).round().astype(int)).tolist()
+        # three views of a path are shown with their photographs
+        shown = np.unique(np.linspace(0, len(rows) - 1, 3).round().astype(int)).tolist()
         at = rows[POSITION].to_numpy()
         of_rows = zip(at, rows[AXIS].to_numpy(), strict=True)
         views = [PathView(place, axis, np.nan, np.empty((0, 2)), (0, 0), None) for place, axis in of_rows]

@@ -34,9 +34,6 @@ from wheretolook.geometry.lattices import VoxelGrid, azimuth_elevation_lattice, 
 from wheretolook.geometry.poses import Float
 from wheretolook_paper.figures.dollhouse import Dollhouse, draw_house, draw_points, draw_segments
 
-_SIGHT_LINES = 120
-_MARGIN_PX = 0.04
-
 
 @dataclass(frozen=True, eq=False)
 class Sampling:
@@ -84,7 +81,7 @@ def _draw_voxels(axes: Axes, sampling: Sampling) -> None:
     _mark_location(axes, sampling)
     low = corners.reshape(-1, 2).min(0)
     high = corners.reshape(-1, 2).max(0)
-    margin = _MARGIN_PX * (high - low)
+    margin = 0.04 * (high - low)
     axes.set(xlim=(low[0] - margin[0], high[0] + margin[0]), ylim=(high[1] + margin[1], low[1] - margin[1]))
     axes.set_anchor("N")
     axes.set_title("a  Locations", loc="left")
@@ -110,7 +107,7 @@ def _draw_occlusion(axes: Axes, sampling: Sampling) -> None:
     draw_house(axes, sampling.plan, fade=0.6)
     unoccluded = sampling.landmarks[sampling.unoccluded]
     hidden = sampling.landmarks[~sampling.unoccluded]
-    ends = unoccluded[:: max(1, len(unoccluded) // _SIGHT_LINES)]
+    ends = unoccluded[:: max(1, len(unoccluded) // 120)]
     lines = np.stack([np.broadcast_to(sampling.place, ends.shape), ends], axis=1)
     draw_segments(axes, sampling.plan, lines, color=ORANGE, linewidth=0.3, alpha=0.7)
     draw_points(axes, sampling.plan, hidden, s=1.0, color=BLUE, rasterized=True)

@@ -23,7 +23,6 @@ from wheretolook_paper.evaluation.paper_tables import PAPER
 from wheretolook_paper.styles import STYLES, method_group, method_style
 
 _MAX_METHODS = {"Fisher": 3, "probes": 0}  # the best methods of a group that a figure shows; all of other groups
-_WRAP = 36  # characters; longer labels are broken into two lines
 _DASHED: Style = {"color": INK, "linewidth": 1, "linestyle": "--", "zorder": 1}
 
 
@@ -137,7 +136,8 @@ def _draw_panels(
             axes.set_xlim(limits)
             axes.axvline(dashed, **_DASHED)
         labels = [method_style(str(method)).label for method in rows.index]
-        labels = [",\n".join(label.rsplit(", ", 1)) if len(label) > _WRAP else label for label in labels]
+        # labels of more characters are broken into two lines
+        labels = [",\n".join(label.rsplit(", ", 1)) if len(label) > 36 else label for label in labels]
         panels[0].set_yticks(range(len(rows)), labels, fontsize=9)
         panels[0].set_ylim(len(rows) - 0.4, -0.6)
         figure.supxlabel(f"{caption}\nwhiskers: 95 % bootstrap interval over locations", fontsize=9)

@@ -45,18 +45,15 @@ GIVEN = "given"
 Space = FreeSpace | MappedSpace
 Rule = Callable[[Float, TurnLimit], ViewSequence]
 
-MAX_DRAWS = 50  # draws for each pair before giving up
 
 GRID_M = 0.25
 MAX_NODES = 200_000
 """Step and size limit of the grid that decides whether a goal is reachable."""
 
 BLOCK = 10_000  # points tested for free space at a time
-N_NEAREST = 8  # grid nodes tried as connections of a point
 
 
 SPACING_M = 0.2  # distance of waypoints in the Active Localization Benchmark
-CELL_DEG = 20.0
 TURN_PENALTY = 0.02
 """Step of ActLoc's lattice of yaws and pitches, and the penalty of its greedy rule (lambda) for each step."""
 
@@ -97,7 +94,7 @@ def _cells(directions: Float) -> Float:
     """Compute differences (D, D) of pitch plus, the short way round, of yaw between directions, in steps of 20 degrees."""
     yaw, pitch = map(np.degrees, pan_tilt_angles(directions))
     across = np.abs(yaw[:, None] - yaw)
-    return np.asarray((np.abs(pitch[:, None] - pitch) + np.minimum(across, 360 - across)) / CELL_DEG)
+    return np.asarray((np.abs(pitch[:, None] - pitch) + np.minimum(across, 360 - across)) / 20.0)
 
 
 RULES: dict[str, Rule] = {"": best_sequence, "greedy": greedy_sequence}
@@ -127,7 +124,7 @@ def draw_pairs(space: Space, config: PathsConfig) -> Float:
     low, high = space.bounds
     reachability = Reachability(space)
     found: list[Float] = []
-    for _ in range(MAX_DRAWS * config.pairs):
+    for _ in range(50 * config.pairs):  # draws for each pair before giving up
         if len(found) == config.pairs:
             break
         points = rng.uniform(low, high, (400, 3))
@@ -178,7 +175,8 @@ class Reachability:
     def _parts_near(self, point: ArrayLike) -> set[int]:
         if not len(self._nodes):
             return set()
-        near = np.atleast_1d(self._tree.query(point, k=min(N_NEAREST, len(self._nodes)))[1])
+        # the nearest eight nodes of the grid are tried as connections
+        near = np.atleast_1d(self._tree.query(point, k=min(8, len(self._nodes)))[1])
         straight = self.space.segments_are_free(np.tile(point, (len(near), 1)), self._nodes[near])
         return set(self._part[near[straight]].tolist())
 

@@ -34,7 +34,6 @@ from wheretolook.tracking.runs import (
     joined,
     log,
     log_history,
-    log_nested,
     start_run,
 )
 from wheretolook.tracking.store import TrackingConfig
@@ -42,6 +41,7 @@ from wheretolook.tracking.store import client as client_of
 from wheretolook.training.provenance import HISTORY_CSV, kept_metrics, params_of
 from wheretolook.utils.files import copy_file, temporary_folder, write_text
 from wheretolook.utils.processes import hold
+from wheretolook_paper.evaluation.comparison import log_comparison
 from wheretolook_paper.evaluation.looks import LOOKS_CSV, log_looks
 from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
 from wheretolook_paper.paths.path_report import PATHS_CSV, log_paths
@@ -177,13 +177,9 @@ def _log_evaluation(
     params = {**params, **choices, "reference": table["reference"].iloc[0]}
     best, first = best_of(table)
     metrics |= {**first, "n_locations": float(table.loc[table["scene"] == ALL, "n_locations"].iloc[0])}
-    tags = {**TAGS, "dataset": params["dataset"], **best}
-    with start_run(tracking, ALL_METHODS, "evaluate", params, tags=tags) as (mlflow, run):
-        log(mlflow, run, metrics=metrics)
-        for path in files:
-            mlflow.log_artifact(run, str(path))
-        log_nested(tracking, run, "evaluate", runs_of_rows(table, params), TAGS)
-    return run
+    about = {"dataset": params["dataset"], **best}
+    nested = runs_of_rows(table, params)
+    return log_comparison(tracking, ALL_METHODS, "evaluate", params, metrics, nested, files, TAGS, about)
 
 
 def _log_training(
@@ -228,17 +224,14 @@ def _log_learners(dataset: Dataset, tracking: TrackingConfig) -> str:
             of_learner.setdefault(joined(learner, source), []).append((numbers[REGRET], numbers[AUC]))
         params = {"dataset": dataset.name, "learner": learner, "trained_on": source, "seed": seed}
         nested.append(NestedRun(joined(learner, source, f"seed {seed}" if seed else ""), params, numbers))
-    tags = dict(TAGS)
+    best = {}
     metrics = {}
     if of_learner:
         means_of = {name: np.mean(numbers, axis=0) for name, numbers in of_learner.items()}
-        tags[BEST_TAG] = min(means_of, key=lambda name: means_of[name][0])
-        metrics = dict(zip((REGRET, AUC), map(float, means_of[tags[BEST_TAG]]), strict=True))
-    with start_run(tracking, "all learners", "learners", {"dataset": dataset.name}, tags=tags) as (mlflow, run):
-        log(mlflow, run, metrics=metrics)
-        mlflow.log_artifact(run, str(path))
-        log_nested(tracking, run, "learners", nested, TAGS)
-    return run
+        best[BEST_TAG] = min(means_of, key=lambda name: means_of[name][0])
+        metrics = dict(zip((REGRET, AUC), map(float, means_of[best[BEST_TAG]]), strict=True))
+    params = {"dataset": dataset.name}
+    return log_comparison(tracking, "all learners", "learners", params, metrics, nested, [path], TAGS, best)
 
 
 def _log_paths(dataset: Dataset, tracking: TrackingConfig) -> str:

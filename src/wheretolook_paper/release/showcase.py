@@ -47,9 +47,7 @@ from wheretolook_paper.release.mlp_architecture import activations
 from wheretolook_rooms.generator import generate_scene
 
 EYE_M = 1.45  # height of the shown locations above the floor, about that of the mapping cameras
-SAME_OCCLUSION = 0.999  # required share of equal lines of sight; rounding may differ
 
-_CHECKED = 16  # locations whose lines of sight are compared
 
 _SEEDED = re.compile(rf"({'|'.join(get_args(SceneKind))})-(\d+)")
 
@@ -168,9 +166,9 @@ def _check_same(scene: Scene) -> None:
     """Raise a SceneError if lines of sight differ from the stored ones."""
     stored = StoredOcclusion.load(scene.folder.occlusion)
     points = scene.landmarks.points
-    some = stored.locations[:: max(1, len(stored.locations) // _CHECKED)]
+    some = stored.locations[:: max(1, len(stored.locations) // 16)]  # locations whose lines of sight are compared
     same = (scene.occlusion.unoccluded(some, points) == stored.unoccluded(some, points)).mean()
-    if not same >= SAME_OCCLUSION:
+    if not same >= 0.999:  # required share of equal lines of sight; rounding may differ
         problem = f"generated from its seed, only {same:.1%} of the lines of sight are as in the labelled scene"
         fix = "Check out the version of the code that release.json names."
         raise SceneError(problem, path=scene.folder.folder, fix=fix)

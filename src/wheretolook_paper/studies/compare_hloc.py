@@ -81,8 +81,6 @@ LABELS = {"aliked": "ALIKED", "disk": "DISK", "opencv": "SIFT"}
 COLORS = {"hloc": "#c44e52", "first": "#8c8c8c", "hypotheses": "#4c72b0", "lightglue": "#55a868"}
 ACCURACIES: Mapping[str, Accuracy] = {"5 cm, 0.4 deg": (0.05, 0.4), "25 cm, 2 deg": (0.25, 2.0)}
 AHEAD_M = 3.0  # of a camera, of the point that decides which images are matched
-MIN_TIMED = 10  # queries of a fold of which hloc's time is stated
-HLOC_ERROR_PX = 12.0  # hloc's default limit of an inlier
 SELECTING = ("set", "bins", "visible", "random")  # methods whose views are the queries in a rendered scene
 DIRECTIONS = 24  # of a location, that they select from
 NO_HLOC = (
@@ -400,7 +398,8 @@ def _by_hloc(fold: Fold, features: str, retrieved: Mapping[str, Sequence[str]]) 
 
     model = pycolmap.Reconstruction(fold.model)
     number_of = {image.name: number for number, image in model.images.items()}
-    localizer = localize_sfm.QueryLocalizer(model, {"estimation": {"ransac": {"max_error": HLOC_ERROR_PX}}})
+    # hloc's default limit of an inlier
+    localizer = localize_sfm.QueryLocalizer(model, {"estimation": {"ransac": {"max_error": 12.0}}})
     camera = pycolmap.Camera(**fold.camera.colmap.record())
     matches = fold.folder / "query-matches.h5"
     pairs = fold.folder / "query-pairs.txt"
@@ -409,7 +408,7 @@ def _by_hloc(fold: Fold, features: str, retrieved: Mapping[str, Sequence[str]]) 
     start = time.perf_counter()
     match_features.main(match_features.confs[MATCHERS[features]], pairs, fold.features, matches=matches)
     # of few queries most of the time is that of loading the matcher
-    matching = (time.perf_counter() - start) / len(retrieved) if len(retrieved) >= MIN_TIMED else np.nan
+    matching = (time.perf_counter() - start) / len(retrieved) if len(retrieved) >= 10 else np.nan
     poses = {}
     for query, images in tqdm(retrieved.items(), desc="hloc"):
         start = time.perf_counter()

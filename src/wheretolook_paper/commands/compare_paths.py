@@ -38,14 +38,15 @@ class ComparePaths(SceneOptions, LabelOptions):
     """Plan paths between random locations by several methods, render what the camera sees, localize it. Resumes.
 
     Examples:
-      wheretolook compare-paths --config configs/demo.yaml --paths.methods '[forward, set]' --paths.pairs 5
+      wheretolook compare-paths --config configs/demo.yaml --methods forward set --pairs 5
 
     Args:
         paths: which paths, and by which methods.
         tracking: where MLflow keeps its runs.
     """
 
-    SHORT: ClassVar = {"engine": "label.engine"}
+    SHORT: ClassVar = {"engine": "label.engine", "stops": "stops.looks", "paths.scenes": "in_scenes"}
+    GROUPS: ClassVar = {"paths": ""}
 
     paths: PathsConfig = field(default_factory=PathsConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
@@ -87,14 +88,14 @@ class ComparePaths(SceneOptions, LabelOptions):
         return summary
 
 
-def scenes_with_meshes(dataset: Dataset, names: Sequence[str], option: str) -> list[SceneFolder]:
-    """Return the scenes of these names, by default the test scenes. `option` is the one that names them.
+def scenes_with_meshes(dataset: Dataset, names: Sequence[str]) -> list[SceneFolder]:
+    """Return the scenes of these names, by default the test scenes.
 
     Raises ConfigError if there is none, SceneError if one has no mesh.
     """
     scenes = [dataset.scene(name) for name in names] or list(dataset.split("test"))
     if not scenes:
-        raise ConfigError("the dataset has no test scene", path=dataset.root, fix=f"Name scenes in {option}.")
+        raise ConfigError("the dataset has no test scene", path=dataset.root, fix="Name scenes: --in-scenes.")
     for scene in scenes:
         if not scene.mesh.is_file():
             raise SceneError("rendering needs a mesh", path=scene.folder, fix="Choose other scenes.")
@@ -107,7 +108,7 @@ def _comparisons(options: ComparePaths, dataset: Dataset, log: Log) -> list[Scen
     from wheretolook_paper.paths.scene_comparison import SceneComparison
 
     config = options.paths
-    scenes = scenes_with_meshes(dataset, config.scenes, "paths.scenes")
+    scenes = scenes_with_meshes(dataset, config.in_scenes)
     weights = {name: resolve_weights(name, config.weights, dataset=dataset, log=log) for name in config.methods}
     comparisons = []
     for files in scenes:

@@ -20,7 +20,7 @@ from wheretolook.commands.options import (
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
-from wheretolook.utils.errors import check_choice, check_range
+from wheretolook.utils.errors import check_choice, check_range, no_option
 from wheretolook.utils.files import atomic_write, fingerprint, write_text
 from wheretolook_paper.commands.compare_paths import scenes_with_meshes
 
@@ -74,7 +74,7 @@ class Relocalize(SceneOptions):
 
     places: int = 30
     views: int = 4
-    confidence: float = 0.95
+    confidence: float = no_option(0.95)
     policies: tuple[str, ...] = tuple(POLICIES)
     in_scenes: tuple[str, ...] = ()
     method: str = "set"
@@ -105,7 +105,7 @@ class Relocalize(SceneOptions):
         with reading(self.root, "relocalize", FOLDER):
             dataset = load_dataset(self, "sample")
             check_store(self.tracking)
-            scenes = scenes_with_meshes(dataset, self.in_scenes, "--in-scenes")
+            scenes = scenes_with_meshes(dataset, self.in_scenes)
             tables = [self._simulated(dataset, files, log).assign(scene=files.name) for files in scenes]
             table = pd.concat(tables, ignore_index=True)
             summary = summarize(table, self.confidence)

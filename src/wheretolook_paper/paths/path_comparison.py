@@ -55,7 +55,7 @@ BLOCK = 10_000  # points tested for free space at a time
 
 SPACING_M = 0.2  # distance of waypoints in the Active Localization Benchmark
 TURN_PENALTY = 0.02
-"""Step of ActLoc's lattice of yaws and pitches, and the penalty of its greedy rule (lambda) for each step."""
+"""Penalty of ActLoc's greedy rule (lambda) for each step of its lattice of yaws and pitches."""
 
 
 def greedy_sequence(scores: ArrayLike, limit: TurnLimit) -> ViewSequence:
@@ -94,7 +94,7 @@ def _cells(directions: Float) -> Float:
     """Compute differences (D, D) of pitch plus, the short way round, of yaw between directions, in steps of 20 degrees."""
     yaw, pitch = map(np.degrees, pan_tilt_angles(directions))
     across = np.abs(yaw[:, None] - yaw)
-    return np.asarray((np.abs(pitch[:, None] - pitch) + np.minimum(across, 360 - across)) / 20.0)
+    return np.asarray((np.abs(pitch[:, None] - pitch) + np.minimum(across, 360 - across)) / 20)
 
 
 RULES: dict[str, Rule] = {"": best_sequence, "greedy": greedy_sequence}

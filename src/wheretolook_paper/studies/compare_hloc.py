@@ -39,7 +39,7 @@ import pycolmap
 from jsonargparse import auto_cli
 from tqdm.auto import tqdm
 
-from wheretolook.commands.map import Map
+from wheretolook.commands.map import BuildMap
 from wheretolook.commands.options import MeshSource, ScenesConfig
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.scenes import Scenes
@@ -182,7 +182,7 @@ def render_set(source: str, locations: int, images: int, work: Path, workers: in
         return out
     dataset: dict[str, Any] = {"data": work, "name": f"scene-{Path(source).stem}", "device": device}
     Scenes(**dataset, scenes=scenes).run()
-    Map(**dataset, mapping=MapConfig(n_images=images, keep_images=True), label=LabelConfig(workers=workers)).run()
+    BuildMap(**dataset, mapping=MapConfig(n_images=images, keep_images=True), label=LabelConfig(workers=workers)).run()
     sample = SampleConfig(keep=0, max_locations=locations, max_directions=DIRECTIONS)
     (scene,) = Sample(**dataset, sample=sample).run().scenes
     table = scene.read_table()

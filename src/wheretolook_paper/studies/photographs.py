@@ -100,9 +100,9 @@ def map_known_poses(folder: Path, work: Path, extractor: ExtractorConfig, worker
     poses = invert_poses(np.stack([np.loadtxt(folder / f"{stem}.pose.txt")[:3] for stem in stems]))
     depth_m = np.stack([shrink_depth(read_depth(folder / f"{stem}.depth.png")) for stem in stems])
     with WorkerPool(workers) as processes:
-        config = MapConfig(extractor=extractor, photographs=PhotographsConfig(max_side_px=0))
+        config = PhotographsConfig(extractor=extractor)
         run = MapRun(config, processes)
-        features = photograph_features(work / "images", work / "photographs", run)
+        features = photograph_features(work / "images", work / "photographs", run, max_side_px=0)
         names = features.names
         stored = features.stored
         pinhole = PinholeCamera(int(features.sizes[0][0]), int(features.sizes[0][1]), FOCAL_PX)
@@ -204,7 +204,7 @@ def main(
         if poses is not None:
             map_known_poses(poses, work, features, workers)
         else:
-            settings = MapConfig(photographs=PhotographsConfig(images=images), extractor=features)
+            settings = PhotographsConfig(images, extractor=features)
             map_photographs(settings, model, work / "photographs", workers=workers)
     scene = source.resolve().name
     photo_map = open_map(

@@ -1,4 +1,4 @@
-"""Comparisons of methods: numbers with their intervals as text, and MLflow runs."""
+"""Comparisons of methods: numbers with their intervals as text, MLflow runs, and tables that several runs fill."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from wheretolook.tracking.runs import NestedRun, Tags, log, log_nested, start_run
 from wheretolook.tracking.store import TrackingConfig
+from wheretolook.utils.files import write_text
 
 
 def interval_text(row: Any, name: str, scale: float = 100.0, digits: int = 1) -> str:
@@ -34,3 +37,13 @@ def log_comparison(
             client.log_artifact(run, str(file))
         log_nested(tracking, run, stage, nested, tags)
     return run
+
+
+def replace_rows(path: Path, rows: pd.DataFrame, keys: Sequence[str], float_format: str | None = None) -> pd.DataFrame:
+    """Write rows to a CSV file in place of those with the same keys, sorted by the first key; return the new table."""
+    others = pd.read_csv(path) if path.is_file() else rows[:0]
+    names = list(keys)
+    kept = others[~others.set_index(names).index.isin(rows.set_index(names).index)]
+    table = pd.concat([kept, rows], ignore_index=True).sort_values(names[0], kind="stable", ignore_index=True)
+    write_text(path, table.to_csv(index=False, float_format=float_format, lineterminator="\n"))
+    return table

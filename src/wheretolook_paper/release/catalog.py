@@ -26,9 +26,9 @@ from wheretolook.training.provenance import HISTORY_CSV
 from wheretolook.utils.errors import ConfigError, MissingRunError, WhereToLookError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.texts import markdown_table
+from wheretolook_paper.commands.figures import FiguresConfig
 from wheretolook_paper.evaluation.looks import LOOKS_CSV
 from wheretolook_paper.evaluation.score_report import comparisons_markdown, score_markdown
-from wheretolook_paper.figures.config import FiguresConfig
 from wheretolook_paper.figures.looks import looks_figure
 from wheretolook_paper.figures.network import inputs_figure, learning_figure, peaks_figure
 from wheretolook_paper.figures.paths import (

@@ -30,7 +30,7 @@ from wheretolook.geometry.camera import field_of_view_deg
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.scorers.registry import is_probability
 from wheretolook.training.weights import method_of_weights
-from wheretolook_paper.studies.tables import replace_rows
+from wheretolook_paper.evaluation.comparison import replace_rows
 
 LIMITS = 0.05, 0.4  # metres and degrees
 SHARES = ("expected-inliers", "visible")  # scores that are shares of a map's landmarks

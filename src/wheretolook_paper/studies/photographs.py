@@ -55,7 +55,7 @@ from wheretolook.mapping.triangulation import (
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.processes import WorkerPool
 from wheretolook.utils.texts import quiet_colmap
-from wheretolook_paper.studies.tables import replace_rows
+from wheretolook_paper.evaluation.comparison import replace_rows
 
 FOCAL_PX = 525.0  # initial focal length of photographs with poses
 PARTNERS = 20  # that each photograph with a pose is matched with

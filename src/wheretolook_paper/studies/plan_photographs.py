@@ -46,6 +46,7 @@ from wheretolook.planning.rrt import Space
 from wheretolook.planning.scene_map import scene_scorer
 from wheretolook.scorers.weights import resolve_weights
 from wheretolook.utils.errors import PlanningError
+from wheretolook_paper.evaluation.comparison import replace_rows
 from wheretolook_paper.figures.paths import (
     AXIS,
     LANDMARKS_CSV,
@@ -53,7 +54,6 @@ from wheretolook_paper.figures.paths import (
     photograph_paths_figure,
     photograph_paths_markdown,
 )
-from wheretolook_paper.studies.tables import replace_rows
 
 GRID = (8, 8, 4)
 DIRECTIONS = 200

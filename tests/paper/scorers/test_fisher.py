@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import get_args
-
 import numpy as np
 import pytest
 
@@ -43,7 +41,7 @@ def views_at(locations: Float, directions: Float = DIRECTIONS) -> Float:
 
 
 @pytest.mark.parametrize("metric", METRICS)
-@pytest.mark.parametrize("approximation", get_args(Approximation))
+@pytest.mark.parametrize("approximation", ["exact", "quadratic", "gp"])
 def test_of_a_room_with_landmarks_on_two_walls_it_looks_at_them(metric: str, approximation: Approximation) -> None:
     rng = np.random.default_rng(1)
     localization_map = LocalizationMap(Map(two_walls(rng)), CAMERA)

@@ -12,14 +12,13 @@ bootstrap intervals over locations.
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import Scene, free_points, open_scene, use_one_thread
+from common import Scene, free_points, open_scene, options, use_one_thread
 from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score
 from tqdm.auto import tqdm
@@ -116,16 +115,9 @@ def numbers(scores: NDArray[Any], good: NDArray[np.bool_]) -> str:
 
 def main() -> None:
     """Map, localize and score every scene by every extractor, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add = parser.add_argument
-    add("--features", nargs="+", default=["opencv"], metavar="NAME[=WEIGHTS]", help="extractors (opencv)")
-    add("--scenes", nargs="+", type=int, default=[901], help="seeds of apartments")
-    add("--locations", type=int, default=60)
-    add("--directions", type=int, default=12)
-    add("--map-images", type=int, default=100)
-    add("--device", default="cpu")
-    add("--work", type=Path, required=True, metavar="FOLDER", help="cache of maps and keypoints")
-    args = parser.parse_args()
+    args = options(
+        __doc__, features=["opencv"], scenes=[901], locations=60, directions=12, map_images=100, device="cpu", work=...
+    )
     use_one_thread()
 
     parts: dict[str, list[Any]] = {}

@@ -9,7 +9,6 @@ how many of the first images' poses are right.
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import time
@@ -20,9 +19,10 @@ import numpy as np
 import pandas as pd
 
 ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "src" / "wheretolook_ros")]
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "benchmarks"), str(ROOT / "src" / "wheretolook_ros")]
 
 import rclpy
+from common import options as parse_options
 from geometry_msgs.msg import PoseStamped
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from wheretolook_ros.conversions import Array, pose_matrix, pose_message, seconds
@@ -120,14 +120,8 @@ class Trial:
         error_m, error_deg = (
             (np.nan, np.nan) if found is None else pose_error(invert_poses(found), invert_poses(self.base))
         )
-        views = min(len(self.axes), self.max_views)
-        return {
-            "confident": found is not None,
-            "views": views,
-            "error_m": error_m,
-            "error_deg": error_deg,
-            "s": elapsed,
-        }
+        outcome = {"confident": found is not None, "views": min(len(self.axes), self.max_views)}
+        return {**outcome, "error_m": error_m, "error_deg": error_deg, "s": elapsed}
 
 
 def first_poses(mesh: Path, folder: Path, bases: list[Array]) -> list[dict[str, object]]:
@@ -163,15 +157,7 @@ def summary(table: pd.DataFrame) -> str:
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--mesh", type=Path, required=True)
-    parser.add_argument("--folder", type=Path, required=True)
-    parser.add_argument("--places", type=int, default=30)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--views", type=int, default=6)
-    parser.add_argument("--policy", choices=("gain", "even"), default="gain")
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
+    options = parse_options(__doc__, mesh=..., folder=..., places=30, seed=0, views=6, policy="gain", out=Path)
     os.environ.update(environment())
     bases = random_bases(options.mesh, options.folder, options.places, options.seed)
     first = first_poses(options.mesh, options.folder, bases)

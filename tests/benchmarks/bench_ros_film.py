@@ -8,7 +8,6 @@ then drives while the gaze node points the camera. The bag has what the nodes an
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import time
@@ -25,6 +24,7 @@ sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "benchmarks"), str(ROO
 
 import rclpy
 from bench_ros_paths import waypoints_of
+from common import options as parse_options
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Path as PathMessage
@@ -156,14 +156,7 @@ def frames_of(bag: Path, folder: Path) -> Iterator[Array]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--mesh", type=Path, required=True)
-    parser.add_argument("--folder", type=Path, required=True)
-    parser.add_argument("--bag", type=Path, required=True)
-    parser.add_argument("--film", type=Path, required=True)
-    parser.add_argument("--min-length", type=float, default=5.0, help="distance of start and goal in metres")
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
+    options = parse_options(__doc__, mesh=..., folder=..., bag=..., film=..., min_length=5.0, seed=0)
     if not options.bag.exists():
         record(options.mesh, options.folder, options.bag, options.min_length, options.seed)
     save_moving(frames_of(options.bag, options.folder), FRAME_MS, options.film, 2000)

@@ -9,7 +9,6 @@ every tenth is black, and the node publishes next views, so that all it does can
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import time
@@ -22,6 +21,7 @@ sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "benchmarks"), str(ROO
 
 import rclpy
 from bench_ros import random_bases
+from common import options as parse_options
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 from wheretolook_ros.conversions import pose_message
@@ -52,13 +52,7 @@ def seconds_of_images(node: Robot) -> list[float]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--mesh", type=Path, required=True)
-    parser.add_argument("--folder", type=Path, required=True)
-    parser.add_argument("--seconds", type=float, default=180)
-    parser.add_argument("--views", type=int, default=40)
-    parser.add_argument("--rate", type=float, default=0, help="images per second; 0: as fast as it localizes them")
-    options = parser.parse_args()
+    options = parse_options(__doc__, mesh=..., folder=..., seconds=180.0, views=40, rate=0.0)
     os.environ.update(environment())
     node_settings = {"folder": options.folder, "next_look": str(options.rate > 0).lower()}
     bases = random_bases(options.mesh, options.folder, options.views, 1)

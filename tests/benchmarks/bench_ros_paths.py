@@ -10,7 +10,6 @@ the right ones.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
@@ -18,7 +17,10 @@ import numpy as np
 import pandas as pd
 
 ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "src" / "wheretolook_ros")]
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "benchmarks"), str(ROOT / "src" / "wheretolook_ros")]
+
+from common import options as parse_options
+from common import write_csv
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.camera_turns import pan_tilt_angles
@@ -58,14 +60,7 @@ def waypoints_of(places: Float, space: FreeSpace, min_length_m: float, rng: np.r
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--mesh", type=Path, required=True)
-    parser.add_argument("--folder", type=Path, required=True)
-    parser.add_argument("--paths", type=int, default=20)
-    parser.add_argument("--min-length", type=float, default=3.0, help="distance of start and goal in metres")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path("paths.csv"))
-    args = parser.parse_args()
+    args = parse_options(__doc__, mesh=..., folder=..., paths=20, min_length=3.0, seed=0, out=Path("paths.csv"))
     mesh = load_mesh(args.mesh)
     space = FreeSpace(mesh)
     renderer = WarpRenderer(mesh)
@@ -93,7 +88,7 @@ def main() -> None:
                 rows.append((number, policy, k, probability, float(error[0]), float(error[1])))
         print(f"path {number + 1}: {len(points)} waypoints", flush=True)
     table = pd.DataFrame(rows, columns=["path", "policy", "waypoint", "probability", "error_m", "error_deg"])
-    table.to_csv(args.out, index=False, float_format="%.6g")
+    write_csv(table, args.out)
     table["confident"] = table["probability"] >= CONFIDENCE
     table["right"] = (table["error_m"] <= LIMITS[0]) & (table["error_deg"] <= LIMITS[1])
     for policy, part in table.groupby("policy"):

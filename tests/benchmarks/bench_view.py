@@ -11,7 +11,6 @@ not measured. Exits with code 1 if a client met an error.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import logging
 import os
@@ -26,7 +25,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from common import write_model
+from common import options, write_model
 
 from wheretolook.view.server import Viewer
 from wheretolook.view.state import ViewState
@@ -190,31 +189,23 @@ def run_clients(viewer: Viewer, n: int, seconds: float) -> int:
 
 def main() -> int:
     """Parse the options, measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--map", type=Path, help="a COLMAP model instead")
-    parser.add_argument("--landmarks", type=int, default=100_000)
-    parser.add_argument("--clients", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--occlusion", default="")
-    parser.add_argument("--repeat", type=int, default=1, help="repeats of opening the map")
-    parser.add_argument("--turns", type=int, default=20)
-    options = parser.parse_args()
+    args = options(__doc__, map=Path, landmarks=100_000, clients=0, seconds=60.0, occlusion="", repeat=1, turns=20)
     errors = ErrorCounter()
     logging.getLogger().addHandler(errors)
     with tempfile.TemporaryDirectory() as folder:
-        model = options.map or Path(folder) / "sparse"
-        if options.map is None:
-            write_model(model, options.landmarks)
-        print_opening(model, options.repeat)
-        viewer = Viewer(open_map(model), port=0, state=ViewState(occlusion=options.occlusion))
+        model = args.map or Path(folder) / "sparse"
+        if args.map is None:
+            write_model(model, args.landmarks)
+        print_opening(model, args.repeat)
+        viewer = Viewer(open_map(model), port=0, state=ViewState(occlusion=args.occlusion))
         Client(viewer.port, 1e9, 0, clicks=False).start()
         while not viewer.sessions:
             time.sleep(0.01)
         session = next(iter(viewer.sessions.values()))
         while " locations" not in session.controls.status.content:
             time.sleep(0.05)
-        print_turns(session, options.turns)
-        failed = run_clients(viewer, options.clients, options.seconds) if options.clients else 0
+        print_turns(session, args.turns)
+        failed = run_clients(viewer, args.clients, args.seconds) if args.clients else 0
         viewer.stop()
     print(f"{failed} clients failed, {errors.n} errors logged")
     return int(failed + errors.n > 0)

@@ -30,8 +30,9 @@ import numpy as np
 import pandas as pd
 import trimesh
 import warp as wp
-from common import free_points, points_on_surface
+from common import free_points, options, points_on_surface, seconds_of, show, write_csv
 
+from wheretolook.figures.style import save_figure
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.mesh import TexturedMesh
@@ -40,11 +41,14 @@ from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.space.free_space import FreeSpace
+from wheretolook.tracking.store import TrackingConfig
 from wheretolook.utils.processes import cores
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.counting import FrustumCounter
 from wheretolook.visibility.occlusion import DevicePoints, MeshOcclusion, NoOcclusion
 from wheretolook.visibility.survey import SurveyOptions, survey
+from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
+from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
 from wheretolook_rooms.generator import generate_apartment
 
 CAMERA = PinholeCamera()
@@ -123,19 +127,6 @@ class PeakMemory:
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
-def seconds_of(work: Callable[[], object], repeats: int) -> dict[str, float]:
-    """Return median, quartiles, minimum and maximum seconds over repeats, after one warm-up run."""
-    work()
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        seconds.append(time.perf_counter() - start)
-    low, median, high = np.percentile(seconds, (25, 50, 75)).tolist()
-    ends = {"min_s": min(seconds), "max_s": max(seconds)}
-    return {"median_s": median, "q1_s": low, "q3_s": high, **ends, "repeats": repeats}
-
-
 def machine(device: str) -> dict[str, Any]:
     """Return the name of the device and of the host's processor, and the number of usable cores."""
     host = platform.machine()
@@ -165,8 +156,7 @@ def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
         row = {"what": what, "threads": threads, **size, **times, "scale": scale}
         row["projections_per_s"] = n / row["median_s"]
         rows.append(row)
-        print(f"{what:32} {threads:3} thread(s): {1e3 * row['median_s']:12,.2f} ms  ({1e3 * row['min_s']:,.2f} to "
-              f"{1e3 * row['max_s']:,.2f}), {row['projections_per_s'] / 1e9:10,.2f} G/s")  # fmt: skip
+        show(f"{what}, {threads} thread(s)", times, f"{row['projections_per_s'] / 1e9:.2f} G/s")
 
     shared = (CAMERA, rotations, setup.locations, landmarks)
     counts_only = {"keep": 1, "keep_occlusion": False}
@@ -249,11 +239,6 @@ def bounded(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
 
 def draw(args: argparse.Namespace) -> None:
     """Write tables and figures of earlier results, and log them to MLflow if asked to."""
-    from wheretolook.figures.style import save_figure
-    from wheretolook.tracking.store import TrackingConfig
-    from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
-    from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
-
     tables = [pd.read_csv(file) for file in args.draw if file.endswith(".csv")]
     results = [json.loads(Path(file).read_text()) for file in args.draw if not file.endswith(".csv")]
     sizes, growth = (
@@ -262,40 +247,25 @@ def draw(args: argparse.Namespace) -> None:
     )
     about = ["what", "threads", "name"]
     sizes = pd.concat([*tables, sizes], ignore_index=True).drop_duplicates(about, keep="last", ignore_index=True)
-    folder = Path(args.figures)
+    folder = args.figures
     folder.mkdir(parents=True, exist_ok=True)
     save_figure(runtime_figure(sizes), folder / "runtimes.png")
-    sizes.to_csv(folder / RUNTIMES_CSV, index=False, float_format="%.6g", lineterminator="\n")
+    write_csv(sizes, folder / RUNTIMES_CSV)
     if len(growth):
         save_figure(scaling_figure(growth), folder / "visibility-scaling.png")
-        growth.to_csv(folder / SCALING_CSV, index=False, float_format="%.6g", lineterminator="\n")
+        write_csv(growth, folder / SCALING_CSV)
     if args.log:
         log_runtimes(TrackingConfig(), folder)
 
 
 def main() -> None:
     """Parse the options and measure, or draw earlier results."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scene", help="mesh file; default: a synthetic apartment")
-    parser.add_argument("--device", default="cpu", help="Warp's device")
-    parser.add_argument("--locations", type=int, default=648)
-    parser.add_argument("--directions", type=int, default=500)
-    parser.add_argument("--landmarks", type=int, default=24_919)
-    parser.add_argument("--triangles", type=int, default=250_000, help="minimum number of triangles")
-    parser.add_argument("--repeats", type=int, default=20)
-    parser.add_argument("--twin-locations", type=int, default=2, help="locations of the twin, whose time is scaled up")
-    parser.add_argument("--twin-repeats", type=int, default=20)
-    parser.add_argument("--scaling", action="store_true", help="also measure how time and memory grow")
-    parser.add_argument("--scaling-limit", type=int, default=2_000_000, help="largest size along each axis")
-    parser.add_argument("--scaling-repeats", type=int, default=5)
-    parser.add_argument("--bounded", action="store_true", help="also run 2 million landmarks x 5,000 locations")
-    parser.add_argument("--memory-gb", type=float, default=2.0, help="memory bound of the blocks in work")
-    parser.add_argument("--out", help="write the results to this JSON file")
-    parser.add_argument("--draw", nargs="+", metavar="FILE", help="draw earlier results: JSON files, and runtimes.csv")
-    parser.add_argument("--figures", default=".", help="folder for figures and tables")
-    parser.add_argument("--log", action="store_true", help="log tables and figures to MLflow")
-    args = parser.parse_args()
-    if args.draw:
+    args = options(
+        __doc__, scene=str, device="cpu", locations=648, directions=500, landmarks=24_919, triangles=250_000,
+        repeats=20, twin_locations=2, twin_repeats=20, scaling=False, scaling_limit=2_000_000, scaling_repeats=5,
+        bounded=False, memory_gb=2.0, out=Path, draw=[""], figures=Path("."), log=False,
+    )  # fmt: skip
+    if any(args.draw):
         draw(args)
         return
     device = start_warp(args.device)
@@ -305,7 +275,7 @@ def main() -> None:
     if args.bounded:
         result["bounded"] = bounded(args, device)
     if args.out:
-        Path(args.out).write_text(json.dumps(result, indent=1))
+        args.out.write_text(json.dumps(result, indent=1))
 
 
 if __name__ == "__main__":

@@ -1,13 +1,19 @@
-"""Helpers that several benchmarks share: timing, rooms of random landmarks, generated scenes, COLMAP models."""
+"""The frame that benchmarks share: options, timing, tables; rooms of random landmarks, generated scenes, COLMAP models."""
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
+import pandas as pd
+import pycolmap
+import torch
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
@@ -25,17 +31,56 @@ SIDE_M = 20.0  # of the building of `write_model`
 HEIGHT_M = 3.0
 
 
-def timed(label: str, work: Callable[[], object], repeats: int, unit: float = 1.0, units: str = "s") -> float:
-    """Print the median and the range over repeats after one warm-up run; return the median in seconds."""
+def options(about: str | None, **defaults: Any) -> argparse.Namespace:
+    """Parse the command line: `...` is a required path, a type an optional value, a list several values, False a flag."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name, default in defaults.items():
+        option = "--" + name.replace("_", "-")
+        if default is False:
+            parser.add_argument(option, action="store_true")
+        elif default is ...:
+            parser.add_argument(option, type=Path, required=True)
+        elif isinstance(default, type):
+            parser.add_argument(option, type=default)
+        elif isinstance(default, list):
+            parser.add_argument(option, nargs="*", type=type(default[0]), default=default)
+        else:
+            parser.add_argument(option, type=type(default), default=default)
+    return parser.parse_args()
+
+
+def seconds_of(
+    work: Callable[[], object], repeats: int, clock: Callable[[], float] = time.perf_counter
+) -> dict[str, float]:
+    """Return median, quartiles, minimum and maximum seconds over repeats, after one warm-up run."""
     work()
-    times = []
+    seconds = []
     for _ in range(repeats):
-        start = time.perf_counter()
+        start = clock()
         work()
-        times.append(time.perf_counter() - start)
-    median = float(np.median(times))
-    print(f"{label:62} {median * unit:9.3f} {units} [{min(times) * unit:.3f}, {max(times) * unit:.3f}]", flush=True)
-    return median
+        seconds.append(clock() - start)
+    low, first, median, third, high = np.percentile(seconds, (0, 25, 50, 75, 100)).tolist()
+    return {"median_s": median, "q1_s": first, "q3_s": third, "min_s": low, "max_s": high, "repeats": repeats}
+
+
+def show(label: str, times: dict[str, float], about: str = "") -> None:
+    """Print median, quartiles and range of `seconds_of` in milliseconds."""
+    median, first, third, low, high = (1e3 * times[f"{name}_s"] for name in ("median", "q1", "q3", "min", "max"))
+    print(f"{label:62} {median:12,.3f} ms, quartiles [{first:,.3f}, {third:,.3f}], range [{low:,.3f}, {high:,.3f}] {about}",
+          flush=True)  # fmt: skip
+
+
+def timed(
+    label: str, work: Callable[[], object], repeats: int, each: int = 1, clock: Callable[[], float] = time.perf_counter
+) -> float:
+    """Print the times of one of `each` pieces of work; return their median in seconds."""
+    times = {name: value / each for name, value in seconds_of(work, repeats, clock).items()}
+    show(label, times)
+    return times["median_s"]
+
+
+def write_csv(table: pd.DataFrame, path: Path) -> None:
+    table.to_csv(path, index=False, float_format="%.6g", lineterminator="\n")
 
 
 def room_landmarks(n: int, seed: int = 0) -> Float:
@@ -115,8 +160,6 @@ def open_scene(source: Path | None, folder: Path, seed: int, device: str) -> Sce
 
 def write_model(folder: Path, n: int) -> None:
     """Write a COLMAP model of n landmarks on the walls of a building of rooms, seen by 200 images of a pinhole."""
-    import pycolmap
-
     rng = np.random.default_rng(0)
     points = rng.uniform((0, 0, 0), (SIDE_M, SIDE_M, HEIGHT_M), (n, 3))
     points[np.arange(n), rng.integers(0, 2, n)] = 5.0 * rng.integers(0, 5, n)
@@ -144,10 +187,16 @@ def write_model(folder: Path, n: int) -> None:
     model.write(str(folder))
 
 
+def waypoints(n: int) -> Float:
+    """Return n points (n, 3) m in the building of `write_model`."""
+    return np.random.default_rng(1).uniform((1, 1, 1), (SIDE_M - 1, SIDE_M - 1, 2), (n, 3))
+
+
+def write_waypoints(n: int, path: Path) -> None:
+    np.savetxt(path, waypoints(n), delimiter=",", header="x,y,z", comments="")
+
+
 def use_one_thread() -> None:
     """Limit OpenCV and PyTorch to one thread, as in a labelling worker."""
-    import cv2
-    import torch
-
     cv2.setNumThreads(1)
     torch.set_num_threads(1)

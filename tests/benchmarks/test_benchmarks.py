@@ -19,8 +19,8 @@ WEIGHTS = ROOT / "data" / "release" / "weights" / "set.safetensors"
 pytestmark = pytest.mark.slow
 
 SMALL = {
-    "fisher": "--landmarks 300 --voxels 2 --directions 20 --repeats 1 --samples 10",
-    "looks": f"{ROOT}/data/release/apartment-209 --directions 30 --places 2",
+    "fisher": "--landmarks 300 --samples 10",
+    "looks": f"--scene {ROOT}/data/release/apartment-209 --directions 30 --places 2",
     "robot": f"--weights {WEIGHTS} --landmarks 500 --directions 20 --repeats 2",
     "scale": "--landmarks 500 5000 --locations 1 2 --repeats 1 --out /dev/null",
     "scorers": f"--weights {WEIGHTS} --landmarks 500 --locations 2 --directions 20 --repeats 1 --poses 2",
@@ -67,7 +67,7 @@ def test_features_and_labelling(tmp_path: Path) -> None:
     assert "| opencv |" in run("features", "--work", str(tmp_path), *sizes)
     scene = tmp_path / "scene-901"
     shutil.copytree(scene / "opencv" / "map", scene / "map")
-    assert "ms per view" in run("labelling", str(scene), "--views", "8", "--batches", "4")
+    assert "ms per view" in run("labelling", "--scene", str(scene), "--views", "8", "--batches", "4")
 
 
 def test_the_ledger_compares_with_the_last_entry(tmp_path: Path) -> None:

@@ -30,7 +30,6 @@ from wheretolook.scorers.weights import load_scorer
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.processes import cores
 from wheretolook.visibility.occlusion import MeshOcclusion
-from wheretolook_paper.paths.greedy import greedy_sequence
 from wheretolook_rooms.generator import generate_apartment
 
 
@@ -72,7 +71,6 @@ def sequences(repeats: int, n: int, d: int) -> None:
     limit = TurnLimit.of(directions)
     timed(f"turn limit of {d} directions", lambda: TurnLimit.of(directions), repeats)
     timed(f"best sequence, {n} waypoints", lambda: best_sequence(scores, limit), repeats)
-    timed(f"greedy sequence, {n} waypoints", lambda: greedy_sequence(scores, limit), repeats)
 
 
 def main() -> None:

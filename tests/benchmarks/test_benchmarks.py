@@ -19,7 +19,6 @@ WEIGHTS = ROOT / "data" / "release" / "weights" / "set.safetensors"
 pytestmark = pytest.mark.slow
 
 SMALL = {
-    "fisher": "--landmarks 300 --samples 10",
     "looks": f"--scene {ROOT}/data/release/apartment-209 --directions 30 --places 2",
     "robot": f"--weights {WEIGHTS} --landmarks 500 --directions 20 --repeats 2",
     "scale": "--landmarks 500 5000 --locations 1 2 --repeats 1 --out /dev/null",
@@ -80,5 +79,4 @@ def test_the_ledger_compares_with_the_last_entry(tmp_path: Path) -> None:
 
 def test_every_benchmark_is_run() -> None:
     names = {path.stem.removeprefix("bench_") for path in FOLDER.glob("bench_*.py")}
-    of_ros = {"ros", "ros_film", "ros_node", "ros_paths"}  # in tests/ros/test_closed_loop.py
-    assert names == {*SMALL, *of_ros, "features", "labelling", "ledger", "visibility"}
+    assert names == {*SMALL, "features", "labelling", "ledger", "visibility"}

@@ -94,7 +94,7 @@ def test_benchmarks_run_small(name: str, options: str, printed: str, tmp_path: P
     save_glb(mesh, tmp_path / "room.glb")
     x, y = np.meshgrid(np.arange(1.0, 6.0), np.arange(1.0, 4.0))
     folder = write_folder(mesh, tmp_path / "robot", np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 1.2)]))
-    command = [sys.executable, str(ROOT / "tests" / "benchmarks" / f"bench_{name}.py")]
+    command = [sys.executable, str(Path(__file__).with_name(f"bench_{name}.py"))]
     command += ["--mesh", str(tmp_path / "room.glb"), "--folder", str(folder)]
     film = tmp_path / "film.webp"
     command += options.format(out=tmp_path / "out.csv", bag=tmp_path / "bag", film=film).split()

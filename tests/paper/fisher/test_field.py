@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
-from twins.fisher import field_sums_plain
+from paper.fisher.twins import field_sums_plain
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.pose_information import bearing_numbers
 from wheretolook_paper.fisher.field import FisherField, stationary_axis_of_trace
@@ -66,3 +70,9 @@ def test_the_stationary_axis_has_no_gradient() -> None:
     gradient = torch.func.grad(trace)(torch.zeros(3, dtype=torch.float64))
     stationary = -torch.linalg.solve(hessian, gradient)
     np.testing.assert_allclose(axis, stationary / stationary.norm(), atol=1e-5)
+
+
+@pytest.mark.slow
+def test_the_benchmark_runs_small() -> None:
+    options = ["--landmarks", "300", "--samples", "10"]
+    subprocess.run([sys.executable, str(Path(__file__).with_name("bench_fisher.py")), *options], check=True)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from twins.fisher import eigenvalues_plain, information_matrices
+from paper.fisher.twins import eigenvalues_plain, information_matrices
 from wheretolook.geometry.pose_information import TRACE, bearing_numbers
 from wheretolook.geometry.poses import Float
 from wheretolook_paper.fisher.metrics import eigenvalues, metric_of, metric_of_eigenvalues

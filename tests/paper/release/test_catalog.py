@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from synthetic_release import history, make_release
+from paper.release.synthetic_release import history, make_release
 from synthetic_scores import make_scores
 from wheretolook.cli import main
 from wheretolook.dataset.config import ALL

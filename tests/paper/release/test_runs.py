@@ -9,8 +9,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from paper.release.synthetic_release import METHODS, history, make_release
 from synthetic_dataset import make_dataset
-from synthetic_release import METHODS, history, make_release
 from wheretolook.commands.evaluate import evaluate_methods as evaluate
 from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig

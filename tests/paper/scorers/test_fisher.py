@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from paper.fisher.twins import information_matrices
 from synthetic_dataset import make_landmarks
-from twins.fisher import information_matrices
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along

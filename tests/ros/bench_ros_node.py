@@ -1,7 +1,7 @@
 """Start-up time, rate and memory of the localizer node, on images that arrive as fast as it localizes them.
 
-    python tests/benchmarks/bench_ros_node.py --mesh scene.glb --folder robot --seconds 180
-    python tests/benchmarks/bench_ros_node.py --mesh scene.glb --folder robot --seconds 3600 --rate 1.5
+    python tests/ros/bench_ros_node.py --mesh scene.glb --folder robot --seconds 180
+    python tests/ros/bench_ros_node.py --mesh scene.glb --folder robot --seconds 3600 --rate 1.5
 
 Times are CPU times of the node's process, whatever else runs on the machine. With a rate, images come with odometry,
 every tenth is black, and the node publishes next views, so that all it does can keep memory.
@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "benchmarks"), str(ROOT / "src" / "wheretolook_ros")]
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "src" / "wheretolook_ros")]
 
 import rclpy
 from bench_ros import random_bases

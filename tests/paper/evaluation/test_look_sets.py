@@ -24,7 +24,7 @@ from wheretolook_paper.commands.reports import LookConfig, evaluate_look_sets
 from wheretolook_paper.evaluation.joint_labels import SET_COLUMNS, label_sets
 from wheretolook_paper.evaluation.looks import look_table, stopping_table
 
-WEIGHTS = Path(__file__).parents[2] / "data" / "release" / "weights" / "set.safetensors"
+WEIGHTS = Path(__file__).parents[3] / "data" / "release" / "weights" / "set.safetensors"
 
 
 def with_matches(scene: SceneFolder) -> pd.DataFrame:

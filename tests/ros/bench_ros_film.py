@@ -1,6 +1,6 @@
 """Record a simulated robot that localizes itself and drives, as a rosbag, and draw a film from the bag.
 
-    python tests/benchmarks/bench_ros_film.py --mesh scene.glb --folder robot --bag drive --film drive.webp
+    python tests/ros/bench_ros_film.py --mesh scene.glb --folder robot --bag drive --film drive.webp
 
 Needs rosbags. The robot is placed at the start of a planned path in a random direction, looks until it is localized, and
 then drives while the gaze node points the camera. The bag has what the nodes and the robot publish.
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "benchmarks"), str(ROOT / "src" / "wheretolook_ros")]
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "src" / "wheretolook_ros")]
 
 import rclpy
 from bench_ros_paths import waypoints_of

@@ -1,11 +1,17 @@
 """Errors of fields of Fisher information against exact information, by the samples of the Gaussian process.
 
-python tests/benchmarks/bench_fisher.py
+python tests/paper/fisher/bench_fisher.py
 """
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+
 from common import options, room_landmarks
 
 from wheretolook.geometry.camera import PinholeCamera

@@ -1,6 +1,6 @@
 """Closed loop under ROS: a simulated robot at random poses looks until the localizer is confident.
 
-    python tests/benchmarks/bench_ros.py --mesh scene.glb --folder robot --places 30 --policy gain --out gain.csv
+    python tests/ros/bench_ros.py --mesh scene.glb --folder robot --places 30 --policy gain --out gain.csv
 
 Processes: simulated robot, localizer and, with the policy gain, gaze node. With the policy even, this one turns the head
 by quarters. Prints the share of places with a confident pose, how many of these are right, the mean number of views, and

@@ -1,6 +1,6 @@
 """Localization along planned paths: the views that the gaze node selects, against a camera that looks ahead.
 
-    python tests/benchmarks/bench_ros_paths.py --mesh scene.glb --folder robot --paths 20 --out paths.csv
+    python tests/ros/bench_ros_paths.py --mesh scene.glb --folder robot --paths 20 --out paths.csv
 
 Shortest paths between random free places. Every half metre the camera of each policy is rendered and localized by itself
 with the folder of `wheretolook export --localize`, as by the localizer node; views are those of the gaze node's path

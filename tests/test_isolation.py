@@ -45,10 +45,7 @@ CHANGES = """
 CHANGED = "README.md, data/changed.txt, data/demo, data/removed.txt, views.csv"
 
 
-@pytest.mark.parametrize(
-    ("code", "changed", "options"),
-    [("", "", []), (CHANGES, CHANGED, []), (CHANGES, CHANGED, ["-p", "xdist", "-n", "1"])],
-)
+@pytest.mark.parametrize(("code", "changed", "options"), [("", "", []), (CHANGES, CHANGED, ["-p", "xdist", "-n", "1"])])
 def test_a_changed_checkout_fails_the_suite(code: str, changed: str, options: list[str], tmp_path: Path) -> None:
     shutil.copy(ROOT / "conftest.py", tmp_path)
     for name in ("data", "tests"):

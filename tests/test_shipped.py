@@ -13,6 +13,7 @@ import wheretolook
 from synthetic_dataset import CAMERA, make_landmarks
 from wheretolook import LocalizationMap, load_scorer, poses_looking_along
 from wheretolook.cli import parse_command
+from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import fingerprint
 from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped, shipped_configs
@@ -25,11 +26,6 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty folder that everything is started in."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-@pytest.fixture
-def localization_map() -> LocalizationMap:
-    return LocalizationMap(make_landmarks(np.random.default_rng(0), 200), CAMERA)
 
 
 def test_what_ships_is_what_lies_in_the_project() -> None:
@@ -58,15 +54,15 @@ def test_files_of_ones_own_come_first(elsewhere: Path) -> None:
 
 
 @pytest.mark.usefixtures("elsewhere")
-def test_a_map_is_scored_by_the_weights_that_ship(localization_map: LocalizationMap) -> None:
-    rng = np.random.default_rng(1)
-    views = poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (20, 3)), rng.normal(size=(20, 3)))
-    scorer = load_scorer(localization_map)
-    assert scorer.name == "set"
+def test_a_map_is_scored_by_the_weights_that_ship() -> None:
+    localization_map = LocalizationMap(make_landmarks(np.random.default_rng(0), 200), CAMERA)
+    views = poses_looking_along([(0.5, 0, 1)] * 12, fibonacci_sphere(12))
     expected = load_scorer(ROOT / WEIGHTS / "set.safetensors", localization_map).score(views)
-    for same in (scorer, load_scorer(None, localization_map), load_scorer(WEIGHTS, localization_map)):
+    for weights in (None, WEIGHTS):
+        np.testing.assert_array_equal(load_scorer(weights, localization_map).score(views), expected)
+    for same in (load_scorer(localization_map), load_scorer(localization_map=localization_map)):
+        assert same.name == "set"
         np.testing.assert_array_equal(same.score(views), expected)
-    assert load_scorer(localization_map=localization_map).name == "set"
     with pytest.raises(ConfigError, match="needs a map"):
         load_scorer(WEIGHTS)  # type: ignore[call-overload]
 

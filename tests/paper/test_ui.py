@@ -23,25 +23,22 @@ def tracking(tmp_path: Path) -> TrackingConfig:
 
 
 def test_evaluations_are_compared_first(tracking: TrackingConfig) -> None:
-    stages = ("label", "paths", "evaluate")
-    ids = {stage: experiment_id(client(tracking), tracking, stage, "house") for stage in stages}
+    with pytest.raises(MissingRunError):
+        comparisons(tracking, "")
+    assert not tracking.root.exists()
+    ids = {"label": experiment_id(client(tracking), tracking, "label", "house")}
+    assert [*comparisons(tracking, "http://server").values()] == ["http://server/#/experiments"]
+    for stage in ("paths", "evaluate"):
+        ids[stage] = experiment_id(client(tracking), tracking, stage, "house")
     links = comparisons(tracking, "http://server")
     assert list(links) == ["house: evaluation", "house: paths"]
     view = "workflowType=machine_learning&viewStateShareKey=methods"
     assert links["house: evaluation"] == f"http://server/#/experiments/{ids['evaluate']}/runs?{view}"
 
 
-def test_a_store_without_comparisons_is_opened(tracking: TrackingConfig) -> None:
-    experiment_id(client(tracking), tracking, "label", "house")
-    assert [*comparisons(tracking, "http://server").values()] == ["http://server/#/experiments"]
-
-
-def test_what_cannot_be_served(tracking: TrackingConfig) -> None:
+def test_a_port_in_use() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(InUseError):
         Ui(port=taken.getsockname()[1]).run()
-    with pytest.raises(MissingRunError):
-        comparisons(tracking, "")
-    assert not tracking.root.exists()
 
 
 @pytest.mark.slow

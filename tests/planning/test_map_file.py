@@ -95,14 +95,10 @@ int main() {{
 @pytest.mark.parametrize(
     "change",
     [
-        {"version": 2},
-        {"format": "else"},
-        {"sizes": {"V": 60, "L": 1, "D": 60, "N": 200}},
-        {"sizes": {}},
-        {"grid": {"lower": [0, 0, 0], "upper": [1, 1, 1], "shape": [1, 1, 1]}},
-        {"origin": {"scorer": "bins"}},
+        {"version": 2}, {"format": "else"}, {"sizes": {"V": 60, "L": 1, "D": 60, "N": 200}}, {"sizes": {}},
+        {"grid": {"lower": [0, 0, 0], "upper": [1, 1, 1], "shape": [1, 1, 1]}}, {"origin": {"scorer": "bins"}},
     ],
-)
+)  # fmt: skip
 def test_damaged_descriptions(folder: Path, change: dict[str, object]) -> None:
     path = folder / DESCRIPTION
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -37,14 +36,6 @@ def export(model: Path, out: Path, *options: str) -> int:
     return main(["export", "--map", str(model), "--out", str(out), "--weights", str(WEIGHTS), *options])
 
 
-def test_a_map_without_occlusion(model: Path, tmp_path: Path) -> None:
-    assert export(model, tmp_path / "robot") == 0
-    robot = RobotScorer(tmp_path / "robot")
-    assert robot.camera == {"width": 640, "height": 480, "fx": 320.0, "fy": 320.0, "cx": 320.0, "cy": 240.0}
-    view = robot.best((2.5, 2.5, 1.5), directions=100)
-    assert view.direction[:2].min() < -0.7 and view.n_visible > 40  # most landmarks are on two walls
-
-
 def test_a_mesh_and_the_camera_of_the_robot(model: Path, tmp_path: Path) -> None:
     mesh = tmp_path / "room.glb"
     save_glb(furnished_room(), mesh)
@@ -64,8 +55,9 @@ def test_the_accuracy_of_scores(model: Path, tmp_path: Path) -> None:
     scores = []
     for options in ((), ("--accuracy", "0.05,0.4"), ("--accuracy", "0.5,5")):
         assert export(model, tmp_path / "robot", *options) == 0
-        scores.append(RobotScorer(tmp_path / "robot").score_directions([(2.5, 2.5, 1.5)], fibonacci_sphere(50))[0])
-        assert json.loads((tmp_path / "robot" / "robot.json").read_text())["accuracy"] in ([0.05, 0.4], [0.5, 5.0])
+        robot = RobotScorer(tmp_path / "robot")
+        scores.append(robot.score_directions([(2.5, 2.5, 1.5)], fibonacci_sphere(50))[0])
+    assert robot.camera == {"width": 640, "height": 480, "fx": 320.0, "fy": 320.0, "cx": 320.0, "cy": 240.0}
     np.testing.assert_array_equal(scores[0], scores[1])
     assert (scores[2] >= scores[0]).all() and scores[2].mean() > scores[0].mean() + 0.01
 

@@ -29,19 +29,13 @@ def at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "at.csv"
 
 
-def test_a_table_of_views(sparse: Path, at: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["select", "--map", str(sparse), "--at", str(at), "--out", "views.csv", "--n", "2", *QUICK]) == 0
-    table = pd.read_csv("views.csv")
-    np.testing.assert_allclose(table[["x", "y", "z"]].to_numpy()[::2], POINTS)
-    assert (table["rank"] == [1, 2] * 4).all() and (table["score"] > 0).all()
-    assert "views: 8 in" in capsys.readouterr().out
-
-
-def test_scores_of_poses(sparse: Path, at: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    given = ["--map", str(sparse), *QUICK[:2], "--device", "cpu"]
-    assert main(["select", "--at", "at.csv", "--out", "views.csv", *given, *QUICK[2:4]]) == 0
-    assert main(["select", "--at", "at.csv", "--out", "views.tum", *given, *QUICK[2:4]]) == 0
+def test_views_and_scores_of_poses(sparse: Path, at: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ["--map", str(sparse), "--weights", str(WEIGHTS), "--device", "cpu"]
+    for name in ("views.csv", "views.tum"):
+        assert main(["select", "--at", "at.csv", "--out", name, "--directions", "60", *given]) == 0
+        assert "views: 4 in" in capsys.readouterr().out
     expected = pd.read_csv("views.csv")
+    np.testing.assert_allclose(expected[["x", "y", "z"]], POINTS)
     for name in ("views.csv", "views.tum"):
         assert main(["score", "--poses", name, "--out", "scores.csv", *given]) == 0
         found = pd.read_csv("scores.csv")
@@ -83,26 +77,16 @@ def test_a_sequence_and_a_grid(sparse: Path, at: Path) -> None:
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["--at", "at.csv"],
-        ["--map", "nowhere", "--at", "at.csv"],
-        ["--map", "nowhere", "--at", "at.csv", "--pitch", "30", "-30"],
-        ["--map", "SPARSE"],
-        ["--map", "SPARSE", "--at", "at.csv", "--grid", "1"],
-        ["--map", "SPARSE", "--at", "gone.csv"],
-        ["--map", "SPARSE", "--at", "1,2,300"],
-        ["--map", "SPARSE", "--at", "at.csv", "--format", "xml"],
-        ["--map", "SPARSE", "--at", "at.csv", "--camera", "MAGIC,1,2"],
-        ["--map", "SPARSE", "--at", "at.csv", "--fov", "60", "--camera-id", "1"],
-        ["--map", "SPARSE", "--at", "at.csv", "--fov", "60", "--size", "big"],
-        ["--map", "SPARSE", "--at", "at.csv", "--nn", "2"],
-        ["--map", "SPARSE", "--at", "at.csv", "--n", "two"],
+        "--at at.csv", "--map nowhere --at at.csv", "--map SPARSE", "--map SPARSE --at at.csv --grid 1",
+        "--map SPARSE --at gone.csv", "--map SPARSE --at 1,2,300", "--map SPARSE --at at.csv --format xml",
+        "--map SPARSE --at at.csv --camera MAGIC,1,2", "--map SPARSE --at at.csv --fov 60 --camera-id 1",
+        "--map SPARSE --at at.csv --fov 60 --size big", "--map SPARSE --at at.csv --nn 2",
     ],
-)
+)  # fmt: skip
 def test_invalid_arguments_exit_with_two_and_one_line(
-    arguments: list[str], sparse: Path, at: Path, capsys: pytest.CaptureFixture[str]
+    arguments: str, sparse: Path, at: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = [str(sparse) if argument == "SPARSE" else argument for argument in arguments]
-    assert main(["select", "--out", "v.csv", *given]) == 2
+    assert main(["select", "--out", "v.csv", *arguments.replace("SPARSE", str(sparse)).split()]) == 2
     error = capsys.readouterr().err
     assert error.startswith("wheretolook: error: ") and error.count("\n") == 1
     assert not Path("v.csv").exists()

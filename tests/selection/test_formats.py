@@ -93,12 +93,16 @@ def test_colmap_reads_the_folder(look: WhereToLook, n: int, tmp_path: Path) -> N
 
 
 def test_invalid_targets_are_rejected(views: SelectedViews, look: WhereToLook, sparse: Path, tmp_path: Path) -> None:
-    for target in ((tmp_path / "views.txt",), (tmp_path / "views.csv", "xml"), (sparse,), (tmp_path, "csv")):
-        with pytest.raises(ConfigError):
-            views.save(*target)
-    for form in ("tum", "benchmark"):
-        with pytest.raises(ConfigError):
-            look.best(POINTS, 2).save(tmp_path / "views", form)
     (tmp_path / "file").write_text("")
-    with pytest.raises(StorageError):
-        views.save(tmp_path / "file" / "views.csv")
+    twice = look.best(POINTS, 2)
+    for chosen, target, error in (
+        (views, (tmp_path / "views.txt",), ConfigError),
+        (views, (tmp_path / "views.csv", "xml"), ConfigError),
+        (views, (sparse,), ConfigError),
+        (views, (tmp_path, "csv"), ConfigError),
+        (twice, (tmp_path / "views", "tum"), ConfigError),
+        (twice, (tmp_path / "views", "benchmark"), ConfigError),
+        (views, (tmp_path / "file" / "views.csv",), StorageError),
+    ):
+        with pytest.raises(error):
+            chosen.save(*target)

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from stages.test_pipeline import EXPERIMENT
 from synthetic_dataset import make_dataset
 from wheretolook.cli import main
 from wheretolook.dataset.layout import Dataset
@@ -117,23 +118,16 @@ def test_views_are_labelled_for_some_minutes_and_found_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """From nothing: a small apartment is made, mapped and sampled; then adapt labels, stops, and goes on."""
-    settings = tmp_path / "small.yaml"
-    settings.write_text("""\
-name: small
-camera: {width: 320, height: 240, focal_px: 160}
-scenes:
-  train: 0
-  test: 1
-  apartment: {n_rooms: 3, area_m2: 26, texture_size: 1024, texels_per_m: 40, light_spacing_m: 0.5, light_rays: 4}
-mapping: {n_images: 24}
-sample: {grid: [6, 6, 4], directions: 100, keep: 50, max_locations: 40, max_directions: 8}
-label: {workers: 1, shard_size: 32}
-""")
+    settings = tmp_path / "tiny.yaml"
+    only_test = EXPERIMENT.replace("train: 1", "train: 0")
+    settings.write_text(
+        only_test.replace("max_locations: 8, max_directions: 5", "max_locations: 40, max_directions: 8")
+    )
     where = ["--config", str(settings), "--data", str(tmp_path / "data"), "--device", "cpu"]
     where += ["--tracking.folder", str(tmp_path / "mlruns")]
     for stage in ("scenes", "map", "sample"):
         assert main([stage, *where]) == 0
-    (scene,) = Dataset.load(tmp_path / "data" / "small").scenes
+    (scene,) = Dataset.load(tmp_path / "data" / "tiny").scenes
     n_views = len(scene.read_table())
     assert n_views > 128  # the clock is looked at after so many
     capsys.readouterr()

@@ -115,16 +115,10 @@ def test_balanced_training_views_are_equally_many_and_all_of_the_rarer_class(dat
 @pytest.mark.parametrize(
     "options",
     [
-        {"methods": ("mlp-2d", "mlp-5d")},
-        {"epochs": 0},
-        {"dropout": 1.0},
-        {"val_fraction": 0.0},
-        {"layout": "sideways"},
-        {"learning_rate": float("nan")},
-        {"l2": -1.0},
-        {"devices": 0},
+        {"methods": ("mlp-2d", "mlp-5d")}, {"epochs": 0}, {"dropout": 1.0}, {"val_fraction": 0.0},
+        {"layout": "sideways"}, {"learning_rate": float("nan")}, {"l2": -1.0}, {"devices": 0},
     ],
-)
+)  # fmt: skip
 def test_options_out_of_range_are_refused(options: dict) -> None:
     with pytest.raises(ConfigError):
         changed(SMALL, **options)
@@ -134,12 +128,10 @@ def test_training_learns_the_rule_logs_a_run_and_is_reused(dataset: Dataset, sto
     tracking = TrackingConfig(store, "tiny")
     config = changed(SMALL, methods=("mlp-2d", "mlp-2d+3d"), epochs=4, noise_px=0.5, noise_m=0.02, schedule="cosine")
     models = train(dataset, config, tracking, progress=False)
-    assert [model.method for model in models] == ["mlp-2d", "mlp-2d+3d"]
-    for model in models:
-        assert model.metrics["val_average_precision"] > 0.9
+    for method, model in zip(config.methods, models, strict=True):
+        assert model.method == method and model.metrics["val_average_precision"] > 0.9
         run = client(tracking).get_run(model.run_id)
-        assert run.info.status == "FINISHED"
-        assert run.data.params["method"] == model.method
+        assert (run.info.status, run.data.params["method"]) == ("FINISHED", method)
         history = client(tracking).get_metric_history(model.run_id, "val_average_precision")
         assert [metric.step for metric in history] == [0, 1, 2, 3]
         assert max(metric.value for metric in history) == pytest.approx(model.metrics["val_average_precision"])
@@ -150,13 +142,11 @@ def test_training_learns_the_rule_logs_a_run_and_is_reused(dataset: Dataset, sto
     before = {path: path.stat().st_mtime_ns for path in (dataset.root / "weights").iterdir()}
     again = train(dataset, config, tracking, progress=False)
     assert [(model.run_id, model.reused) for model in again] == [(model.run_id, True) for model in models]
-    assert {path: path.stat().st_mtime_ns for path in (dataset.root / "weights").iterdir()} == before
-
+    assert {path: path.stat().st_mtime_ns for path in before} == before
     models[0].path.write_bytes(b"changed")
     scene = dataset.split("test")[0]
     write_table(scene.read_table().iloc[:-1], scene.table)  # test scenes do not change the training
-    third = train(dataset, config, tracking, progress=False)
-    assert [model.reused for model in third] == [False, True]
+    assert [model.reused for model in train(dataset, config, tracking, progress=False)] == [False, True]
 
 
 def test_further_datasets_are_trained_on(dataset: Dataset, store: str) -> None:

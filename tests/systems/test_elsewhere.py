@@ -14,25 +14,11 @@ import pandas as pd
 import pytest
 
 from selection.room import POINTS, WEIGHTS, write_room
+from stages.test_pipeline import EXPERIMENT
 from wheretolook.cli import main
 from wheretolook.dataset.layout import Dataset
 
 SCRIPT = Path(__file__).with_name("elsewhere.py")
-
-EXPERIMENT = """\
-name: tiny
-device: cpu
-camera: {width: 320, height: 240, focal_px: 160}
-scenes:
-  train: 1
-  test: 1
-  apartment: {n_rooms: 3, area_m2: 26, texture_size: 1024, texels_per_m: 40, light_spacing_m: 0.5, light_rays: 4}
-mapping: {n_images: 24}
-sample: {grid: [6, 6, 4], directions: 100, keep: 50, max_locations: 8, max_directions: 5}
-label: {workers: 2, shard_size: 20}
-train: {val_fraction: 0.3, methods: [mlp-2d], mlp: {epochs: 2}}
-evaluate: {resamples: 20, top_n: [1], methods: [random, visible, mlp]}
-"""
 
 
 def run_elsewhere(folder: Path, *commands: Sequence[str]) -> str:
@@ -58,9 +44,9 @@ def test_select_and_score(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_from_scenes_to_evaluation(tmp_path: Path) -> None:
-    (tmp_path / "tiny.yaml").write_text(EXPERIMENT)
+    (tmp_path / "tiny.yaml").write_text(EXPERIMENT.replace("workers: 1", "workers: 2"))
     stages = ("scenes", "map", "sample", "label", "train", "evaluate")
-    run_elsewhere(tmp_path, *([stage, "--config", "tiny.yaml"] for stage in stages))
+    run_elsewhere(tmp_path, *([stage, "--config", "tiny.yaml", "--device", "cpu"] for stage in stages))
     dataset = Dataset.load(tmp_path / "data" / "tiny")
     assert not any((scene.read_table()["status"] == "unlabelled").any() for scene in dataset.scenes)
     assert {"random", "visible", "mlp-2d"} <= {*pd.read_csv(dataset.root / "results" / "scores.csv")["method"]}

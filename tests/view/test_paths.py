@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -74,24 +75,30 @@ def test_looking_ahead_follows_the_path_and_keeps_direction_where_it_stops() -> 
     np.testing.assert_allclose(axes, [(1, 0, 0), (1, 0, 0), (0, 1, 0), (0, 1, 0), (0, 1, 0)], atol=1e-12)
 
 
-@pytest.mark.parametrize("text", ["", "0 1 2 3 0 0 0 1\n", "0 1 2 3 0 0 0 0\n" * 2])
-def test_invalid_trajectories(text: str, tmp_path: Path) -> None:
-    (tmp_path / "path.tum").write_text(text)
-    with pytest.raises(TableError):
-        read_paths(tmp_path / "path.tum")
-
-
-@pytest.mark.parametrize("invalid", [{"tx": 1e300}, {"qw": np.nan}, {"method": [f"m{row}" for row in range(30)]}])
-def test_invalid_tables(invalid: dict[str, object], tmp_path: Path) -> None:
+def write_table(folder: Path, **columns: object) -> None:
     poses = pose_columns(np.tile(np.eye(3, 4), (30, 1, 1)))
     table = pd.DataFrame({**poses, "pair": 0, "task": "planned", "waypoint": range(30), "method": "set"})
-    table.assign(**invalid).to_parquet(tmp_path / "views.parquet")
-    with pytest.raises(TableError):
-        read_paths(tmp_path / "views.parquet")
+    table.assign(**columns).to_parquet(folder / "views.parquet")
 
 
-def test_a_large_table_in_a_small_file(tmp_path: Path) -> None:
+def write_large_table(folder: Path) -> None:
     table = pa.table({"pair": pa.array(np.zeros(20_000_000, dtype=np.int64))})  # 160 MB in a few kilobytes
-    pq.write_table(table, tmp_path / "views.parquet", compression="zstd")
+    pq.write_table(table, folder / "views.parquet", compression="zstd")
+
+
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [
+        ("path.tum", lambda folder: (folder / "path.tum").write_text("")),
+        ("path.tum", lambda folder: (folder / "path.tum").write_text("0 1 2 3 0 0 0 1\n")),
+        ("path.tum", lambda folder: (folder / "path.tum").write_text("0 1 2 3 0 0 0 0\n" * 2)),
+        ("views.parquet", lambda folder: write_table(folder, tx=1e300)),
+        ("views.parquet", lambda folder: write_table(folder, qw=np.nan)),
+        ("views.parquet", lambda folder: write_table(folder, method=[f"m{row}" for row in range(30)])),
+        ("views.parquet", write_large_table),
+    ],
+)
+def test_invalid_paths(name: str, write: Callable[[Path], object], tmp_path: Path) -> None:
+    write(tmp_path)
     with pytest.raises(TableError):
-        read_paths(tmp_path / "views.parquet")
+        read_paths(tmp_path / name)

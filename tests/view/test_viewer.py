@@ -29,7 +29,6 @@ from wheretolook.planning.config import FORWARD
 from wheretolook.scenes.loading import save_glb
 from wheretolook.utils.errors import ConfigError, InUseError, MapWarning
 from wheretolook.view.drawing import escape_markdown
-from wheretolook.view.page import intersect_plane
 from wheretolook.view.server import Viewer, check_port
 from wheretolook.view.state import RecordedPath, ViewState, looking_ahead
 from wheretolook.view.viewed_map import open_map
@@ -192,12 +191,6 @@ def test_paths_are_drawn_with_their_cameras(viewer: Viewer) -> None:
         lines = join(viewer, client).scene.get_handle_by_name(f"/paths/{FORWARD}").points
     np.testing.assert_allclose(lines[: len(positions) - 1, 1], positions[1:], atol=1e-6)
     assert len(lines) == len(positions) - 1 + 8 * len(positions)  # edges of a frustum
-
-
-def test_rays_meet_the_floor() -> None:
-    np.testing.assert_allclose(intersect_plane((0, 0, 5), (1, 0, -2), 1.0), (2, 0, 1))  # type: ignore[arg-type]
-    for direction in ((1, 0, 2), (1, 0, 0), (1, 0, np.nan), ()):
-        assert intersect_plane((0, 0, 5), direction, 1.0) is None
 
 
 def test_a_port_in_use(viewer: Viewer) -> None:

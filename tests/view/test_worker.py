@@ -27,12 +27,10 @@ def test_urgent_jobs_go_first_and_failures_stop_nothing_else() -> None:
         if name == "fails":
             raise ValueError
 
-    worker.submit(1, "floor", LATER, steps("first", 3), errors.append)
-    worker.submit(2, "floor", LATER, steps("second", 2), errors.append)
-    worker.submit(3, "floor", LATER, steps("fails", 1), errors.append)
-    worker.submit(1, "view", NOW, steps("replaced", 5), errors.append)
-    worker.submit(1, "view", NOW, steps("new", 2), errors.append)
-    worker.submit(4, "floor", LATER, steps("forgotten", 5), errors.append)
+    for client, name, n in ((1, "first", 3), (2, "second", 2), (3, "fails", 1), (4, "forgotten", 5)):
+        worker.submit(client, "floor", LATER, steps(name, n), errors.append)
+    for name in ("replaced", "new"):
+        worker.submit(1, "view", NOW, steps(name, 2), errors.append)
     worker.forget(4)
     ready.set()
     wait_until(lambda: len(done) >= 8 and errors)

@@ -59,19 +59,14 @@ def test_files_and_summary_of_a_method(method: str, out: Path, scene_folder: Pat
     drawn = WarpRenderer(load_mesh(scene_folder / "room.glb")).render(DRAWN_CAMERA, poses.cam_from_world[[4]]).rgb[0]
     np.testing.assert_array_equal(cv2.imread(str(folder / "images" / "5.png"))[:, :, ::-1], drawn)
     estimates = read_poses(folder / "estimate_poses.txt")
-    metres, degrees = pose_error(
-        estimates.cam_from_world, poses.cam_from_world[[poses.ids.index(name) for name in estimates.ids]]
-    )
+    truth = poses.cam_from_world[[poses.ids.index(name) for name in estimates.ids]]
     rows = [errors.ids.index(name) for name in estimates.ids]
-    assert_allclose(errors.metres[rows], metres, atol=1e-9)
-    assert_allclose(errors.degrees[rows], degrees, atol=1e-6)
-    summary = pd.read_csv(out / "summary.csv")
-    summary = summary[summary["method"] == method]
+    assert_allclose([errors.metres[rows], errors.degrees[rows]], pose_error(estimates.cam_from_world, truth), atol=1e-6)
+    summary = pd.read_csv(out / "summary.csv").query("method == @method")
     shipped = [*zip(summary["as_shipped_hits"], summary["as_shipped_total"], strict=True)]
     paths = folder / "pose_errors.txt", folder / "selected_gt_poses.txt"
     assert shipped == [*loc_as_released(paths[0]), plan_as_released(*paths)]
-    views = pd.read_csv(out / "views.csv", dtype={"id": str})
-    views = views[views["method"] == method]
+    views = pd.read_csv(out / "views.csv", dtype={"id": str}).query("method == @method")
     assert [*summary["mended_hits"]] == [views[measure].sum() for measure in summary["measure"]]
 
 

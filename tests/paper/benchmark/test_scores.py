@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -55,14 +54,11 @@ def plan_as_released(errors: Path, poses: Path) -> tuple[int, int] | None:
     """evaluate_plan.py, said again: the n-th error with the n-th pose; it stops if their numbers differ."""
     lines = [line.split() for line in errors.read_text().splitlines()]
     pairs = [(float(line[1]), float(line[2])) for line in lines if len(line) == 3]
-    rows = [line.split() for line in poses.read_text().splitlines() if not line.startswith("#")]
-    quaternions = [[float(cell) for cell in row[1:5]] for row in rows if len(row) == 8]
+    quaternions = np.loadtxt(poses, dtype=str, ndmin=2)[:, 1:5].astype(float)
     if len(pairs) != len(quaternions):
         return None
-    turns = [0.0]
-    for before, after in pairwise(quaternions):
-        cosine = abs(sum(a * b for a, b in zip(before, after, strict=True)))
-        turns.append(math.degrees(2 * math.acos(min(1.0, cosine))))
+    cosines = np.abs((quaternions[1:] * quaternions[:-1]).sum(1)).clip(max=1)
+    turns = [0.0, *np.degrees(2 * np.arccos(cosines))]
     good = [m <= 0.25 and d <= 2 and turn <= 30 for (m, d), turn in zip(pairs, turns, strict=True)]
     return sum(good), len(pairs)
 

@@ -42,17 +42,6 @@ def test_a_field_holds_the_sums_of_the_plain_twin(visibility: SoftVisibility, ma
     np.testing.assert_allclose(field.information(7, axes), expected, atol=1e-5 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("visibility", VISIBILITIES)
-def test_a_map_far_from_the_origin(visibility: SoftVisibility) -> None:
-    rng = np.random.default_rng(0)
-    far = np.array([4e6, -2e6, 512.0])
-    locations = rng.integers(-512, 512, (3, 3)) / 256
-    points = rng.integers(-2048, 2048, (200, 3)) / 256
-    near = FisherField.build(locations, points, visibility)
-    np.testing.assert_array_equal(FisherField.build(locations + far, points + far, visibility).factors, near.factors)
-    assert not FisherField.build(locations, np.empty((0, 3)), visibility).factors.any()
-
-
 def test_the_stationary_axis_has_no_gradient() -> None:
     rng = np.random.default_rng(0)
     visibility = QuadraticVisibility(HALF_ANGLE)

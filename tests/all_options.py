@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 from wheretolook.commands.demo import Demo
 from wheretolook.commands.options import select_options
@@ -19,6 +18,6 @@ class AllOptions(Demo):
     release_name: str = "release"
 
 
-def run(command: Any, options: object, log: Any = lambda line: None) -> Any:
+def run(command, options, log=lambda line: None):
     """Run a command with those of the options that it has."""
     return select_options(command, options).run(log)

@@ -1,7 +1,5 @@
 """Textured scenes made of boxes and quads, whose geometry and colours are known in closed form."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from wheretolook.geometry.mesh import TexturedMesh

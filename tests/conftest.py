@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import shutil
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -17,7 +15,7 @@ from matplotlib.figure import Figure
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.localization import labeller
-from wheretolook.localization.shard import LabelledShard, Shard, ShardWorker
+from wheretolook.localization.shard import ShardWorker
 from wheretolook.tracking.store import TrackingConfig, client
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.frustum import LandmarkSets
@@ -26,11 +24,11 @@ LONG = [f"test_{name}.py" for name in ("pipeline", "release", "notebooks", "eval
 """Files that take longest. They are begun first, so that no process is left with one when the others have finished."""
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
 
 
-def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+def pytest_generate_tests(metafunc):
     """Tests that take a device run on the CPU, and on CUDA where there is one."""
     if "device" in metafunc.fixturenames:
         start_warp()
@@ -38,12 +36,12 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def migrated_stores(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def migrated_stores(tmp_path_factory):
     """New MLflow stores start as a copy of an empty one, since MLflow takes seconds to make a store's tables."""
     empty = TrackingConfig(str(tmp_path_factory.mktemp("mlruns")))
-    made_by_mlflow = TrackingConfig.uri.fget  # type: ignore[attr-defined]
+    made_by_mlflow = TrackingConfig.uri.fget
 
-    def uri(tracking: TrackingConfig) -> str:
+    def uri(tracking):
         store = tracking.root / "mlflow.db"
         if tracking != empty and not store.exists():
             if not (empty.root / store.name).exists():
@@ -57,10 +55,10 @@ def migrated_stores(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
-def _without_pictures() -> Iterator[None]:
+def _without_pictures():
     """Figures are built, but their files stay empty: drawing is a third of a small training or evaluation."""
 
-    def savefig(figure: Figure, file: io.BytesIO, **options: object) -> None:
+    def savefig(figure, file, **options):
         file.write(b"")
 
     with pytest.MonkeyPatch.context() as patch:
@@ -73,11 +71,11 @@ no_pictures_here = pytest.fixture(_without_pictures, name="no_pictures_here")
 
 
 @pytest.fixture
-def in_this_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def in_this_process(monkeypatch):
     """Shards are labelled here one after the other: quicker, for what the workers have no part in."""
     threads = torch.get_num_threads(), cv2.getNumThreads()
 
-    def run(shards: Sequence[Shard], workers: int) -> Iterator[tuple[Shard, LabelledShard]]:
+    def run(shards, workers):
         worker = ShardWorker()
         for shard in shards:
             yield shard, worker.label(shard.job, shard.rows)
@@ -103,7 +101,7 @@ class RandomViews:
 
 
 @pytest.fixture(params=[0, 1, 2])
-def random_views(request: pytest.FixtureRequest) -> RandomViews:
+def random_views(request):
     rng = np.random.default_rng(request.param)
     camera = PinholeCamera(320, 200 + 20 * request.param, 150.0 + 30 * request.param)
     points = rng.uniform(-4, 4, (800, 3))

@@ -1,18 +1,14 @@
 """Disks that fail: full ones and read-only ones, which are real file systems, and a limit on the size of files."""
 
-from __future__ import annotations
-
 import resource
 import subprocess
-from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
 
 
 @contextmanager
-def file_limit(n_bytes: int) -> Iterator[None]:
+def file_limit(n_bytes):
     """No file that is written meanwhile may be larger (`ulimit -f`)."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, before[1]))
@@ -23,7 +19,7 @@ def file_limit(n_bytes: int) -> Iterator[None]:
 
 
 @contextmanager
-def small_disk(folder: Path, n_bytes: int) -> Iterator[Path]:
+def small_disk(folder, n_bytes):
     """Mount a file system of this size in memory. Skips the test where nothing may be mounted."""
     folder.mkdir(parents=True, exist_ok=True)
     _mount("-t", "tmpfs", "-o", f"size={n_bytes}", "tmpfs", str(folder))
@@ -34,7 +30,7 @@ def small_disk(folder: Path, n_bytes: int) -> Iterator[Path]:
 
 
 @contextmanager
-def read_only(disk: Path) -> Iterator[None]:
+def read_only(disk):
     """A disk of `small_disk` that nobody can write to meanwhile, root neither."""
     _mount("-o", "remount,ro", str(disk))
     try:
@@ -43,7 +39,7 @@ def read_only(disk: Path) -> Iterator[None]:
         _mount("-o", "remount,rw", str(disk))
 
 
-def fill(disk: Path, leave: int = 0) -> Path:
+def fill(disk, leave=0):
     """Fill a disk but for so many bytes. Returns the file that does."""
     filler = disk / "filler"
     with filler.open("wb", buffering=0) as file:
@@ -56,7 +52,7 @@ def fill(disk: Path, leave: int = 0) -> Path:
     return filler
 
 
-def _mount(*arguments: str) -> None:
+def _mount(*arguments):
     try:
         done = subprocess.run(["mount", *arguments], capture_output=True, text=True, check=False)
     except FileNotFoundError:

@@ -1,18 +1,15 @@
 """Two small tables of labelled viewpoints, whose statistics are computed by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 
-from wheretolook.dataset.sampling_config import Split
 from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, pose_columns
 from wheretolook.geometry.poses import poses_looking_along
 
 NAN = float("nan")
 
 
-def table(rows: list[tuple[int, float, int, str, float, float]]) -> pd.DataFrame:
+def table(rows):
     """Viewpoints of rows (location, its height, landmarks in view, status, errors in metres and degrees)."""
     names = ["location_id", "z", "n_visible", "status", "error_m", "error_deg"]
     frame = pd.DataFrame(rows, columns=names)
@@ -34,4 +31,4 @@ HALL = table(
     ]
 )
 SHED = table([(0, 10.0, 1000, LOCALIZED, 0.002, 0.2), (0, 10.0, 50, NO_POSE, 500.0, 179.0)])
-SPLITS: dict[str, Split] = {"hall": "train", "shed": "test"}
+SPLITS = {"hall": "train", "shed": "test"}

@@ -1,7 +1,5 @@
 """Views of a room, some of which localize less often than a scorer predicts."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.special import expit
 
@@ -9,7 +7,7 @@ from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.scorers.adapted.calibration import LocalizedViews
 
 
-def random_views(n_locations: int = 30, n_directions: int = 12, seed: int = 0, shift: float = 0.0) -> LocalizedViews:
+def random_views(n_locations=30, n_directions=12, seed=0, shift=0.0):
     """Views of a 6 x 6 m room; in one half of it those that look along +x do not localize, whatever a scorer thinks."""
     rng = np.random.default_rng(seed)
     centers = np.repeat(rng.uniform((-3, -3, 0.5), (3, 3, 2), (n_locations, 3)), n_directions, axis=0)

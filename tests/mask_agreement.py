@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 
 @dataclass(frozen=True)
@@ -16,7 +15,7 @@ class MaskAgreement:
     recall: float  # share of the free lines that were found free; NaN if none is free
 
     @classmethod
-    def between(cls, mask: ArrayLike, truth: ArrayLike) -> MaskAgreement:
+    def between(cls, mask, truth):
         """Compare masks (L, N), True where free."""
         found = np.asarray(mask, dtype=bool)
         free = np.asarray(truth, dtype=bool)
@@ -26,7 +25,7 @@ class MaskAgreement:
         return cls(both / n_found if n_found else float("nan"), both / n_free if n_free else float("nan"))
 
     @property
-    def f1(self) -> float:
+    def f1(self):
         """Harmonic mean of precision and recall."""
         total = self.precision + self.recall
         return 2 * self.precision * self.recall / total if total else 0.0

@@ -1,30 +1,23 @@
 """Labels the viewpoints of one scene, as `wheretolook.localization.labeller.label_scenes` does those of many."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
-import pandas as pd
-
 from wheretolook.features.config import ExtractorConfig
-from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.localization.config import LabelConfig
 from wheretolook.localization.labeller import LabelTask, label_scenes
 from wheretolook.localization.shard import SceneJob
 
 
 def label_viewpoints(
-    table: pd.DataFrame,
-    mesh: Path,
-    landmarks: Path,
-    camera: PinholeCamera,
-    shards: Path,
-    config: LabelConfig | None = None,
-    extractor: ExtractorConfig | None = None,
-    device: str = "cpu",
-    progress: bool = True,
-    description: str = "label",
-) -> pd.DataFrame:
+    table,
+    mesh,
+    landmarks,
+    camera,
+    shards,
+    config=None,
+    extractor=None,
+    device="cpu",
+    progress=True,
+    description="label",
+):
     """`label_scenes` for one scene, of the parts of a `SceneJob` and a `LabelTask`: the table with its labels."""
     config = config or LabelConfig()
     extractor = extractor or ExtractorConfig()

@@ -1,19 +1,14 @@
 """A tiny dataset for tests: random landmarks, views in all directions, and labels that follow a known rule."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.dataset.sampling_config import Split
 from wheretolook.dataset.viewpoint_files import write_table
 from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, TOO_FEW_MATCHES, pose_columns
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
-from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.bins import bin_views_plain
 from wheretolook.mapping.colmap_model import save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
@@ -24,7 +19,7 @@ CAMERA = PinholeCamera(160, 120, 80.0)
 BINS = 30
 
 
-def make_landmarks(rng: np.random.Generator, n: int) -> Landmarks:
+def make_landmarks(rng, n):
     """Landmarks on one half of a box's walls, so that some directions see many and others none."""
     points = rng.uniform((-3, -3, 0), (3, 3, 2.5), (n, 3))
     wall = rng.integers(0, 2, n)
@@ -43,15 +38,13 @@ def make_landmarks(rng: np.random.Generator, n: int) -> Landmarks:
     return Landmarks(ids=np.arange(n, dtype=np.int64), points=points, descriptors=None, **values)
 
 
-def make_mapping_poses(seed: int, n: int = 12) -> Float:
+def make_mapping_poses(seed, n=12):
     """Poses of mapping cameras that look around in the box."""
     rng = np.random.default_rng([seed, 1])
     return poses_looking_along(rng.uniform((-2, -2, 1), (2, 2, 2), (n, 3)), rng.normal(size=(n, 3)) * (1, 1, 0.2))
 
 
-def make_scene(
-    folder: Path, split: Split, seed: int, n_locations: int = 24, n_directions: int = 20, n_landmarks: int = 500
-) -> SceneFolder:
+def make_scene(folder, split, seed, n_locations=24, n_directions=20, n_landmarks=500):
     """Write one labelled scene. The errors fall with the number of filled bins, the median view just localizes."""
     rng = np.random.default_rng(seed)
     scene = SceneFolder(folder, split, CAMERA)
@@ -91,7 +84,7 @@ def make_scene(
     return scene
 
 
-def make_dataset(root: Path, splits: tuple[Split, ...] = ("train", "train", "test"), **options: int) -> Dataset:
+def make_dataset(root, splits=("train", "train", "test"), **options):
     """Write a dataset with one scene for each split named."""
     scenes = [make_scene(root / f"scene-{index}", split, seed=index, **options) for index, split in enumerate(splits)]
     dataset = Dataset(root, tuple(scenes))

@@ -1,9 +1,5 @@
 """Score tables with all columns, made up."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-
 import numpy as np
 import pandas as pd
 
@@ -11,12 +7,12 @@ from wheretolook.dataset.config import THRESHOLDS, threshold_key
 from wheretolook.evaluation.results import RELEASED_DIVISOR
 
 KEYS = tuple(map(threshold_key, THRESHOLDS))
-FISHER: tuple[str, ...] = tuple(
+FISHER = tuple(
     f"fisher-{metric}-{approximation}"
     for metric in ("mineig", "logdet", "trace")
     for approximation in ("exact", "quadratic", "gp")
 )
-EVERY_METHOD: tuple[str, ...] = (
+EVERY_METHOD = (
     "random", "forward", "visible", "bins", "max-visibility",
     "max-visibility-swapped", *FISHER, "fisher-worst-trace", "fisher-stationary-trace",
     "mlp-2d", "mlp-2d+z", "mlp-2d+3d",
@@ -26,13 +22,7 @@ _BAD = {"random": 0.4, "forward": 0.45, "max-visibility-swapped": 0.42, "fisher-
         "fisher-stationary-trace": 0.05}  # fmt: skip
 
 
-def make_scores(
-    methods: Sequence[str] = EVERY_METHOD,
-    reference: str = "mlp-2d+3d",
-    top_n: Sequence[int] = (1, 5, 10),
-    scenes: Sequence[str] = ("a", "b"),
-    seed: int = 0,
-) -> pd.DataFrame:
+def make_scores(methods=EVERY_METHOD, reference="mlp-2d+3d", top_n=(1, 5, 10), scenes=("a", "b"), seed=0):
     """A table as the evaluate stage writes it, of 50 locations a scene; the oracle's shares are 0.9."""
     rng = np.random.default_rng(seed)
     shape = (len(top_n), len(KEYS))
@@ -47,7 +37,7 @@ def make_scores(
             learned = method.startswith("mlp")
             width = 0.0 if method == reference else 0.02
             for number, n in enumerate(top_n):
-                row: dict[str, object] = {"method": method, "occlusion": "mesh", "candidates": "all"}
+                row = {"method": method, "occlusion": "mesh", "candidates": "all"}
                 row |= {"top_n": n, "scene": scene}
                 row |= {"n_locations": n_locations, "n_views": n * n_locations}
                 for key, share, difference in zip(KEYS, shares[number], differences[number], strict=True):

@@ -246,7 +246,7 @@ def test_listings_hold_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
 def test_help_explains_every_option(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([command, "--help"]) == 0
     text = capsys.readouterr().out
-    missing = [name for name in cli.option_types(cli.load_command(command)) if f"--{name}" not in text]
+    missing = [name for name in cli.command_options(cli.load_command(command)) if f"--{name}" not in text]
     assert missing == [] and f"wheretolook {command} " in text
 
 

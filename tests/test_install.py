@@ -7,12 +7,12 @@ import sys
 import tomllib
 from pathlib import Path
 
-from wheretolook.utils.extras import EXTRAS
+from wheretolook.utils.package import EXTRAS
 
 ROOT = Path(__file__).parents[1]
 BLOCKED = """
 import sys
-from wheretolook.utils.extras import EXTRAS
+from wheretolook.utils.package import EXTRAS
 from wheretolook.cli import main
 sys.modules.update(dict.fromkeys(EXTRAS))
 sys.exit(main(sys.argv[1:]))
@@ -36,7 +36,7 @@ def test_every_extra_is_declared() -> None:
 
 def test_base_modules_import_no_extra() -> None:
     modules = ("holdout.report", "view.server", "robot.export", "localization.localizer", "select.where_to_look")
-    text = "import sys; from importlib import import_module; from wheretolook.utils.extras import EXTRAS;"
+    text = "import sys; from importlib import import_module; from wheretolook.utils.package import EXTRAS;"
     text += " sys.modules.update(dict.fromkeys(EXTRAS));"
     text += f" [import_module('wheretolook.' + name) for name in {modules}]"
     subprocess.run([sys.executable, "-c", text], check=True)

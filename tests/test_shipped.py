@@ -16,7 +16,7 @@ from wheretolook.cli import parse_command
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import fingerprint
-from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped, shipped_configs
+from wheretolook.utils.package import WEIGHTS, or_shipped, shipped, shipped_configs
 
 ROOT = Path(__file__).parents[1]
 
@@ -80,6 +80,6 @@ print([name for name in ("lightning", "mlflow", "sklearn", "matplotlib", "ray") 
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     own, missing, heavy = done.stdout.splitlines()
     modules = [name for name in eval(own) if name.startswith("wheretolook")]
-    assert modules == ["wheretolook", "wheretolook.utils", "wheretolook.utils.version"]
+    assert modules == ["wheretolook", "wheretolook.utils", "wheretolook.utils.errors", "wheretolook.utils.package"]
     assert not {"torch", "numpy", "warp", "pandas"} & set(eval(own))
     assert missing == "[]" and heavy == "[]"

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from wheretolook.utils.version import VERSION
+from wheretolook.utils.package import VERSION
 
 pytestmark = pytest.mark.slow  # half a minute
 

@@ -1,12 +1,9 @@
 """Wait for a condition in another thread or process."""
 
-from __future__ import annotations
-
 import time
-from collections.abc import Callable
 
 
-def wait_until(condition: Callable[[], object], seconds: float = 60.0) -> None:
+def wait_until(condition, seconds=60.0):
     """Wait until a condition holds; fail after so many seconds."""
     end = time.monotonic() + seconds
     while not condition():

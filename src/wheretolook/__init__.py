@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from wheretolook.utils.version import VERSION as __version__
+from wheretolook.utils.package import VERSION as __version__
 
 if TYPE_CHECKING:
     from wheretolook.geometry.camera import PinholeCamera

@@ -4,29 +4,26 @@ from __future__ import annotations
 
 import atexit
 import gc
-import json
+import inspect
 import os
 import re
 import signal
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass, replace
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, get_type_hints
 
-from wheretolook.utils.errors import ConfigError, WhereToLookError
-from wheretolook.utils.extras import EXTRAS, missing_package
-from wheretolook.utils.images import MAX_PIXELS
+from wheretolook.utils.errors import ConfigError, WhereToLookError, did_you_mean
+from wheretolook.utils.files import MAX_PIXELS, read_yaml
+from wheretolook.utils.package import EXTRAS, VERSION, missing_package, or_shipped, shipped, shipped_configs
 from wheretolook.utils.processes import collect_less_garbage, in_main_thread, interrupt, on_sigterm
-from wheretolook.utils.shipped import or_shipped, shipped, shipped_configs
 from wheretolook.utils.texts import quiet_libraries
-from wheretolook.utils.validation import did_you_mean
-from wheretolook.utils.version import VERSION
 
 COMMANDS = {
     "scenes": "wheretolook.commands.scenes:Scenes",
@@ -48,20 +45,8 @@ COMMANDS = {
 }
 """Dataclass of each command's options, whose `run()` does the work. Packages add theirs as entry points of this group."""
 
-GROUP = "wheretolook.commands"
-
 NUMBERS = re.compile(r"tuple\[(int|float),")
-NUMBER = re.compile(r"[^\s,()\[\]]+")
-"""Types of several numbers, and each of these where they are written 1 2 3, 1,2,3 or [1, 2, 3]."""
-
-NEEDED = {"bool": "true or false", "int": "a whole number", "float": "a number"}
-"""Descriptions of types by their names."""
-
-ENVIRONMENT = {
-    "OMP_WAIT_POLICY": "PASSIVE",  # idle threads leave the core to other processes
-    "OPENCV_IO_MAX_IMAGE_PIXELS": str(MAX_PIXELS),  # also of formats that Pillow does not read
-    "GLOG_logtostderr": "1",  # COLMAP leaves no log files in the folder of temporary files
-}
+"""Types of several numbers."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -70,8 +55,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns the exit code: 0, 2 for bad input, 130 when interrupted by Ctrl-C or SIGTERM, 141 when the reader of the
     output, such as `head`, has closed it.
     """
-    for name, value in ENVIRONMENT.items():
-        os.environ.setdefault(name, value)
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads leave the core to other processes
+    # also of formats that Pillow does not read
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))
+    os.environ.setdefault("GLOG_logtostderr", "1")  # COLMAP leaves no log files in the folder of temporary files
     collect_less_garbage()
     atexit.register(gc.freeze)  # collections at the exit after `import torch` would take half a second
     given = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
@@ -126,7 +113,7 @@ def run_command(arguments: list[str]) -> None:
 @cache
 def command_targets() -> dict[str, str]:
     """Return `module:Class` of every command by its name, those of installed packages included."""
-    return COMMANDS | {entry.name: entry.value for entry in entry_points(group=GROUP)}
+    return COMMANDS | {entry.name: entry.value for entry in entry_points(group="wheretolook.commands")}
 
 
 def load_command(name: str) -> Any:
@@ -148,6 +135,80 @@ def print_commands() -> None:
     print("\n`wheretolook COMMAND --help` lists the options of a command, `wheretolook --version` prints the version.")
 
 
+@dataclass(frozen=True)
+class Option:
+    """An option of a command: a field of its dataclass, or of a dataclass within it.
+
+    Attributes:
+        kind: its type.
+        about: its description.
+        default: its value if it is not given; MISSING if it must be given.
+        group: description of its group; empty for the command's own.
+    """
+
+    kind: Any
+    about: str
+    default: Any
+    group: str
+
+
+def command_options(command: Any) -> dict[str, Option]:
+    """Return the options of a command's dataclass by their names, dotted in groups."""
+    return dict(_options(command, MISSING, "", "", command.GROUPS))
+
+
+def _options(
+    kind: Any, defaults: Any, prefix: str, group: str, prefixes: Mapping[str, str]
+) -> Iterator[tuple[str, Option]]:
+    """Yield the options of a dataclass, with the values of an instance as defaults; MISSING for those of its fields."""
+    hints = get_type_hints(kind)
+    about = described_fields(kind)
+    for field in option_fields(kind):
+        name = field.name
+        default = default_of(field) if defaults is MISSING else getattr(defaults, name)
+        if is_dataclass(hints[name]):
+            inner = prefixes.get(name, f"{prefix}{name}.")
+            yield from _options(hints[name], default, inner, about.get(name, name) if inner else group, {})
+        else:
+            yield f"{prefix}{name}", Option(hints[name], about.get(name, ""), default, group)
+
+
+def construct(
+    kind: Any, values: Mapping[str, Any], prefix: str = "", prefixes: Mapping[str, str] = {}, defaults: Any = MISSING
+) -> Any:
+    """Return a dataclass with the values of its options by their names. Raises what its checks do."""
+    hints = get_type_hints(kind)
+    given = {}
+    for field in option_fields(kind):
+        name = field.name
+        if is_dataclass(hints[name]):
+            default = default_of(field) if defaults is MISSING else getattr(defaults, name)
+            given[name] = construct(hints[name], values, prefixes.get(name, f"{prefix}{name}."), {}, default)
+        else:
+            given[name] = values[f"{prefix}{name}"]
+    return kind(**given) if defaults is MISSING else replace(defaults, **given)
+
+
+def option_fields(kind: Any) -> list[Field[Any]]:
+    """Return the fields of a dataclass that the command line sets."""
+    return [field for field in fields(kind) if field.init and field.metadata.get("option", True)]
+
+
+def default_of(field: Field[Any]) -> Any:
+    """Return the default of a field; MISSING if it has none."""
+    return field.default if field.default_factory is MISSING else field.default_factory()
+
+
+def described_fields(kind: Any) -> dict[str, str]:
+    """Return descriptions of fields: the section `Args` in the docstrings of a dataclass and its bases."""
+    about: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        _, _, section = inspect.cleandoc(base.__doc__ or "").partition("\nArgs:\n")
+        for name, text in re.findall(r"^    (\w+): (.*(?:\n        .*)*)", section, re.MULTILINE):
+            about[name] = " ".join(text.split())
+    return about
+
+
 def build_parser(name: str) -> Any:
     """Return the jsonargparse parser of a command's options."""
     from argparse import RawDescriptionHelpFormatter
@@ -158,9 +219,8 @@ def build_parser(name: str) -> Any:
         """Keeps the line breaks of a command's description."""
 
     command = load_command(name)
-    option_types(command)
     about, _, _ = command.__doc__.partition("\n    Args:")
-    short = ", ".join(f"--{short} for --{option}" for short, option in command.SHORT.items())
+    short = ", ".join(f"--{short} for --{option}" for short, option in command.SHORT.items() if "." not in short)
     parser = ArgumentParser(
         prog=f"wheretolook {name}",
         usage=f"wheretolook {name} [--config FILE.yaml] [--OPTION VALUE ...]",
@@ -169,8 +229,14 @@ def build_parser(name: str) -> Any:
         formatter_class=HelpFormatter,
         exit_on_error=False,
     )
-    parser.add_argument("--config", action="config", help="YAML file with a section for each group of options")
-    parser.add_class_arguments(command)
+    parser.add_argument("--config", help="YAML file with a section for each group of options")
+    parser.add_argument("--print_config", type=bool, default=False, help="only print all options as YAML")
+    groups = {"": parser}
+    for option, known in command_options(command).items():
+        if known.group not in groups:
+            groups[known.group] = parser.add_argument_group(known.group.rstrip("."))
+        needed = {"required": True} if known.default is MISSING else {"default": known.default}
+        groups[known.group].add_argument(f"--{option}", type=known.kind, help=known.about, **needed)
     return parser
 
 
@@ -182,29 +248,30 @@ def parse_command(name: str, arguments: Sequence[str]) -> Any:
     from jsonargparse import ArgumentError
 
     command = load_command(name)
-    types = option_types(command)
-    given = list(named_values(command, types, arguments))
-    files = [value for option, value in given if option == "config"]
+    options = {known: option.kind for known, option in command_options(command).items()}
+    given, files = read_arguments(command, options, arguments)
     if not files and command.CONFIG:
         files = [str(shipped(f"configs/{command.CONFIG}.yaml"))]
-    set_by_files = [setting for file in files for setting in read_settings(or_shipped(file), types)]
-    options = [(option, value) for option, value in given if option != "config"]
-    chosen: dict[str, str] = {}
-    for option, value in options:
-        if chosen.setdefault(option, value) != value:
-            raise ConfigError(f"--{option} has two values", value=(chosen[option], value), fix="Give it once.")
-    settings = [*set_by_files, *options]
+    values: dict[str, Any] = {}
+    for settings in (*(read_settings(or_shipped(file), command, options) for file in files), given):
+        for option, value in settings.items():
+            former = values.get(option)
+            values[option] = {**former, **value} if isinstance(former, dict) and isinstance(value, dict) else value
     parser = build_parser(name)
     try:
-        parsed = vars(parser.instantiate(parser.parse_args([f"--{option}={value}" for option, value in settings])))
-        parsed.pop("config")
-        return command(**parsed)
+        parsed = parser.parse_object(values)
+        made = construct(command, parser.instantiate(parsed), prefixes=command.GROUPS)
     except (ArgumentError, WhereToLookError) as error:
-        raise explained(error, name, ", ".join(files) or None, types, {option for option, _ in given}) from error
+        raise explained(error, name, ", ".join(files) or None, options, {*given}) from error
+    if parsed.pop("print_config"):
+        parsed.pop("config")
+        print(parser.dump(parsed), end="")
+        sys.exit()
+    return made
 
 
 def explained(
-    error: BaseException, name: str, files: str | None, types: Mapping[str, Any], given: set[str]
+    error: BaseException, name: str, files: str | None, options: Mapping[str, Any], given: set[str]
 ) -> WhereToLookError:
     """Return the error of this project that the parser's error hides, or a ConfigError on the option that it names.
 
@@ -222,7 +289,7 @@ def explained(
     if wrong := re.search(r'Parser key "([\w.]+)".*(?:Got value|Given value): (.*)', text):
         option, value = wrong.groups()
         short = next((short for short, known in load_command(name).SHORT.items() if known == option), option)
-        if needed := describe_type(str(types.get(option))):
+        if needed := describe_type(str(options.get(option))):
             return ConfigError(
                 f"--{short} needs {needed}", path=None if option in given else files, value=value, fix=help_text
             )
@@ -235,27 +302,40 @@ def describe_type(kind: str) -> str:
         return "one of " + ", ".join(re.findall("'(.*?)'", kind))
     if NUMBERS.match(kind):
         return "numbers" if "..." in kind else f"{kind.count(',') + 1} numbers"
-    return next((text for name, text in NEEDED.items() if name in kind), "")
+    needed = {"bool": "true or false", "int": "a whole number", "float": "a number"}
+    return next((text for name, text in needed.items() if name in kind), "")
 
 
-def option_types(command: Any, prefix: str = "") -> dict[str, Any]:
-    """Return the types of all options of a dataclass of dataclasses by dotted name."""
-    types: dict[str, Any] = {}
-    hints = get_type_hints(command)
-    command.__init__.__annotations__.update(hints)  # or the parser would import modules that only type checkers need
-    for field in fields(command):
-        kind = hints[field.name]
-        if field.init and is_dataclass(kind):
-            types |= option_types(kind, f"{prefix}{field.name}.")
-        elif field.init:
-            types[f"{prefix}{field.name}"] = kind
-    return types
+def full_name(command: Any, name: str) -> str:
+    """Return the name of an option that is given by its short name, or with the group that the command leaves out."""
+    for group, prefix in command.GROUPS.items():
+        if name.startswith(f"{group}."):
+            name = prefix + name.removeprefix(f"{group}.")
+    short: str = command.SHORT.get(name, name)
+    return short
 
 
-def named_values(command: Any, types: Mapping[str, Any], arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Yield full name and value of each option in the arguments; several values become a list, none becomes true.
+def option_of(name: str, known: Iterable[str]) -> str | None:
+    """Return the option of this name, or the option of a group that has it as a key of its value; None if there is none."""
+    return next(
+        (option for option in known if name == option or ("." in option and name.startswith(f"{option}."))), None
+    )
 
-    Values before the first option are those of the command's option `POSITIONAL`.
+
+def with_keys(name: str, option: str, value: Any) -> Any:
+    """Return the value of an option of which a dotted name sets one key."""
+    for key in reversed(name.removeprefix(option).split(".")[1:]):
+        value = {key: value}
+    return value
+
+
+def read_arguments(
+    command: Any, options: Mapping[str, Any], arguments: Sequence[str]
+) -> tuple[dict[str, Any], list[str]]:
+    """Return the values of options by their full names, as texts, lists of them or true; and the files of `--config`.
+
+    Values before the first option are those of the command's option `POSITIONAL`. Raises ConfigError for an option that
+    does not exist, has no value, or two.
     """
     words: list[list[str]] = [[f"--{command.POSITIONAL}"]]
     for argument in arguments:
@@ -265,41 +345,54 @@ def named_values(command: Any, types: Mapping[str, Any], arguments: Sequence[str
             words[-1].append(argument)
     if len(words[0]) == 1:
         words = words[1:]
-    known = [*types, "config", "print_config"]
-    for option, *values in words:
-        name = option.removeprefix("--").replace("-", "_")
-        name = command.SHORT.get(name.replace("_", "-"), name)
-        if not is_option(name, known):
-            if hasattr(command, "root") and "." in name and is_option(name, configurable_options()):
+    known = [*options, "config", "print_config"]
+    given: dict[str, Any] = {}
+    files: list[str] = []
+    for option, *texts in words:
+        name = full_name(command, option.removeprefix("--").replace("-", "_"))
+        found = option_of(name, known)
+        if found is None:
+            if hasattr(command, "root") and "." in name and option_of(name, configurable_options()):
                 continue  # of a group of another command: the same options may be given to all
             fix = did_you_mean(name, [*known, *command.SHORT], "--")
             raise ConfigError("unknown option", value=option, fix=fix)
-        kind = str(types.get(name))
-        text = " ".join(values)
-        if NUMBERS.match(kind) and text != "null":
-            values = [f"[{', '.join(NUMBER.findall(text))}]"]
-        elif kind.startswith("tuple[") and not text.startswith(("[", "null")):
-            values = [json.dumps(values)]
-        if len(values) > 1:
-            raise ConfigError("this option takes one value", value=f"{option} {text}")
-        elif not values and kind != str(bool) and name != "print_config":
-            raise ConfigError("this option needs a value", value=option)
-        else:
-            yield name, values[0] if values else "" if name == "print_config" else "true"
+        value = with_keys(name, found, read_value(option, str(options.get(found)), texts, found == "print_config"))
+        if found == "config":
+            files.append(value)
+            continue
+        former = given.get(found)
+        if isinstance(former, dict) and isinstance(value, dict):
+            value = {**former, **value}
+        elif found in given and former != value:
+            raise ConfigError(f"--{found} has two values", value=(former, value), fix="Give it once.")
+        given[found] = value
+    return given, files
 
 
-def is_option(name: str, known: Sequence[str]) -> bool:
-    """Return whether a dotted name is an option's, or that of a key within the value of an option of a group."""
-    return any(name == option or ("." in option and name.startswith(f"{option}.")) for option in known)
+def read_value(option: str, kind: str, texts: list[str], is_flag: bool) -> Any:
+    """Return the value that words after an option of a type mean: a text, a list of texts, or true for none.
+
+    Raises ConfigError if the type takes one value and there are more, or none.
+    """
+    if not texts:
+        if is_flag or kind == str(bool):
+            return True
+        raise ConfigError("this option needs a value", value=option)
+    joined = " ".join(texts)
+    if NUMBERS.match(kind) and joined != "null":  # written 1 2 3, 1,2,3 or [1, 2, 3]
+        return re.findall(r"[^\s,()\[\]]+", joined)
+    if kind.startswith("tuple[") and not joined.startswith(("[", "null")):
+        return texts
+    if len(texts) > 1:
+        raise ConfigError("this option takes one value", value=f"{option} {joined}")
+    return texts[0]
 
 
-def read_settings(path: Path, types: Mapping[str, Any]) -> list[tuple[str, str]]:
+def read_settings(path: Path, command: Any, options: Mapping[str, Any]) -> dict[str, Any]:
     """Read the options of one command from a YAML file that may hold those of all commands.
 
     Raises ConfigError, naming the file, if it cannot be read or sets an option that no command has.
     """
-    from wheretolook.utils.files import read_yaml
-
     try:
         content = read_yaml(path) or {}
     except FileNotFoundError as error:
@@ -310,30 +403,41 @@ def read_settings(path: Path, types: Mapping[str, Any]) -> list[tuple[str, str]]
         raise ConfigError(f"not a YAML file: {error}", path=path) from error
     if not isinstance(content, dict):
         raise ConfigError("a configuration is a mapping", path=path, fix="Write settings, such as `name: demo`.")
-    settings = []
-    for name, value in flattened(content, types):
-        if is_option(name, list(types)):
-            settings.append((name, value if isinstance(value, str) else json.dumps(value, default=str)))
-        elif not is_option(name, known := configurable_options()):
-            raise ConfigError("unknown option", path=path, value=name, fix=did_you_mean(name, known))
+    settings: dict[str, Any] = {}
+    for name, value in flattened(content, command, options):
+        if found := option_of(name, options):
+            settings[found] = str(value) if options[found] is str else with_keys(name, found, value)
+        elif not option_of(name, configurable_options()):
+            raise ConfigError("unknown option", path=path, value=name, fix=did_you_mean(name, configurable_options()))
     return settings
 
 
-def flattened(content: Mapping[str, Any], types: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield dotted names and values of nested mappings, down to the options."""
+def flattened(
+    content: Mapping[str, Any], command: Any, options: Mapping[str, Any], prefix: str = ""
+) -> Iterator[tuple[str, Any]]:
+    """Yield full names and values of nested mappings, down to the options."""
     for key, value in content.items():
         name = f"{prefix}{key}"
-        if isinstance(value, dict) and value and not ("." in name and name in types):
-            yield from flattened(value, types, f"{name}.")
+        full = full_name(command, name)
+        if isinstance(value, dict) and value and not ("." in full and full in options):
+            yield from flattened(value, command, options, f"{name}.")
         else:
-            yield name, value
+            yield full, value
 
 
 @cache
 def configurable_options() -> list[str]:
-    """Return the dotted names of the options of all commands that read configurations: those that have a dataset."""
-    commands = [command for command in map(load_command, command_targets()) if hasattr(command, "root")]
-    return [option for command in commands for option in option_types(command)]
+    """Return the names of the options of all commands that read configurations: those that have a dataset.
+
+    Options of groups that a command leaves out have both names.
+    """
+    names = []
+    for command in map(load_command, command_targets()):
+        if hasattr(command, "root"):
+            options = [*command_options(command)]
+            groups = [f"{group}.{name}" for group, prefix in command.GROUPS.items() for name in options if not prefix]
+            names += [*options, *groups, *(short for short in command.SHORT if "." in short)]
+    return names
 
 
 if __name__ == "__main__":

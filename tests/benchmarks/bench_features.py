@@ -36,7 +36,7 @@ from wheretolook.mapping.rendered_map import build_map
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.scorers.weights import load_scorer
-from wheretolook.utils.npz_files import load_npz, save_npz
+from wheretolook.utils.files import load_npz, save_npz
 from wheretolook.visibility.occlusion import MeshOcclusion
 
 CAMERA = PinholeCamera()

@@ -1,7 +1,5 @@
 """Environments of a scene and of a COLMAP model."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -21,7 +19,7 @@ from wheretolook.visibility.occlusion import CachedOcclusion
 
 
 @pytest.fixture
-def files(tmp_path: Path) -> SceneFolder:
+def files(tmp_path):
     files = SceneFolder(tmp_path / "room", "test")
     files.map.mkdir(parents=True)
     save_glb(furnished_room(), files.mesh)
@@ -29,7 +27,7 @@ def files(tmp_path: Path) -> SceneFolder:
     return files
 
 
-def test_parts_of_a_scene_share_one_ray_caster(files: SceneFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parts_of_a_scene_share_one_ray_caster(files, monkeypatch):
     built = []
     build = raycasting.MeshRaycaster.__init__
     monkeypatch.setattr(raycasting.MeshRaycaster, "__init__", lambda *args: built.append(args) or build(*args))
@@ -40,7 +38,7 @@ def test_parts_of_a_scene_share_one_ray_caster(files: SceneFolder, monkeypatch: 
     assert len(built) == 1
 
 
-def test_without_a_mesh_landmarks_hide_one_another_and_a_unit_is_needed(files: SceneFolder) -> None:
+def test_without_a_mesh_landmarks_hide_one_another_and_a_unit_is_needed(files):
     files.mesh.unlink()
     with pytest.raises(ConfigError):
         _ = SceneEnvironment(files, CAMERA).occlusion
@@ -58,13 +56,13 @@ def test_without_a_mesh_landmarks_hide_one_another_and_a_unit_is_needed(files: S
 @pytest.mark.parametrize(
     ("occlusion", "mesh", "depth"), [("mesh", None, None), ("tsdf", "m", None), ("x", None, None), ("", "m", "d")]
 )
-def test_an_occlusion_model_needs_its_files(occlusion: str, mesh: str | None, depth: str | None) -> None:
+def test_an_occlusion_model_needs_its_files(occlusion, mesh, depth):
     files = ColmapFiles(Path("sparse"), mesh=mesh and Path(mesh), depth=depth and Path(depth))
     with pytest.raises(ConfigError):
         ColmapEnvironment(files, occlusion=occlusion)
 
 
-def test_the_most_accurate_occlusion_model_is_the_default(files: SceneFolder) -> None:
+def test_the_most_accurate_occlusion_model_is_the_default(files):
     by_mesh = ColmapEnvironment(ColmapFiles(Path("sparse"), mesh=files.mesh))
     assert by_mesh.available_occlusion == ("mesh", "hidden-points", "none") and by_mesh.occlusion_config.model == "mesh"
     assert isinstance(ColmapEnvironment(ColmapFiles(Path("sparse"))).occlusion, HiddenPointRemoval)
@@ -73,6 +71,6 @@ def test_the_most_accurate_occlusion_model_is_the_default(files: SceneFolder) ->
 
 
 @pytest.mark.parametrize("options", [{"grid": (8, 0, 8)}, {"directions": 0}, {"lattice": "spiral"}])
-def test_invalid_lattices(options: dict[str, object]) -> None:
+def test_invalid_lattices(options):
     with pytest.raises(ConfigError):
-        ViewLattice(**options)  # type: ignore[arg-type]
+        ViewLattice(**options)

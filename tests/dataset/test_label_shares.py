@@ -1,9 +1,6 @@
 """Shares of labels, compared with numbers computed by hand on small tables, and their logging."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -13,7 +10,6 @@ from labelled_tables import HALL, SHED, SPLITS
 from synthetic_dataset import make_dataset
 from wheretolook.commands.label import log_labels
 from wheretolook.dataset.config import ALL
-from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_files import read_table, write_table
 from wheretolook.dataset.viewpoint_table import (
     LOCALIZED,
@@ -29,7 +25,7 @@ from wheretolook.tracking.store import TrackingConfig
 from wheretolook.utils.errors import TableError
 
 
-def test_shares_by_hand() -> None:
+def test_shares_by_hand():
     pooled = pooled_labels({"hall": HALL, "shed": SHED}, SPLITS)
     shares = label_shares(pooled).set_index(["scene", "split"])
     assert list(shares.index) == [("hall", "train"), ("shed", "test"), (ALL, "train"), (ALL, "test"), (ALL, ALL)]
@@ -52,7 +48,7 @@ def test_shares_by_hand() -> None:
     pd.testing.assert_series_equal(shares.loc[ALL, "test"], shares.loc["shed", "test"], check_names=False)
 
 
-def test_shares_of_both_localizers_by_hand() -> None:
+def test_shares_of_both_localizers_by_hand():
     """By the first RANSAC result one view less is right in the shed, by 3 m, and none of the hall changes."""
     names = ("status", "error_m", "error_deg")
     hall, shed = (scene.assign(**{f"first_{name}": scene[name] for name in names}) for scene in (HALL, SHED))
@@ -63,11 +59,11 @@ def test_shares_of_both_localizers_by_hand() -> None:
 
 
 @pytest.fixture
-def dataset(tmp_path: Path) -> Dataset:
+def dataset(tmp_path):
     return make_dataset(tmp_path / "hut", ("train", "train", "test"), n_locations=5, n_directions=8, n_landmarks=100)
 
 
-def test_logged_numbers_are_those_of_the_tables(dataset: Dataset, tmp_path: Path) -> None:
+def test_logged_numbers_are_those_of_the_tables(dataset, tmp_path):
     tracking = TrackingConfig(str(tmp_path / "mlruns"))
     shares = log_labels(dataset, tracking, {"render": 1.5, "label": 20.0})
     run = newest_run(tracking, "label", {"dataset": "hut"})
@@ -85,7 +81,7 @@ def test_logged_numbers_are_those_of_the_tables(dataset: Dataset, tmp_path: Path
     pd.testing.assert_frame_equal(pd.read_csv(dataset.root / "results" / "labels.csv"), shares, check_dtype=False)
 
 
-def test_unlabelled_or_empty_scenes_are_named(dataset: Dataset, tmp_path: Path) -> None:
+def test_unlabelled_or_empty_scenes_are_named(dataset, tmp_path):
     tracking = TrackingConfig(str(tmp_path / "mlruns"))
     path = dataset.scenes[1].table
     labelled = read_table(path)

@@ -1,7 +1,5 @@
 """Choosing viewpoints by what they see."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -16,28 +14,27 @@ from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.geometry.poses import camera_centers, poses_looking_along, transform
-from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import ConfigError
-from wheretolook.visibility.occlusion import NoOcclusion, StoredOcclusion
+from wheretolook.visibility.occlusion import NoOcclusion
 
 CAMERA = PinholeCamera(320, 240, 160.0)
 GRID = VoxelGrid((-2.0, -2.0, 0.0), (2.0, 2.0, 2.0), (4, 4, 2))
 
 
 @pytest.fixture
-def landmarks() -> Landmarks:
+def landmarks():
     """A wall at x = 5."""
     rng = np.random.default_rng(0)
     points = np.column_stack([np.full(300, 5.0), rng.uniform(-3, 3, 300), rng.uniform(0, 2, 300)])
     return replace(make_landmarks(rng, 300), points=points)
 
 
-def sampled(landmarks: Landmarks, **options: object) -> tuple[pd.DataFrame, StoredOcclusion]:
-    config = SampleConfig(directions=100, **options)  # type: ignore[arg-type]
+def sampled(landmarks, **options):
+    config = SampleConfig(directions=100, **options)
     return sample_viewpoints(GRID, np.arange(len(GRID)), landmarks, CAMERA, NoOcclusion(), config)
 
 
-def test_rows_say_what_their_viewpoint_sees(landmarks: Landmarks) -> None:
+def test_rows_say_what_their_viewpoint_sees(landmarks):
     table, _ = sampled(landmarks, keep=20)
     assert set(table.columns) == set(SCHEMA.names)
     seen = transform(poses(table), landmarks.points)
@@ -48,7 +45,7 @@ def test_rows_say_what_their_viewpoint_sees(landmarks: Landmarks) -> None:
     assert (table["viewpoint_id"] == table["location_id"] * 100 + table["direction_id"]).all()
 
 
-def test_a_share_of_the_viewpoints_is_near_mapping_images(landmarks: Landmarks) -> None:
+def test_a_share_of_the_viewpoints_is_near_mapping_images(landmarks):
     grid = VoxelGrid((-2.0, -2.0, 0.0), (2.0, 2.0, 2.0), (20, 20, 10))
     mapped = poses_looking_along(np.array([[-1.5, -1.5, 1.0], [-1.5, 1.5, 1.0]]), np.eye(3)[[0, 0]])
     config = SampleConfig(directions=400, keep=0, min_visible=0, max_locations=60, max_directions=8, near_map=0.5)
@@ -65,13 +62,13 @@ def test_a_share_of_the_viewpoints_is_near_mapping_images(landmarks: Landmarks) 
     assert distance_m[near].max() < np.sqrt(3) * (0.6 + 0.1) and distance_m[~near].median() > 1
 
 
-def test_near_map_and_keep_take_the_best_of_the_directions_near_those_of_images(landmarks: Landmarks) -> None:
+def test_near_map_and_keep_take_the_best_of_the_directions_near_those_of_images(landmarks):
     grid = VoxelGrid((-2.0, -2.0, 0.0), (2.0, 2.0, 2.0), (20, 20, 10))
     mapped = poses_looking_along(np.array([[-1.5, -1.5, 1.0], [-1.5, 1.5, 1.0]]), np.array([[0.5, 1, 0]] * 2))
     options = {"directions": 400, "max_locations": 60, "near_map": 0.5}
     tables = []
     for keep in (0, 5):
-        config = SampleConfig(**options, keep=keep)  # type: ignore[arg-type]
+        config = SampleConfig(**options, keep=keep)
         arguments = (grid, np.arange(len(grid)), landmarks, CAMERA, NoOcclusion(), config)
         tables.append(sample_viewpoints(*arguments, mapped=mapped)[0])
     everything, best = tables
@@ -81,12 +78,12 @@ def test_near_map_and_keep_take_the_best_of_the_directions_near_those_of_images(
     assert best["visibility_rank"].max() >= 5  # not the five that see most of all
 
 
-def test_near_map_is_a_share_of_a_number_of_locations() -> None:
+def test_near_map_is_a_share_of_a_number_of_locations():
     with pytest.raises(ConfigError, match="max_locations"):
         SampleConfig(near_map=0.5)
 
 
-def test_each_location_looks_with_one_of_several_cameras(landmarks: Landmarks) -> None:
+def test_each_location_looks_with_one_of_several_cameras(landmarks):
     cameras = {1: PinholeCamera(160, 120, 60.0), 2: PinholeCamera(80, 160, 150.0, center_px=(44.0, 77.0))}
     config = SampleConfig(directions=100, keep=0, min_visible=0)
     ids = np.arange(len(GRID))
@@ -101,7 +98,7 @@ def test_each_location_looks_with_one_of_several_cameras(landmarks: Landmarks) -
         np.testing.assert_array_equal(occlusion.packed, same.packed)
 
 
-def test_the_best_directions_are_kept_and_ranked(landmarks: Landmarks) -> None:
+def test_the_best_directions_are_kept_and_ranked(landmarks):
     everything, _ = sampled(landmarks, keep=0, min_visible=0)
     best, _ = sampled(landmarks, keep=7)
     assert len(everything) == len(GRID) * 100
@@ -116,7 +113,7 @@ def test_the_best_directions_are_kept_and_ranked(landmarks: Landmarks) -> None:
         assert (rows["n_visible"] >= 1).all()
 
 
-def test_subsets_are_drawn_by_seed(landmarks: Landmarks) -> None:
+def test_subsets_are_drawn_by_seed(landmarks):
     options = {"keep": 20, "max_locations": 9, "max_directions": 5}
     first, stored = sampled(landmarks, **options, seed=1)
     again, _ = sampled(landmarks, **options, seed=1)
@@ -133,8 +130,8 @@ def test_subsets_are_drawn_by_seed(landmarks: Landmarks) -> None:
     [{"keep": -1}, {"max_directions": -1}, {"max_directions": {"train": 3}},
      {"max_directions": {"train": 3, "val": 1, "test": -1}}],
 )  # fmt: skip
-def test_directions_may_differ_by_split(options: dict[str, object]) -> None:
+def test_directions_may_differ_by_split(options):
     config = SampleConfig(max_directions={"train": 3, "val": 0, "test": 7})
     assert [config.directions_of(split) for split in ("train", "val", "test")] == [3, 0, 7]
     with pytest.raises(ConfigError):
-        SampleConfig(**options)  # type: ignore[arg-type]
+        SampleConfig(**options)

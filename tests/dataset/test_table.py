@@ -1,9 +1,5 @@
 """The table on disk: schema, poses, labels, damage."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -16,7 +12,7 @@ from wheretolook.utils.files import fingerprint
 
 
 @pytest.fixture
-def table() -> pd.DataFrame:
+def table():
     rng = np.random.default_rng(0)
     truth = poses_looking_along(rng.normal(size=(5, 3)), rng.normal(size=(5, 3)))
     return pd.DataFrame(
@@ -35,7 +31,7 @@ def table() -> pd.DataFrame:
     )
 
 
-def test_round_trip_and_equal_bytes(table: pd.DataFrame, tmp_path: Path) -> None:
+def test_round_trip_and_equal_bytes(table, tmp_path):
     write_table(table, tmp_path / "a.parquet")
     write_table(table, tmp_path / "b.parquet")
     back = read_table(tmp_path / "a.parquet")
@@ -46,7 +42,7 @@ def test_round_trip_and_equal_bytes(table: pd.DataFrame, tmp_path: Path) -> None
 
 
 @pytest.fixture
-def matched(table: pd.DataFrame) -> pd.DataFrame:
+def matched(table):
     """Views with many matches, one, and none; of two, all are inliers."""
     matches = [np.arange(0, 90, 3), np.arange(30), np.arange(7, 20), np.array([1_000_000]), np.zeros(0)]
     inliers = [np.arange(0, 60, 3), np.arange(30), np.arange(8, 20), np.zeros(0), np.zeros(0)]
@@ -54,7 +50,7 @@ def matched(table: pd.DataFrame) -> pd.DataFrame:
     return table.assign(**{name: [one.astype(np.int32) for one in rows] for name, rows in columns.items()})
 
 
-def test_matches_are_read_on_request(matched: pd.DataFrame, tmp_path: Path) -> None:
+def test_matches_are_read_on_request(matched, tmp_path):
     path = tmp_path / "a.parquet"
     write_table(matched, path)
     back = read_table(path, matches=True)
@@ -67,7 +63,7 @@ def test_matches_are_read_on_request(matched: pd.DataFrame, tmp_path: Path) -> N
     assert list(read_table(path).columns) == SCHEMA.names
 
 
-def test_labels_are_strict_at_both_limits(table: pd.DataFrame) -> None:
+def test_labels_are_strict_at_both_limits(table):
     assert is_good(table).tolist() == [True, False, False, False, False]
     assert is_good(table, 0.25, 2).tolist() == [True, True, True, False, False]
     with pytest.raises(TableError):
@@ -75,7 +71,7 @@ def test_labels_are_strict_at_both_limits(table: pd.DataFrame) -> None:
 
 
 @pytest.fixture
-def many(table: pd.DataFrame) -> pd.DataFrame:
+def many(table):
     """Forty locations with fifty directions each, in no order."""
     rng = np.random.default_rng(1)
     locations = rng.uniform(-20, 20, (40, 3))
@@ -90,7 +86,7 @@ def many(table: pd.DataFrame) -> pd.DataFrame:
     return rows.sample(frac=1, random_state=0).reset_index(drop=True)
 
 
-def test_a_compact_table_reads_the_same(many: pd.DataFrame, tmp_path: Path) -> None:
+def test_a_compact_table_reads_the_same(many, tmp_path):
     plain, compact, again = (tmp_path / f"{name}.parquet" for name in ("plain", "compact", "again"))
     write_table(many, plain)
     write_table(many, compact, compact=True)
@@ -111,7 +107,7 @@ def test_a_compact_table_reads_the_same(many: pd.DataFrame, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("name", ["appearance", "changes"])
 @pytest.mark.parametrize("compact", [False, True])
-def test_strengths_are_kept(compact: bool, name: str, many: pd.DataFrame, tmp_path: Path) -> None:
+def test_strengths_are_kept(compact, name, many, tmp_path):
     strengths = np.random.default_rng(0).random(len(many)).astype(np.float32)
     write_table(many.assign(**{name: strengths}), tmp_path / "a.parquet", compact)
     back = read_table(tmp_path / "a.parquet")
@@ -120,7 +116,7 @@ def test_strengths_are_kept(compact: bool, name: str, many: pd.DataFrame, tmp_pa
 
 
 @pytest.mark.parametrize("compact", [False, True])
-def test_damaged_files(compact: bool, many: pd.DataFrame, tmp_path: Path) -> None:
+def test_damaged_files(compact, many, tmp_path):
     path = tmp_path / "viewpoints.parquet"
     write_table(many, path, compact)
     whole = path.read_bytes()
@@ -132,7 +128,7 @@ def test_damaged_files(compact: bool, many: pd.DataFrame, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("change", [{"qw": 2.0}, {"x_m": np.nan}, {"error_m": "near"}, {"error_m": None}])
-def test_columns_that_are_missing_or_invalid(change: dict[str, object], many: pd.DataFrame, tmp_path: Path) -> None:
+def test_columns_that_are_missing_or_invalid(change, many, tmp_path):
     path = tmp_path / "viewpoints.parquet"
     write_table(many, path, compact=True)
     columns = pd.read_parquet(path)
@@ -142,7 +138,7 @@ def test_columns_that_are_missing_or_invalid(change: dict[str, object], many: pd
         read_table(path)
 
 
-def test_matches_that_are_not_stored(table: pd.DataFrame, matched: pd.DataFrame, tmp_path: Path) -> None:
+def test_matches_that_are_not_stored(table, matched, tmp_path):
     path = tmp_path / "viewpoints.parquet"
     for content, compact in ((table, False), (matched.drop(columns="inlier_rows"), False), (matched, True)):
         write_table(content, path, compact)

@@ -1,7 +1,5 @@
 """Bootstrap intervals and paired tests against closed forms, brute force and SciPy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -9,7 +7,7 @@ from scipy import stats
 from wheretolook.evaluation.statistics import ClusterBootstrap
 
 
-def test_interval_of_independent_observations_is_binomial() -> None:
+def test_interval_of_independent_observations_is_binomial():
     good = np.zeros((400, 1))
     good[:120] = 1
     low, high = ClusterBootstrap(np.arange(400), 4000, seed=0).ratio_interval(good, np.ones((400, 1)))
@@ -18,7 +16,7 @@ def test_interval_of_independent_observations_is_binomial() -> None:
     assert high[0] == pytest.approx(0.3 + 1.96 * error, abs=0.006)
 
 
-def test_clusters_are_drawn_within_strata() -> None:
+def test_clusters_are_drawn_within_strata():
     stratum = np.repeat([0, 1], [30, 70])
     good = (stratum == 0).astype(float)[:, None]  # constant within a stratum
     low, high = ClusterBootstrap(np.arange(100), 500, 1, stratum).ratio_interval(good, np.ones((100, 1)))
@@ -26,12 +24,12 @@ def test_clusters_are_drawn_within_strata() -> None:
 
 
 @pytest.mark.parametrize("clusters, strata", [(np.full(5, 7), None), (np.arange(2), np.arange(2))])
-def test_no_interval_where_no_stratum_has_two_clusters(clusters: np.ndarray, strata: np.ndarray | None) -> None:
+def test_no_interval_where_no_stratum_has_two_clusters(clusters, strata):
     ones = np.ones((len(clusters), 1))
     assert np.isnan(ClusterBootstrap(clusters, 100, 0, strata).ratio_interval(ones, ones)).all()
 
 
-def test_resamples_without_a_denominator_do_not_count() -> None:
+def test_resamples_without_a_denominator_do_not_count():
     top = np.array([[1.0, 0.0], [1.0, 0.0]])
     bottom = np.array([[1.0, 0.0], [0.0, 0.0]])
     low, high = ClusterBootstrap(np.arange(2), 1000, seed=0).ratio_interval(top, bottom)
@@ -39,7 +37,7 @@ def test_resamples_without_a_denominator_do_not_count() -> None:
     assert np.isnan([low[1], high[1]]).all()
 
 
-def test_copies_of_an_observation_in_its_cluster_change_nothing() -> None:
+def test_copies_of_an_observation_in_its_cluster_change_nothing():
     rng = np.random.default_rng(3)
     good = rng.random((80, 2))
     chosen = rng.integers(1, 4, (80, 1)).astype(float)
@@ -56,7 +54,7 @@ def test_copies_of_an_observation_in_its_cluster_change_nothing() -> None:
     np.testing.assert_allclose(wide / narrow, np.sqrt(3), rtol=0.15)
 
 
-def test_paired_p_is_that_of_all_sign_flips() -> None:
+def test_paired_p_is_that_of_all_sign_flips():
     rng = np.random.default_rng(0)
     first, second = rng.integers(0, 5, (2, 10, 4)).astype(float)
     second[:, 1] -= 2  # different
@@ -74,7 +72,7 @@ def test_paired_p_is_that_of_all_sign_flips() -> None:
     assert p[2] == 1
 
 
-def test_paired_p_is_never_zero() -> None:
+def test_paired_p_is_never_zero():
     bootstrap = ClusterBootstrap(np.arange(300), 500, seed=0)
     assert bootstrap.paired_p(np.ones((300, 1)))[0] == 1 / 501
     assert np.isnan(ClusterBootstrap(np.empty(0, dtype=int), 10, seed=0).paired_p(np.empty((0, 2)))).all()

@@ -1,7 +1,5 @@
 """Reliability, calibration error and temperature against closed forms and scikit-learn."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.special import expit
@@ -19,14 +17,13 @@ from wheretolook.evaluation.statistics import (
     reliability,
     scale_probability,
 )
-from wheretolook.geometry.poses import Float
 
 
-def draw(rng: np.random.Generator, probability: Float) -> np.ndarray:
+def draw(rng, probability):
     return rng.random(len(probability)) < probability
 
 
-def test_calibration_error_by_hand() -> None:
+def test_calibration_error_by_hand():
     probability = np.array([0.0, 0.1, 0.25, 0.3, 1.0])
     good = np.array([False, True, True, False, True])
     assert list(reliability(probability, good, bins=4)["n"]) == [2, 2, 0, 1]
@@ -34,7 +31,7 @@ def test_calibration_error_by_hand() -> None:
     assert expected_calibration_error(probability, good, 4) == pytest.approx(0.27)
 
 
-def test_reliability_is_that_of_scikit_learn() -> None:
+def test_reliability_is_that_of_scikit_learn():
     rng = np.random.default_rng(0)
     probability = rng.beta(0.5, 0.7, 5000)
     good = draw(rng, probability**1.5)
@@ -47,7 +44,7 @@ def test_reliability_is_that_of_scikit_learn() -> None:
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 3.0])
-def test_temperature_is_recovered(factor: float) -> None:
+def test_temperature_is_recovered(factor):
     rng = np.random.default_rng(2)
     logits = rng.normal(0.5, 2, 200_000)
     good = draw(rng, expit(logits))
@@ -64,7 +61,7 @@ def test_temperature_is_recovered(factor: float) -> None:
         assert negative_log_likelihood(scaled, good) < negative_log_likelihood(sure, good)
 
 
-def test_temperature_of_one_class_is_unknown() -> None:
+def test_temperature_of_one_class_is_unknown():
     for labels in (np.ones(5, dtype=bool), np.zeros(5, dtype=bool), np.empty(0, dtype=bool)):
         assert np.isnan(fit_temperature(np.linspace(0, 1, len(labels)), labels))
     certain = np.array([0.0, 1.0, 1.0, 0.0])  # logits beyond all bounds
@@ -72,7 +69,7 @@ def test_temperature_of_one_class_is_unknown() -> None:
     assert np.isfinite(negative_log_likelihood(certain, np.array([True, False, True, False])))
 
 
-def test_rows_before_and_after() -> None:
+def test_rows_before_and_after():
     rng = np.random.default_rng(3)
     logits = rng.normal(0, 2, 20_000)
     good = draw(rng, expit(logits))
@@ -85,7 +82,7 @@ def test_rows_before_and_after() -> None:
     assert set(calibration_rows(expit(logits), good, np.nan)["when"]) == {"before"}
 
 
-def test_precision_over_coverage() -> None:
+def test_precision_over_coverage():
     """Precision as scikit-learn's at each threshold, ties included; queries without a pose only lower the coverage."""
     rng = np.random.default_rng(4)
     confidence = rng.integers(0, 20, 200) / 20
@@ -100,7 +97,7 @@ def test_precision_over_coverage() -> None:
     assert precision_area(*with_missing) == pytest.approx(precision_area(confidence, right) / 2)
 
 
-def test_area_of_a_perfect_order() -> None:
+def test_area_of_a_perfect_order():
     """Of n poses k are right and all more confident: 1 up to k / n, then k / i."""
     right = np.arange(10) < 4
     expected = (4 + sum(4 / i for i in range(5, 11))) / 10

@@ -1,7 +1,5 @@
 """Choice of views, oracle, expectation of random choice and the table, by hand and by brute force."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np
@@ -23,7 +21,7 @@ HAND = RankedViews(
 HAND_SCORES = np.array([0.2, 0.9, 0.5, 0.1, 0.5, 0.2, 0.4, 0.9])
 
 
-def random_views(rng: np.random.Generator, n_locations: int = 40) -> RankedViews:
+def random_views(rng, n_locations=40):
     location = np.repeat(np.arange(n_locations), rng.integers(1, 15, n_locations))
     order = rng.permutation(len(location))
     quality = rng.random(len(location))
@@ -43,14 +41,14 @@ def random_views(rng: np.random.Generator, n_locations: int = 40) -> RankedViews
         (9, [4, 1, 3], [[2, 3], [0, 0], [1, 2]]),
     ],
 )
-def test_best_views_by_hand(n: int, chosen: list[int], good: list[list[int]]) -> None:
+def test_best_views_by_hand(n, chosen, good):
     top = choose_best(HAND, rank_views(HAND, HAND_SCORES), n)
     np.testing.assert_array_equal(top.chosen, chosen)
     np.testing.assert_array_equal(top.good, good)
     np.testing.assert_array_equal(top.any_good, np.array(good) > 0)
 
 
-def test_ties_do_not_depend_on_the_order_of_rows() -> None:
+def test_ties_do_not_depend_on_the_order_of_rows():
     order = np.random.default_rng(0).permutation(len(HAND.location))
     shuffled = HAND.only(order)
     for n in (1, 2, 3):
@@ -58,7 +56,7 @@ def test_ties_do_not_depend_on_the_order_of_rows() -> None:
         np.testing.assert_array_equal(choose_best(shuffled, rank_views(shuffled, np.zeros(8)), n).good, expected)
 
 
-def test_nothing_beats_the_oracle() -> None:
+def test_nothing_beats_the_oracle():
     rng = np.random.default_rng(0)
     views = random_views(rng)
     for n in (1, 2, 5, 20):
@@ -70,7 +68,7 @@ def test_nothing_beats_the_oracle() -> None:
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 9])
-def test_random_choice_by_enumeration(n: int) -> None:
+def test_random_choice_by_enumeration(n):
     top = choose_at_random(HAND, n)
     for location in range(3):
         good = HAND.good[HAND.location == location]
@@ -79,7 +77,7 @@ def test_random_choice_by_enumeration(n: int) -> None:
         np.testing.assert_allclose(top.any_good[location], np.mean([draw.any(0) for draw in draws], axis=0), atol=1e-12)
 
 
-def test_table_by_hand() -> None:
+def test_table_by_hand():
     config = EvaluateConfig(methods=("bins",), top_n=(1, 3), thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=200)
     table = score_table(HAND, {"bins": HAND_SCORES}, ["a", "b"], config)
     row = {(r["method"], r["top_n"], r["scene"]): r for r in table.to_dict("records")}
@@ -104,7 +102,7 @@ def test_table_by_hand() -> None:
     assert top1["average_precision"] == pytest.approx((1 / 4 + 2 / 5 + 3 / 7) / 3)
 
 
-def test_shares_by_both_localizers_by_hand() -> None:
+def test_shares_by_both_localizers_by_hand():
     """The two columns are one threshold by several hypotheses, and by the first RANSAC result."""
     config = EvaluateConfig(methods=("bins",), top_n=(1, 3), thresholds=((5.0, 10.0),), resamples=20)
     table = score_table(HAND, {"bins": HAND_SCORES}, ["a", "b"], config)
@@ -115,7 +113,7 @@ def test_shares_by_both_localizers_by_hand() -> None:
     assert threshold_keys(table) == ["5m_10deg"]
 
 
-def test_regret_and_difference_by_hand() -> None:
+def test_regret_and_difference_by_hand():
     # location 0: 11, 13, 12, 10; location 2: 6, 7, 5
     reference = np.array([0.1, 0.3, 0.9, 0.5, 0.2, 0.8, 0.6, 0.4])
     scores = {"random": np.zeros(8), "bins": HAND_SCORES, "mlp-2d": reference}
@@ -143,7 +141,7 @@ def test_regret_and_difference_by_hand() -> None:
     assert bins[f"released_{coarse}"] == pytest.approx(1 / 3 / 0.527)
 
 
-def test_reference_method() -> None:
+def test_reference_method():
     methods = ["random", "mlp-2d", "mlp-2d+3d", "visible"]
     assert reference_method(methods, "") == "mlp-2d+3d"
     assert reference_method(methods[:1], "") == ""
@@ -152,7 +150,7 @@ def test_reference_method() -> None:
         reference_method(methods, "mlp-2d+z")
 
 
-def test_a_scene_without_candidates_has_no_shares() -> None:
+def test_a_scene_without_candidates_has_no_shares():
     config = EvaluateConfig(top_n=(1,), thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=50)
     in_a = HAND.location < 2
     rows = score_table(HAND.only(in_a), {"mlp-2d": HAND_SCORES[in_a]}, ["a", "b"], config)
@@ -161,7 +159,7 @@ def test_a_scene_without_candidates_has_no_shares() -> None:
     assert rows.loc["all", "raw_5m_10deg"] == rows.loc["a", "raw_5m_10deg"] == 1 / 2
 
 
-def test_calibration_columns_of_learned_methods() -> None:
+def test_calibration_columns_of_learned_methods():
     # predicted 0.8 for all, of which 3 in 8 are good; at temperature 2 it says sigmoid(log(4) / 2) = 2/3
     config = EvaluateConfig(top_n=(1,), thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=10)
     scores = dict.fromkeys(("bins", "mlp-2d"), np.full(8, 0.8))

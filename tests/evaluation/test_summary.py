@@ -1,7 +1,5 @@
 """Which methods chose best, in words."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -13,7 +11,7 @@ FINEST = KEYS[0]
 
 @pytest.mark.parametrize("reference", ["", "bins", "visible"])
 @pytest.mark.parametrize("good, significant", [(0.62, False), (0.8, True)])
-def test_summary_of_significance(reference: str, good: float, significant: bool) -> None:
+def test_summary_of_significance(reference, good, significant):
     """Against visible, whose share is 0.6; intervals reach 6 points, those of differences 3."""
     table = make_scores(("random", "bins", "visible"), reference or None, (1,), ("a",)).assign(reference=reference)
     shares = table["method"].map({"random": 0.4, "bins": good, "visible": 0.6, "oracle": 0.9})

@@ -1,7 +1,5 @@
 """Nearest landmarks of a large map by an index, next to the exact search."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -10,13 +8,13 @@ from wheretolook.features.matches import match
 from wheretolook.features.matching import MAX_NEAREST, DescriptorIndex, DescriptorMatcher, has_index
 
 
-def stored(values: np.ndarray) -> np.ndarray:
+def stored(values):
     """Descriptors (N, 128) uint8 of length 512."""
     positive = np.abs(values)
     return np.round(512 * positive / np.linalg.norm(positive, axis=1, keepdims=True)).astype(np.uint8)
 
 
-def test_the_index_finds_what_the_exact_search_finds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_index_finds_what_the_exact_search_finds(monkeypatch):
     pytest.importorskip("faiss")
     monkeypatch.setattr(descriptor_index, "_LISTS", 64)
     rng = np.random.default_rng(0)
@@ -35,7 +33,7 @@ def test_the_index_finds_what_the_exact_search_finds(monkeypatch: pytest.MonkeyP
     assert len(found[1].keypoints) == 0
 
 
-def test_an_index_serves_large_maps_on_a_cpu(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_index_serves_large_maps_on_a_cpu(monkeypatch, caplog):
     monkeypatch.setattr(descriptor_index, "find_spec", lambda name: object())
     assert has_index(1_000_000, "cpu") and not has_index(1_000_000, "cuda:0") and not has_index(25_000, "cpu")
     monkeypatch.setattr(descriptor_index, "find_spec", lambda name: None)

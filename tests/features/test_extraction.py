@@ -1,7 +1,5 @@
 """Keypoints at known places, unit descriptors, and the same answer every time."""
 
-from __future__ import annotations
-
 import numpy as np
 import pycolmap
 import pytest
@@ -14,7 +12,7 @@ from wheretolook.utils.processes import WorkerPool
 METHODS = ("colmap", "opencv")
 
 
-def blob(x: float, y: float, sigma: float) -> np.ndarray:
+def blob(x, y, sigma):
     """A Gaussian blob centred at (x, y), where (0.5, 0.5) is the centre of the top-left pixel."""
     rows, columns = np.mgrid[:120, :160] + 0.5
     grey = 60 + 150 * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * sigma**2))

@@ -1,7 +1,5 @@
 """Every extractor owns its descriptors; learned ones are found by kornia, where it is installed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +17,7 @@ from wheretolook.utils.errors import WeightsError
 LEARNED = ("aliked", "disk", "xfeat")
 
 
-def unit(n: int, dimension: int, seed: int = 0) -> np.ndarray:
+def unit(n, dimension, seed=0):
     return unit_descriptors(np.random.default_rng(seed).normal(size=(n, dimension)))
 
 
@@ -68,7 +66,7 @@ def test_mutual_nearest_neighbours_are_those_of_all_products(n, monkeypatch):
         assert n // 4 < len(rows) <= n // 2  # of twins, the nearer
 
 
-def untrained(method: str, folder: Path) -> Path:
+def untrained(method, folder):
     """A file of weights as the authors of a network give theirs, but with random numbers."""
     torch = pytest.importorskip("torch")
     kornia = pytest.importorskip("kornia.feature", reason="learned features need kornia: pip install kornia")
@@ -88,7 +86,7 @@ def untrained(method: str, folder: Path) -> Path:
     return path
 
 
-def image(seed: int = 0) -> np.ndarray:
+def image(seed=0):
     from scipy.ndimage import gaussian_filter
 
     rng = np.random.default_rng(seed)

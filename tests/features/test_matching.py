@@ -1,7 +1,5 @@
 """Matching against its plain twin, exactly: all sizes, extremes, blocks, devices, and CPUs without VNNI."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -19,11 +17,11 @@ from wheretolook.features.matching import DescriptorMatcher
 Descriptors = NDArray[np.uint8]
 
 
-def random_descriptors(n: int, seed: int = 0) -> Descriptors:
+def random_descriptors(n, seed=0):
     return np.random.default_rng(seed).integers(0, 256, (n, 128), dtype=np.uint8)
 
 
-def extreme_descriptors(n: int, seed: int = 0) -> Descriptors:
+def extreme_descriptors(n, seed=0):
     """Only values 0 and 255, so that sums are as large as possible; the first row is all 255, the second all 0."""
     values = 255 * np.random.default_rng(seed).integers(0, 2, (n, 128), dtype=np.uint8)
     values[:1] = 255
@@ -31,13 +29,13 @@ def extreme_descriptors(n: int, seed: int = 0) -> Descriptors:
     return values
 
 
-def sift_like_descriptors(n: int, seed: int = 0) -> Descriptors:
+def sift_like_descriptors(n, seed=0):
     """RootSIFT of length 512: many small values and a few large ones."""
     histograms = np.random.default_rng(seed).exponential(size=(n, 128)) ** 2
     return quantize_descriptors(unit_descriptors(np.sqrt(histograms)))
 
 
-def views_of(landmarks: Descriptors, n: int, noise: float, seed: int = 1) -> Descriptors:
+def views_of(landmarks, n, noise, seed=1):
     """Noisy descriptors of random landmarks, some of them chosen twice."""
     rng = np.random.default_rng(seed)
     seen = unit_descriptors(landmarks[rng.integers(0, len(landmarks), n)])
@@ -47,7 +45,7 @@ def views_of(landmarks: Descriptors, n: int, noise: float, seed: int = 1) -> Des
 KINDS = pytest.mark.parametrize("make", [random_descriptors, extreme_descriptors, sift_like_descriptors])
 
 
-def assert_nearest(device: str, queries: Descriptors, landmarks: Descriptors, count: int = 2) -> None:
+def assert_nearest(device, queries, landmarks, count=2):
     rows, products = DescriptorMatcher(landmarks, device).products(queries, count)
     assert rows.dtype == products.dtype == np.int64 and rows.shape == products.shape == (len(queries), count)
     plain_rows, plain_products = nearest(queries, landmarks, count + 1)
@@ -64,23 +62,23 @@ def assert_nearest(device: str, queries: Descriptors, landmarks: Descriptors, co
 
 
 @KINDS
-def test_nearest_two_agree_with_their_twin_at_every_size(device: str, make) -> None:  # type: ignore[no-untyped-def]
+def test_nearest_two_agree_with_their_twin_at_every_size(device, make):
     for n in [*range(2, 71), 5_000]:
         assert_nearest(device, make(40, seed=n + 1), make(n, seed=n))
         assert_nearest(device, make(40, seed=n + 1), make(n, seed=n), 16)
 
 
 @pytest.mark.parametrize("n", [1, 63, 64, 65, 127, 128, 129, 500])
-def test_blocks_leave_no_seam(device: str, n: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blocks_leave_no_seam(device, n, monkeypatch):
     """Blocks of 64 descriptors, or of one where the product of more does not fit."""
     for block in (64, 1):
         monkeypatch.setattr(matching, "_PRODUCT_BYTES", dict.fromkeys(("cpu", "cuda"), 4 * 512 * block))
         assert_nearest(device, sift_like_descriptors(n, seed=1), sift_like_descriptors(300))
 
 
-def lowe(queries: Descriptors, landmarks: Descriptors, max_ratio: float) -> dict[int, int]:
+def lowe(queries, landmarks, max_ratio):
     """Keypoint to landmark, by brute force: ratio of distances, and of each landmark its nearest keypoint."""
-    found: dict[int, tuple[int, int]] = {}
+    found = {}
     for keypoint, query in enumerate(queries.astype(np.int64)):
         squared = np.maximum(2 * (512**2 - landmarks.astype(np.int64) @ query), 0)
         nearest, second = np.argsort(squared, kind="stable")[:2]
@@ -90,7 +88,7 @@ def lowe(queries: Descriptors, landmarks: Descriptors, max_ratio: float) -> dict
 
 
 @pytest.mark.parametrize("max_ratio", [0.6, 0.85, 1.0])
-def test_matches_pass_lowes_test_and_take_each_landmark_once(device: str, max_ratio: float) -> None:
+def test_matches_pass_lowes_test_and_take_each_landmark_once(device, max_ratio):
     landmarks = sift_like_descriptors(300)
     landmarks[10] = landmarks[11]  # twins never match: their keypoints are as near to the one as to the other
     queries = np.concatenate([views_of(landmarks, 200, noise) for noise in (0.0, 0.02, 0.06)])
@@ -100,7 +98,7 @@ def test_matches_pass_lowes_test_and_take_each_landmark_once(device: str, max_ra
     assert (np.diff(keypoints) > 0).all() and len(set(rows)) == len(rows) and not {10, 11} & set(rows)
 
 
-def run_python(code: str, **environment: str) -> str:
+def run_python(code, **environment):
     path = os.pathsep.join(sys.path)
     run = subprocess.run(
         [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": path, **environment}, capture_output=True
@@ -111,7 +109,7 @@ def run_python(code: str, **environment: str) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("instructions", ["AVX2", "AVX512_CORE"])
-def test_a_cpu_whose_byte_products_saturate_finds_the_same(instructions: str) -> None:
+def test_a_cpu_whose_byte_products_saturate_finds_the_same(instructions):
     """oneDNN does not use the newer instructions of this CPU."""
     code = (
         "from features import test_matching as tests\n"

@@ -1,7 +1,5 @@
 """`WarpSift` against OpenCV, its twin, and against itself: the same bits every time, whatever the batch."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import warp as wp
@@ -9,24 +7,23 @@ from scipy.spatial import KDTree
 
 from features.textures import texture
 from wheretolook.features.config import ExtractorConfig, KeypointExtractor
-from wheretolook.features.extractor import Keypoints
 from wheretolook.features.warp_sift import WarpSift
 
 EVERYTHING = ExtractorConfig(max_keypoints=100_000)
 
 
-def opencv(grey: np.ndarray, config: ExtractorConfig) -> Keypoints:
+def opencv(grey, config):
     return KeypointExtractor(config).extract(np.repeat(grey[..., None], 3, axis=2))
 
 
-def assert_same(first: list[Keypoints], second: list[Keypoints]) -> None:
+def assert_same(first, second):
     assert len(first) == len(second)
     for a, b in zip(first, second, strict=True):
         assert a.pixels.tobytes() == b.pixels.tobytes()
         assert a.descriptors.tobytes() == b.descriptors.tobytes()
 
 
-def best_match(a: Keypoints, b: Keypoints) -> np.ndarray:
+def best_match(a, b):
     """For each keypoint of a, the highest cosine to one of b at its place (0.1 px), or NaN."""
     best = np.full(len(a), np.nan)
     for row, near in enumerate(KDTree(b.pixels).query_ball_point(a.pixels, 0.1)):
@@ -35,7 +32,7 @@ def best_match(a: Keypoints, b: Keypoints) -> np.ndarray:
     return best
 
 
-def assert_agree(ours: Keypoints, theirs: Keypoints) -> None:
+def assert_agree(ours, theirs):
     for a, b in ((ours, theirs), (theirs, ours)):
         cosine = best_match(a, b)
         assert np.mean(np.isfinite(cosine)) >= 0.97

@@ -1,9 +1,5 @@
 """Cameras of COLMAP's models against pycolmap and OpenCV."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -13,7 +9,7 @@ from wheretolook.mapping.colmap_model import read_model
 from wheretolook.utils.errors import MapError
 
 
-def test_opencv_model_projects_as_opencv() -> None:
+def test_opencv_model_projects_as_opencv():
     params = (300.0, 310.0, 330.0, 235.0, -0.2, 0.05, 1e-3, -1e-3)
     camera = ColmapCamera("OPENCV", 640, 480, params)
     points = np.random.default_rng(0).uniform((-1, -0.7, 1), (1, 0.7, 2), (200, 3))
@@ -24,7 +20,7 @@ def test_opencv_model_projects_as_opencv() -> None:
     np.testing.assert_allclose(camera.project(points)[seen], expected[seen, 0], atol=1e-9)
 
 
-def test_distortion_that_turns_back_does_not_bring_the_side_into_view() -> None:
+def test_distortion_that_turns_back_does_not_bring_the_side_into_view():
     """With k1 = -0.25 the image of a ray 61 degrees off the axis falls left of the image's edge again."""
     import pycolmap
 
@@ -36,7 +32,7 @@ def test_distortion_that_turns_back_does_not_bring_the_side_into_view() -> None:
     assert camera.sees(np.array([[np.tan(np.radians(45)), 0, 1]]))[0]
 
 
-def test_a_panorama_sees_everything_and_a_fisheye_what_is_in_its_image() -> None:
+def test_a_panorama_sees_everything_and_a_fisheye_what_is_in_its_image():
     directions = np.random.default_rng(0).normal(size=(1000, 3))
     assert ColmapCamera("EQUIRECTANGULAR", 640, 320, (640.0, 320.0)).sees(directions).all()
     fisheye = ColmapCamera("SIMPLE_FISHEYE", 400, 400, (200 / np.radians(70), 200.0, 200.0))
@@ -46,14 +42,14 @@ def test_a_panorama_sees_everything_and_a_fisheye_what_is_in_its_image() -> None
     assert not fisheye.sees(directions[off_axis > 100]).any()
 
 
-def test_not_a_number_and_the_centre_are_not_seen() -> None:
+def test_not_a_number_and_the_centre_are_not_seen():
     camera = ColmapCamera("OPENCV", 640, 480, (300.0, 300.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0))
     assert camera.sees(np.array([[0, 0, 0], [np.nan, 0, 1], [0, 0, np.inf], [0, 0, -1], [0, 0, 1.0]])).tolist() == [
         False, False, False, False, True,
     ]  # fmt: skip
 
 
-def test_the_camera_of_a_map(tmp_path: Path) -> None:
+def test_the_camera_of_a_map(tmp_path):
     import pycolmap
 
     model = pycolmap.Reconstruction()

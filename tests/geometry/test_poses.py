@@ -1,7 +1,5 @@
 """Poses, projection and errors against SciPy, pycolmap and closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pycolmap
 import pytest
@@ -11,12 +9,12 @@ from wheretolook.geometry import poses as geo
 from wheretolook.utils.errors import PoseError
 
 
-def random_poses(n: int, seed: int = 0) -> np.ndarray:
+def random_poses(n, seed=0):
     rng = np.random.default_rng(seed)
     return np.concatenate([Rotation.random(n, rng=rng).as_matrix(), rng.normal(size=(n, 3, 1))], axis=-1)
 
 
-def test_inverse_and_centres() -> None:
+def test_inverse_and_centres():
     poses = random_poses(20)
     points = np.random.default_rng(1).normal(size=(7, 3))
     there = geo.transform(poses, points)
@@ -26,7 +24,7 @@ def test_inverse_and_centres() -> None:
     np.testing.assert_allclose(np.einsum("bij,bj->bi", poses[..., :3], centers) + poses[..., 3], 0, atol=1e-12)
 
 
-def test_quaternions_agree_with_pycolmap_and_scipy() -> None:
+def test_quaternions_agree_with_pycolmap_and_scipy():
     rotation = random_poses(50)[..., :3]
     quaternion = geo.quaternion_from_rotation(rotation)
     for q, r in zip(quaternion, rotation, strict=True):
@@ -35,7 +33,7 @@ def test_quaternions_agree_with_pycolmap_and_scipy() -> None:
     np.testing.assert_allclose(geo.rotation_from_quaternion(2 * quaternion), rotation, atol=1e-12)
 
 
-def test_looking_along_keeps_the_horizon_level_and_down_down() -> None:
+def test_looking_along_keeps_the_horizon_level_and_down_down():
     directions = np.random.default_rng(2).normal(size=(200, 3))
     directions[:2, :2] = 0  # straight up or down
     rotation = geo.rotation_looking_along(directions)
@@ -51,13 +49,13 @@ def test_looking_along_keeps_the_horizon_level_and_down_down() -> None:
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 1e-6, 0.4, 30.0, 179.999])
-def test_rotation_angle_is_exact_even_when_tiny(angle_deg: float) -> None:
+def test_rotation_angle_is_exact_even_when_tiny(angle_deg):
     base = Rotation.random(rng=np.random.default_rng(3))
     turned = Rotation.from_rotvec(np.radians(angle_deg) * np.array([0.6, 0, 0.8])) * base
     assert geo.rotation_angle_deg(base.as_matrix(), turned.as_matrix()) == pytest.approx(angle_deg, abs=1e-7, rel=1e-6)
 
 
-def test_pose_error_is_between_centres_not_translations() -> None:
+def test_pose_error_is_between_centres_not_translations():
     rotation = Rotation.random(rng=np.random.default_rng(4)).as_matrix()
     center = np.array([10.0, -20, 3])
     true = np.concatenate([rotation, -rotation @ center[:, None]], axis=1)
@@ -69,14 +67,14 @@ def test_pose_error_is_between_centres_not_translations() -> None:
 
 
 @pytest.mark.parametrize("invalid", [(0, 0, 0), (np.nan, 0, 1), (np.inf, 0, 1), (1e300, 1e300, 0)])
-def test_invalid_directions(invalid: tuple[float, ...]) -> None:
+def test_invalid_directions(invalid):
     with pytest.raises(PoseError):
         geo.rotation_looking_along([[(1, 0, 0)], [invalid]])
     with pytest.raises(PoseError):
         geo.poses_looking_along((0, 0, 1), invalid)
 
 
-def test_rigid_transforms_of_any_shape_and_no_others() -> None:
+def test_rigid_transforms_of_any_shape_and_no_others():
     poses = random_poses(2)
     square = np.concatenate([poses, np.broadcast_to([0.0, 0, 0, 1], (2, 1, 4))], axis=1)
     for given, expected in ((poses, poses), (square, poses), (poses[1], poses[1:]), (square[1], poses[1:])):
@@ -97,7 +95,7 @@ def test_rigid_transforms_of_any_shape_and_no_others() -> None:
             geo.rigid_poses(invalid)
 
 
-def test_invalid_locations_and_poses() -> None:
+def test_invalid_locations_and_poses():
     with pytest.raises(PoseError):
         geo.poses_looking_along([(0, 0, 1), (0, np.nan, 1)], (1, 0, 0))
     for locations in ([], [(0, 0, 1), (0, 1, 1)], [("a", 0, 1)] * 3, [(1j, 0, 1)] * 3, [(0, 1)] * 3):

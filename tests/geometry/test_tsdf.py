@@ -1,7 +1,5 @@
 """Depth images fused to a surface, against the exact mesh they were rendered from."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -13,16 +11,16 @@ from wheretolook.utils.errors import ConfigError, SceneError
 
 
 @pytest.fixture(scope="module")
-def images() -> list[DepthImage]:
+def images():
     return depth_images(room(), seed=1, n=70)
 
 
 @pytest.fixture(scope="module")
-def volume(images: list[DepthImage]) -> TsdfVolume:
+def volume(images):
     return TsdfVolume.from_images(images, progress=False)
 
 
-def test_the_surface_lies_where_the_mesh_is(volume: TsdfVolume) -> None:
+def test_the_surface_lies_where_the_mesh_is(volume):
     surface = volume.surface()
     distance = MeshRaycaster(room()).distance_to_surface(surface.vertices, 0.5)
     assert np.quantile(distance, 0.95) < 0.005
@@ -31,7 +29,7 @@ def test_the_surface_lies_where_the_mesh_is(volume: TsdfVolume) -> None:
     np.testing.assert_allclose(again.vertices.mean(0), surface.vertices.mean(0), atol=1e-4)
 
 
-def test_a_depth_camera_may_have_two_focal_lengths_and_its_own_centre() -> None:
+def test_a_depth_camera_may_have_two_focal_lengths_and_its_own_centre():
     depth = np.random.default_rng(0).uniform(1, 2, (240, 320))
     pose = np.eye(4)[:3]
     camera = ColmapCamera("PINHOLE", 320, 240, (200.0, 210.0, 155.0, 118.0))
@@ -43,9 +41,7 @@ def test_a_depth_camera_may_have_two_focal_lengths_and_its_own_centre() -> None:
         DepthImage(depth, ColmapCamera("RADIAL", 320, 240, (200.0, 160.0, 120.0, 0.1, 0.0)), pose)
 
 
-def test_voxels_that_do_not_fit_into_memory_are_refused(
-    images: list[DepthImage], volume: TsdfVolume, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_voxels_that_do_not_fit_into_memory_are_refused(images, volume, monkeypatch):
     assert 1 <= estimate_blocks(images, volume.config) / len(volume) < 2
     monkeypatch.setattr("wheretolook.geometry.tsdf.fitting", lambda bytes_each: (5 << 20) // bytes_each)
     with pytest.raises(ConfigError):
@@ -60,12 +56,12 @@ def test_voxels_that_do_not_fit_into_memory_are_refused(
     "options",
     [{"voxel_size_m": 0.0}, {"voxel_size_m": float("nan")}, {"truncation_voxels": 0.5}, {"max_depth_m": -1.0}],
 )
-def test_invalid_options(options: dict[str, float]) -> None:
+def test_invalid_options(options):
     with pytest.raises(ConfigError):
-        TsdfConfig(**options)  # type: ignore[arg-type]
+        TsdfConfig(**options)
 
 
-def test_scenes_without_a_surface(images: list[DepthImage]) -> None:
+def test_scenes_without_a_surface(images):
     for seen in ([], images):
         with pytest.raises(SceneError):
             TsdfVolume.from_images(seen, TsdfConfig(max_depth_m=0.1), progress=False)

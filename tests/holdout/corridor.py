@@ -1,15 +1,10 @@
 """A COLMAP model of a corridor, whose photographs, landmarks and descriptors are known; and its database."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pycolmap
 
-from wheretolook.features.extractor import DescriptorKind
 from wheretolook.features.sift import SIFT
-from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping.triangulation import fill_database
 
 N = 30  # photographs, and the rows of those that look at what no other sees
@@ -18,7 +13,7 @@ WIDTH = 320
 HEIGHT = 240
 
 
-def corridor_poses() -> Float:
+def corridor_poses():
     """27 photographs half a metre apart look at a wall 2 m away; 3 more, at the end, look the other way."""
     along = np.column_stack([0.5 * np.arange(27), np.zeros(27), np.full(27, 1.5)])
     end = np.column_stack([6 + 0.5 * np.arange(3), np.zeros(3), np.full(3, 1.5)])
@@ -26,14 +21,7 @@ def corridor_poses() -> Float:
     return poses_looking_along(np.concatenate([along, end]), axes)
 
 
-def write_corridor(
-    folder: Path,
-    noise_px: float = 0.2,
-    photographs: int = N,
-    scale: float = 1.0,
-    rotation: Float = np.eye(3),
-    kind: DescriptorKind = SIFT,
-) -> tuple[Path, Path]:
+def write_corridor(folder, noise_px=0.2, photographs=N, scale=1.0, rotation=np.eye(3), kind=SIFT):
     """Write the model and its database of keypoints and descriptors; their paths.
 
     Odd photographs are taken with a camera of another model. `scale` and `rotation` take the corridor to a frame of the

@@ -1,9 +1,5 @@
 """A room rendered from 24 places, of which nothing is known but the poses: photographs without features."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pycolmap
@@ -14,7 +10,7 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.rendering.warp_renderer import WarpRenderer
 
 
-def write_rendered_room(folder: Path) -> None:
+def write_rendered_room(folder):
     """Write the photographs, into `photographs`, and a COLMAP model of their poses alone, into `sparse`."""
     angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     outward = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(24)])

@@ -1,11 +1,7 @@
 """`wheretolook check` on a corridor whose photographs, landmarks and descriptors are known."""
 
-from __future__ import annotations
-
 import json
 import shutil
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -33,23 +29,23 @@ from wheretolook.utils.errors import ConfigError, MapError, WeightsError
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 
 
-def run(arguments: list[str]) -> None:
+def run(arguments):
     parse_command("check", arguments).run()
 
 
 @pytest.fixture(scope="module")
-def corridor(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def corridor(tmp_path_factory):
     return write_corridor(tmp_path_factory.mktemp("corridor"))
 
 
 @pytest.fixture(scope="module")
-def checked(corridor: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def checked(corridor, tmp_path_factory):
     out = tmp_path_factory.mktemp("checked") / "out"
     run(_arguments(*corridor, out, "--scale", "1", "--also", "bins"))
     return out
 
 
-def _arguments(sparse: Path, database: Path, out: Path, *more: str) -> list[str]:
+def _arguments(sparse, database, out, *more):
     where = ["--map", str(sparse), "--database", str(database), "--out", str(out)]
     return [*where, "--occlusion", "none", "--workers", "1", "--device", "cpu", *more]
 
@@ -57,7 +53,7 @@ def _arguments(sparse: Path, database: Path, out: Path, *more: str) -> list[str]
 # --- what is left of a map
 
 
-def test_tracks_without_some_photographs_are_those_of_the_others(tmp_path: Path) -> None:
+def test_tracks_without_some_photographs_are_those_of_the_others(tmp_path):
     sparse, _ = write_corridor(tmp_path, noise_px=0.0)
     whole = read_model(sparse)
     before = model_arrays(whole)
@@ -74,7 +70,7 @@ def test_tracks_without_some_photographs_are_those_of_the_others(tmp_path: Path)
     assert rest.image_ids.tolist() == before.image_ids[np.isin(before.image_ids, removed, invert=True)].tolist()
 
 
-def test_landmarks_are_triangulated_without_the_removed_photographs(corridor: tuple[Path, Path]) -> None:
+def test_landmarks_are_triangulated_without_the_removed_photographs(corridor):
     whole = read_model(corridor[0])
     moved = pycolmap.Reconstruction(whole)
     for number, point in whole.points3D.items():
@@ -91,7 +87,7 @@ def test_landmarks_are_triangulated_without_the_removed_photographs(corridor: tu
 # --- blocks
 
 
-def test_blocks_share_out_all_photographs_and_grow(corridor: tuple[Path, Path]) -> None:
+def test_blocks_share_out_all_photographs_and_grow(corridor):
     source = open_map(*corridor, frame=FrameOptions(scale=1))
     blocks = choose_blocks(source)
     parts = [block for block in blocks if block.is_part]
@@ -114,7 +110,7 @@ def test_blocks_share_out_all_photographs_and_grow(corridor: tuple[Path, Path]) 
 # --- the command
 
 
-def test_photographs_localize_where_the_rest_maps_what_they_show(checked: Path) -> None:
+def test_photographs_localize_where_the_rest_maps_what_they_show(checked):
     table = pd.read_csv(checked / "check.csv")
     blocks = pd.read_csv(checked / "blocks.csv")
     assert table["photograph"].tolist() == [f"{row:03}.jpg" for row in range(N)]
@@ -131,7 +127,7 @@ def test_photographs_localize_where_the_rest_maps_what_they_show(checked: Path) 
     assert (checked / "check.png").is_file()
 
 
-def test_the_part_that_nothing_else_shows_is_named(checked: Path) -> None:
+def test_the_part_that_nothing_else_shows_is_named(checked):
     parts = json.loads((checked / "check.json").read_text())["weak_parts"]
     (part,) = (part for part in parts if "027.jpg" in part["photographs"])
     assert {f"{row:03}.jpg" for row in ALONE} == {*part["photographs"]}
@@ -142,9 +138,7 @@ def test_the_part_that_nothing_else_shows_is_named(checked: Path) -> None:
 
 
 @pytest.mark.slow
-def test_adapted_weights_are_checked_on_their_own_map_alone(
-    checked: Path, corridor: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_adapted_weights_are_checked_on_their_own_map_alone(checked, corridor, tmp_path):
     source = open_map(*corridor, frame=FrameOptions(scale=1))
     base = TrainedNetwork.load(WEIGHTS / "set.safetensors", SetNetwork, "set")
     base = for_map(base, whole_map(source, HiddenPointRemoval(), "cpu"))  # as `adapt` writes it
@@ -166,7 +160,7 @@ def test_adapted_weights_are_checked_on_their_own_map_alone(
 
 
 @pytest.mark.slow
-def test_a_map_of_any_scale_and_frame_gives_the_same(corridor: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_map_of_any_scale_and_frame_gives_the_same(corridor, tmp_path):
     turned = Rotation.from_euler("x", 90, degrees=True).as_matrix()  # y is down, as COLMAP leaves it
     tables = []
     for name, files in (("own", corridor), ("other", write_corridor(tmp_path, scale=0.01, rotation=turned))):
@@ -182,7 +176,7 @@ def test_a_map_of_any_scale_and_frame_gives_the_same(corridor: tuple[Path, Path]
     assert own["limit"].median() == pytest.approx(0.025, rel=0.1)
 
 
-def test_finished_blocks_are_reused(checked: Path, corridor: tuple[Path, Path], tmp_path: Path) -> None:
+def test_finished_blocks_are_reused(checked, corridor, tmp_path):
     shutil.copytree(checked, tmp_path / "out")
     (work,) = (tmp_path / "out" / "work").glob("blocks-*")
     (work / "02" / "views.json").unlink()
@@ -194,7 +188,7 @@ def test_finished_blocks_are_reused(checked: Path, corridor: tuple[Path, Path], 
     assert (work / "01" / "views.json").stat().st_mtime_ns == cached
 
 
-def test_another_accuracy_judges_the_same_poses(checked: Path, corridor: tuple[Path, Path], tmp_path: Path) -> None:
+def test_another_accuracy_judges_the_same_poses(checked, corridor, tmp_path):
     shutil.copytree(checked, tmp_path / "out")
     (work,) = (tmp_path / "out" / "work").glob("blocks-*")
     before = [path.stat().st_mtime_ns for path in sorted(work.glob("*/views.json"))]
@@ -219,22 +213,18 @@ def test_another_accuracy_judges_the_same_poses(checked: Path, corridor: tuple[P
         (None, None, 1.0, "unknown"),
     ],
 )
-def test_the_advice_follows_from_order_values_and_range(
-    auc: float | None, ece: float | None, in_range: float, expected: str
-) -> None:
+def test_the_advice_follows_from_order_values_and_range(auc, ece, in_range, expected):
     numbers = {
         "methods": {"set": {"auc": {"value": auc}}},
         "ece": None if ece is None else {"value": ece},
         "share_in_range": in_range,
     }
-    none: Any = None
+    none = None
     advice = CheckReport(none, "set", none, none, none, numbers, []).advice()
     assert advice.startswith(expected) or advice.endswith(expected)
 
 
-def test_other_methods_are_printed(
-    corridor: tuple[Path, Path], checked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_other_methods_are_printed(corridor, checked, tmp_path, capsys):
     shutil.copytree(checked, tmp_path / "out")
     run(_arguments(*corridor, tmp_path / "out", "--scale", "1", "--also", "bins"))
     printed = capsys.readouterr().out
@@ -242,7 +232,7 @@ def test_other_methods_are_printed(
     assert f"bins picks the better one {100 * auc:.0f} times in 100" in printed
 
 
-def test_narrower_views_of_photographs(corridor: tuple[Path, Path], checked: Path, tmp_path: Path) -> None:
+def test_narrower_views_of_photographs(corridor, checked, tmp_path):
     """Three views of each photograph, fewer of which localize; the table of photographs has the middle ones."""
     run(_arguments(*corridor, tmp_path / "out", "--scale", "1", "--fov", "25"))
     whole, narrow = (pd.read_csv(folder / "views.csv") for folder in (checked, tmp_path / "out"))
@@ -256,7 +246,7 @@ def test_narrower_views_of_photographs(corridor: tuple[Path, Path], checked: Pat
         run(wide)
 
 
-def test_eight_photographs_are_enough(tmp_path: Path) -> None:
+def test_eight_photographs_are_enough(tmp_path):
     run(_arguments(*write_corridor(tmp_path / "few", photographs=8), tmp_path / "out", "--scale", "1"))
     numbers = json.loads((tmp_path / "out" / "check.json").read_text())
     assert numbers["n_photographs"] == 8 and numbers["n_blocks"] >= 2 and numbers["ece"]["low"] >= 0
@@ -279,7 +269,7 @@ def test_eight_photographs_are_enough(tmp_path: Path) -> None:
         (["--map", "{sparse}", "--database", "{database}", "--weights", "{folder}/none"], WeightsError),
     ],
 )
-def test_invalid_input(options: list[str], error: type[Exception], corridor: tuple[Path, Path], tmp_path: Path) -> None:
+def test_invalid_input(options, error, corridor, tmp_path):
     sparse, database = corridor
     shutil.copytree(sparse, tmp_path / "alone")
     write_corridor(tmp_path / "few", photographs=7)
@@ -290,7 +280,7 @@ def test_invalid_input(options: list[str], error: type[Exception], corridor: tup
 
 
 @pytest.mark.slow
-def test_photographs_without_features_are_extracted_again(tmp_path: Path) -> None:
+def test_photographs_without_features_are_extracted_again(tmp_path):
     write_rendered_room(tmp_path)
     arguments = ["--map", str(tmp_path / "sparse"), "--images", str(tmp_path / "photographs")]
     arguments += ["--scale", "1", "--workers", "1"]

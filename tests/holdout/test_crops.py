@@ -1,12 +1,10 @@
 """Narrower views of photographs: their pixels are where their cameras project the landmarks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera, field_of_view_deg
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera, field_of_view_deg
 from wheretolook.geometry.poses import transform
 from wheretolook.holdout.photo_map import PANS, crop_pixels, crops_of
 from wheretolook.utils.errors import ConfigError
@@ -16,7 +14,7 @@ CAMERAS = [PinholeCamera(640, 480, 320.0), ColmapCamera("SIMPLE_RADIAL", 800, 60
 
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("crop", range(len(PANS)))
-def test_pixels_are_those_of_the_turned_pinhole(camera: Camera, crop: int) -> None:
+def test_pixels_are_those_of_the_turned_pinhole(camera, crop):
     rng = np.random.default_rng(0)
     pose = np.column_stack([Rotation.random(random_state=1).as_matrix(), rng.normal(size=3)])
     rays = camera.colmap.unproject(rng.uniform(0, (camera.width, camera.height), (500, 2)))
@@ -31,7 +29,7 @@ def test_pixels_are_those_of_the_turned_pinhole(camera: Camera, crop: int) -> No
     assert 20 < shown.sum() < 400
 
 
-def test_the_outer_crops_end_at_the_sides_of_the_photograph() -> None:
+def test_the_outer_crops_end_at_the_sides_of_the_photograph():
     camera = CAMERAS[0]
     pinhole, _ = crops_of(camera, 40.0)
     middle = camera.height / 2
@@ -41,7 +39,7 @@ def test_the_outer_crops_end_at_the_sides_of_the_photograph() -> None:
     np.testing.assert_allclose(sorted(ends[:2]), [0, pinhole.width], atol=0.6)
 
 
-def test_pixels_outside_a_crop_are_not_shown_and_wider_views_are_an_error() -> None:
+def test_pixels_outside_a_crop_are_not_shown_and_wider_views_are_an_error():
     pinhole, _ = crops_of(CAMERAS[0], 30.0)
     pixels, shown = crop_pixels(CAMERAS[0], np.array([[320.0, 240.0], [5.0, 240.0]]), 30.0, 0)
     assert shown.tolist() == [True, False]

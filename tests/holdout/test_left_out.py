@@ -1,10 +1,7 @@
 """What stages make of photographs that were left out: weights adapted by them, and rows of an evaluation."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -24,7 +21,7 @@ from wheretolook.tracking.runs import finished_runs
 from wheretolook.tracking.store import TrackingConfig
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.weights import read_training
-from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.utils.package import WEIGHTS, shipped
 from wheretolook.visibility.occlusion import NoOcclusion
 from wheretolook_paper.evaluation.score_report import score_markdown
 
@@ -32,12 +29,12 @@ pytestmark = pytest.mark.usefixtures("no_pictures")
 SET = shipped(WEIGHTS) / "set.safetensors"
 
 
-def run(arguments: list[str]) -> None:
+def run(arguments):
     parse_command("check", arguments).run()
 
 
 @pytest.fixture(scope="module")
-def checked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
+def checked(tmp_path_factory):
     """The corridor's model and database, and the data folder with its check."""
     folder = tmp_path_factory.mktemp("place")
     sparse, database = write_corridor(folder / "corridor")
@@ -46,16 +43,14 @@ def checked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]
     return sparse, database, folder / "data"
 
 
-def adapt(checked: tuple[Path, Path, Path], tmp_path: Path, *options: str) -> int:
+def adapt(checked, tmp_path, *options):
     sparse, database, data = checked
     where = ["--map", str(sparse), "--database", str(database), "--data", str(data), "--device", "cpu"]
     how = ["--occlusion.model", "none", "--label.workers", "1", "--tracking.folder", str(tmp_path / "mlruns")]
     return main(["adapt", *where, *how, *options])
 
 
-def test_underconfident_weights_are_adapted_by_photographs(
-    checked: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_underconfident_weights_are_adapted_by_photographs(checked, tmp_path, capsys):
     sparse, database, data = checked
     bundled = TrainedNetwork.load(SET, SetNetwork, "set")
     replace(bundled, offset=bundled.offset - 4).save(tmp_path / "timid.safetensors", read_training(SET))
@@ -78,7 +73,7 @@ def test_underconfident_weights_are_adapted_by_photographs(
     assert content["method"] == "adapted" and content["ece"]["value"] < training["before"]["calibration_error"] / 2
 
 
-def test_photographs_have_their_own_rows(checked: tuple[Path, Path, Path], tmp_path: Path) -> None:
+def test_photographs_have_their_own_rows(checked, tmp_path):
     sparse, database, data = checked
     rendered = make_dataset(tmp_path / "data" / "both", ("test",), n_locations=14, n_directions=16)
     source = open_map(sparse, database, frame=FrameOptions(scale=1))
@@ -99,9 +94,7 @@ def test_photographs_have_their_own_rows(checked: tuple[Path, Path, Path], tmp_p
 
 
 @pytest.mark.slow
-def test_a_scene_of_photographs_alone_is_evaluated_and_adapted_to(
-    checked: tuple[Path, Path, Path], tmp_path: Path
-) -> None:
+def test_a_scene_of_photographs_alone_is_evaluated_and_adapted_to(checked, tmp_path):
     sparse, database, _ = checked
     where = ["--name", "mine", "--data", str(tmp_path / "data"), "--tracking.folder", str(tmp_path / "mlruns")]
     where += ["--device", "cpu", "--label.workers", "1"]

@@ -1,7 +1,5 @@
 """Numbers of a check against those of other implementations, and against ones worked out by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -19,7 +17,7 @@ from wheretolook.holdout.metrics import (
 
 
 @pytest.fixture(scope="module")
-def views() -> pd.DataFrame:
+def views():
     rng = np.random.default_rng(3)
     score = rng.random(300).round(2)  # with ties
     good = rng.random(300) < score
@@ -32,7 +30,7 @@ def views() -> pd.DataFrame:
     )  # fmt: skip
 
 
-def test_auc_is_that_of_scikit_learn_for_every_resample(views: pd.DataFrame) -> None:
+def test_auc_is_that_of_scikit_learn_for_every_resample(views):
     bootstrap = ClusterBootstrap(views["block"].to_numpy(), resamples=20, seed=0)
     good = views["good"].to_numpy()
     score = views["score"].to_numpy()
@@ -42,7 +40,7 @@ def test_auc_is_that_of_scikit_learn_for_every_resample(views: pd.DataFrame) -> 
         assert area == pytest.approx(roc_auc_score(good, score, sample_weight=weights), abs=1e-12)
 
 
-def test_auc_within_blocks_counts_pairs_of_one_block(views: pd.DataFrame) -> None:
+def test_auc_within_blocks_counts_pairs_of_one_block(views):
     good, score, block = (views[name].to_numpy() for name in ("good", "score", "block"))
     bootstrap = ClusterBootstrap(block, 10, seed=0)
     wins = pairs = 0.0
@@ -57,13 +55,13 @@ def test_auc_within_blocks_counts_pairs_of_one_block(views: pd.DataFrame) -> Non
     assert resampled_auc(bootstrap, good, shifted)[0] < wins / pairs
 
 
-def test_places_are_within_a_radius_and_a_block() -> None:
+def test_places_are_within_a_radius_and_a_block():
     centers = np.array([(0, 0, 0), (0.3, 0, 0), (0.8, 0, 0), (0, 0, 0)], dtype=float)
     place = places_of(centers, np.array([1, 1, 1, 2]), 0.5)
     assert place[0] == place[1] and len({place[0], place[2], place[3]}) == 3
 
 
-def test_regret_is_of_places_where_another_view_was_better() -> None:
+def test_regret_is_of_places_where_another_view_was_better():
     place = np.array([0, 0, 1, 1, 2, 3, 3])
     good = np.array([True, False, True, False, True, False, False])
     rows, possible, chosen = regret_of_places(place, good, np.array([0.1, 0.9, 0.9, 0.1, 0.5, 0.2, 0.3]))
@@ -71,7 +69,7 @@ def test_regret_is_of_places_where_another_view_was_better() -> None:
     assert possible.tolist() == [True, True, False] and chosen.tolist() == [False, True, False]
 
 
-def test_measure_compares_methods(views: pd.DataFrame) -> None:
+def test_measure_compares_methods(views):
     centers = np.random.default_rng(0).uniform(0, 2, (len(views), 3))
     numbers = measure(views, {"set": "score", "visible": "visible"}, centers, 0.5, True)
     good, score = (views[name].to_numpy() for name in ("good", "score"))
@@ -89,14 +87,14 @@ def test_measure_compares_methods(views: pd.DataFrame) -> None:
     assert 0 < mine["regret"]["value"] < other["regret"]["value"] and numbers["n_places_of_both_kinds"] > 10
 
 
-def test_where_all_localize_there_is_no_auc(views: pd.DataFrame) -> None:
+def test_where_all_localize_there_is_no_auc(views):
     found = measure(views.assign(good=True), {"set": "score", "visible": "visible"}, np.zeros((300, 3)), 0.5, True)
     assert found["methods"]["set"]["auc"] == {"value": None, "low": None, "high": None}
     assert found["methods"]["set"]["regret"]["value"] == 0
 
 
-def test_few_blocks_have_wide_intervals(views: pd.DataFrame) -> None:
-    def error_of(blocks: int) -> tuple[float, float, float]:
+def test_few_blocks_have_wide_intervals(views):
+    def error_of(blocks):
         part = views.assign(block=views["block"] % blocks)
         found = measure(part, {"set": "score", "visible": "visible"}, np.zeros((300, 3)), 0.5, True)["ece"]
         bootstrap = ClusterBootstrap(part["block"].to_numpy(), RESAMPLES, seed=0)

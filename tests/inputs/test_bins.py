@@ -1,32 +1,28 @@
 """Binned inputs against bins counted by hand and the plain twin."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from conftest import RandomViews
 from synthetic_dataset import make_landmarks
-from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.inputs.bins import bin_views, bin_views_plain, count_bins
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, LANDMARK_CHANNELS
 from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews, landmarks_in_view
 
 LOOKING_ALONG_Z = np.eye(3, 4)[None]
 DISTORTED = ColmapCamera("RADIAL", 320, 240, (150.0, 165.0, 118.0, -0.15, 0.02))
 
 
-def hand_counted(points: list[list[float]]) -> LandmarkSets:
+def hand_counted(points):
     return LandmarkSets.from_mask(np.ones((1, len(points)), dtype=bool))
 
 
 @pytest.mark.parametrize("bin_function", [bin_views, bin_views_plain])
-def test_bins_counted_by_hand(bin_function) -> None:  # type: ignore[no-untyped-def]
+def test_bins_counted_by_hand(bin_function):
     # 60 x 30 pixels, f = 30: bins of 2 x 1 pixels. The optical axis passes through (30, 15).
     camera = PinholeCamera(60, 30, 30.0)
     points = [
@@ -47,9 +43,7 @@ def test_bins_counted_by_hand(bin_function) -> None:  # type: ignore[no-untyped-
     assert np.all(binned.means[:, :, binned.counts[0] == 0] == 0)
 
 
-def test_counted_bins_are_those_that_the_plain_twin_fills(
-    random_views: RandomViews, device: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_counted_bins_are_those_that_the_plain_twin_fills(random_views, device, monkeypatch):
     arguments = posed_views(random_views)
     plain = bin_views_plain(arguments, bins=12)
     for block_bytes in (1 << 30, 3 * 12 * 12 * 4):  # all at once, and three views at a time
@@ -62,15 +56,15 @@ def test_counted_bins_are_those_that_the_plain_twin_fills(
     np.testing.assert_array_equal(count_bins(arguments, bins=6), (binned.n_visible, binned.n_filled))
 
 
-def posed_views(views: RandomViews, camera: Camera | None = None) -> PosedViews:
+def posed_views(views, camera=None):
     return PosedViews(camera or views.camera, views.cam_from_world, views.points, views.visible, views.location_rows)
 
 
-def landmarks_of(views: RandomViews) -> Landmarks:
+def landmarks_of(views):
     return replace(make_landmarks(np.random.default_rng(0), len(views.points)), points=views.points)
 
 
-def test_kernel_bins_what_landmarks_are_like_as_its_plain_twin(random_views: RandomViews, device: str) -> None:
+def test_kernel_bins_what_landmarks_are_like_as_its_plain_twin(random_views, device):
     landmarks = landmarks_of(random_views)
     arguments = posed_views(random_views)
     kernel = bin_views(arguments, bins=12, device=device, landmarks=landmarks)
@@ -85,7 +79,7 @@ def test_kernel_bins_what_landmarks_are_like_as_its_plain_twin(random_views: Ran
 
 
 @pytest.mark.parametrize("distorted", [False, True])
-def test_channels_of_landmarks_are_means_of_their_attributes(random_views: RandomViews, distorted: bool) -> None:
+def test_channels_of_landmarks_are_means_of_their_attributes(random_views, distorted):
     landmarks = landmarks_of(random_views)
     arguments = posed_views(random_views, DISTORTED if distorted else None)
     binned = bin_views(arguments, bins=1, landmarks=landmarks)
@@ -99,7 +93,7 @@ def test_channels_of_landmarks_are_means_of_their_attributes(random_views: Rando
         np.testing.assert_allclose(binned.means[view, len(CHANNELS) :, 0, 0], expected, rtol=1e-4, atol=1e-5)
 
 
-def test_a_mean_with_an_unknown_value_is_unknown_and_nothing_else_is(random_views: RandomViews, device: str) -> None:
+def test_a_mean_with_an_unknown_value_is_unknown_and_nothing_else_is(random_views, device):
     landmarks = landmarks_of(random_views)
     known = np.random.default_rng(1).random(len(landmarks)) < 0.9
     landmarks = replace(landmarks, ambiguity=np.where(known, landmarks.ambiguity, np.nan).astype(np.float32))
@@ -112,7 +106,7 @@ def test_a_mean_with_an_unknown_value_is_unknown_and_nothing_else_is(random_view
     assert unknown.sum() == unknown[ALL_CHANNELS.index("ambiguity")]
 
 
-def test_blocks_do_not_change_the_bins(random_views: RandomViews, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blocks_do_not_change_the_bins(random_views, monkeypatch):
     arguments = posed_views(random_views)
     whole = bin_views(arguments, bins=6)
     monkeypatch.setattr("wheretolook.inputs.bins.BLOCK_BYTES", 7 * 36 * 24)

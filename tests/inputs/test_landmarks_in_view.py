@@ -1,14 +1,12 @@
 """Landmarks of views described one by one, and pooled, against NumPy view by view."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 
 from synthetic_dataset import CAMERA, make_landmarks
 from wheretolook.geometry.camera import ColmapCamera
-from wheretolook.geometry.poses import Float, poses_looking_along, transform
+from wheretolook.geometry.poses import poses_looking_along, transform
 from wheretolook.inputs.channels import ATTRIBUTES, POSE_ATTRIBUTES
 from wheretolook.inputs.landmark_features import LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
@@ -18,14 +16,14 @@ from wheretolook.visibility.occlusion import StoredOcclusion
 COLMAP = ColmapCamera("OPENCV", 160, 120, (80.0, 80.0, 80.0, 60.0, -0.1, 0.01, 1e-3, -1e-3))
 
 
-def some_views() -> Float:
+def some_views():
     rng = np.random.default_rng(1)
     at = rng.uniform((-2, -2, 0.5), (2, 2, 2), (6, 3))
     return poses_looking_along(at[rng.integers(0, 6, 50)], rng.normal(size=(50, 3)))
 
 
 @pytest.fixture(params=[CAMERA, COLMAP], ids=["pinhole", "opencv"])
-def localization_map(request: pytest.FixtureRequest, device: str) -> LocalizationMap:
+def localization_map(request, device):
     rng = np.random.default_rng(0)
     landmarks = make_landmarks(rng, 400)
     centers = np.unique(-np.einsum("bji,bj->bi", some_views()[:, :, :3], some_views()[:, :, 3]).round(6), axis=0)
@@ -33,7 +31,7 @@ def localization_map(request: pytest.FixtureRequest, device: str) -> Localizatio
     return LocalizationMap(landmarks, request.param, occlusion, device)
 
 
-def test_each_landmark_by_hand(localization_map: LocalizationMap) -> None:
+def test_each_landmark_by_hand(localization_map):
     m = localization_map.landmarks
     views = some_views()
     described = LandmarkDescriber(localization_map).describe(views)
@@ -71,9 +69,7 @@ def test_each_landmark_by_hand(localization_map: LocalizationMap) -> None:
 
 
 @pytest.mark.parametrize("most", [None, 1, 20])
-def test_blocks_of_views_hold_all_or_evenly_spread_landmarks(
-    localization_map: LocalizationMap, most: int | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_blocks_of_views_hold_all_or_evenly_spread_landmarks(localization_map, most, monkeypatch):
     views = some_views()
     describer = LandmarkDescriber(localization_map)
     whole = describer.describe(views)
@@ -93,7 +89,7 @@ def test_blocks_of_views_hold_all_or_evenly_spread_landmarks(
     assert n_views == len(views)
 
 
-def test_views_share_locations_in_whatever_order_they_come() -> None:
+def test_views_share_locations_in_whatever_order_they_come():
     rng = np.random.default_rng(5)
     places = rng.uniform(0, 4, (4, 3))
     for order in ([0, 0, 0], [0, 0, 1, 1, 2], [2, 0, 2, 1, 0, 3, 3, 0], []):
@@ -103,7 +99,7 @@ def test_views_share_locations_in_whatever_order_they_come() -> None:
         np.testing.assert_allclose(locations[rows], places[order], atol=1e-6)
 
 
-def test_one_view_is_described_and_thinned_as_it_is_among_others(localization_map: LocalizationMap) -> None:
+def test_one_view_is_described_and_thinned_as_it_is_among_others(localization_map):
     poses = some_views()
     describer = LandmarkDescriber(localization_map)
     ((_, together, seen),) = describer.in_blocks(poses, 20)

@@ -1,9 +1,6 @@
 """Landmarks that are hard to match are counted by their distance, angle, descriptor and line of sight."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -16,7 +13,7 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scenes.loading import save_glb
 
 
-def test_counts_by_the_definitions(tmp_path: Path) -> None:
+def test_counts_by_the_definitions(tmp_path):
     save_glb(furnished_room(), tmp_path / "room.glb")
     room = LocalizationMap.from_colmap(write_room(tmp_path / "sparse"), mesh=tmp_path / "room.glb")
     mapped_m = room.landmarks.mapping_distance_m / 4  # so that some are twice as far
@@ -44,7 +41,7 @@ def test_counts_by_the_definitions(tmp_path: Path) -> None:
     assert (expected.sum(0) > 0).all()
 
 
-def test_without_descriptors_repetition_is_unknown(tmp_path: Path) -> None:
+def test_without_descriptors_repetition_is_unknown(tmp_path):
     room = LocalizationMap.from_colmap(write_room(tmp_path / "sparse"))
     counts = ReasonCounter(room).count(poses_looking_along(POINTS, np.tile((1.0, 0, 0), (4, 1))))
     assert np.isnan(counts.n_repeated).all() and (counts.n_occluded == 0).all() and (counts.n_too_far >= 0).all()

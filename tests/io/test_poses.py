@@ -1,7 +1,6 @@
 """Pose files hold the poses that were written, and invalid ones are rejected."""
 
 import os
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -25,7 +24,7 @@ from wheretolook.utils.errors import ConfigError, TableError
 POSES = poses_looking_along([(1.5, -2, 0.25), (0, 3, 1)], [(1, 0, 0), (-1, 2, 0.5)])
 
 
-def test_round_trips(tmp_path: Path) -> None:
+def test_round_trips(tmp_path):
     (tmp_path / "path.tum").write_text("# a comment\n" + tum_text(["0.5", "1"], POSES))
     pd.DataFrame(pose_values(POSES), columns=[*POSE_COLUMNS]).to_csv(tmp_path / "path.csv")
     world = invert_poses(POSES)
@@ -42,7 +41,7 @@ def test_round_trips(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("time", ["t", "timestamp", None])
-def test_header_in_the_order_of_tum(time: str | None, tmp_path: Path) -> None:
+def test_header_in_the_order_of_tum(time, tmp_path):
     """A camera at (1, 2, 3) that looks along the world's x, its image upright: quaternion xyzw -0.5, 0.5, -0.5, 0.5."""
     names, values = "tx,ty,tz,qx,qy,qz,qw", "1,2,3,-0.5,0.5,-0.5,0.5"
     path = tmp_path / "path.csv"
@@ -54,27 +53,27 @@ def test_header_in_the_order_of_tum(time: str | None, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("names", ["tx,ty,tz,qw,qx,qy,qz", "qx,qy,qz,qw,tx,ty,tz"])
-def test_header_in_an_order_of_no_convention(names: str, tmp_path: Path) -> None:
+def test_header_in_an_order_of_no_convention(names, tmp_path):
     (tmp_path / "path.csv").write_text(f"{names}\n0.5,0.5,0.5,0.5,0.5,0.5,0.5\n")
     for read in (read_poses, read_waypoints):
         with pytest.raises(TableError, match=r"TUM.*camera-to-world.*COLMAP.*world-to-camera"):
             read(tmp_path / "path.csv")
 
 
-def test_texts_keep_the_centre_of_a_camera_far_away() -> None:
+def test_texts_keep_the_centre_of_a_camera_far_away():
     for exact, offset, limit in ((True, 0, 1e-15), (False, 0, 1e-8), (False, 1e6, 1e-8)):
         poses = poses_looking_along(camera_centers(POSES) + offset, POSES[:, 2, :3])
         again = poses_of_values([[float(cell) for cell in text.split()] for text in pose_texts(poses, exact)])
         np.testing.assert_allclose(camera_centers(again), camera_centers(poses), rtol=1e-15, atol=limit)
 
 
-def test_rows(tmp_path: Path) -> None:
+def test_rows(tmp_path):
     path = tmp_path / "rows"
     path.write_text('\ufeff# comment\n\n"a; b"; 1;2\nc;3\n', encoding="utf-8")
     assert read_rows(path) == [(3, ["a; b", "1", "2"]), (4, ["c", "3"])]
 
 
-def test_large_tables_are_rejected_without_reading_them(tmp_path: Path) -> None:
+def test_large_tables_are_rejected_without_reading_them(tmp_path):
     path = tmp_path / "rows"
     path.write_text("1\n" * (MAX_ROWS + 1))
     with pytest.raises(TableError):
@@ -103,7 +102,7 @@ def test_large_tables_are_rejected_without_reading_them(tmp_path: Path) -> None:
         b"1 1 0 0 0 0 0 0 1 a.jpg\n\n2 3 0 0 0 0 0 0 1 b.jpg\n\n",
     ],
 )
-def test_invalid_files(content: bytes, tmp_path: Path) -> None:
+def test_invalid_files(content, tmp_path):
     for name in ("path.tum", "path.csv", "images.txt"):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(TableError):

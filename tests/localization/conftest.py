@@ -1,12 +1,10 @@
 """One room for all tests of labelling, and its labels from a plain loop in this process."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest
 
-from localization.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, file_bytes, map_room
+from localization.rooms import CAMERA, PLAIN, POSTER, facing, file_bytes, map_room
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.shard import label_rows
 from wheretolook.mapping.landmarks import Landmarks
@@ -15,20 +13,20 @@ from wheretolook.scenes.loading import load_mesh
 
 
 @pytest.fixture(scope="session")
-def room(tmp_path_factory: pytest.TempPathFactory) -> MappedRoom:
+def room(tmp_path_factory):
     """No texture repeats: the room is 5 m long, and so is a texture."""
     return map_room(tmp_path_factory.mktemp("room"), texture_scale=0.5)
 
 
 @pytest.fixture(scope="session")
-def views() -> pd.DataFrame:
+def views():
     """24 unlabelled viewpoints, of which some localize."""
     parts = facing(POSTER, 12, 1.5), facing(PLAIN, 6, 2.5, seed=1), facing(PLAIN, 6, 1.1)
     return pd.concat(parts, ignore_index=True).assign(viewpoint_id=np.arange(24))
 
 
 @pytest.fixture(scope="session")
-def expected(room: MappedRoom, views: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def expected(room, views, tmp_path_factory):
     """The file of their labels that every engine must produce."""
     localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
     labelled = label_rows(views, WarpRenderer(load_mesh(room.mesh)), localizer, CAMERA)
@@ -37,13 +35,13 @@ def expected(room: MappedRoom, views: pd.DataFrame, tmp_path_factory: pytest.Tem
 
 
 @pytest.fixture(scope="session")
-def matched(room: MappedRoom, views: pd.DataFrame) -> pd.DataFrame:
+def matched(room, views):
     """Their labels with the landmarks that were matched."""
     localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
     return label_rows(views, WarpRenderer(load_mesh(room.mesh)), localizer, CAMERA, store_matches=True)
 
 
 @pytest.fixture(scope="session")
-def expected_matches(matched: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def expected_matches(matched, tmp_path_factory):
     """The file that every engine must produce when it stores matches."""
     return file_bytes(matched, tmp_path_factory.mktemp("matched"))

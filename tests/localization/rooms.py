@@ -8,7 +8,6 @@ from __future__ import annotations
 import signal
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -40,11 +39,11 @@ class MappedRoom:
     landmarks: Path
 
     @property
-    def job(self) -> SceneJob:
+    def job(self):
         return SceneJob(self.mesh, self.landmarks, CAMERA)
 
 
-def map_room(folder: Path, texture_scale: float) -> MappedRoom:
+def map_room(folder, texture_scale):
     mesh = box_room()
     textures = list(mesh.textures)
     textures[PLAIN] = np.full_like(textures[PLAIN], 200)
@@ -56,14 +55,14 @@ def map_room(folder: Path, texture_scale: float) -> MappedRoom:
     return MappedRoom(folder / "mesh.glb", folder / "map" / "landmarks.npz")
 
 
-def viewpoints(locations: np.ndarray, directions: np.ndarray) -> pd.DataFrame:
+def viewpoints(locations, directions):
     n = len(locations)
     columns = {name: np.zeros(n) for name in SCHEMA.names} | pose_columns(poses_looking_along(locations, directions))
     table = pd.DataFrame(columns).assign(viewpoint_id=np.arange(n), status=UNLABELLED, error_m=np.nan, error_deg=np.nan)
     return table.astype({"viewpoint_id": np.int64, "n_inliers": np.int32})
 
 
-def facing(wall: int, n: int, distance_m: float, seed: int = 0) -> pd.DataFrame:
+def facing(wall, n, distance_m, seed=0):
     """Views perpendicular to a wall x = const, so near that they see only this wall."""
     rng = np.random.default_rng(seed)
     locations = np.column_stack([np.zeros(n), rng.uniform(1.6, 2.4, n), rng.uniform(1.2, 1.4, n)])
@@ -71,35 +70,35 @@ def facing(wall: int, n: int, distance_m: float, seed: int = 0) -> pd.DataFrame:
     return viewpoints(locations, np.tile([1.0 if wall == PLAIN else -1.0, 0, 0], (n, 1)))
 
 
-def label(table: pd.DataFrame, room: MappedRoom, shards: Path, **config: Any) -> bytes:
+def label(table, room, shards, **config):
     """Bytes of the labelled table's file."""
     options = LabelConfig(**config)
     labelled = label_viewpoints(table, room.mesh, room.landmarks, CAMERA, shards, options, progress=False)
     return file_bytes(labelled, shards)
 
 
-def file_bytes(table: pd.DataFrame, folder: Path) -> bytes:
+def file_bytes(table, folder):
     path = folder.with_name(f"{folder.name}-labelled.parquet")
     write_table(table, path)
     return path.read_bytes()
 
 
-def times(shards: Path) -> dict[Path, int]:
+def times(shards):
     """When each finished shard was written."""
     return {path: path.stat().st_mtime_ns for path in sorted(shards.glob("*.parquet"))}
 
 
-def workers_of(pid: int) -> list[int]:
+def workers_of(pid):
     """Spawned worker processes of a process."""
     children = [child for path in Path(f"/proc/{pid}/task").glob("*/children") for child in path.read_text().split()]
     return [int(child) for child in children if "spawn_main" in _command(child)]
 
 
-def is_running(pid: int) -> bool:
+def is_running(pid):
     return bool(_command(pid))
 
 
-def _command(pid: int | str) -> str:
+def _command(pid):
     """Command line of a process; empty when it has ended."""
     try:
         return Path(f"/proc/{pid}/cmdline").read_text()
@@ -110,5 +109,5 @@ def _command(pid: int | str) -> str:
 class Deadly:
     """Kills the worker that receives it."""
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self):
         return signal.raise_signal, (signal.SIGKILL,)

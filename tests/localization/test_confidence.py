@@ -9,7 +9,7 @@ from wheretolook.localization.confidence import RIGHT_PLACE, ConfidenceModel, Er
 from wheretolook.localization.rig_localization import JointLocalization
 
 
-def pose(n_inliers: int, deviation_m: float, rivals: tuple[JointLocalization, ...] = ()) -> JointLocalization:
+def pose(n_inliers, deviation_m, rivals=()):
     """A result with inliers and a deviation, and no landmarks."""
     covariance = np.diag([deviation_m**2, 0, 0, (deviation_m / 5) ** 2, 0, 0])
     inliers = (np.ones(n_inliers, dtype=bool),)
@@ -19,14 +19,14 @@ def pose(n_inliers: int, deviation_m: float, rivals: tuple[JointLocalization, ..
     )
 
 
-def test_the_error_is_log_normal() -> None:
+def test_the_error_is_log_normal():
     model = ErrorModel(1.2, 0.3, 0.8)
     expected = lognorm(s=0.8, scale=math.exp(1.2 * math.log(0.02) + 0.3)).cdf(0.05)
     assert model.p_below(0.05, 0.02) == pytest.approx(expected)
     assert model.p_below(math.inf, math.inf) == 1 and model.p_below(0.05, math.inf) == 0 and model.p_below(0.05, 0) == 1
 
 
-def test_a_coarser_accuracy_is_more_probable_up_to_the_right_place() -> None:
+def test_a_coarser_accuracy_is_more_probable_up_to_the_right_place():
     model = ConfidenceModel.bundled()
     found = [model.of(pose(200, 0.02), limits) for limits in ((0.01, 0.1), ACCURACY, (0.25, 2.0), RIGHT_PLACE)]
     assert found == sorted(found) and found[0] < 0.5 < found[1]
@@ -34,7 +34,7 @@ def test_a_coarser_accuracy_is_more_probable_up_to_the_right_place() -> None:
     assert model.of(pose(5, 0.02)) == 0
 
 
-def test_poses_that_exclude_each_other_have_probabilities_up_to_one_together() -> None:
+def test_poses_that_exclude_each_other_have_probabilities_up_to_one_together():
     strong = pose(300, 0.01)
     found = probabilities(pose(300, 0.01, (strong, pose(30, 0.1))), RIGHT_PLACE)
     assert found.shape == (3,) and found.sum() == pytest.approx(1) and found[0] == found[1] > found[2]

@@ -1,14 +1,9 @@
 """The same table from any engine, number of workers and size of shards, after an interruption, and from a cluster."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,15 +20,13 @@ SLOW = pytest.mark.slow
 
 @SLOW
 @pytest.mark.parametrize(("workers", "shard_size"), [(2, 5), (1, 24), (4, 3)])
-def test_workers_and_shards_do_not_change_the_table(
-    room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path, workers: int, shard_size: int
-) -> None:
+def test_workers_and_shards_do_not_change_the_table(room, views, expected, tmp_path, workers, shard_size):
     assert label(views, room, tmp_path / "shards", workers=workers, shard_size=shard_size) == expected
     assert not multiprocessing.active_children()
 
 
 @SLOW
-def test_workers_do_not_change_appearances(room: MappedRoom, views: pd.DataFrame, tmp_path: Path) -> None:
+def test_workers_do_not_change_appearances(room, views, tmp_path):
     one, three = (
         label(views, room, tmp_path / str(workers), workers=workers, shard_size=24 // workers, appearance=0.7)
         for workers in (1, 3)
@@ -42,7 +35,7 @@ def test_workers_do_not_change_appearances(room: MappedRoom, views: pd.DataFrame
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[Any]:
+def cluster():
     """Two nodes of one core each, on this machine."""
     pytest.importorskip("ray")
     import ray
@@ -62,9 +55,7 @@ def cluster() -> Iterator[Any]:
 
 
 @SLOW
-def test_a_cluster_gives_the_same_table(
-    cluster: Any, room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path
-) -> None:
+def test_a_cluster_gives_the_same_table(cluster, room, views, expected, tmp_path):
     """The engine connects to the cluster and disconnects again, also after an error."""
     import ray
 

@@ -1,16 +1,12 @@
 """Faults at each step of labelling lead to the same table, possibly after resuming, or to a typed error."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import threading
-from pathlib import Path
 
-import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
@@ -24,24 +20,22 @@ from wheretolook.utils.errors import WorkerError
 
 
 @pytest.mark.slow
-def test_killed_workers_are_replaced(
-    room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_killed_workers_are_replaced(room, views, expected, tmp_path, monkeypatch):
     """One is killed while it starts, one when the first shard is finished."""
-    killed: set[int] = set()
+    killed = set()
 
-    def kill_one() -> None:
+    def kill_one():
         victim = workers_of(os.getpid())[0]
         os.kill(victim, signal.SIGKILL)
         killed.add(victim)
 
-    def watched(shards: list[Shard], workers: int):  # type: ignore[no-untyped-def]
+    def watched(shards, workers):
         for number, result in enumerate(run_local(shards, workers)):
             if number == 0:
                 kill_one()
             yield result
 
-    def kill_at_start() -> None:
+    def kill_at_start():
         wait_until(lambda: len(workers_of(os.getpid())) == 2)
         kill_one()
 
@@ -55,11 +49,9 @@ def test_killed_workers_are_replaced(
 
 
 @pytest.mark.slow
-def test_a_shard_that_kills_its_worker_every_time_is_given_up(
-    room: MappedRoom, views: pd.DataFrame, tmp_path: Path
-) -> None:
+def test_a_shard_that_kills_its_worker_every_time_is_given_up(room, views, tmp_path):
     rows = views[:2]
-    good = Shard(room.job, tmp_path / "a", rows)  # type: ignore
+    good = Shard(room.job, tmp_path / "a", rows)
     deadly = Shard(room.job, tmp_path / "b", Deadly())
     run = run_local([good, deadly], workers=1)
     shard, labelled = next(run)
@@ -71,9 +63,7 @@ def test_a_shard_that_kills_its_worker_every_time_is_given_up(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("in_this_process")
-def test_damaged_shards_are_made_anew_and_no_others(
-    room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path
-) -> None:
+def test_damaged_shards_are_made_anew_and_no_others(room, views, expected, tmp_path):
     label(views, room, tmp_path, shard_size=4)
     truncated, flipped, empty, swapped, *_ = paths = list(times(tmp_path))
     truncated.write_bytes(truncated.read_bytes()[:-100])
@@ -87,9 +77,7 @@ def test_damaged_shards_are_made_anew_and_no_others(
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_shards_of_another_mesh_or_of_other_viewpoints_are_not_used(
-    room: MappedRoom, views: pd.DataFrame, tmp_path: Path
-) -> None:
+def test_shards_of_another_mesh_or_of_other_viewpoints_are_not_used(room, views, tmp_path):
     mesh = tmp_path / "mesh.glb"
     mesh.write_bytes(room.mesh.read_bytes())
     copy = MappedRoom(mesh, room.landmarks)
@@ -109,9 +97,7 @@ def test_shards_of_another_mesh_or_of_other_viewpoints_are_not_used(
 
 
 @pytest.mark.slow
-def test_killed_at_any_moment_it_resumes_to_the_same_table(
-    room: MappedRoom, views: pd.DataFrame, expected_matches: bytes, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
+def test_killed_at_any_moment_it_resumes_to_the_same_table(room, views, expected_matches, tmp_path, request):
     write_table(views, tmp_path / "table.parquet")
     script = tmp_path / "run.py"
     script.write_text(
@@ -143,12 +129,12 @@ def test_killed_at_any_moment_it_resumes_to_the_same_table(
     assert finished.items() <= times(tmp_path / "shards").items()
 
 
-def with_flipped_bit(content: bytes, place: int, bit: int = 0) -> bytes:
+def with_flipped_bit(content, place, bit=0):
     flipped = bytearray(content)
     flipped[place] ^= 1 << bit
     return bytes(flipped)
 
 
-def inside_a_page(path: Path) -> int:
+def inside_a_page(path):
     """The bit is in the translations, which are not compressed: only the checksum reveals the change."""
     return int(pq.ParquetFile(path).metadata.row_group(0).column(7).data_page_offset) - 4  # its dictionary's last value

@@ -1,7 +1,5 @@
 """Matching again under a pose finds the landmarks that the pose predicts, and none that it does not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

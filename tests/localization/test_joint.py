@@ -1,7 +1,5 @@
 """Joint localization recovers known poses in spite of outliers, noise, and similar rooms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,15 +1,12 @@
 """Labels of a room whose answers are known: a plain wall never localizes, a poster wall in the map always does."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from localization.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, file_bytes, label, map_room, times
+from localization.rooms import CAMERA, PLAIN, POSTER, facing, file_bytes, label, map_room, times
 from one_scene import label_viewpoints
 from wheretolook.commands.options import MeshSource, ScenesConfig
 from wheretolook.commands.scenes import Scenes
@@ -17,7 +14,7 @@ from wheretolook.dataset.viewpoint_files import FIRST_FIELDS, SCHEMA, read_table
 from wheretolook.dataset.viewpoint_table import LOCALIZED, by_first, is_good, poses
 from wheretolook.features.extractor import Keypoints
 from wheretolook.features.matches import Matches
-from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import pose_error, transform
 from wheretolook.localization.config import LabelConfig, LocalizerConfig
 from wheretolook.localization.labeller import LabelTask, label_scenes
@@ -30,7 +27,7 @@ from wheretolook.utils.errors import ConfigError, SceneError
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_a_plain_wall_never_localizes_and_a_poster_wall_always_does(room: MappedRoom, tmp_path: Path) -> None:
+def test_a_plain_wall_never_localizes_and_a_poster_wall_always_does(room, tmp_path):
     for wall, expected in ((PLAIN, 0.0), (POSTER, 1.0)):
         table = facing(wall, 12, distance_m=1.1)
         labelled = label_viewpoints(
@@ -43,13 +40,11 @@ def test_a_plain_wall_never_localizes_and_a_poster_wall_always_does(room: Mapped
             assert (labelled["n_inliers"] >= 10).all() and labelled["error_m"].max() < 0.05
 
 
-def test_batches_that_exceed_the_memory_are_halved(
-    room: MappedRoom, views: pd.DataFrame, expected: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_batches_that_exceed_the_memory_are_halved(room, views, expected, tmp_path, caplog):
     """A renderer and an extractor that fail, as on a full GPU, for more than three views give the same labels."""
 
     class SmallRenderer(WarpRenderer):
-        def render(self, camera, cam_from_world):  # type: ignore[no-untyped-def]
+        def render(self, camera, cam_from_world):
             if len(cam_from_world) > 3:
                 raise RuntimeError("Failed to allocate 1000 bytes on device 'cuda:0'")
             return super().render(camera, cam_from_world)
@@ -57,28 +52,28 @@ def test_batches_that_exceed_the_memory_are_halved(
     localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
     whole = localizer.extractor.extract_batch
 
-    def extract_batch(images):  # type: ignore[no-untyped-def]
+    def extract_batch(images):
         if len(images) > 3:
             raise RuntimeError("CUDA out of memory. Tried to allocate 1000 MiB")
         return whole(images)
 
-    localizer.extractor.extract_batch = extract_batch  # type: ignore[method-assign]
+    localizer.extractor.extract_batch = extract_batch
     with caplog.at_level("WARNING"):
         labelled = label_rows(views, SmallRenderer(load_mesh(room.mesh)), localizer, CAMERA)
     assert file_bytes(labelled, tmp_path / "halved") == expected
     assert "GPU memory does not suffice" in caplog.text
 
-    def broken(images):  # type: ignore[no-untyped-def]
+    def broken(images):
         raise RuntimeError("another error")
 
-    localizer.extractor.extract_batch = broken  # type: ignore[method-assign]
+    localizer.extractor.extract_batch = broken
     with pytest.raises(RuntimeError, match="another error"):
         label_rows(views, WarpRenderer(load_mesh(room.mesh)), localizer, CAMERA)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("in_this_process")
-def test_a_repeated_texture_localizes_at_the_wrong_copy_and_is_labelled_so(tmp_path: Path) -> None:
+def test_a_repeated_texture_localizes_at_the_wrong_copy_and_is_labelled_so(tmp_path):
     """On the 4 m long wall the texture repeats after 2.5 m: some poses are wrong by 2.5 m, with many inliers."""
     room = map_room(tmp_path, texture_scale=1.0)
     arguments = room.mesh, room.landmarks, CAMERA, tmp_path / "shards", LabelConfig(workers=1)
@@ -89,9 +84,7 @@ def test_a_repeated_texture_localizes_at_the_wrong_copy_and_is_labelled_so(tmp_p
     assert labelled["n_inliers"][wrong].min() > 50 and not is_good(labelled)[wrong].any()
 
 
-def test_several_hypotheses_also_label_by_the_first_ransac_result(
-    room: MappedRoom, views: pd.DataFrame, tmp_path: Path
-) -> None:
+def test_several_hypotheses_also_label_by_the_first_ransac_result(room, views, tmp_path):
     """The same renderings, localized by each method alone; of a plain wall there are too few matches, or a wrong pose."""
     renderer = WarpRenderer(load_mesh(room.mesh))
     landmarks = Landmarks.load(room.landmarks)
@@ -109,13 +102,13 @@ def test_several_hypotheses_also_label_by_the_first_ransac_result(
     assert [*label_rows(stored, renderer, Localizer(landmarks, CAMERA), CAMERA)] == SCHEMA.names
 
 
-def test_errors_are_measured_against_the_true_pose(room: MappedRoom) -> None:
+def test_errors_are_measured_against_the_true_pose(room):
     """A table whose poses are wrong by 10 cm and 3 degrees gets exactly these errors."""
     table = facing(POSTER, 3, distance_m=1.5)
     localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
 
     class Elsewhere(WarpRenderer):
-        def render(self, camera, cam_from_world):  # type: ignore[no-untyped-def]
+        def render(self, camera, cam_from_world):
             moved = np.array(cam_from_world)
             turn = np.radians(3.0)
             yaw = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
@@ -137,7 +130,7 @@ def test_errors_are_measured_against_the_true_pose(room: MappedRoom) -> None:
     ],
     ids=lambda camera: getattr(camera, "model", "pinhole"),
 )
-def test_a_pose_is_found_with_every_camera(room: MappedRoom, camera: Camera) -> None:
+def test_a_pose_is_found_with_every_camera(room, camera):
     """Half of the matches are wrong."""
     landmarks = Landmarks.load(room.landmarks)
     (pose,) = poses(facing(POSTER, 1, distance_m=1.5))
@@ -154,7 +147,7 @@ def test_a_pose_is_found_with_every_camera(room: MappedRoom, camera: Camera) -> 
     assert error_m < 0.02 and error_deg < 0.3 and len(estimate.inlier_rows) >= 0.4 * len(rows)
 
 
-def test_views_of_several_cameras_are_labelled_as_each_alone(room: MappedRoom) -> None:
+def test_views_of_several_cameras_are_labelled_as_each_alone(room):
     cameras = {4: CAMERA, 9: PinholeCamera(240, 320, 200.0, center_px=(118.0, 166.0))}
     table = facing(POSTER, 8, distance_m=1.5).assign(camera_id=np.array([4, 9, 9, 4, 4, 4, 9, 4], np.int32))
     renderer = WarpRenderer(load_mesh(room.mesh))
@@ -168,7 +161,7 @@ def test_views_of_several_cameras_are_labelled_as_each_alone(room: MappedRoom) -
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_appearances_depend_on_the_view_alone(room: MappedRoom, views: pd.DataFrame, tmp_path: Path) -> None:
+def test_appearances_depend_on_the_view_alone(room, views, tmp_path):
     """Not on shards or an interruption; without them the table has no such column."""
     table = views.iloc[:12]
     shards = tmp_path / "shards"
@@ -185,7 +178,7 @@ def test_appearances_depend_on_the_view_alone(room: MappedRoom, views: pd.DataFr
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_half_of_the_locations_show_the_changed_mesh(room: MappedRoom, tmp_path: Path) -> None:
+def test_half_of_the_locations_show_the_changed_mesh(room, tmp_path):
     """Labels are those of each mesh alone, whatever the shards; a location's views all show the same mesh."""
     table = facing(POSTER, 24, distance_m=1.5).assign(location_id=np.repeat(np.arange(12, dtype=np.int32), 2))
     mesh = load_mesh(room.mesh)
@@ -211,7 +204,7 @@ def test_half_of_the_locations_show_the_changed_mesh(room: MappedRoom, tmp_path:
     assert "changes" not in again and is_good(again).all()
 
 
-def test_scenes_from_files_do_not_change(room: MappedRoom, tmp_path: Path) -> None:
+def test_scenes_from_files_do_not_change(room, tmp_path):
     loaded = ScenesConfig(train=0, test=0, meshes=(MeshSource(room.mesh, name="room"),))
     scenes = Scenes(name="own", data=tmp_path, device="cpu", scenes=loaded)
     (files,) = scenes.run(log=lambda line: None).scenes
@@ -222,13 +215,13 @@ def test_scenes_from_files_do_not_change(room: MappedRoom, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("strength", [-0.1, 1.01, np.nan])
-def test_changes_beyond_0_and_1_are_refused(strength: float) -> None:
+def test_changes_beyond_0_and_1_are_refused(strength):
     with pytest.raises(ConfigError, match=r"label\.changes"):
         LabelConfig(changes=strength)
 
 
 @pytest.mark.parametrize("strength", [-0.1, 1.01, 30.0, np.nan, np.inf])
-def test_appearances_beyond_0_and_1_are_refused(strength: float) -> None:
+def test_appearances_beyond_0_and_1_are_refused(strength):
     with pytest.raises(ConfigError, match=r"label\.appearance") as error:
         LabelConfig(appearance=strength)
     assert error.value.value is strength and error.value.fix

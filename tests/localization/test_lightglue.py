@@ -1,9 +1,6 @@
 """Queries are matched by LightGlue with the mapping images that see most of what they show."""
 
-from __future__ import annotations
-
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,7 +23,7 @@ from wheretolook.utils.errors import MapError, WeightsError
 KIND = all_kinds()["aliked"]
 
 
-def nearest_neighbour_weights(path: Path) -> Path:
+def nearest_neighbour_weights(path):
     """Weights with which LightGlue's layers change nothing, and its assignment finds mutual nearest neighbours."""
     torch = pytest.importorskip("torch")
     kornia = pytest.importorskip("kornia.feature", reason="LightGlue needs kornia: pip install kornia")
@@ -48,7 +45,7 @@ def nearest_neighbour_weights(path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def corridor(tmp_path_factory) -> Path:
+def corridor(tmp_path_factory):
     """A map's folder with its database, of ALIKED's kind of descriptors."""
     sparse, database = write_corridor(tmp_path_factory.mktemp("aliked"), kind=KIND)
     shutil.copy(database, sparse / "database.db")

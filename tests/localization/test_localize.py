@@ -1,11 +1,7 @@
 """`wheretolook localize`: images of a rendered room against its map, alone and as a rig."""
 
-from __future__ import annotations
-
 import json
 import re
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,9 +9,9 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
-from localization.rooms import CAMERA, MappedRoom
+from localization.rooms import CAMERA
 from wheretolook.cli import main
-from wheretolook.geometry.poses import Float, pose_error, poses_looking_along
+from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.io.poses import read_poses
 from wheretolook.localization.rig import checked_turns, read_turns
@@ -26,7 +22,7 @@ from wheretolook.mapping.photographs import read_photograph
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.select.image_localizer import ImageLocalizer
-from wheretolook.select.localized import Localized, figure_of
+from wheretolook.select.localized import figure_of
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import ConfigError, MapError, PoseError, TableError
 
@@ -35,7 +31,7 @@ POSES = poses_looking_along(np.tile((2.0, 2.0, 1.4), (3, 1)), AXES)
 
 
 @pytest.fixture(scope="module")
-def photos(room: MappedRoom, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def photos(room, tmp_path_factory):
     """Images of `POSES`: a.png, b.png and c.png."""
     folder = tmp_path_factory.mktemp("photos")
     for name, rgb in zip("abc", WarpRenderer(load_mesh(room.mesh)).render(CAMERA, POSES).rgb, strict=True):
@@ -44,19 +40,17 @@ def photos(room: MappedRoom, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def localizer(room: MappedRoom) -> ImageLocalizer:
+def localizer(room):
     return ImageLocalizer.open(room.landmarks.parent)
 
 
-def assert_near(poses: Float | None, expected: Float) -> None:
+def assert_near(poses, expected):
     assert poses is not None
     error_m, error_deg = pose_error(poses, expected)
     assert (error_m < 0.05).all() and (error_deg < 0.4).all()
 
 
-def test_a_batch_is_localized_and_an_unreadable_image_is_a_row_with_its_reason(
-    room: MappedRoom, photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_batch_is_localized_and_an_unreadable_image_is_a_row_with_its_reason(room, photos, tmp_path, capsys):
     (tmp_path / "broken.png").write_bytes(b"no image")
     cut = cv2.imencode(".jpg", cv2.imread(str(photos / "a.png")))[1].tobytes()
     (tmp_path / "cut.jpg").write_bytes(cut[: len(cut) // 2])
@@ -75,7 +69,7 @@ def test_a_batch_is_localized_and_an_unreadable_image_is_a_row_with_its_reason(
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {"a.png", "b.png", "c.png"}
 
 
-def test_images_of_the_same_name_in_two_folders_are_distinct(room: MappedRoom, photos: Path, tmp_path: Path) -> None:
+def test_images_of_the_same_name_in_two_folders_are_distinct(room, photos, tmp_path):
     for folder, name in (("left", "a"), ("right", "b")):
         (tmp_path / "rig" / folder).mkdir(parents=True)
         (tmp_path / "rig" / folder / "1.png").write_bytes((photos / f"{name}.png").read_bytes())
@@ -94,9 +88,7 @@ def test_images_of_the_same_name_in_two_folders_are_distinct(room: MappedRoom, p
     assert_near(found.cam_from_world, POSES[:2])
 
 
-def test_figures_do_not_replace_the_images(
-    room: MappedRoom, photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_figures_do_not_replace_the_images(room, photos, tmp_path, capsys):
     image = tmp_path / "a.png"
     image.write_bytes((photos / "a.png").read_bytes())
     command = ["localize", str(image), "--map", str(room.landmarks.parent), "--figure", str(tmp_path)]
@@ -106,20 +98,16 @@ def test_figures_do_not_replace_the_images(
 
 
 @pytest.mark.parametrize("option", ["--accuracy=0,1", "--prior=1,2"])
-def test_an_invalid_option_is_an_error_of_the_batch_not_of_each_image(
-    room: MappedRoom, photos: Path, tmp_path: Path, option: str
-) -> None:
+def test_an_invalid_option_is_an_error_of_the_batch_not_of_each_image(room, photos, tmp_path, option):
     out = tmp_path / "poses.csv"
     assert main(["localize", str(photos), "--map", str(room.landmarks.parent), option, "--out", str(out)]) == 2
     assert not out.exists()
 
 
-def test_an_interrupted_batch_keeps_its_results(
-    room: MappedRoom, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_batch_keeps_its_results(room, photos, tmp_path, monkeypatch):
     localize = ImageLocalizer.localize
 
-    def interrupted(self: ImageLocalizer, image: Path, *options: Any) -> Localized:
+    def interrupted(self, image, *options):
         if image.name == "c.png":
             raise KeyboardInterrupt
         return localize(self, image, *options)
@@ -130,9 +118,7 @@ def test_an_interrupted_batch_keeps_its_results(
     assert pd.read_csv(out)["image"].tolist() == ["a.png", "b.png"]
 
 
-def test_images_are_matched_with_the_landmarks_of_their_pairs_alone(
-    room: MappedRoom, photos: Path, localizer: ImageLocalizer, tmp_path: Path
-) -> None:
+def test_images_are_matched_with_the_landmarks_of_their_pairs_alone(room, photos, localizer, tmp_path):
     """Of all mapping images: the same result. Of those that observe another wall: few matches, and no confident pose."""
     folder = room.landmarks.parent
     model = read_model(folder)
@@ -158,13 +144,13 @@ def test_images_are_matched_with_the_landmarks_of_their_pairs_alone(
     ("text", "problem"),
     [("a.png one two\n", "line 1"), ("a.png nowhere.png\n", "no mapping image"), ("\x00\xff", "line 1|cannot be read")],
 )
-def test_damaged_pairs(room: MappedRoom, tmp_path: Path, text: str, problem: str) -> None:
+def test_damaged_pairs(room, tmp_path, text, problem):
     (tmp_path / "pairs.txt").write_bytes(text.encode("latin-1"))
     with pytest.raises(TableError, match=problem):
         ImageLocalizer.open(room.landmarks.parent, pairs=tmp_path / "pairs.txt")
 
 
-def test_a_rig_by_yaw_and_pitch_has_the_pose_of_each_image(room: MappedRoom, photos: Path, tmp_path: Path) -> None:
+def test_a_rig_by_yaw_and_pitch_has_the_pose_of_each_image(room, photos, tmp_path):
     yaw = np.degrees(np.arctan2(AXES[:, 1], AXES[:, 0]))
     pitch = np.degrees(np.arcsin(AXES[:, 2] / np.linalg.norm(AXES, axis=1)))
     pd.DataFrame({"image": ["c.png", "a.png", "b.png"], "yaw": yaw[[2, 0, 1]] - 50, "pitch": pitch[[2, 0, 1]]}).to_csv(
@@ -181,8 +167,8 @@ def test_a_rig_by_yaw_and_pitch_has_the_pose_of_each_image(room: MappedRoom, pho
 
 
 def test_a_rig_whose_rotations_the_images_contradict_is_not_reported_as_localized(
-    room: MappedRoom, photos: Path, localizer: ImageLocalizer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    room, photos, localizer, tmp_path, capsys
+):
     """The pose is kept, as the rotations are refined with it; COLMAP's file, which has no status, leaves it out."""
     yaw = np.degrees(np.arctan2(AXES[:, 1], AXES[:, 0])) + np.array((0, 8, 0))
     pitch = np.degrees(np.arcsin(AXES[:, 2] / np.linalg.norm(AXES, axis=1)))
@@ -203,7 +189,7 @@ def test_a_rig_whose_rotations_the_images_contradict_is_not_reported_as_localize
     assert_near(result.cam_from_world, POSES)
 
 
-def test_results_are_in_the_maps_own_frame_and_unit(room: MappedRoom, photos: Path, tmp_path: Path) -> None:
+def test_results_are_in_the_maps_own_frame_and_unit(room, photos, tmp_path):
     centimetres = Similarity(100.0, np.array([(1.0, 0, 0), (0, 0, -1), (0, 1, 0)]), np.array((50.0, 0, 0)))  # z to -y
     model = read_model(room.landmarks.parent)
     centimetres.transform_model(model)
@@ -219,18 +205,18 @@ def test_results_are_in_the_maps_own_frame_and_unit(room: MappedRoom, photos: Pa
     assert image.get_title() == "a.png" and plan.get_xlabel() == "x, map unit"
 
 
-def test_a_prior_is_a_hypothesis_and_an_array_an_image(localizer: ImageLocalizer, photos: Path) -> None:
+def test_a_prior_is_a_hypothesis_and_an_array_an_image(localizer, photos):
     rgb = read_photograph(photos / "b.png")
     assert_near(localizer.localize(rgb, prior=(2.3, 1.8, 1.4, -160)).cam_from_world, POSES[1:2])
     with pytest.raises(PoseError, match="array"):
-        localizer.localize(rgb.astype(float))  # type: ignore[arg-type]
+        localizer.localize(rgb.astype(float))
     with pytest.raises(ConfigError, match="prior"):
         localizer.localize(rgb, prior=(1, 2))
     with pytest.raises(ConfigError, match="rotations"):
         localizer.localize([rgb, rgb])
     for images in ([], None, 5, [None], {"a": rgb}):
         with pytest.raises((PoseError, ConfigError), match="images"):
-            localizer.localize(images)  # type: ignore[arg-type]
+            localizer.localize(images)
     nan = np.full((2, 3, 3), np.nan)
     for turns in (
         np.ones((2, 3, 3)),
@@ -247,16 +233,16 @@ def test_a_prior_is_a_hypothesis_and_an_array_an_image(localizer: ImageLocalizer
         localizer.localize([], turns=np.zeros((0, 3, 3)))
     for prior in ("abc", 5, (1, 2, np.nan), [[1, 2, 3]], (1, 2, 3, 4, 5)):
         with pytest.raises(ConfigError, match="prior"):
-            localizer.localize(rgb, prior=prior)  # type: ignore[arg-type]
+            localizer.localize(rgb, prior=prior)
     for accuracy in ("ab", 0.1, (0.1, None)):
         with pytest.raises(ConfigError, match="accuracy"):
-            localizer.localize(rgb, accuracy=accuracy)  # type: ignore[arg-type]
+            localizer.localize(rgb, accuracy=accuracy)
     for camera in ("abc", 7.5, (1, 2), 77):
         with pytest.raises((ConfigError, MapError), match="camera"):
-            localizer.localize(rgb, camera=camera)  # type: ignore[arg-type]
+            localizer.localize(rgb, camera=camera)
 
 
-def test_the_probability_is_that_of_the_accuracy(localizer: ImageLocalizer, photos: Path) -> None:
+def test_the_probability_is_that_of_the_accuracy(localizer, photos):
     coarse, fine = (localizer.localize(photos / "a.png", accuracy=limits) for limits in ((0.5, 5.0), (0.0005, 0.005)))
     assert coarse.probability > 0.9 and fine.probability < coarse.probability / 2
     np.testing.assert_array_equal(coarse.cam_from_world, fine.cam_from_world)
@@ -265,7 +251,7 @@ def test_the_probability_is_that_of_the_accuracy(localizer: ImageLocalizer, phot
             localizer.localize(photos / "a.png", accuracy=limits)
 
 
-def test_where_to_look_localizes_in_the_map_that_it_opened(room: MappedRoom, photos: Path) -> None:
+def test_where_to_look_localizes_in_the_map_that_it_opened(room, photos):
     look = WhereToLook.from_colmap(room.landmarks.parent, method="visible", directions=60, device="cpu")
     rotations = POSES[:, :, :3] @ POSES[0, :, :3].T
     result = look.localize([photos / f"{name}.png" for name in "abc"], rotations, "SIMPLE_PINHOLE,640,480,320,320,240")
@@ -275,7 +261,7 @@ def test_where_to_look_localizes_in_the_map_that_it_opened(room: MappedRoom, pho
         WhereToLook(look.scorer).localize(photos / "a.png")
 
 
-def test_the_next_view_of_a_rig(room: MappedRoom, photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_next_view_of_a_rig(room, photos, capsys):
     model = str(room.landmarks.parent)
     given = ["--camera", "SIMPLE_PINHOLE,640,480,320,320,240"]
     assert main(["localize", "--map", model, "--images", str(photos / "a.png"), *given, "--next"]) == 0
@@ -288,7 +274,7 @@ def test_the_next_view_of_a_rig(room: MappedRoom, photos: Path, capsys: pytest.C
     assert "--turns" in capsys.readouterr().err
 
 
-def test_an_image_of_another_camera_needs_it(localizer: ImageLocalizer, photos: Path) -> None:
+def test_an_image_of_another_camera_needs_it(localizer, photos):
     square = np.zeros((100, 100, 3), dtype=np.uint8)
     with pytest.raises(ConfigError, match="the camera of this image of 100 x 100 px is unknown"):
         localizer.localize(square)
@@ -299,7 +285,7 @@ def test_an_image_of_another_camera_needs_it(localizer: ImageLocalizer, photos: 
     assert_near(localizer.localize(twice).cam_from_world, POSES[:1])  # reduced to the size of the map's images
 
 
-def test_a_map_without_descriptors_or_with_others_is_an_error(room: MappedRoom, tmp_path: Path) -> None:
+def test_a_map_without_descriptors_or_with_others_is_an_error(room, tmp_path):
     folder = tmp_path / "map"
     folder.mkdir()
     for path in room.landmarks.parent.iterdir():
@@ -312,7 +298,7 @@ def test_a_map_without_descriptors_or_with_others_is_an_error(room: MappedRoom, 
         ImageLocalizer.open(folder)
 
 
-def test_turns_of_odometry_and_tables(tmp_path: Path) -> None:
+def test_turns_of_odometry_and_tables(tmp_path):
     path = tmp_path / "turns.tum"
     half = np.sqrt(0.5)
     path.write_text(f"10.0 1 2 0 0 0 0 1\n10.5 1 2 0 0 0 {half} {half}\n")
@@ -336,7 +322,7 @@ def test_turns_of_odometry_and_tables(tmp_path: Path) -> None:
         read_turns(table, ["a.png"])
 
 
-def test_rounded_rotations_are_made_orthonormal() -> None:
+def test_rounded_rotations_are_made_orthonormal():
     exact = Rotation.from_euler("yx", [33.7, 10], degrees=True).as_matrix()
     poses = checked_turns(np.round([np.eye(3), exact], 4), 2)
     np.testing.assert_allclose(poses[:, :, :3] @ poses[:, :, :3].swapaxes(1, 2), [np.eye(3)] * 2, atol=1e-12)

@@ -1,10 +1,7 @@
 """The pipeline: order, overlap, bounds, errors and threads."""
 
-from __future__ import annotations
-
 import threading
 import time
-from collections.abc import Iterator
 
 import pytest
 
@@ -12,22 +9,22 @@ from wheretolook.localization.shard import Step, run_pipeline
 
 
 @pytest.fixture(autouse=True)
-def no_thread_is_left() -> Iterator[None]:
+def no_thread_is_left():
     before = threading.active_count()
     yield
     assert threading.active_count() == before
 
 
-def slowly(seconds: float) -> Step:
-    def run(item: int) -> int:
+def slowly(seconds):
+    def run(item):
         time.sleep(seconds)
         return item
 
     return Step(f"slow {seconds}", run)
 
 
-def test_order_is_kept_whichever_item_takes_longest() -> None:
-    def uneven(item: int) -> int:
+def test_order_is_kept_whichever_item_takes_longest():
+    def uneven(item):
         time.sleep(0.01 * (item % 3))
         return item
 
@@ -42,15 +39,15 @@ class OwnError(BaseException):
 
 @pytest.mark.parametrize("place", ["source", "first", "last"])
 @pytest.mark.parametrize("error", [ValueError, OwnError])
-def test_an_error_of_any_step_is_raised_after_the_items_before_it(place: str, error: type[BaseException]) -> None:
-    def source() -> Iterator[int]:
+def test_an_error_of_any_step_is_raised_after_the_items_before_it(place, error):
+    def source():
         for item in range(1000):
             if place == "source" and item == 5:
                 raise error("five")
             yield item
 
-    def failing(name: str) -> Step:
-        def run(item: int) -> int:
+    def failing(name):
+        def run(item):
             if place == name and item == 5:
                 raise error("five")
             return item
@@ -64,7 +61,7 @@ def test_an_error_of_any_step_is_raised_after_the_items_before_it(place: str, er
     assert got == [0, 1, 2, 3, 4]
 
 
-def test_a_consumer_that_leaves_ends_the_threads() -> None:
+def test_a_consumer_that_leaves_ends_the_threads():
     before = threading.active_count()
     run = run_pipeline(iter(int, 1), [Step("a", abs), Step("b", abs)])
     next(run)

@@ -1,7 +1,5 @@
 """Two rooms alike: the pose with evidence of its own is chosen, though a wrong one has more inliers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,15 +1,12 @@
 """Matched landmarks stored with the labels: their rows, and that nothing else changes."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from localization.rooms import CAMERA, PLAIN, POSTER, MappedRoom, facing, file_bytes, label, times
+from localization.rooms import CAMERA, PLAIN, POSTER, facing, file_bytes, label, times
 from wheretolook.dataset.viewpoint_files import MATCH_FIELDS, SCHEMA, read_table, write_table
 from wheretolook.dataset.viewpoint_table import TOO_FEW_MATCHES, is_good, poses
 from wheretolook.features.config import ExtractorConfig
@@ -25,7 +22,7 @@ from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import fingerprint
 
 
-def test_matched_rows_agree_with_the_labels(room: MappedRoom, matched: pd.DataFrame) -> None:
+def test_matched_rows_agree_with_the_labels(room, matched):
     n = len(Landmarks.load(room.landmarks))
     assert list(matched.columns) == [*SCHEMA.names, *MATCH_FIELDS.names]
     for view in matched.itertuples():
@@ -39,14 +36,12 @@ def test_matched_rows_agree_with_the_labels(room: MappedRoom, matched: pd.DataFr
     assert lengths.min() == 0 and (lengths > matched["n_inliers"]).any() and matched["n_inliers"].max() > 50
 
 
-def test_labels_are_the_same_with_and_without(
-    views: pd.DataFrame, matched: pd.DataFrame, expected: bytes, tmp_path: Path
-) -> None:
+def test_labels_are_the_same_with_and_without(views, matched, expected, tmp_path):
     assert file_bytes(matched.drop(columns=MATCH_FIELDS.names), tmp_path / "bare") == expected
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_shards_with_and_without_matches_have_names_of_their_own(room: MappedRoom, tmp_path: Path) -> None:
+def test_shards_with_and_without_matches_have_names_of_their_own(room, tmp_path):
     """Shards without matches have the names and the manifest of versions that could not store matches."""
     table = pd.concat([facing(POSTER, 3, 1.5), facing(PLAIN, 1, 1.1)], ignore_index=True)
     shards = tmp_path / "shards"
@@ -72,9 +67,7 @@ def test_shards_with_and_without_matches_have_names_of_their_own(room: MappedRoo
     assert times(shards) == both
 
 
-def test_pixels_are_kept_in_the_order_of_the_landmarks(
-    room: MappedRoom, views: pd.DataFrame, matched: pd.DataFrame, tmp_path: Path
-) -> None:
+def test_pixels_are_kept_in_the_order_of_the_landmarks(room, views, matched, tmp_path):
     """Inliers of a good view are within RANSAC's limit of their projection at the true pose."""
     landmarks = Landmarks.load(room.landmarks)
     rows = np.flatnonzero(is_good(matched))[:4]

@@ -1,19 +1,16 @@
 """The next view of a camera that turns in place."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from selection.room import POINTS, WEIGHTS, write_room
 from wheretolook import LocalizationMap, load_scorer
 from wheretolook.geometry.lattices import direction_lattice
-from wheretolook.geometry.poses import Float, poses_looking_along, rotation_angle_deg, rotation_looking_along
+from wheretolook.geometry.poses import poses_looking_along, rotation_angle_deg, rotation_looking_along
 from wheretolook.localization.confidence import RIGHT_PLACE, probabilities
 from wheretolook.localization.rig import Look
 from wheretolook.localization.rig_localization import JointLocalization
 from wheretolook.looks.next_look import MIN_ANGLE_DEG, N_DIRECTIONS, NextLookSelector, mean_scores_by_pitch
-from wheretolook.scorers.base import Scorer
 from wheretolook.utils.errors import PlanningError
 
 CENTER = np.asarray(POINTS[0], dtype=np.float64)
@@ -21,18 +18,16 @@ FIRST = poses_looking_along(CENTER[None], [(1.0, 0.2, 0.1)])[0]
 
 
 @pytest.fixture(scope="module")
-def scorer(tmp_path_factory: pytest.TempPathFactory) -> Scorer:
+def scorer(tmp_path_factory):
     return load_scorer(WEIGHTS, LocalizationMap.from_colmap(write_room(tmp_path_factory.mktemp("room") / "sparse")))
 
 
 @pytest.fixture(scope="module")
-def selector(scorer: Scorer) -> NextLookSelector:
+def selector(scorer):
     return NextLookSelector(scorer, mean_scores_by_pitch(scorer, POINTS))
 
 
-def localization(
-    scorer: Scorer, pose: Float | None, n_inliers: int = 2000, rivals: tuple[JointLocalization, ...] = ()
-) -> JointLocalization:
+def localization(scorer, pose, n_inliers=2000, rivals=()):
     """A result of one view with a pose (3, 4): certain with many inliers."""
     none = np.zeros(0, dtype=np.int64)
     look = Look(np.eye(3, 4), np.zeros((0, 2)), none, scorer.localization_map.camera)
@@ -45,7 +40,7 @@ def localization(
     return JointLocalization("localized", (look,), n_inliers, pose, pose[None], inliers, *found)
 
 
-def test_of_a_known_pose_the_view_with_the_best_score_is_next(scorer: Scorer, selector: NextLookSelector) -> None:
+def test_of_a_known_pose_the_view_with_the_best_score_is_next(scorer, selector):
     certain = localization(scorer, FIRST)
     assert probabilities(certain, RIGHT_PLACE)[0] > 0.999
     chosen = selector.select(certain, pitch_deg=(-90, 90))
@@ -65,7 +60,7 @@ def test_of_a_known_pose_the_view_with_the_best_score_is_next(scorer: Scorer, se
     np.testing.assert_allclose(rolled, rotation_looking_along(axis), atol=1e-3)
 
 
-def test_the_gain_is_a_sum_over_hypotheses(scorer: Scorer, selector: NextLookSelector) -> None:
+def test_the_gain_is_a_sum_over_hypotheses(scorer, selector):
     other = poses_looking_along(np.asarray(POINTS[1:2], dtype=np.float64), [(-0.3, 1.0, 0.0)])[0]
     weak = localization(scorer, other, 12)
     both = localization(scorer, FIRST, 14, (weak,))
@@ -83,7 +78,7 @@ def test_the_gain_is_a_sum_over_hypotheses(scorer: Scorer, selector: NextLookSel
     np.testing.assert_allclose(lost / lost[3], [0, np.degrees(0.5) / 90, 1, 1], atol=1e-9)
 
 
-def test_without_a_pose_a_level_camera_turns_within_limits(scorer: Scorer, selector: NextLookSelector) -> None:
+def test_without_a_pose_a_level_camera_turns_within_limits(scorer, selector):
     lost = localization(scorer, None)
     chosen = selector.select(lost, pitch_deg=(-10, 10), pan_deg=(20, 60))
     assert -10 <= chosen.pitch_deg <= 10 and 20 <= chosen.pan_deg <= 60

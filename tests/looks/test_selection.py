@@ -1,7 +1,5 @@
 """Joint sums of views from one location, and the selection of sets of views."""
 
-from __future__ import annotations
-
 from itertools import pairwise, permutations
 
 import numpy as np
@@ -24,7 +22,6 @@ from wheretolook.looks.selection import (
     score_of_set,
     select_views,
 )
-from wheretolook.scorers.base import Scorer
 from wheretolook.utils.errors import ConfigError, PlanningError
 from wheretolook_paper.evaluation.look_strategies import count_score, information_score
 from wheretolook_paper.fisher.exact import exact_information
@@ -34,23 +31,23 @@ MODEL = SetScoreModel.bundled()
 
 
 @pytest.fixture(scope="module")
-def scorer(tmp_path_factory: pytest.TempPathFactory) -> Scorer:
+def scorer(tmp_path_factory):
     return load_scorer(WEIGHTS, LocalizationMap.from_colmap(write_room(tmp_path_factory.mktemp("room") / "sparse")))
 
 
 @pytest.fixture(scope="module")
-def views(scorer: Scorer) -> CandidateViews:
+def views(scorer):
     return candidate_views(scorer, POINTS[0], AXES)
 
 
-def random_views(seed: int = 0, d: int = 9, u: int = 30) -> CandidateViews:
+def random_views(seed=0, d=9, u=30):
     rng = np.random.default_rng(seed)
     p_detect = (rng.random((d, u)) * (rng.random((d, u)) < 0.4)).astype(np.float32)
     terms = np.concatenate([np.ones((u, 1)), bearing_numbers(rng.normal(0, 2, (u, 3)))], 1)
     return CandidateViews(p_detect, terms, (p_detect > 0).sum(1), rng.random(d))
 
 
-def test_sums_of_a_set() -> None:
+def test_sums_of_a_set():
     views = random_views()
     for rows in ([0], [1, 4], [2, 3, 8]):
         np.testing.assert_allclose(views.joint_sums(rows), joint_sums(views, rows), rtol=1e-5, atol=1e-6)
@@ -60,12 +57,12 @@ def test_sums_of_a_set() -> None:
     np.testing.assert_allclose(log_position_variance(np.zeros((2, 16))), np.log(3 / 1e-3))  # the prior alone
 
 
-def test_a_single_view_is_expected_to_detect_what_the_scorer_reports(scorer: Scorer, views: CandidateViews) -> None:
+def test_a_single_view_is_expected_to_detect_what_the_scorer_reports(scorer, views):
     poses = poses_looking_along(np.tile(POINTS[0], (len(AXES), 1)), AXES)
     np.testing.assert_allclose(views.sums_with_each()[:, 0], scorer.report(poses).expected_inliers, rtol=1e-5)
 
 
-def test_certain_detection_gives_the_exact_information_of_two_opposite_views(scorer: Scorer) -> None:
+def test_certain_detection_gives_the_exact_information_of_two_opposite_views(scorer):
     certain = candidate_views(scorer, POINTS[0], AXES, certain=True)
     opposite = [0, int((AXES @ AXES[0]).argmin())]
     poses = poses_looking_along(np.tile(POINTS[0], (2, 1)), AXES[opposite])
@@ -74,25 +71,23 @@ def test_certain_detection_gives_the_exact_information_of_two_opposite_views(sco
 
 
 @pytest.mark.parametrize("set_score", [MODEL, information_score, count_score])
-def test_greedy_selection_with_exchange_is_near_the_best_of_all_sets(set_score: object) -> None:
+def test_greedy_selection_with_exchange_is_near_the_best_of_all_sets(set_score):
     rotations = Rotations(AXES[:9])
     for seed in range(3):
         views = random_views(seed)
         for n in (1, 2, 3):
-            chosen = select_views(views, set_score, n, rotations)  # type: ignore[arg-type]
-            best = best_of_all_sets(views, set_score, n, rotations)  # type: ignore[arg-type]
+            chosen = select_views(views, set_score, n, rotations)
+            best = best_of_all_sets(views, set_score, n, rotations)
             assert len({*chosen.rows}) == n
             assert best.score - 1e-9 <= chosen.score + 0.05 * abs(best.score)
 
 
 @pytest.mark.parametrize("start", [None, (0.3, -1.0, 0.1)])
-def test_the_order_is_of_least_rotation_and_within_the_limit(
-    views: CandidateViews, start: tuple[float, ...] | None
-) -> None:
+def test_the_order_is_of_least_rotation_and_within_the_limit(views, start):
     rotations = Rotations(AXES, start)
     matrices = rotation_looking_along(AXES)
 
-    def length(order: tuple[int, ...]) -> float:
+    def length(order):
         legs = sum(float(rotation_angle_deg(matrices[a], matrices[b])) for a, b in pairwise(order))
         first = 0.0 if start is None else rotation_angle_deg(matrices[order[0]], rotation_looking_along(start))
         return legs + float(first)
@@ -105,7 +100,7 @@ def test_the_order_is_of_least_rotation_and_within_the_limit(
     assert chosen.total_turn_deg <= 160 + 1e-4 and chosen.total_turn_deg == pytest.approx(length(chosen.rows))
 
 
-def test_more_views_score_higher_and_the_first_is_the_best_single_one(scorer: Scorer) -> None:
+def test_more_views_score_higher_and_the_first_is_the_best_single_one(scorer):
     axes = direction_lattice(200)
     scores = scorer.score_directions(POINTS[:1], axes)[0]
     sets = [best_views(scorer, POINTS[0], axes, scores, n) for n in (1, 2, 3)]
@@ -115,7 +110,7 @@ def test_more_views_score_higher_and_the_first_is_the_best_single_one(scorer: Sc
     assert near.total_turn_deg <= 50 + 1e-4 and near.score <= sets[2].score + 1e-6
 
 
-def test_candidates_are_separated_and_in_reach() -> None:
+def test_candidates_are_separated_and_in_reach():
     axes = direction_lattice(500)
     scores = np.random.default_rng(0).random(500)
     rows = candidates(axes, scores, 24)
@@ -125,7 +120,7 @@ def test_candidates_are_separated_and_in_reach() -> None:
     assert (axes[close] @ axes[100]).min() > np.cos(np.radians(40.1))
 
 
-def test_new_landmarks_score_higher_than_the_same_again() -> None:
+def test_new_landmarks_score_higher_than_the_same_again():
     views = random_views(u=60)
     p_detect = np.repeat(views.p_detect[:1], 3, axis=0)
     p_detect[2] = views.p_detect[0, ::-1]
@@ -137,6 +132,6 @@ def test_new_landmarks_score_higher_than_the_same_again() -> None:
     ("n", "limit", "error"),
     [(0, None, ConfigError), (7, None, ConfigError), (2, float("nan"), ConfigError), (3, 5.0, PlanningError)],
 )
-def test_invalid_requests(views: CandidateViews, n: int, limit: float | None, error: type[Exception]) -> None:
+def test_invalid_requests(views, n, limit, error):
     with pytest.raises(error):
         select_views(views, MODEL, n, Rotations(AXES), limit)

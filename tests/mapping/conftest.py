@@ -40,7 +40,7 @@ class BoxFreeSpace:
         return np.where(inside, 0.0, np.nan)
 
 
-def noise_texture(rng: np.random.Generator, size: int = 512) -> np.ndarray:
+def noise_texture(rng, size=512):
     """Coloured blobs of several sizes, periodic."""
     image = np.zeros((size, size, 3))
     for sigma in (2, 4, 8, 16):
@@ -49,7 +49,7 @@ def noise_texture(rng: np.random.Generator, size: int = 512) -> np.ndarray:
     return np.clip(128 + 35 * image, 0, 255).astype(np.uint8)
 
 
-def box_room(size: tuple[float, float, float] = ROOM_SIZE, seed: int = 0) -> TexturedMesh:
+def box_room(size=ROOM_SIZE, seed=0):
     """The inside of a box with a corner at the origin, each face with a texture of its own, 2.5 m across."""
     size_m = np.array(size)
     vertices = []
@@ -79,10 +79,10 @@ def box_room(size: tuple[float, float, float] = ROOM_SIZE, seed: int = 0) -> Tex
 
 
 @pytest.fixture(scope="session")
-def room() -> TexturedMesh:
+def room():
     return box_room()
 
 
 @pytest.fixture(scope="session")
-def room_free_space() -> BoxFreeSpace:
+def room_free_space():
     return BoxFreeSpace()

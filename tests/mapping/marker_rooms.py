@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from mapping.conftest import box_room
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.rendering.warp_renderer import WarpRenderer
 
 CAMERA = PinholeCamera(480, 360, 330.0)
@@ -30,7 +29,7 @@ class WallMarker:
     size_m: float = 0.4
 
     @property
-    def corners(self) -> Float:
+    def corners(self):
         """Corners (4, 3) of the black square, clockwise from the top left."""
         across = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * self.size_m / 2
         return np.array(self.center) + across[:, :1] * self.right + across[:, 1:] * [[0.0, 0.0, -1.0]]
@@ -40,7 +39,7 @@ MARKERS = (WallMarker(3, (1.6, 3.99, 1.5)), WallMarker(7, (2.6, 3.99, 1.0)), Wal
 """On the wall y = 4 m, seen from inside the room."""
 
 
-def marker_room(markers: tuple[WallMarker, ...] = MARKERS, dictionary: str = DICTIONARY) -> TexturedMesh:
+def marker_room(markers=MARKERS, dictionary=DICTIONARY):
     """`box_room` with markers, each on a white square. No texture repeats: a mapping would take places for one."""
     room = box_room()
     vertices = [room.vertices]
@@ -67,7 +66,7 @@ def marker_room(markers: tuple[WallMarker, ...] = MARKERS, dictionary: str = DIC
     )
 
 
-def hand_held_poses(n: int = 14, seed: int = 0) -> Float:
+def hand_held_poses(n=14, seed=0):
     """Poses (n, 3, 4) of someone who walks along a room, looks about, and rolls the camera by a degree or so."""
     rng = np.random.default_rng(seed)
     along = np.linspace(0, 1, n)
@@ -85,7 +84,7 @@ def hand_held_poses(n: int = 14, seed: int = 0) -> Float:
     return turn @ poses
 
 
-def take_photographs(mesh: TexturedMesh, poses: Float, folder: Path, camera: PinholeCamera = CAMERA) -> list[str]:
+def take_photographs(mesh, poses, folder, camera=CAMERA):
     """Render photographs of poses (B, 3, 4) into a folder. Returns their names."""
     folder.mkdir(parents=True, exist_ok=True)
     names = [f"photo-{index:02d}.png" for index in range(len(poses))]

@@ -1,7 +1,5 @@
 """A map of a small textured box, held against the box itself."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -39,7 +37,7 @@ def built(room, room_free_space, renderer, tmp_path_factory):
     return folder, report
 
 
-def distance_to_box_m(points: np.ndarray, mesh: TexturedMesh) -> np.ndarray:
+def distance_to_box_m(points, mesh):
     """Distance from points to the surface of the box, in closed form."""
     low, high = mesh.bounds
     outside = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0), axis=1)

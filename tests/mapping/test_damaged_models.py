@@ -1,7 +1,5 @@
 """Corrupt COLMAP models give a typed error that names the file, without delay."""
 
-from __future__ import annotations
-
 import os
 import struct
 import subprocess

@@ -1,10 +1,7 @@
 """Files of features that do not fit the model, are damaged, or were made to do harm."""
 
-from __future__ import annotations
-
 import sqlite3
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,28 +22,28 @@ N = len(KEYPOINTS[0])
 COUNT = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT"  # without end
 
 
-def replaced(name: str = "keypoints", **dataset):
+def replaced(name="keypoints", **dataset):
     """An edit that puts another array in the place of an image's."""
 
-    def edit(h5py, file) -> None:
+    def edit(h5py, file):
         del file[f"0.png/{name}"]
         file.create_dataset(f"0.png/{name}", **dataset)
 
     return edit
 
 
-def link(h5py, file) -> None:
+def link(h5py, file):
     del file["0.png"]
     file["0.png"] = h5py.ExternalLink("other.h5", "/0.png")
 
 
-def soft_link(h5py, file) -> None:
+def soft_link(h5py, file):
     link(h5py, file)
     file.move("0.png", "away")
     file["0.png"] = h5py.SoftLink("/away")
 
 
-def virtual(h5py, file) -> None:
+def virtual(h5py, file):
     layout = h5py.VirtualLayout(shape=(N, 2), dtype="f8")
     layout[:] = h5py.VirtualSource("other.h5", "0.png/keypoints", shape=layout.shape)
     del file["0.png/keypoints"]
@@ -71,7 +68,7 @@ def virtual(h5py, file) -> None:
         lambda h5py, file: file["0.png"].pop("descriptors"),
     ],
 )
-def test_invalid_hdf5_is_rejected(edit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_hdf5_is_rejected(edit, tmp_path, monkeypatch):
     h5py = pytest.importorskip("h5py")
     monkeypatch.chdir(tmp_path)
     hdf5_of(tmp_path / "other.h5", KEYPOINTS, LEARNED)
@@ -84,7 +81,7 @@ def test_invalid_hdf5_is_rejected(edit, tmp_path: Path, monkeypatch: pytest.Monk
     assert caught.value.path == path
 
 
-def test_time_does_not_grow_with_the_links_of_hdf5(tmp_path: Path) -> None:
+def test_time_does_not_grow_with_the_links_of_hdf5(tmp_path):
     h5py = pytest.importorskip("h5py")
     path = hdf5_of(tmp_path / "feats-aliked.h5", KEYPOINTS, LEARNED)
     with h5py.File(path, "a", libver="latest") as file:
@@ -96,7 +93,7 @@ def test_time_does_not_grow_with_the_links_of_hdf5(tmp_path: Path) -> None:
     assert time.process_time() - start < 1
 
 
-def test_a_file_that_is_no_hdf5(tmp_path: Path) -> None:
+def test_a_file_that_is_no_hdf5(tmp_path):
     (tmp_path / "feats.h5").write_bytes(b"not HDF5")
     with pytest.raises(MapError):
         read_features(tmp_path / "feats.h5", ["0.png"])
@@ -128,7 +125,7 @@ FLOATS = np.full((N, 128), 3e38, "<f4").tobytes().hex()
         ["UPDATE keypoints SET rows = rows - 1, data = substr(data, 1, length(data) - 4 * cols)"],
     ],
 )
-def test_invalid_databases_are_rejected(statements: list[str], tmp_path: Path) -> None:
+def test_invalid_databases_are_rejected(statements, tmp_path):
     path = database_of(tmp_path / "a.db", MODEL, KEYPOINTS, LEARNED, ALIKED)
     connection = sqlite3.connect(path)
     for statement in statements:
@@ -141,14 +138,14 @@ def test_invalid_databases_are_rejected(statements: list[str], tmp_path: Path) -
 
 
 @pytest.mark.parametrize("content", [None, b"", b"\x00garbage" * 999])
-def test_files_that_are_not_databases_are_rejected(content: bytes | None, tmp_path: Path) -> None:
+def test_files_that_are_not_databases_are_rejected(content, tmp_path):
     if content is not None:
         (tmp_path / "a.db").write_bytes(content)
     with pytest.raises(MapError):
         read_features(tmp_path / "a.db", ["0.png"])
 
 
-def test_databases_of_other_keypoints_are_rejected(tmp_path: Path) -> None:
+def test_databases_of_other_keypoints_are_rejected(tmp_path):
     path = write_database(tmp_path / "moved.db", MODEL, [pixels + 3 for pixels in KEYPOINTS], DESCRIPTORS)
     with pytest.raises(MapError):
         read_descriptors(path, MODEL, ARRAYS)

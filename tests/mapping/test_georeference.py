@@ -1,9 +1,6 @@
 """Georeferencing: closed forms, tables and invalid inputs."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,16 +23,16 @@ from wheretolook.utils.errors import ConfigError, MapError
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float64)
 
 
-def square(marker_id: int, side: float) -> Marker:
+def square(marker_id, side):
     return Marker(marker_id, SQUARE * side + marker_id, ("a.jpg", "b.jpg"), 0.1)
 
 
-def by_photograph(n: int) -> dict[str, np.ndarray]:
+def by_photograph(n):
     points = np.random.default_rng(3).normal(size=(n, 3))
     return {f"{index}.jpg": point for index, point in enumerate(points)}
 
 
-def test_similarity_is_recovered_and_never_mirrors() -> None:
+def test_similarity_is_recovered_and_never_mirrors():
     points = np.random.default_rng(0).normal(size=(10, 3))
     rotation = Rotation.random(random_state=1).as_matrix()
     similarity = fit_similarity(points, 3.7 * points @ rotation.T + (1, -2, 5))
@@ -49,7 +46,7 @@ def test_similarity_is_recovered_and_never_mirrors() -> None:
             fit_similarity(few, few)
 
 
-def test_scale_is_the_median_over_the_sides_of_markers() -> None:
+def test_scale_is_the_median_over_the_sides_of_markers():
     often = Marker(3, SQUARE * 0.49, ("a.jpg", "b.jpg", "c.jpg"), 0.3)
     scale = scale_from_markers([square(1, 0.5), square(2, 0.51), often], 0.2)
     assert scale.source == "markers" and scale.is_metric and scale.unit == "percent"
@@ -67,13 +64,13 @@ def test_scale_is_the_median_over_the_sides_of_markers() -> None:
             scale_from_markers(wrong, 0.2)
 
 
-def test_scale_from_a_distance() -> None:
+def test_scale_from_a_distance():
     assert scale_from_distance((0, 0, 0), (0, 3, 4), 2.5) == MapScale("distance", 0.5)
     with pytest.raises(MapError):
         scale_from_distance((1, 1, 1), (1, 1, 1), 2.5)
 
 
-def test_positions_determine_the_frame_and_leave_residuals() -> None:
+def test_positions_determine_the_frame_and_leave_residuals():
     centers = by_photograph(6)
     rotation = Rotation.random(random_state=4).as_matrix()
     positions = {name: 2 * rotation @ center + (5, 0, 1) for name, center in centers.items()}
@@ -86,7 +83,7 @@ def test_positions_determine_the_frame_and_leave_residuals() -> None:
     assert max(worst, key=lambda name: worst[name]) == "2.jpg"
 
 
-def test_positions_that_do_not_fit_are_rejected_worst_first() -> None:
+def test_positions_that_do_not_fit_are_rejected_worst_first():
     centers = by_photograph(14)
     for off_m in (2.0, 100.0):
         positions = {name: 2 * center for name, center in centers.items()}
@@ -98,7 +95,7 @@ def test_positions_that_do_not_fit_are_rejected_worst_first() -> None:
         scale_from_positions(centers, dict(zip(centers, reversed(centers.values()), strict=True)))
 
 
-def test_tables_of_markers_and_positions_are_read(tmp_path: Path) -> None:
+def test_tables_of_markers_and_positions_are_read(tmp_path):
     table = tmp_path / "markers.csv"
     table.write_text("id, size_m\n3, 0.4\n7, 0.2\n7, 0.2\n")
     assert read_marker_table(table) == {3: 0.4, 7: 0.2}
@@ -117,14 +114,14 @@ def test_tables_of_markers_and_positions_are_read(tmp_path: Path) -> None:
         ("p.csv", None),
     ],
 )
-def test_invalid_tables_are_rejected(tmp_path: Path, name: str, text: str | None) -> None:
+def test_invalid_tables_are_rejected(tmp_path, name, text):
     if text is not None:
         (tmp_path / name).write_text(text)
     with pytest.raises(ConfigError):
         (read_marker_table if name[0] == "m" else read_positions)(tmp_path / name)
 
 
-def test_invalid_settings_are_rejected() -> None:
+def test_invalid_settings_are_rejected():
     known = FrameOptions(distance=("a.jpg", "marker:7", 1.5))
     assert known.marker_ids == ["7"]
     for ends in (("a.jpg", "a.jpg"), ("a.jpg", "marker:x")):
@@ -148,7 +145,7 @@ def test_invalid_settings_are_rejected() -> None:
 @pytest.mark.parametrize(
     "source", [{"photographs": PhotographsConfig(Path("photos"))}, {"existing": ExistingModelConfig(Path("model"))}]
 )
-def test_options_of_renders_are_rejected_by_name_for_other_maps(source: dict[str, Any]) -> None:
+def test_options_of_renders_are_rejected_by_name_for_other_maps(source):
     of_renders = {"camera": CameraConfig(), "draw_camera": True, "vary": True, "appearance": 0.4, "keep_images": True}
     MapConfig(**source, keep_database=True)
     for name, value in of_renders.items():
@@ -157,7 +154,7 @@ def test_options_of_renders_are_rejected_by_name_for_other_maps(source: dict[str
             MapConfig(**source, **{name: value})
 
 
-def test_a_mislabelled_position_of_many_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_mislabelled_position_of_many_is_left_out(caplog):
     rng = np.random.default_rng(0)
     centers = {f"{n:02}.jpg": rng.normal(0, 2, 3) for n in range(30)}
     positions = {name: 3 * center + (1, 2, 3) for name, center in centers.items()}

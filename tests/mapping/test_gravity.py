@@ -1,7 +1,5 @@
 """Up, from how cameras were held."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -13,7 +11,7 @@ TURN = Rotation.from_euler("xyz", [40, -65, 110], degrees=True).as_matrix()
 """From the world to the arbitrary frame of a mapping."""
 
 
-def looking(yaw_deg: np.ndarray, pitch_deg: np.ndarray, roll_deg: np.ndarray) -> np.ndarray:
+def looking(yaw_deg, pitch_deg, roll_deg):
     yaw = np.radians(yaw_deg)
     pitch = np.radians(pitch_deg)
     axes = np.stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)], axis=1)
@@ -23,11 +21,11 @@ def looking(yaw_deg: np.ndarray, pitch_deg: np.ndarray, roll_deg: np.ndarray) ->
     return poses
 
 
-def off_deg(up: np.ndarray) -> float:
+def off_deg(up):
     return float(np.degrees(np.arccos(np.clip(up @ TURN[:, 2], -1, 1))))
 
 
-def test_level_cameras_give_up_exactly_whatever_their_pitch() -> None:
+def test_level_cameras_give_up_exactly_whatever_their_pitch():
     yaw = np.linspace(-60, 60, 9)
     gravity = estimate_gravity(looking(yaw, np.full(9, -35.0), np.zeros(9)))
     assert gravity.method == "level"
@@ -36,7 +34,7 @@ def test_level_cameras_give_up_exactly_whatever_their_pitch() -> None:
     np.testing.assert_allclose(gravity.rotation @ gravity.up, (0, 0, 1), atol=1e-12)
 
 
-def test_rolled_photographs_do_not_move_it() -> None:
+def test_rolled_photographs_do_not_move_it():
     rng = np.random.default_rng(0)
     yaw = rng.uniform(0, 360, 20)
     roll = rng.normal(scale=1.0, size=20)
@@ -46,21 +44,21 @@ def test_rolled_photographs_do_not_move_it() -> None:
     assert np.median(gravity.residual_deg) < 2 and (gravity.residual_deg[:5] > 45).all()
 
 
-def test_cameras_that_do_not_turn_leave_it_to_their_mean() -> None:
+def test_cameras_that_do_not_turn_leave_it_to_their_mean():
     gravity = estimate_gravity(looking(np.full(6, 30.0), np.array([-2.0, -1, 0, 0, 1, 2]), np.zeros(6)))
     assert gravity.method == "mean"
     assert off_deg(gravity.up) < 0.1
     assert gravity.residual_deg.max() == pytest.approx(2, abs=0.1)
 
 
-def test_up_can_be_given_in_the_camera() -> None:
+def test_up_can_be_given_in_the_camera():
     down = looking(np.linspace(0, 300, 7), np.full(7, -89.9), np.zeros(7))
     gravity = estimate_gravity(down, up_in_camera=(0.0, 0.0, -2.0))
     assert gravity.method == "given"
     assert off_deg(gravity.up) < 0.2
 
 
-def test_rotation_to_z_is_the_least() -> None:
+def test_rotation_to_z_is_the_least():
     for direction in np.random.default_rng(1).normal(size=(20, 3)):
         rotation = rotation_to_z(direction)
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)

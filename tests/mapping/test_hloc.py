@@ -1,7 +1,5 @@
 """Folders exactly as hloc writes them (`hloc/README.md`)."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import warnings
@@ -17,7 +15,7 @@ from wheretolook.mapping.feature_files import read_descriptors
 from wheretolook.mapping.mapped_images import choose_features, find_features, find_photographs, open_colmap
 from wheretolook.utils.errors import MapWarning
 from wheretolook.utils.files import sha256
-from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.utils.package import WEIGHTS, shipped
 
 h5py = pytest.importorskip("h5py", reason="hloc's features need h5py: pip install h5py")
 
@@ -28,12 +26,12 @@ N_LANDMARKS = 87  # as hloc's own summary of the model states
 
 
 @pytest.fixture
-def outputs(tmp_path: Path) -> Path:
+def outputs(tmp_path):
     """A copy of hloc's folder that a test may change."""
     return Path(shutil.copytree(OUTPUTS, tmp_path / "outputs"))
 
 
-def test_a_map_is_opened_with_the_features_that_hloc_wrote_beside_it() -> None:
+def test_a_map_is_opened_with_the_features_that_hloc_wrote_beside_it():
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*(features|descriptors)", category=MapWarning)
         landmarks = open_colmap(SFM).landmarks
@@ -41,7 +39,7 @@ def test_a_map_is_opened_with_the_features_that_hloc_wrote_beside_it() -> None:
     assert np.isfinite(landmarks.ambiguity).all()
 
 
-def test_images_without_observations_need_no_features(outputs: Path) -> None:
+def test_images_without_observations_need_no_features(outputs):
     model = read_model(SFM)
     unobserving = [image.name for image in model.images.values() if not image.num_points2D()]
     assert sorted(unobserving) == ["room/blurred-0.jpg", "room/blurred-1.jpg"]
@@ -54,12 +52,12 @@ def test_images_without_observations_need_no_features(outputs: Path) -> None:
     np.testing.assert_array_equal(found[1], expected[1])
 
 
-def test_a_database_without_descriptors_is_replaced_by_the_features() -> None:
+def test_a_database_without_descriptors_is_replaced_by_the_features():
     assert choose_features(SFM, read_model(SFM), SFM / "database.db") == FEATURES.absolute()
 
 
 @pytest.mark.parametrize("missing", ["features", "database too"])
-def test_features_that_are_not_found_are_reported(outputs: Path, missing: str) -> None:
+def test_features_that_are_not_found_are_reported(outputs, missing):
     (outputs / FEATURES.name).unlink()
     if missing == "database too":
         (outputs / "sfm_aliked/database.db").unlink()
@@ -67,7 +65,7 @@ def test_features_that_are_not_found_are_reported(outputs: Path, missing: str) -
         assert open_colmap(outputs / "sfm_aliked").landmarks.features == ""
 
 
-def test_of_several_files_the_one_of_the_model_is_found(outputs: Path) -> None:
+def test_of_several_files_the_one_of_the_model_is_found(outputs):
     shutil.copy(outputs / FEATURES.name, outputs / "feats-a-aliked-r512.h5")
     with h5py.File(outputs / "feats-a-aliked-r512.h5", "a") as file:
         for group in file["room"].values():
@@ -82,7 +80,7 @@ def test_of_several_files_the_one_of_the_model_is_found(outputs: Path) -> None:
 
 
 @pytest.mark.parametrize("model", ["sfm_aliked", "sfm_aliked/models/0"])
-def test_images_and_features_are_found_above_the_model(outputs: Path, model: str) -> None:
+def test_images_and_features_are_found_above_the_model(outputs, model):
     folder = outputs / model
     shutil.copytree(SFM, folder, dirs_exist_ok=True)
     assert find_photographs(folder) is None
@@ -94,14 +92,14 @@ def test_images_and_features_are_found_above_the_model(outputs: Path, model: str
 
 
 @pytest.mark.parametrize("chosen, larger", [("sfm", "sfm/models/1"), ("sparse/0", "sparse/1")])
-def test_a_larger_model_of_the_same_images_is_reported(tmp_path: Path, chosen: str, larger: str) -> None:
+def test_a_larger_model_of_the_same_images_is_reported(tmp_path, chosen, larger):
     write_model(hand_written_model()[0], tmp_path / chosen)
     shutil.copytree(SFM, tmp_path / larger)
     with pytest.warns(MapWarning, match=larger):
         read_model(tmp_path / chosen)
 
 
-def test_commands_report_and_use_the_features(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_report_and_use_the_features(tmp_path, capsys):
     out = tmp_path / "views.csv"
     assert main(["select", "--map", str(SFM), "--at", "0,0,1", "--out", str(out), "--directions", "20"]) == 0
     assert f"{FEATURES.name} (aliked)" in capsys.readouterr().out

@@ -1,7 +1,5 @@
 """Landmarks of COLMAP models written by hand with pycolmap, with attributes worked out by hand."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -22,12 +20,12 @@ TRACKS = ([0, 1, 2], [1, 2], [0, 1, 2], [0, 2])
 OFFSETS_PX = (0.0, 0.3, 2.0, 0.0)  # each observation of the point is off by this much in x
 
 
-def project(point: np.ndarray, image: int) -> np.ndarray:
+def project(point, image):
     x, y, z = point - CENTERS[image]  # a camera that looks along +y has x to the right, z up, hence y down
     return FOCAL_PX[CAMERA_OF[image]] * np.array([x / y, -z / y]) + (320, 240)
 
 
-def hand_written_model(offsets_px=OFFSETS_PX, tracks=TRACKS, points=POINTS) -> tuple[pycolmap.Reconstruction, list]:
+def hand_written_model(offsets_px=OFFSETS_PX, tracks=TRACKS, points=POINTS):
     """The model, with ids 10, 20, ... for the points, and the keypoints of its images, one unused at the front."""
     model = pycolmap.Reconstruction()
     for camera_id, focal_px in FOCAL_PX.items():
@@ -35,7 +33,7 @@ def hand_written_model(offsets_px=OFFSETS_PX, tracks=TRACKS, points=POINTS) -> t
             camera_id=camera_id, model="SIMPLE_PINHOLE", width=640, height=480, params=[focal_px, 320, 240]
         )
         model.add_camera_with_trivial_rig(camera)
-    keypoints: list[list[np.ndarray]] = [[np.array([1.0 + i, 2.0])] for i in range(3)]
+    keypoints = [[np.array([1.0 + i, 2.0])] for i in range(3)]
     elements = []
     for point, track, offset in zip(points, tracks, offsets_px, strict=True):
         for image in track:
@@ -56,7 +54,7 @@ def hand_written_model(offsets_px=OFFSETS_PX, tracks=TRACKS, points=POINTS) -> t
     return model, [np.array(k, dtype=np.float32) for k in keypoints]
 
 
-def write_database(path: Path, model: pycolmap.Reconstruction, keypoints: list, descriptors: list) -> Path:
+def write_database(path, model, keypoints, descriptors):
     with pycolmap.Database.open(str(path)) as database:
         for camera in model.cameras.values():
             database.write_camera(camera, use_camera_id=True)
@@ -70,13 +68,13 @@ def write_database(path: Path, model: pycolmap.Reconstruction, keypoints: list, 
     return path
 
 
-def random_descriptors(counts: list[int], seed: int = 0) -> list[np.ndarray]:
+def random_descriptors(counts, seed=0):
     rng = np.random.default_rng(seed)
     return [quantize_descriptors(unit_descriptors(rng.gamma(0.5, size=(n, 128)))) for n in counts]
 
 
 @pytest.fixture
-def model_dir(tmp_path: Path) -> Path:
+def model_dir(tmp_path):
     folder = tmp_path / "model"
     folder.mkdir()
     hand_written_model()[0].write_binary(str(folder))

@@ -1,9 +1,6 @@
 """Maps of learned features: from databases of COLMAP 4 and hloc's HDF5, on disk again, and localized against."""
 
-from __future__ import annotations
-
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,24 +19,24 @@ from wheretolook.utils.processes import WorkerPool
 LEARNED = [kind for kind in all_kinds().values() if not kind.in_bytes]
 
 
-def unit(n: int, dimension: int, seed: int = 0) -> np.ndarray:
+def unit(n, dimension, seed=0):
     return unit_descriptors(np.random.default_rng(seed).normal(size=(n, dimension)))
 
 
-def case(folder: Path, kind):
+def case(folder, kind):
     """A model of three images, its folder, and descriptors of their keypoints as files hold them."""
     model, keypoints = hand_written_model()
     stored = [kind.store(unit(len(found), kind.dimension, seed)) for seed, found in enumerate(keypoints)]
     return model, written(model, folder / "model"), keypoints, stored
 
 
-def database_of(path: Path, model, keypoints, stored, kind) -> Path:
+def database_of(path, model, keypoints, stored, kind):
     pixels = [np.asarray(found, dtype=np.float32) for found in keypoints]
     fill_database(path, model, list(zip(pixels, stored, strict=True)), kind)
     return path
 
 
-def hdf5_of(path: Path, keypoints, stored, names=("0.png", "1.png", "2.png"), dtype=None) -> Path:
+def hdf5_of(path, keypoints, stored, names=("0.png", "1.png", "2.png"), dtype=None):
     h5py = pytest.importorskip("h5py", reason="hloc's features need h5py: pip install h5py")
     with h5py.File(path, "w") as file:
         for name, found, descriptors in zip(names, keypoints, stored, strict=False):
@@ -51,7 +48,7 @@ def hdf5_of(path: Path, keypoints, stored, names=("0.png", "1.png", "2.png"), dt
     return path
 
 
-def expected_means(model, landmarks: Landmarks, stored) -> np.ndarray:
+def expected_means(model, landmarks, stored):
     arrays = model_arrays(model)
     means = []
     for number in landmarks.ids:

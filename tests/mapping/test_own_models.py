@@ -1,7 +1,5 @@
 """COLMAP models of other versions and tools, with rigs, several cameras and doubtful frames."""
 
-from __future__ import annotations
-
 import sqlite3
 from pathlib import Path
 
@@ -22,7 +20,7 @@ from wheretolook.utils.errors import MapError, MapWarning
 pytestmark = pytest.mark.filterwarnings("error::wheretolook.utils.errors.MapWarning")
 
 
-def walk_in_a_room(n: int = 40) -> np.ndarray:
+def walk_in_a_room(n=40):
     """Poses (n, 3, 4) of a camera that is carried along a room and turned, 1.5 m above the floor."""
     along = np.linspace(0, 1, n)
     heading = 6 * np.pi * along
@@ -30,13 +28,13 @@ def walk_in_a_room(n: int = 40) -> np.ndarray:
     return poses_looking_along(centers, np.column_stack([np.cos(heading), np.sin(heading), -0.1 * np.ones(n)]))
 
 
-def written(model: pycolmap.Reconstruction, folder: Path, text: bool = False) -> Path:
+def written(model, folder, text=False):
     folder.mkdir(parents=True)
     (model.write_text if text else model.write_binary)(str(folder))
     return folder
 
 
-def rig_model() -> pycolmap.Reconstruction:
+def rig_model():
     """Two frames of a rig of two cameras 0.2 m apart that look along +y, with points 2 to 5 m ahead."""
     model = pycolmap.Reconstruction()
     rig = pycolmap.Rig(rig_id=1)

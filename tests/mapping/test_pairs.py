@@ -1,7 +1,5 @@
 """Overlap of views against surfaces whose overlap follows from plane geometry."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from wheretolook.geometry.camera import PinholeCamera
@@ -11,7 +9,7 @@ from wheretolook.mapping.triangulation import choose_pairs, shrink_depth, surfac
 CAMERA = PinholeCamera(320, 240, 160.0)
 
 
-def wall_depth(distance_m: float) -> np.ndarray:
+def wall_depth(distance_m):
     """Depth of a wall across the optical axis."""
     return np.full((CAMERA.height, CAMERA.width), distance_m, dtype=np.float32)
 

@@ -1,11 +1,8 @@
 """A room with markers, mapped from its photographs alone and held against the truth; and the stages upon it."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -40,38 +37,38 @@ PARAMS = (CAMERA.focal_px, CAMERA.cx, CAMERA.cy)
 
 
 @pytest.fixture(scope="module")
-def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def photographs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("photographs") / "room"
     take_photographs(marker_room(), TRUTH, folder)
     cv2.imwrite(str(folder / "photo-99.png"), np.random.default_rng(0).integers(0, 255, (360, 480, 3), dtype=np.uint8))
     return folder
 
 
-def config_of(photographs: Path, frame: FrameOptions = FrameOptions(), **markers: object) -> MapConfig:
-    known = MarkerConfig(**markers)  # type: ignore[arg-type]
+def config_of(photographs, frame=FrameOptions(), **markers):
+    known = MarkerConfig(**markers)
     camera = {"camera_model": "SIMPLE_PINHOLE", "camera_params": PARAMS}
     return MapConfig(photographs=PhotographsConfig(photographs, scale=known, **camera), frame=frame)
 
 
 @pytest.fixture(scope="module")
-def mapped(photographs: Path, tmp_path_factory: pytest.TempPathFactory):
+def mapped(photographs, tmp_path_factory):
     folder = tmp_path_factory.mktemp("mapped")
     config = config_of(photographs, marker_size_m=MARKERS[0].size_m)
     return folder, map_photographs(config, folder / "map", folder / "work", progress=False)
 
 
 @pytest.fixture
-def no_second_mapping(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_second_mapping(monkeypatch):
     """Fail where a finished step is done again."""
 
-    def again(*arguments: object, **named: object) -> None:
+    def again(*arguments, **named):
         raise AssertionError("done again")
 
     for name in ("_extract", "match_pairs", "_reconstruct"):
         monkeypatch.setattr(incremental, name, again)
 
 
-def test_photographs_are_placed_at_their_true_scale_and_upright(mapped, photographs: Path) -> None:
+def test_photographs_are_placed_at_their_true_scale_and_upright(mapped, photographs):
     folder, report = mapped
     assert report.n_images == len(TRUTH) + 1 and report.n_registered == len(TRUTH)
     assert report.unregistered == ["photo-99.png"] and report.model_sizes == [len(TRUTH)]
@@ -83,7 +80,7 @@ def test_photographs_are_placed_at_their_true_scale_and_upright(mapped, photogra
     np.testing.assert_allclose(centers.mean(0), 0, atol=1e-6)
 
 
-def test_the_map_is_as_any_other(mapped) -> None:
+def test_the_map_is_as_any_other(mapped):
     folder, report = mapped
     landmarks = Landmarks.load(folder / "map" / "landmarks.npz")
     assert len(landmarks) == report.n_landmarks > 1000
@@ -99,10 +96,10 @@ def test_the_map_is_as_any_other(mapped) -> None:
 
 
 @pytest.mark.usefixtures("no_second_mapping")
-def test_other_sources_of_scale_reuse_the_mapping(mapped, photographs: Path, tmp_path: Path) -> None:
+def test_other_sources_of_scale_reuse_the_mapping(mapped, photographs, tmp_path):
     folder, _ = mapped
 
-    def scaled(**frame: object):
+    def scaled(**frame):
         return map_photographs(
             config_of(photographs, FrameOptions(**frame)), tmp_path / "map", folder / "work", progress=False
         )
@@ -138,7 +135,7 @@ def test_other_sources_of_scale_reuse_the_mapping(mapped, photographs: Path, tmp
         map_photographs(config, tmp_path / "map", folder / "work", progress=False)
 
 
-def test_photographs_that_do_not_overlap_are_refused(tmp_path: Path) -> None:
+def test_photographs_that_do_not_overlap_are_refused(tmp_path):
     rng = np.random.default_rng(1)
     for index in range(4):
         blobs = cv2.GaussianBlur(rng.normal(size=(240, 320, 3)), (0, 0), 3)
@@ -150,7 +147,7 @@ def test_photographs_that_do_not_overlap_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def experiment(mapped, photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> AllOptions:
+def experiment(mapped, photographs, tmp_path_factory):
     """The map stage done, without a scale, from keypoints and matches found before."""
     experiment = AllOptions(
         name="photos",
@@ -161,18 +158,18 @@ def experiment(mapped, photographs: Path, tmp_path_factory: pytest.TempPathFacto
         scenes=ScenesConfig(mapped_space=MappedSpaceConfig(max_camera_distance_m=0.6)),
     )
     shutil.copytree(mapped[0] / "work", experiment.root / "room" / "photographs")
-    said: list[str] = []
+    said = []
     run(Map, experiment, said.append)
     assert any("scale unknown" in line for line in said) and any("photo-99.png" in line for line in said)
     return experiment
 
 
 @pytest.mark.slow
-def test_a_scene_of_photographs_is_sampled_and_scored_but_not_labelled(experiment: AllOptions) -> None:
+def test_a_scene_of_photographs_is_sampled_and_scored_but_not_labelled(experiment):
     scale = MarkerConfig(marker_size_m=MARKERS[0].size_m)
     photographs = replace(experiment.mapping.photographs, scale=scale)
     metric = replace(experiment, mapping=replace(experiment.mapping, photographs=photographs))
-    said: list[str] = []
+    said = []
     run(Map, metric, said.append)
     assert any("scale: markers" in line for line in said)
     dataset = run(Sample, metric, said.append)

@@ -1,9 +1,6 @@
 """Photographs in folders: pixels, cameras, pairs."""
 
-from __future__ import annotations
-
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,7 +21,7 @@ EXIF_IFD = 0x8769
 FOCAL_35MM = 0xA405
 
 
-def save(path: Path, rgb: np.ndarray, orientation: int = 1, focal_mm: int = 0) -> None:
+def save(path, rgb, orientation=1, focal_mm=0):
     path.parent.mkdir(parents=True, exist_ok=True)
     exif = Image.Exif()
     exif[ORIENTATION] = orientation
@@ -33,24 +30,24 @@ def save(path: Path, rgb: np.ndarray, orientation: int = 1, focal_mm: int = 0) -
     Image.fromarray(rgb).save(path, exif=exif, quality=95)
 
 
-def sized(height: int, width: int) -> np.ndarray:
+def sized(height, width):
     return np.full((height, width, 3), 90, np.uint8)
 
 
-def cameras_of(folder: Path, config: PhotographsConfig, reduction: float = 1.0):
+def cameras_of(folder, config, reduction=1.0):
     names = list_photographs(folder)
     full = np.array([read_photograph(folder / name).shape[1::-1] for name in names])
     return photograph_cameras(folder, names, full, (full * reduction).astype(np.int64), config)
 
 
-def test_photographs_are_listed_by_name(tmp_path: Path) -> None:
+def test_photographs_are_listed_by_name(tmp_path):
     for name in ("b.JPG", "a.png", "hall/c.jpg"):
         save(tmp_path / name, sized(20, 30))
     (tmp_path / "notes.txt").write_text("not a photograph")
     assert list_photographs(tmp_path) == ["a.png", "b.JPG", "hall/c.jpg"]
 
 
-def test_depth_images_are_no_photographs(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_depth_images_are_no_photographs(tmp_path, caplog):
     for name in ("a.color.jpg", "b.color.png"):
         save(tmp_path / name, sized(20, 30))
     Image.fromarray(np.full((20, 30), 90, np.uint8)).save(tmp_path / "grey.png")
@@ -60,7 +57,7 @@ def test_depth_images_are_no_photographs(tmp_path: Path, caplog: pytest.LogCaptu
     assert "2 depth images" in caplog.text
 
 
-def test_names_that_colmap_cannot_read_are_rejected(tmp_path: Path) -> None:
+def test_names_that_colmap_cannot_read_are_rejected(tmp_path):
     for name in (b"a.png", b"caf\xe9.png", "ä.png".encode()):
         (tmp_path / os.fsdecode(name)).touch()
     with pytest.raises(MapError, match="UTF-8"):
@@ -69,7 +66,7 @@ def test_names_that_colmap_cannot_read_are_rejected(tmp_path: Path) -> None:
     assert list_photographs(tmp_path) == ["a.png", "ä.png"]
 
 
-def test_photographs_are_turned_upright_and_reduced(tmp_path: Path) -> None:
+def test_photographs_are_turned_upright_and_reduced(tmp_path):
     rgb = sized(40, 60)
     rgb[:, :20] = (250, 10, 10)  # red at the left
     save(tmp_path / "turned.jpg", rgb, orientation=6)  # to be shown turned by 90 degrees clockwise
@@ -80,7 +77,7 @@ def test_photographs_are_turned_upright_and_reduced(tmp_path: Path) -> None:
     assert reduce_photograph(upright, 0) is upright and reduce_photograph(upright, 60) is upright
 
 
-def test_focal_lengths_and_shared_cameras_from_exif(tmp_path: Path) -> None:
+def test_focal_lengths_and_shared_cameras_from_exif(tmp_path):
     for name in ("a.jpg", "b.jpg"):
         save(tmp_path / name, sized(240, 360), focal_mm=28)
     save(tmp_path / "c.jpg", sized(240, 360), focal_mm=50)
@@ -99,7 +96,7 @@ def test_focal_lengths_and_shared_cameras_from_exif(tmp_path: Path) -> None:
     assert apart.camera_of.tolist() == [0, 1, 2, 3, 4]
 
 
-def test_intrinsics_can_be_given(tmp_path: Path) -> None:
+def test_intrinsics_can_be_given(tmp_path):
     for name in ("a.jpg", "b.jpg"):
         save(tmp_path / name, sized(240, 360))
     config = PhotographsConfig(camera_model="PINHOLE", camera_params=(300.0, 310.0, 181.0, 119.0))
@@ -114,7 +111,7 @@ def test_intrinsics_can_be_given(tmp_path: Path) -> None:
         cameras_of(tmp_path, config)
 
 
-def test_few_are_matched_all_with_all_and_many_in_turn() -> None:
+def test_few_are_matched_all_with_all_and_many_in_turn():
     assert photograph_pairs(4, 10, 2).tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]
     pairs = photograph_pairs(100, 60, 10)
     steps = pairs[:, 1] - pairs[:, 0]

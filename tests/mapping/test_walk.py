@@ -1,7 +1,5 @@
 """Walks in rooms whose free space is known in closed form."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np
@@ -16,7 +14,7 @@ SIZE = (8.0, 6.0, 2.6)
 BOUNDS = np.array([(0, 0, 0), SIZE])
 
 
-def two_rooms(door_m: float, clearance_m: float = 0.2) -> BoxFreeSpace:
+def two_rooms(door_m, clearance_m=0.2):
     """A box with a wall across it at x = 4 m that has a door of a given width at its low end."""
     reach = 0.05 + clearance_m
     return BoxFreeSpace(SIZE, clearance_m, ((4 - reach, door_m - clearance_m), (4 + reach, 99.0)))
@@ -46,7 +44,7 @@ class TwoStoreys(BoxFreeSpace):
         return np.where(inside, np.where(points[:, 2] >= upper, upper, lower), np.nan)
 
 
-def walked_distance_m(places: np.ndarray, path: np.ndarray) -> np.ndarray:
+def walked_distance_m(places, path):
     """Straight distance from places to the nearest point of a path: a lower bound of the walking distance."""
     dense = np.concatenate([np.linspace(a, b, 10) for a, b in pairwise(path)])
     return np.linalg.norm(places[:, None, :2] - dense[None, :, :2], axis=-1).min(1)

@@ -1,13 +1,11 @@
 """Each operation on images whose result follows from a formula; sRGB 137 and 188 are a quarter and half of white."""
 
-from __future__ import annotations
-
 from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
 
-from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.rendering.appearance import PERSON_M, READ_NOISE, Appearance
 
 NONE = Appearance.draw(0.0, np.random.default_rng(0))
@@ -15,22 +13,22 @@ CAMERA = PinholeCamera()
 """320 px of focal length at 640 x 480: 45 degrees to the left and right side."""
 
 
-def plain(value: int, camera: Camera = CAMERA) -> np.ndarray:
+def plain(value, camera=CAMERA):
     return np.full((camera.height, camera.width, 3), value, np.uint8)
 
 
-def in_light(image: np.ndarray) -> np.ndarray:
+def in_light(image):
     values = image / 255
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
-def test_strength_0_is_the_identity() -> None:
+def test_strength_0_is_the_identity():
     image = np.random.default_rng(1).integers(0, 256, (480, 640, 3)).astype(np.uint8)
     assert len(np.unique(image)) == 256
     np.testing.assert_array_equal(NONE.apply(image, CAMERA), image)
 
 
-def test_exposure_multiplies_linear_light_and_saturates() -> None:
+def test_exposure_multiplies_linear_light_and_saturates():
     gains = (2.0, 1.0, 0.25)
     changed = replace(NONE, gains=gains).apply(plain(137), CAMERA)
     assert (changed == [188, 137, 71]).all()  # a sixteenth of white is sRGB 71
@@ -38,7 +36,7 @@ def test_exposure_multiplies_linear_light_and_saturates() -> None:
 
 
 @pytest.mark.parametrize("noise", [0.02, 0.08])
-def test_variance_of_noise_is_in_proportion_to_light(noise: float) -> None:
+def test_variance_of_noise_is_in_proportion_to_light(noise):
     for value in (99, 188):
         image = plain(value)
         changed = in_light(replace(NONE, noise=noise).apply(image, CAMERA))
@@ -47,7 +45,7 @@ def test_variance_of_noise_is_in_proportion_to_light(noise: float) -> None:
         assert changed.var() == pytest.approx(noise**2 * (light + READ_NOISE**2), rel=0.03)
 
 
-def test_blur_of_a_point_keeps_its_light_and_has_the_moments_of_a_line_and_a_gaussian() -> None:
+def test_blur_of_a_point_keeps_its_light_and_has_the_moments_of_a_line_and_a_gaussian():
     """The variance of a line of length L is L^2 / 12."""
     image = plain(0)
     image[240, 320] = 255
@@ -68,7 +66,7 @@ def test_blur_of_a_point_keeps_its_light_and_has_the_moments_of_a_line_and_a_gau
 @pytest.mark.parametrize(
     "camera", [CAMERA, ColmapCamera("OPENCV", 640, 480, (320.0, 320.0, 320.0, 240.0, -0.1, 0.02, 0.0, 0.0))]
 )
-def test_vignetting_falls_off_from_the_principal_point(camera: Camera) -> None:
+def test_vignetting_falls_off_from_the_principal_point(camera):
     """By cos^4 of the angle from the axis: a quarter at 45 degrees."""
     light = in_light(replace(NONE, vignetting=2.0).apply(plain(255), camera))
     assert light[239:241, 319:321].min() == 1
@@ -76,13 +74,13 @@ def test_vignetting_falls_off_from_the_principal_point(camera: Camera) -> None:
     assert light[0, 320, 0] == pytest.approx(np.cos(np.arctan(240 / 320)) ** 4, abs=0.005)
 
 
-def test_jpeg_keeps_a_constant_image_constant() -> None:
+def test_jpeg_keeps_a_constant_image_constant():
     for value in (0, 100, 255):
         changed = replace(NONE, jpeg_quality=30).apply(plain(value), CAMERA)
         assert len(np.unique(changed)) == 1 and abs(int(changed[0, 0, 0]) - value) <= 2
 
 
-def test_occluders_have_a_persons_size_and_hide_only_what_is_further() -> None:
+def test_occluders_have_a_persons_size_and_hide_only_what_is_further():
     """In this camera all of a box between 1 and 4 m can be seen, unless it is at the image's side."""
     camera = PinholeCamera(400, 400, 100.0)
     whole = 0
@@ -103,14 +101,14 @@ def test_occluders_have_a_persons_size_and_hide_only_what_is_further() -> None:
     assert whole > 10
 
 
-def test_parameters_grow_with_the_strength() -> None:
+def test_parameters_grow_with_the_strength():
     half, full = (Appearance.draw(strength, np.random.default_rng(7)) for strength in (0.5, 1.0))
     for one, two in zip(np.hstack(astuple(half)[:6]), np.hstack(astuple(full)[:6]), strict=True):
         assert one == pytest.approx(two / 2) or one == pytest.approx(np.sqrt(two))  # gains are powers
     assert 101 - half.jpeg_quality == pytest.approx((101 - full.jpeg_quality) / 4, abs=1)
 
 
-def test_a_views_appearance_follows_from_its_pose_and_the_seed() -> None:
+def test_a_views_appearance_follows_from_its_pose_and_the_seed():
     poses = np.random.default_rng(2).normal(size=(300, 3, 4))
     views = Appearance.of_views(poses, 0.6, 3)
     assert Appearance.of_views(poses[::-1] + 1e-12, 0.6, 3) == views[::-1]

@@ -1,7 +1,5 @@
 """Images of cameras with distortion, against OpenCV's maps of an image that a pinhole took."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -15,11 +13,11 @@ POSE = poses_looking_along([[0.2, -0.1, 1.2]], [[1.0, 0.3, -0.1]])
 
 
 @pytest.fixture(scope="module")
-def renderer() -> WarpRenderer:
+def renderer():
     return WarpRenderer(furnished_room())
 
 
-def test_without_distortion_it_is_the_pinholes_image(renderer: WarpRenderer) -> None:
+def test_without_distortion_it_is_the_pinholes_image(renderer):
     pinhole = PinholeCamera(160, 120, 90.0, 95.0, (83.0, 57.0))
     straight = renderer.render(pinhole, POSE)
     looked_up = renderer.render(pinhole.colmap, POSE)
@@ -28,7 +26,7 @@ def test_without_distortion_it_is_the_pinholes_image(renderer: WarpRenderer) -> 
     assert np.median(off) < 0.005 and np.mean(off < 0.05) > 0.95  # but at edges of what stands in front
 
 
-def test_distortion_is_opencvs(renderer: WarpRenderer) -> None:
+def test_distortion_is_opencvs(renderer):
     """A wide image of a pinhole, distorted by OpenCV, is what the camera with distortion sees."""
     k = np.array([[110.0, 0, 80.0], [0, 112.0, 60.0], [0, 0, 1]])
     distortion = np.array([-0.12, 0.02, 0.003, -0.002])
@@ -44,7 +42,7 @@ def test_distortion_is_opencvs(renderer: WarpRenderer) -> None:
     assert np.mean(np.abs(seen.astype(int) - shifted)) > 1.5 * np.mean(np.abs(seen.astype(int) - expected))
 
 
-def test_a_fisheye_sees_half_a_sphere(renderer: WarpRenderer) -> None:
+def test_a_fisheye_sees_half_a_sphere(renderer):
     """What it sees at a pixel is what a pinhole that looks along the pixel's ray sees at its centre."""
     fisheye = ColmapCamera("SIMPLE_FISHEYE", 200, 200, (60.0, 100.0, 100.0))  # 100 / 60 rad = 95 degrees off the axis
     seen = renderer.render(fisheye, POSE)

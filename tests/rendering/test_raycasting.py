@@ -1,7 +1,5 @@
 """Ray and distance queries against Open3D and closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

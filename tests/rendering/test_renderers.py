@@ -1,7 +1,5 @@
 """The Warp renderer against Open3D, and both against images known in closed form."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 
@@ -151,7 +149,7 @@ def test_rasterizing_leaves_no_gap_on_edges_through_pixel_centres(turn):
         np.testing.assert_allclose(image.depth_m, 2.0, rtol=1e-6)
 
 
-def test_invalid_input() -> None:
+def test_invalid_input():
     with pytest.raises(SceneError):
         WarpRenderer(replace(furnished_room(), triangles=np.zeros((0, 3), np.int32)))
     with pytest.raises(ConfigError):

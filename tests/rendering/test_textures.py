@@ -1,7 +1,5 @@
 """Mip pyramids and texel gradients against averages and differences taken by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from box_scenes import random_texture, random_triangles

@@ -22,7 +22,7 @@ from wheretolook.scenes.loading import save_glb
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import MapWarning
-from wheretolook.utils.shipped import shipped
+from wheretolook.utils.package import shipped
 
 WEIGHTS = shipped("data/release/weights/set.safetensors")
 

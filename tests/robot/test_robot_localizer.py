@@ -36,7 +36,7 @@ from wheretolook.robot.localizer import ImageSequence, RobotLocalizer
 from wheretolook.robot.wheretolook_robot import RobotScorer
 from wheretolook.scorers.base import Scorer
 from wheretolook.utils.errors import ConfigError, MapError
-from wheretolook.utils.shipped import shipped
+from wheretolook.utils.package import shipped
 
 BUNDLED = shipped("data/release/weights/set.safetensors")
 POSES = poses_looking_along([(-0.5, 0.3, 1.2)] * 2, [(1, 0.2, 0), (0.3, 1, 0)])

@@ -34,7 +34,7 @@ from wheretolook.scorers.weights import load_scorer
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.training.trained_network import TrainedNetwork, TrainingRange
 from wheretolook.utils.errors import CameraError, WeightsError
-from wheretolook.utils.shipped import shipped
+from wheretolook.utils.package import shipped
 from wheretolook.visibility.occlusion import MeshOcclusion
 
 pytestmark = pytest.mark.filterwarnings("ignore::wheretolook.utils.errors.OutOfRangeWarning")

@@ -1,23 +1,20 @@
 """A mesh cut by a level plane keeps what is below, with its textures."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from box_scenes import box_quads, quads_mesh, random_texture, random_triangles
-from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.cutting import cut_above
 
 
-def areas(mesh: TexturedMesh) -> np.ndarray:
+def areas(mesh):
     return np.linalg.norm(mesh.normals, axis=1) / 2
 
 
-def test_cutting_a_box_leaves_walls_of_the_height() -> None:
+def test_cutting_a_box_leaves_walls_of_the_height():
     mesh = quads_mesh(box_quads((0, 0, 0), (2, 3, 4)), [random_texture(np.random.default_rng(0), 8, 8)])
     cut = cut_above(mesh, 1.0)
     assert cut.bounds[1, 2] == pytest.approx(1.0)
@@ -26,7 +23,7 @@ def test_cutting_a_box_leaves_walls_of_the_height() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_cut_changes_nothing_below_it(seed: int) -> None:
+def test_a_cut_changes_nothing_below_it(seed):
     mesh = random_triangles(seed)
     cut = cut_above(mesh, 0.3)
     assert cut.vertices[cut.triangles][..., 2].max() <= 0.3 + 1e-5
@@ -47,7 +44,7 @@ def test_a_cut_changes_nothing_below_it(seed: int) -> None:
         assert min(_uv_error(mesh, number, point, uv) for number in candidates) < 1e-3
 
 
-def _uv_error(mesh: TexturedMesh, number: int, point: np.ndarray, uv: np.ndarray) -> float:
+def _uv_error(mesh, number, point, uv):
     a, b, c = mesh.vertices[mesh.triangles[number]].astype(np.float64)
     solved, *_ = np.linalg.lstsq(np.column_stack([b - a, c - a]), point - a, rcond=None)
     off_plane = np.linalg.norm(a + np.column_stack([b - a, c - a]) @ solved - point)

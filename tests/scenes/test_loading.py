@@ -1,7 +1,5 @@
 """Reading and writing meshes, against files written by hand or by trimesh."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

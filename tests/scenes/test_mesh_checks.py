@@ -1,7 +1,5 @@
 """Corrupt and hostile PLY, OBJ and GLB files and textures give a typed error that names them, with little memory."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json
@@ -21,23 +19,23 @@ from wheretolook.utils import devices as memory
 from wheretolook.utils.errors import SceneError
 
 
-def png(height: int = 4, width: int = 6) -> bytes:
+def png(height=4, width=6):
     buffer = io.BytesIO()
     Image.fromarray(random_texture(np.random.default_rng(0), height, width)).save(buffer, "png")
     return buffer.getvalue()
 
 
-def huge_png() -> bytes:
+def huge_png():
     """A small image whose header says that it has 180 million pixels."""
     head = struct.pack(">4sIIBBBBB", b"IHDR", 60_000, 3_000, 8, 2, 0, 0, 0)
     return png()[:12] + head + struct.pack(">I", zlib.crc32(head)) + png()[33:]
 
 
-def uri(data: bytes, kind: str = "image/png") -> str:
+def uri(data, kind="image/png"):
     return f"data:{kind};base64,{base64.b64encode(data).decode()}"
 
 
-def obj(head: str = "", faces: str = "f 1/1 2/1 3/1\n") -> bytes:
+def obj(head="", faces="f 1/1 2/1 3/1\n"):
     return f"{head}v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 0 1 0 1 0 0\nv 0 0 1 1 0 0\nvt 0.1 0.1\n{faces}".encode()
 
 
@@ -59,7 +57,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_invalid_files_are_rejected_by_name(name: str, tmp_path: Path) -> None:
+def test_invalid_files_are_rejected_by_name(name, tmp_path):
     files = BROKEN[name]
     for file, content in files.items():
         (tmp_path / file).write_bytes(content)
@@ -68,7 +66,7 @@ def test_invalid_files_are_rejected_by_name(name: str, tmp_path: Path) -> None:
     assert Path(caught.value.path or "").name in files
 
 
-def test_textures_beyond_the_memory_are_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_textures_beyond_the_memory_are_rejected(tmp_path, monkeypatch):
     materials = ""
     faces = ""
     for number in range(4):
@@ -84,12 +82,12 @@ def test_textures_beyond_the_memory_are_rejected(tmp_path: Path, monkeypatch: py
 
 
 @pytest.fixture
-def whole(tmp_path: Path) -> Path:
+def whole(tmp_path):
     textured(random_texture(np.random.default_rng(0), 4, 6)).export(tmp_path / "a.glb")
     return tmp_path / "a.glb"
 
 
-def rewrite(path: Path, change) -> None:
+def rewrite(path, change):
     """Replace the JSON of a binary glTF by change(tree, buffer); without its buffer where the JSON holds that."""
     content = path.read_bytes()
     (length,) = struct.unpack_from("<I", content, 12)
@@ -104,7 +102,7 @@ def rewrite(path: Path, change) -> None:
     )
 
 
-def with_image(address: str):
+def with_image(address):
     return lambda tree, _: {**tree, "images": [{"uri": address}]}
 
 
@@ -121,7 +119,7 @@ def nested(tree, _):
     return {**tree, "nodes": nodes, "scenes": [{"nodes": [0]}]}
 
 
-def with_nodes(n: int, n_primitives: int = 1):
+def with_nodes(n, n_primitives=1):
     """Many nodes that share a mesh."""
 
     def change(tree, _):
@@ -139,7 +137,7 @@ def few_uvs(tree, _):
 
 
 @pytest.mark.parametrize("change", [with_image(uri(png())), with_image("picture.png"), embedded])
-def test_images_and_buffers_at_a_uri_are_read(whole: Path, change) -> None:
+def test_images_and_buffers_at_a_uri_are_read(whole, change):
     expected = load_mesh(whole)
     (whole.parent / "picture.png").write_bytes(png())
     rewrite(whole, change)
@@ -158,14 +156,14 @@ CHANGES += [lambda tree, _: None, lambda tree, _: {**tree, "accessors": None}, l
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_invalid_trees_are_rejected(whole: Path, change) -> None:
+def test_invalid_trees_are_rejected(whole, change):
     rewrite(whole, change)
     with pytest.raises(SceneError):
         load_mesh(whole)
 
 
 @pytest.mark.parametrize("vertices", [VERTICES * (1, 1, 0), 0 * VERTICES, np.where(VERTICES == 3, np.nan, VERTICES)])
-def test_degenerate_geometry_is_rejected(tmp_path: Path, vertices: np.ndarray) -> None:
+def test_degenerate_geometry_is_rejected(tmp_path, vertices):
     textured(random_texture(np.random.default_rng(0), 4, 6), vertices).export(tmp_path / "a.glb")
     with pytest.raises(SceneError):
         load_mesh(tmp_path / "a.glb")

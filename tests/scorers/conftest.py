@@ -1,18 +1,15 @@
 """A labelled dataset with stored matches, for the learners."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from synthetic_dataset import CAMERA, make_dataset
-from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_files import read_table, write_table
 from wheretolook.dataset.viewpoint_table import poses
 
 
 @pytest.fixture(scope="session")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def dataset(tmp_path_factory):
     """Labels by filled bins; a landmark is detected if its ambiguity is low."""
     made = make_dataset(tmp_path_factory.mktemp("data"))
     for scene in made.scenes:

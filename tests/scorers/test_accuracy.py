@@ -1,18 +1,14 @@
 """Scores of the set network at any accuracy, against closed forms."""
 
-from __future__ import annotations
-
 import json
 import math
 import warnings
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pycolmap
 import pytest
-from numpy.typing import NDArray
 from scipy.stats import lognorm
 
 from selection.room import write_room
@@ -20,7 +16,7 @@ from synthetic_dataset import CAMERA, make_landmarks
 from wheretolook.dataset.config import ACCURACY
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import direction_lattice, fibonacci_sphere
-from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import write_model
@@ -32,7 +28,7 @@ from wheretolook.scorers.weights import load_scorer
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.training.weights import read_header
 from wheretolook.utils.errors import ConfigError, MapWarning, OutOfRangeWarning, WeightsError
-from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.utils.package import WEIGHTS, shipped
 from wheretolook_paper.studies import fit_accuracy
 
 ACCURACIES = ((1e-9, 1e-9), (0.01, 0.1), ACCURACY, (0.1, 1.0), (0.25, 2.0), (math.inf, math.inf))
@@ -40,7 +36,7 @@ DISTANCE_M = read_header(shipped(WEIGHTS) / "set.safetensors")["range"]["distanc
 MODEL = AccuracyModel((1.0, 0.5), 0.2, (LogError((0.1, 0.2, -0.3), -4.0, 0.9), LogError((0.0, 0.4, -0.1), -2.0, 0.8)))
 
 
-def views(n: int = 200) -> Float:
+def views(n=200):
     """Statistics as of views with few to many landmarks."""
     rng = np.random.default_rng(0)
     statistics = np.zeros((n, len(ALL_STATISTICS)))
@@ -54,7 +50,7 @@ def views(n: int = 200) -> Float:
     return statistics
 
 
-def p_within(statistics: Float, accuracy: tuple[float, float]) -> Float:
+def p_within(statistics, accuracy):
     """F of `MODEL` by SciPy's log-normal distribution."""
     visible, position, orientation, cells = (
         statistics[:, ALL_STATISTICS.index(name)]
@@ -66,7 +62,7 @@ def p_within(statistics: Float, accuracy: tuple[float, float]) -> Float:
     return np.minimum(*within)
 
 
-def test_it_is_the_product_of_both_factors_where_the_network_is() -> None:
+def test_it_is_the_product_of_both_factors_where_the_network_is():
     statistics = views()
     place = np.random.default_rng(1).uniform(0.1, 0.9, len(statistics))
     own = place * p_within(statistics, ACCURACY)
@@ -79,7 +75,7 @@ def test_it_is_the_product_of_both_factors_where_the_network_is() -> None:
             assert found == pytest.approx(place[row] * p_within(statistics[row : row + 1], accuracy), abs=1e-9)
 
 
-def test_it_rises_from_0_through_the_networks_own_probability_to_the_right_place() -> None:
+def test_it_rises_from_0_through_the_networks_own_probability_to_the_right_place():
     statistics = views()
     own = np.random.default_rng(2).uniform(0, 1, len(statistics))
     own[:2] = 0, 1
@@ -92,7 +88,7 @@ def test_it_rises_from_0_through_the_networks_own_probability_to_the_right_place
     assert found[-1][unsure] == pytest.approx(place[unsure], abs=1e-9)
 
 
-def test_errors_and_limits_scale_with_the_unit() -> None:
+def test_errors_and_limits_scale_with_the_unit():
     statistics = views()
     larger = statistics.copy()
     larger[:, ALL_STATISTICS.index("log_position_variance")] += 2 * math.log(10)
@@ -102,7 +98,7 @@ def test_errors_and_limits_scale_with_the_unit() -> None:
     assert MODEL.expected_errors(statistics)[:, 0] == pytest.approx(lognorm(0.9, scale=median_m).mean())
 
 
-def test_the_fit_finds_the_model_that_errors_are_drawn_from(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_fit_finds_the_model_that_errors_are_drawn_from(monkeypatch):
     rng = np.random.default_rng(3)
     statistics = views(20_000)
     own = rng.uniform(0.01, 0.99, len(statistics))
@@ -122,7 +118,7 @@ def test_the_fit_finds_the_model_that_errors_are_drawn_from(monkeypatch: pytest.
         assert (error.bias + 12, error.deviation) == pytest.approx((known.bias, known.deviation), abs=0.1)
 
 
-def test_the_bundled_file_is_the_model_and_damage_is_found(tmp_path: Path) -> None:
+def test_the_bundled_file_is_the_model_and_damage_is_found(tmp_path):
     stored = json.loads(AccuracyModel.file.read_text())
     model = AccuracyModel.bundled()
     assert dict(zip(AccuracyModel.names, model.weights, strict=True)) == stored["weights"]
@@ -136,19 +132,19 @@ def test_the_bundled_file_is_the_model_and_damage_is_found(tmp_path: Path) -> No
 
 
 @pytest.fixture(scope="module")
-def scorer() -> SetScorer:
+def scorer():
     scorer = load_scorer(LocalizationMap(make_landmarks(np.random.default_rng(0), 400), CAMERA))
     assert isinstance(scorer, SetScorer)
     return scorer
 
 
 @pytest.fixture(scope="module")
-def poses() -> Float:
+def poses():
     return poses_looking_along(np.tile([0.0, 0.0, 1.5], (60, 1)), direction_lattice(60))
 
 
 @pytest.mark.filterwarnings("ignore::wheretolook.utils.errors.OutOfRangeWarning")
-def test_scores_rise_with_the_limits_and_are_unchanged_at_the_weights_own(scorer: SetScorer, poses: Float) -> None:
+def test_scores_rise_with_the_limits_and_are_unchanged_at_the_weights_own(scorer, poses):
     own = scorer.score(poses)
     found = [scorer.at_accuracy(accuracy).score(poses) for accuracy in ACCURACIES]
     assert np.array_equal(found[2], own) and scorer.at_accuracy(ACCURACY).name == "set"
@@ -162,7 +158,7 @@ def test_scores_rise_with_the_limits_and_are_unchanged_at_the_weights_own(scorer
 
 
 @pytest.mark.filterwarnings("ignore::wheretolook.utils.errors.OutOfRangeWarning")
-def test_views_have_an_accuracy_and_expected_errors(scorer: SetScorer) -> None:
+def test_views_have_an_accuracy_and_expected_errors(scorer):
     look = WhereToLook(scorer, direction_lattice(60))
     place = [(0.0, 0.0, 1.5)]
     own = look.best(place)
@@ -181,7 +177,7 @@ def test_views_have_an_accuracy_and_expected_errors(scorer: SetScorer) -> None:
         visible.best(place, accuracy=(0.25, 2))
 
 
-def sphere(radius_m: float) -> SetScorer:
+def sphere(radius_m):
     """The bundled scorer of landmarks on a sphere around the origin."""
     landmarks = make_landmarks(np.random.default_rng(0), 2000)
     points = fibonacci_sphere(2000) * radius_m
@@ -196,7 +192,7 @@ def sphere(radius_m: float) -> SetScorer:
 
 
 @pytest.mark.parametrize("radius_m", [6.0, 35.0])
-def test_the_depth_that_is_in_range_depends_on_the_accuracy(radius_m: float) -> None:
+def test_the_depth_that_is_in_range_depends_on_the_accuracy(radius_m):
     scorer = sphere(radius_m)
     farthest = DISTANCE_M[1]
     views = poses_looking_along(np.zeros((8, 3)), direction_lattice(8))
@@ -207,7 +203,7 @@ def test_the_depth_that_is_in_range_depends_on_the_accuracy(radius_m: float) -> 
         assert (at.at_accuracy(ACCURACY).in_range(views) == scorer.in_range(views)).all()
 
 
-def test_it_warns_once_of_depth_relative_to_the_accuracy() -> None:
+def test_it_warns_once_of_depth_relative_to_the_accuracy():
     scorer = sphere(6.0)
     views = poses_looking_along(np.zeros((8, 3)), direction_lattice(8))
     for accuracy in (ACCURACY, (0.02, 0.2), (0.25, 2.0)):
@@ -220,7 +216,7 @@ def test_it_warns_once_of_depth_relative_to_the_accuracy() -> None:
     assert f"35 m (in range: {DISTANCE_M[0]:.3g} to {DISTANCE_M[1]:.3g})" in warned
 
 
-def test_depth_over_accuracy_does_not_depend_on_an_unknown_unit(tmp_path: Path) -> None:
+def test_depth_over_accuracy_does_not_depend_on_an_unknown_unit(tmp_path):
     """1 % of the depth is in range in any unit; in metres, 5 cm are a smaller share of a larger depth."""
     room = pycolmap.Reconstruction(write_room(tmp_path / "metric"))
     for image in room.images.values():  # the room's images also observe what is behind them
@@ -241,15 +237,15 @@ def test_depth_over_accuracy_does_not_depend_on_an_unknown_unit(tmp_path: Path) 
     assert found == {(1.0, False): (1, 0), (1.0, True): (1, 0), (10.0, False): (1, 0), (10.0, True): (0, 1)}
 
 
-def warnings_of(scorer: SetScorer, views: Float) -> list[str]:
+def warnings_of(scorer, views):
     """Texts of the warnings of range of scoring views."""
     with warnings.catch_warnings(record=True, action="always", category=OutOfRangeWarning) as warned:
         scorer.score(views)
     return [str(one.message) for one in warned]
 
 
-def test_landmarks_mapped_from_one_place_are_out_of_range(poses: Float) -> None:
-    def seen_and_in_range(angle_deg: float, error_px: float, spread: float) -> NDArray[np.bool_]:
+def test_landmarks_mapped_from_one_place_are_out_of_range(poses):
+    def seen_and_in_range(angle_deg, error_px, spread):
         of_map = {
             "triangulation_angle_deg": np.full(400, angle_deg, np.float32),
             "reprojection_error_px": np.full(400, error_px, np.float32),

@@ -1,9 +1,5 @@
 """Calibration of log-odds to a scene, and adapted weights."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -23,12 +19,12 @@ from wheretolook.scorers.weights import load_scorer
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.weights import read_weights, write_weights
 from wheretolook.utils.errors import WeightsError
-from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.utils.package import WEIGHTS, shipped
 
 SET = shipped(WEIGHTS) / "set.safetensors"
 
 
-def test_calibration_alone_is_platts() -> None:
+def test_calibration_alone_is_platts():
     from sklearn.linear_model import LogisticRegression
 
     views = random_views(300, shift=0.7)
@@ -37,7 +33,7 @@ def test_calibration_alone_is_platts() -> None:
     assert abs(scale - platt.coef_[0, 0]) < 0.02 and abs(offset - platt.intercept_[0]) < 0.02
 
 
-def photographed(shift: float, seed: int = 0) -> LocalizedViews:
+def photographed(shift, seed=0):
     """Return 120 photographs held out in six groups and again in two large ones; log-odds are too low by a shift."""
     rng = np.random.default_rng(seed)
     n = 120
@@ -50,7 +46,7 @@ def photographed(shift: float, seed: int = 0) -> LocalizedViews:
     return LocalizedViews(log_odds, good, centers, axes, group, photograph, photograph // 4)
 
 
-def test_photographs_calibrate() -> None:
+def test_photographs_calibrate():
     views = photographed(2.0)
     fitted = adapt(views)
     assert log_losses(fitted.held_out, views.good).mean() < log_losses(views.log_odds, views.good).mean() - 0.1
@@ -60,7 +56,7 @@ def test_photographs_calibrate() -> None:
     assert fitted.offset == pytest.approx(2, abs=0.8)
 
 
-def test_photographs_are_judged_by_blocks_that_share_none_with_those_trained_on() -> None:
+def test_photographs_are_judged_by_blocks_that_share_none_with_those_trained_on():
     views = photographed(0.0)
     judged = np.zeros(len(views), dtype=int)
     for out, trained_on in splits(views):
@@ -71,7 +67,7 @@ def test_photographs_are_judged_by_blocks_that_share_none_with_those_trained_on(
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> tuple[LocalizationMap, Path]:
+def place(tmp_path_factory):
     """A map, and weights adapted to it."""
     scene = make_dataset(tmp_path_factory.mktemp("data") / "place", ("test",)).scenes[0]
     localization_map = LocalizationMap(scene.read_landmarks(), scene.camera)
@@ -83,7 +79,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> tuple[LocalizationMap, Pa
     return localization_map, path
 
 
-def test_a_file_of_adapted_weights_scores_as_it_says(place: tuple[LocalizationMap, Path]) -> None:
+def test_a_file_of_adapted_weights_scores_as_it_says(place):
     localization_map, path = place
     adapted = load_scorer(path, localization_map)
     base = load_scorer(SET, localization_map)
@@ -99,7 +95,7 @@ def test_a_file_of_adapted_weights_scores_as_it_says(place: tuple[LocalizationMa
     assert adapted.name == "adapted"
 
 
-def test_they_are_refused_in_another_scene_unless_forced(place: tuple[LocalizationMap, Path]) -> None:
+def test_they_are_refused_in_another_scene_unless_forced(place):
     localization_map, path = place
     landmarks = localization_map.landmarks
     moved = Landmarks(**{**landmarks.__dict__, "points": landmarks.points + np.array([0.5, 0, 0])})
@@ -109,7 +105,7 @@ def test_they_are_refused_in_another_scene_unless_forced(place: tuple[Localizati
     assert load_scorer(path, other, anywhere=True).name == "adapted"
 
 
-def test_weights_with_a_gaussian_process_are_refused_by_name(place: tuple[LocalizationMap, Path]) -> None:
+def test_weights_with_a_gaussian_process_are_refused_by_name(place):
     localization_map, path = place
     tensors, header = read_weights(path)
     older = path.with_name("older.safetensors")

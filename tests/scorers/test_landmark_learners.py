@@ -1,7 +1,5 @@
 """Learners of single landmarks: which are detected, and the statistics expected of a view."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +9,6 @@ import torch
 
 from learning_options import train_config
 from synthetic_dataset import CAMERA
-from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good, poses
 from wheretolook.geometry import pose_information as information
 from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
@@ -34,7 +31,7 @@ DISTANCE = ATTRIBUTES.index("distance")
 NO_STATISTICS = FeatureStatistics(ATTRIBUTES, (0.0,) * len(ATTRIBUTES), (1.0,) * len(ATTRIBUTES))
 
 
-def attributes_of(offsets: np.ndarray) -> torch.Tensor:
+def attributes_of(offsets):
     """Attributes of landmarks at offsets (N, 3) in the camera's axes; those of the map are 0."""
     values = np.zeros((len(offsets), len(ATTRIBUTES)))
     values[:, 0] = offsets[:, 0] / offsets[:, 2]
@@ -44,11 +41,11 @@ def attributes_of(offsets: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(values)
 
 
-def some_offsets(n: int, seed: int = 0) -> np.ndarray:
+def some_offsets(n, seed=0):
     return np.random.default_rng(seed).uniform((-1, -1, 1), (1, 1, 4), (n, 3))
 
 
-def test_the_information_is_that_of_the_fisher_package() -> None:
+def test_the_information_is_that_of_the_fisher_package():
     offsets = some_offsets(40)
     numbers = bearing_numbers(attributes_of(offsets))
     np.testing.assert_allclose(numbers, information.bearing_numbers(offsets), rtol=1e-9, atol=1e-12)
@@ -56,7 +53,7 @@ def test_the_information_is_that_of_the_fisher_package() -> None:
     np.testing.assert_allclose(matrices, information.information_matrices(numbers.numpy()), rtol=1e-12)
 
 
-def test_expectations_in_closed_form() -> None:
+def test_expectations_in_closed_form():
     offsets = some_offsets(50)
     values = attributes_of(offsets)
     rng = np.random.default_rng(1)
@@ -88,7 +85,7 @@ def test_expectations_in_closed_form() -> None:
     assert found["expected_share"] == pytest.approx(p.mean(), rel=1e-5)
 
 
-def test_expected_cells_in_closed_form() -> None:
+def test_expected_cells_in_closed_form():
     """Two landmarks share a cell, one lies elsewhere, one is 90 degrees off; another view has one, a third none."""
     degrees = np.array([[1.0, 1.0], [5.0, 3.0], [-40.0, 20.0], [89.99, 0.0], [0.5, 0.5]])
     values = torch.zeros(5, len(ATTRIBUTES), dtype=torch.float64)
@@ -101,7 +98,7 @@ def test_expected_cells_in_closed_form() -> None:
     np.testing.assert_allclose(found, [1 - 0.7 * 0.4 + 0.25 + 0.5, 1 - 0.1**2, 0], rtol=1e-12)
 
 
-def test_detection_is_learned_from_known_matches_only() -> None:
+def test_detection_is_learned_from_known_matches_only():
     network = SetNetwork(NO_STATISTICS).eval()
     values = torch.randn(3, 5, len(ATTRIBUTES))
     counts = torch.tensor([5, 2, 0])
@@ -118,7 +115,7 @@ def test_detection_is_learned_from_known_matches_only() -> None:
 
 
 @pytest.mark.parametrize("pooled", [0, 4])
-def test_a_sample_of_all_landmarks_scores_as_all_of_them(pooled: int) -> None:
+def test_a_sample_of_all_landmarks_scores_as_all_of_them(pooled):
     torch.manual_seed(0)
     network = SetNetwork(NO_STATISTICS, pooled=pooled).eval()
     counts = torch.tensor([30, 1, 17])
@@ -134,7 +131,7 @@ def test_a_sample_of_all_landmarks_scores_as_all_of_them(pooled: int) -> None:
     torch.testing.assert_close(network(padded, counts, counts, height), whole, rtol=1e-4, atol=1e-5)
 
 
-def test_unknown_attributes_become_the_mean_and_hidden_ones_are_ignored() -> None:
+def test_unknown_attributes_become_the_mean_and_hidden_ones_are_ignored():
     values = torch.randn(100, len(ATTRIBUTES))
     values[:, -1] = torch.nan
     statistics = FeatureStatistics.of_attributes(values)
@@ -151,7 +148,7 @@ def test_unknown_attributes_become_the_mean_and_hidden_ones_are_ignored() -> Non
     assert not torch.equal(network(values), network(known))
 
 
-def test_views_by_their_landmarks(dataset: Dataset) -> None:
+def test_views_by_their_landmarks(dataset):
     scenes = training_scenes(dataset)
     views = load_landmark_views(dataset, scenes, train_config(), 20, progress=False, matches=True)
     assert views.detected is not None
@@ -177,7 +174,7 @@ def test_views_by_their_landmarks(dataset: Dataset) -> None:
             np.testing.assert_array_equal(views.detected[part].numpy() > 0, np.isin(kept, inliers))
 
 
-def test_batches_hold_samples_of_each_view(dataset: Dataset) -> None:
+def test_batches_hold_samples_of_each_view(dataset):
     views = load_landmark_views(dataset, training_scenes(dataset), train_config(), 40, progress=False)
     rows = torch.arange(5, len(views))
     loader = LandmarkBatches(views, rows, 8, 64, 3)
@@ -189,7 +186,7 @@ def test_batches_hold_samples_of_each_view(dataset: Dataset) -> None:
     assert torch.equal(values[0, : counts[0]].half(), views.values[views.starts[5] : views.starts[5] + counts[0]])
 
 
-def test_enlarged_views_are_those_of_an_enlarged_scene(dataset: Dataset) -> None:
+def test_enlarged_views_are_those_of_an_enlarged_scene(dataset):
     views = load_landmark_views(dataset, training_scenes(dataset), train_config(), 40, progress=False)
     views = replace(views, axis_height=torch.arange(len(views)).float())  # identifies the view
     rows = torch.arange(len(views))
@@ -208,7 +205,7 @@ def test_enlarged_views_are_those_of_an_enlarged_scene(dataset: Dataset) -> None
     assert np.array_equal(large.labels.numpy() > 0, good) and not torch.equal(large.labels, plain.labels)
 
 
-def test_small_datasets_take_more_epochs() -> None:
+def test_small_datasets_take_more_epochs():
     config = SetConfig()
     assert of_size(config, 200_000) is config and of_size(config, 16 * 1024) is config
     few = of_size(config, 1350)
@@ -217,7 +214,7 @@ def test_small_datasets_take_more_epochs() -> None:
 
 
 @pytest.mark.parametrize(("world_size", "max_scale"), [(2, 1.0), (3, 3.0)])
-def test_processes_share_every_batch(dataset: Dataset, world_size: int, max_scale: float) -> None:
+def test_processes_share_every_batch(dataset, world_size, max_scale):
     views = load_landmark_views(dataset, training_scenes(dataset), train_config(), 40, progress=False)
     rows = torch.arange(101)  # the last batch has one view: some processes get none
     whole = list(LandmarkBatches(views, rows, 8, 20, 3, max_scale=max_scale))

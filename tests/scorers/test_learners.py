@@ -1,12 +1,8 @@
 """The contract of all learned methods: trained, stored, loaded, scored and evaluated alike."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,20 +13,16 @@ from learning_options import changed, train_config
 from synthetic_dataset import CAMERA, make_dataset
 from wheretolook.commands.evaluate import evaluate_methods
 from wheretolook.commands.train import train_methods
-from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.geometry.poses import Float
 from wheretolook.inputs.landmark_features import LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.matchability.config import MatchabilityConfig
 from wheretolook.scorers.matchability.network import MatchabilityNetwork
 from wheretolook.scorers.registry import learned, make_scorer, scorers
 from wheretolook.scorers.set.config import SetConfig
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.tracking.store import TrackingConfig, client
-from wheretolook.training.provenance import TrainedModel
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.weights import METADATA_KEY, method_of_weights, read_training
 from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, TableError, WeightsError
@@ -57,17 +49,17 @@ SCORING = [name for name in learned() if name in scorers()]
 
 
 @pytest.fixture(scope="module")
-def tracking(tmp_path_factory: pytest.TempPathFactory) -> TrackingConfig:
+def tracking(tmp_path_factory):
     return TrackingConfig(folder=str(tmp_path_factory.mktemp("mlruns")))
 
 
 @pytest.fixture(scope="module")
-def trained(dataset: Dataset, tracking: TrackingConfig) -> dict[str, TrainedModel]:
+def trained(dataset, tracking):
     return {model.method: model for model in train_methods(dataset, FEW, tracking, progress=False)}
 
 
 @pytest.mark.parametrize("name", learned())
-def test_weights_and_run(name: str, trained: dict[str, TrainedModel], tracking: TrackingConfig) -> None:
+def test_weights_and_run(name, trained, tracking):
     model = trained[name]
     assert not model.reused and np.isfinite(list(model.metrics.values())).all()
     assert method_of_weights(model.path) == name == read_training(model.path)["method"]
@@ -78,9 +70,7 @@ def test_weights_and_run(name: str, trained: dict[str, TrainedModel], tracking: 
     assert run.metrics["kept_val_average_precision"] == pytest.approx(model.metrics["val_average_precision"])
 
 
-def test_the_same_seed_gives_the_same_bytes_and_is_reused(
-    dataset: Dataset, trained: dict[str, TrainedModel], tracking: TrackingConfig
-) -> None:
+def test_the_same_seed_gives_the_same_bytes_and_is_reused(dataset, trained, tracking):
     assert all(model.reused for model in train_methods(dataset, FEW, tracking, progress=False))
     names = ("matchability", "set", "mlp-2d+z", "conv", "sphere", "trees")
     before = {name: trained[name].path.read_bytes() for name in names}
@@ -88,7 +78,7 @@ def test_the_same_seed_gives_the_same_bytes_and_is_reused(
     assert {name: trained[name].path.read_bytes() for name in names} == before
 
 
-def test_all_are_evaluated(dataset: Dataset, trained: dict[str, TrainedModel], tracking: TrackingConfig) -> None:
+def test_all_are_evaluated(dataset, trained, tracking):
     config = EvaluateConfig(methods=("bins", *SCORING), top_n=(1,), resamples=20)
     table = evaluate_methods(dataset, config, tracking, progress=False)
     rows = table[table["scene"] == "all"].set_index("method")
@@ -96,9 +86,7 @@ def test_all_are_evaluated(dataset: Dataset, trained: dict[str, TrainedModel], t
     assert rows.loc["set", "roc_auc"] > 0.8 and np.isfinite(rows.loc[SCORING, "ece"].astype(float)).all()
 
 
-def test_detection_is_learned_and_the_set_network_starts_from_it(
-    dataset: Dataset, trained: dict[str, TrainedModel]
-) -> None:
+def test_detection_is_learned_and_the_set_network_starts_from_it(dataset, trained):
     matchability = TrainedNetwork.load(trained["matchability"].path, MatchabilityNetwork, "matchability")
     localization_map = dataset.split("test")[0].localization_map(CAMERA)
     described = LandmarkDescriber(localization_map).describe(poses(dataset.split("test")[0].read_table())[:50])
@@ -121,9 +109,7 @@ def test_detection_is_learned_and_the_set_network_starts_from_it(
         None,
     ],
 )
-def test_damaged_weights(
-    change: dict[str, Any] | None, trained: dict[str, TrainedModel], dataset: Dataset, tmp_path: Path
-) -> None:
+def test_damaged_weights(change, trained, dataset, tmp_path):
     whole = trained["set"].path
     with safe_open(whole, framework="np") as file:
         header = json.loads(file.metadata()[METADATA_KEY])
@@ -143,7 +129,7 @@ def test_damaged_weights(
         load_scorer(path, localization_map)
 
 
-def warnings_of(scorer: Scorer, cam_from_world: Float) -> list[str]:
+def warnings_of(scorer, cam_from_world):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         scorer.score(cam_from_world)
@@ -152,9 +138,7 @@ def warnings_of(scorer: Scorer, cam_from_world: Float) -> list[str]:
 
 
 @pytest.mark.parametrize("name", ["set", "trees", "expected-inliers"])
-def test_views_outside_the_training_range_warn_once(
-    dataset: Dataset, trained: dict[str, TrainedModel], name: str
-) -> None:
+def test_views_outside_the_training_range_warn_once(dataset, trained, name):
     weights = trained[scorers()[name].weights].path
     scene = dataset.split("train")[0]
     localization_map = scene.localization_map(CAMERA)
@@ -170,7 +154,7 @@ def test_views_outside_the_training_range_warn_once(
     assert len(warnings_of(scorer, far)) == 1 and not warnings_of(scorer, far)
 
 
-def test_matches_must_be_stored(tmp_path: Path, tracking: TrackingConfig) -> None:
+def test_matches_must_be_stored(tmp_path, tracking):
     with pytest.raises(TableError):
         train_methods(make_dataset(tmp_path), changed(FEW, methods=("matchability",)), tracking, progress=False)
 
@@ -189,6 +173,6 @@ def test_matches_must_be_stored(tmp_path: Path, tracking: TrackingConfig) -> Non
         (TreesConfig, {"max_leaves": 1}),
     ],
 )
-def test_invalid_options(config: type, options: dict[str, Any]) -> None:
+def test_invalid_options(config, options):
     with pytest.raises(ConfigError):
         config(**options)

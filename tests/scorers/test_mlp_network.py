@@ -1,7 +1,5 @@
 """Inputs of the network, and weights on disk."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -18,7 +16,7 @@ CAMERA = PinholeCamera(64, 48, 32.0)
 
 
 @pytest.fixture
-def views() -> tuple[torch.Tensor, torch.Tensor]:
+def views():
     """Random binned views with all channels; view 0 sees nothing."""
     generator = torch.Generator().manual_seed(0)
     filled = torch.rand((50, BINS, BINS), generator=generator) < 0.4
@@ -28,19 +26,15 @@ def views() -> tuple[torch.Tensor, torch.Tensor]:
     return (values + 3) * scale * filled[:, None], filled
 
 
-def make_network(
-    views: tuple[torch.Tensor, torch.Tensor], variant: str = "2d+z", **options: object
-) -> ViewpointNetwork:
+def make_network(views, variant="2d+z", **options):
     statistics = FeatureStatistics.of_bins(*views, torch.arange(50), ALL_CHANNELS).select(INPUTS[variant])
     torch.manual_seed(1)
-    spec = NetworkSpec(statistics, bins=BINS, hidden=(8, 8), **options)  # type: ignore[arg-type]
+    spec = NetworkSpec(statistics, bins=BINS, hidden=(8, 8), **options)
     return ViewpointNetwork(spec).eval()
 
 
 @pytest.mark.parametrize("variant", INPUTS)
-def test_standardized_inputs_have_mean_0_and_deviation_1_where_filled_and_are_0_elsewhere(
-    views: tuple[torch.Tensor, torch.Tensor], variant: str
-) -> None:
+def test_standardized_inputs_have_mean_0_and_deviation_1_where_filled_and_are_0_elsewhere(views, variant):
     means, filled = views
     statistics = FeatureStatistics.of_bins(means, filled, torch.arange(50), ALL_CHANNELS).select(INPUTS[variant])
     layer = BinnedInput(NetworkSpec(statistics, bins=BINS))
@@ -53,7 +47,7 @@ def test_standardized_inputs_have_mean_0_and_deviation_1_where_filled_and_are_0_
         assert channel[filled].std(correction=0).item() == pytest.approx(1, abs=1e-4)
 
 
-def test_unknown_landmark_attributes_become_the_mean_of_known_ones(views: tuple[torch.Tensor, torch.Tensor]) -> None:
+def test_unknown_landmark_attributes_become_the_mean_of_known_ones(views):
     means, filled = views
     ambiguity, spread = (ALL_CHANNELS.index(name) for name in ("ambiguity", "distance_spread"))
     means[:20, ambiguity] = torch.where(filled[:20], torch.nan, 0.0)  # a map without descriptors
@@ -68,7 +62,7 @@ def test_unknown_landmark_attributes_become_the_mean_of_known_ones(views: tuple[
     assert torch.all(values[:, spread] == 0)
 
 
-def test_compact_layout_is_the_one_of_features(views: tuple[torch.Tensor, torch.Tensor]) -> None:
+def test_compact_layout_is_the_one_of_features(views):
     means, filled = views
     expected = move_to_front_plain(means.numpy(), filled.numpy())
     np.testing.assert_array_equal(move_to_front(means, filled).numpy(), expected)

@@ -1,22 +1,18 @@
 """The offset of the log-odds of detection that a map's own images determine."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
 import torch
-from numpy.typing import NDArray
 from scipy.special import logit
 
 from selection.room import WEIGHTS, write_room
 from synthetic_dataset import make_landmarks
-from wheretolook.geometry.camera import Camera, PinholeCamera
-from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import ModelArrays
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
@@ -37,15 +33,15 @@ PREDICTED = 0.3
 class SeesHalf(OcclusionModel):
     """Hides every second landmark."""
 
-    def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
+    def unoccluded(self, locations, points):
         return np.tile(np.arange(len(points)) % 2 == 0, (len(locations), 1))
 
 
-def bundled() -> TrainedNetwork[SetNetwork]:
+def bundled():
     return TrainedNetwork.load(WEIGHTS / "set.safetensors", SetNetwork, "set")
 
 
-def constant_network() -> SetNetwork:
+def constant_network():
     """Return a network that predicts the same probability of detection for every landmark."""
     network = deepcopy(bundled().network)
     last = network.matchability.layers[-1]
@@ -56,19 +52,19 @@ def constant_network() -> SetNetwork:
     return network
 
 
-def first_of(landmarks: Landmarks, n: int) -> Landmarks:
+def first_of(landmarks, n):
     """Return the first landmarks."""
     values = {name: v[:n] if isinstance(v, np.ndarray) else v for name, v in vars(landmarks).items()}
     return Landmarks(**values)
 
 
-def observed_map(p_detect: float, n_images: int = 40, n: int = 2000, photographs: bool = True) -> LocalizationMap:
+def observed_map(p_detect, n_images=40, n=2000, photographs=True):
     """Return a map whose images, of two cameras, observe each landmark in view with a probability."""
     rng = np.random.default_rng(0)
     landmarks = make_landmarks(rng, n)
     axes = rng.normal((1.5, 1.5, 0), 1, (n_images, 3))
     poses = poses_looking_along(rng.uniform((-2, -2, 1), (1, 1, 2), (n_images, 3)), axes)
-    cameras: list[Camera] = [WIDE if row % 3 else NARROW for row in range(n_images)]
+    cameras = [WIDE if row % 3 else NARROW for row in range(n_images)]
     seen = np.zeros((n, n_images), dtype=bool)
     for row, camera in enumerate(cameras):
         local = landmarks.points @ poses[row, :, :3].T + poses[row, :, 3]
@@ -97,24 +93,24 @@ def observed_map(p_detect: float, n_images: int = 40, n: int = 2000, photographs
 
 
 @pytest.mark.parametrize("p_detect", [0.2, 0.3, 0.6])
-def test_the_offset_is_that_of_the_rate_of_detection(p_detect: float) -> None:
+def test_the_offset_is_that_of_the_rate_of_detection(p_detect):
     """Whether a held-out image observes a landmark is independent of the others, so that the rate is known."""
     expected = logit(p_detect) - logit(PREDICTED)
     assert detection_offset(constant_network(), observed_map(p_detect)) == pytest.approx(expected, abs=0.12)
 
 
-def test_the_offset_is_bounded() -> None:
+def test_the_offset_is_bounded():
     assert detection_offset(constant_network(), observed_map(0.06, n=10_000)) == OFFSETS[0]
     assert detection_offset(constant_network(), observed_map(0.97)) == OFFSETS[-1]
 
 
-def test_few_images_do_not_determine_it() -> None:
+def test_few_images_do_not_determine_it():
     assert detection_offset(constant_network(), observed_map(0.6, n_images=4)) == 0
     assert detection_offset(constant_network(), observed_map(0.6, n=3)) == 0
     assert detection_offset(constant_network(), replace(observed_map(0.6), images=None)) == 0
 
 
-def test_maps_that_do_not_show_it() -> None:
+def test_maps_that_do_not_show_it():
     """Stored occlusion is of all landmarks at other locations; no third image observes what two do."""
     localization_map = observed_map(0.6)
     images = localization_map.images
@@ -130,7 +126,7 @@ def test_maps_that_do_not_show_it() -> None:
     assert detection_offset(constant_network(), replace(localization_map, images=pairs)) == 0
 
 
-def test_every_occlusion_model_has_its_own() -> None:
+def test_every_occlusion_model_has_its_own():
     localization_map = observed_map(0.6)
     half = replace(localization_map, occlusion=SeesHalf())
     offsets = [for_map(bundled(), one).network.matchability.layers[-1].bias.item() for one in (localization_map, half)]
@@ -138,7 +134,7 @@ def test_every_occlusion_model_has_its_own() -> None:
     assert for_map(bundled(), half).network.matchability.layers[-1].bias.item() == offsets[1]
 
 
-def test_it_is_added_for_photographs_only_and_to_a_copy() -> None:
+def test_it_is_added_for_photographs_only_and_to_a_copy():
     trained = replace(bundled(), network=constant_network())
     assert for_map(trained, observed_map(0.6, photographs=False)) is trained
     calibrated = for_map(trained, observed_map(0.6))
@@ -149,7 +145,7 @@ def test_it_is_added_for_photographs_only_and_to_a_copy() -> None:
     np.testing.assert_allclose(after, 0.6, atol=0.03)
 
 
-def test_all_scorers_of_a_map_use_it(tmp_path: Path) -> None:
+def test_all_scorers_of_a_map_use_it(tmp_path):
     """Of single poses, of directions, and on the robot."""
     localization_map = observed_map(0.6)
     views = localization_map.mapping_poses
@@ -168,7 +164,7 @@ def test_all_scorers_of_a_map_use_it(tmp_path: Path) -> None:
     np.testing.assert_allclose(RobotScorer(folder).score(views), scorer.score(views), atol=1e-5)
 
 
-def test_landmarks_without_an_image_are_those_of_the_smaller_model(tmp_path: Path) -> None:
+def test_landmarks_without_an_image_are_those_of_the_smaller_model(tmp_path):
     folder = write_room(tmp_path / "sparse", metric=False)
     images = LocalizationMap.from_colmap(folder, scale=1.0, up="z").images
     assert images is not None and len(images) == 12

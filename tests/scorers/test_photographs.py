@@ -1,9 +1,6 @@
 """Log-odds of maps of photographs have the offset of the weights once; those of maps of renders have none."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,12 +12,12 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.training.trained_network import TrainedNetwork
-from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.utils.package import WEIGHTS, shipped
 from wheretolook_paper.studies.calibrate_photographs import fitted_offset
 
 
 @pytest.mark.parametrize("rendered", [True, False])
-def test_the_offset_is_added_once_and_only_for_photographs(rendered: bool, tmp_path: Path) -> None:
+def test_the_offset_is_added_once_and_only_for_photographs(rendered, tmp_path):
     folder = write_room(tmp_path / "sparse", metric=rendered)  # whose report then states that it is rendered
     trained = replace(
         TrainedNetwork.load(shipped(WEIGHTS) / "set.safetensors", SetNetwork, "set"), photograph_offset=0.7
@@ -42,7 +39,7 @@ def test_the_offset_is_added_once_and_only_for_photographs(rendered: bool, tmp_p
             np.testing.assert_allclose(logit(scorer.score(views)) - logit(plain.score(views)), expected, atol=1e-6)
 
 
-def test_the_offset_of_several_places_is_fitted_with_equal_weights() -> None:
+def test_the_offset_of_several_places_is_fitted_with_equal_weights():
     """Probabilities that are too low by 1 in log-odds on one place and by 0 on one of ten times the views."""
     rng = np.random.default_rng(0)
     places = []

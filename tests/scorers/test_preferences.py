@@ -1,7 +1,5 @@
 """What a scorer that knows its landmarks must prefer, all else alike."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -15,7 +13,7 @@ from wheretolook.scorers.weights import load_scorer
 CAMERA = PinholeCamera(320, 240, 160.0)
 
 
-def two_walls(n: int, seed: int) -> Landmarks:
+def two_walls(n, seed):
     """Walls x = -2, where no two patches are alike, and x = 2, its mirror image, whose texture repeats 12 patches."""
     rng = np.random.default_rng(seed)
     left = np.column_stack([np.full(n, -2.0), rng.uniform(-1.2, 1.2, n), rng.uniform(0.6, 2.0, n)])
@@ -46,7 +44,7 @@ def two_walls(n: int, seed: int) -> Landmarks:
 
 
 @pytest.mark.parametrize(("n", "seed"), [(40, 0), (80, 1), (160, 2), (400, 0)])
-def test_a_wall_that_repeats_its_texture_is_not_the_one_to_look_at(n: int, seed: int) -> None:
+def test_a_wall_that_repeats_its_texture_is_not_the_one_to_look_at(n, seed):
     landmarks = two_walls(n, seed)
     views = poses_looking_along([[0, 0, 1.3]] * 2, [[-1.0, 0, 0], [1.0, 0, 0]])
     localization_map = LocalizationMap(landmarks, CAMERA)
@@ -58,7 +56,7 @@ def test_a_wall_that_repeats_its_texture_is_not_the_one_to_look_at(n: int, seed:
 
 
 @pytest.mark.parametrize("n", [40, 100, 200])
-def test_a_wall_mapped_from_one_side_is_best_seen_from_that_side(n: int) -> None:
+def test_a_wall_mapped_from_one_side_is_best_seen_from_that_side(n):
     both = two_walls(n, seed=1)
     left = {name: None if value is None else value[:n] for name, value in vars(both).items()}
     localization_map = LocalizationMap(Landmarks(**left), CAMERA)

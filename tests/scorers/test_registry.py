@@ -1,7 +1,5 @@
 """Methods of other packages, families of methods, and which weights are preferred."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -36,7 +34,7 @@ from pathlib import Path
 import numpy as np
 
 from wheretolook.scorers.base import CountingScorer
-from wheretolook.scorers.registry import Method, MethodStyle
+from wheretolook.scorers.registry import Learner, Method
 
 
 @dataclass(frozen=True)
@@ -95,10 +93,9 @@ class Fewest(CountingScorer):
 
 
 METHODS = (
-    Method("linear", "A line through the number of landmarks in view.", MethodStyle("line", "#123456", "o", "-"),
-           "learned", build, "linear", probability=True, learn=learn, config=LinearConfig, folder="linear"),
-    Method("fewest", "The fewest landmarks in view.", MethodStyle("fewest landmarks", "#654321", "s", ":"),
-           build=lambda localization_map, options: Fewest(localization_map)),
+    Method("linear", "A line through the number of landmarks in view.", build, "linear", probability=True,
+           learner=Learner(learn, LinearConfig)),
+    Method("fewest", "The fewest landmarks in view.", lambda localization_map, options: Fewest(localization_map)),
 )
 '''
 
@@ -140,7 +137,7 @@ table = evaluate_methods(dataset, EvaluateConfig(("random", "bins", "linear", "f
 assert {*table["method"]} == {"random", "bins", "linear", "fewest", "oracle"}
 assert (table["reference"] == "linear").all() and table.loc[table["method"] == "linear", "ece"].notna().all()
 labels = [text.get_text() for text in score_figure(table).axes[0].get_yticklabels()]
-assert sorted(labels) == ["fewest landmarks", "line", "random", "reprojections with bins"], labels
+assert sorted(labels) == ["fewest", "linear", "random", "reprojections with bins"], labels
 options = ["--data", str(folder), "--name", "tiny", "--tracking.folder", tracking.folder, "--device", "cpu",
            "--camera.width", "160", "--camera.height", "120", "--camera.focal_px", "80",
            "--scene", dataset.split("test")[0].name, "--start", "[-1, -1, 1]", "--goal", "[1, 1, 1]",
@@ -161,14 +158,14 @@ print("trained, compared, drawn and planned with")
 """
 
 
-def run_python(program: str, *arguments: str, path: list[Path]) -> subprocess.CompletedProcess[str]:
+def run_python(program, *arguments, path):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, path))}
     command = [sys.executable, "-c", program, *arguments]
     return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
 
 
 @pytest.mark.slow
-def test_another_package_adds_a_learner_and_a_rule(tmp_path: Path) -> None:
+def test_another_package_adds_a_learner_and_a_rule(tmp_path):
     installed = tmp_path / "site"
     about = installed / "wheretolook_linear-1.0.dist-info"
     about.mkdir(parents=True)
@@ -185,7 +182,7 @@ def test_another_package_adds_a_learner_and_a_rule(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "value", ["nowhere.at.all:METHOD", "math:pi", "os:environ", "wheretolook.scorers.visible:METHODS"]
 )
-def test_invalid_methods_of_other_packages(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_methods_of_other_packages(value, monkeypatch):
     monkeypatch.setattr(registry, "entry_points", lambda group: [EntryPoint("broken", value, registry.GROUP)])
     with pytest.raises(ConfigError):
         all_methods.__wrapped__()
@@ -200,12 +197,12 @@ print([name for name in ("torch", "lightning", "pandas", "mlflow", "warp", "scip
 """
 
 
-def test_records_of_methods_are_light() -> None:
+def test_records_of_methods_are_light():
     done = run_python(LIGHT, path=[SOURCE.parent])
     assert done.stdout.strip() == "[]", done.stdout + done.stderr
 
 
-def test_families_stand_for_their_methods() -> None:
+def test_families_stand_for_their_methods():
     names = [method.name for method in methods_named(("mlp", "bins"), scorers())]
     assert names == ["mlp-2d", "mlp-2d+z", "mlp-2d+3d", "mlp-2d+3d+landmark", "mlp-released", "bins"]
     assert len(methods_named(("fisher",), scorers())) == 9
@@ -215,7 +212,7 @@ def test_families_stand_for_their_methods() -> None:
     assert all(method.name == name and METHODS[0] for name, method in all_methods().items())
 
 
-def test_an_attribute_that_maps_do_not_know_is_named(tmp_path: Path) -> None:
+def test_an_attribute_that_maps_do_not_know_is_named(tmp_path):
     tensors, header = read_weights(WEIGHTS / "set.safetensors")
     header.pop("format_version")
     header["attributes"] = ["colour" if name == "ambiguity" else name for name in header["attributes"]]
@@ -227,7 +224,7 @@ def test_an_attribute_that_maps_do_not_know_is_named(tmp_path: Path) -> None:
     assert make_scorer("visible", localization_map).score(views).shape == (1,)
 
 
-def test_weights_of_many_cameras_come_before_those_of_one(tmp_path: Path) -> None:
+def test_weights_of_many_cameras_come_before_those_of_one(tmp_path):
     """Precision on views of many cameras is lower than on those of one, and does not rank weights."""
     localization_map = LocalizationMap(make_landmarks(np.random.default_rng(0), 50), CAMERA)
     for name in ("set", "matchability", "mlp-2d+z"):
@@ -269,7 +266,7 @@ np.savez(out, **scores)
 """
 
 
-def test_a_new_attribute_leaves_shipped_weights_as_they_are(tmp_path: Path) -> None:
+def test_a_new_attribute_leaves_shipped_weights_as_they_are(tmp_path):
     """Adding an attribute to two files leaves the scores of bundled weights identical."""
     changed = tmp_path / "changed"
     shutil.copytree(SOURCE, changed / "wheretolook", ignore=shutil.ignore_patterns("__pycache__"))

@@ -1,7 +1,5 @@
 """Views near a heading."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -17,11 +15,11 @@ CAMERA = PinholeCamera(320, 320, 277.0)
 
 
 @pytest.fixture
-def localization_map() -> LocalizationMap:
+def localization_map():
     return LocalizationMap(make_landmarks(np.random.default_rng(0), 400), CAMERA)
 
 
-def test_forward_prefers_the_heading(localization_map: LocalizationMap) -> None:
+def test_forward_prefers_the_heading(localization_map):
     directions = fibonacci_sphere(200)
     poses = poses_looking_along(np.zeros((200, 3)), directions)
     for heading in ((1.0, 0, 0), (0, -20.0, 0), (1, 1, 1e-3)):
@@ -33,17 +31,17 @@ def test_forward_prefers_the_heading(localization_map: LocalizationMap) -> None:
     np.testing.assert_allclose(ForwardScorer(localization_map, (1, 0, 0)).score(straight), [1, 0.5, 0])
 
 
-def test_forward_follows_a_path(localization_map: LocalizationMap) -> None:
+def test_forward_follows_a_path(localization_map):
     path = [[0.0, 0, 1], [4, 0, 1], [4, 3, 1], [4, 3, 2]]
     scorer = ForwardScorer(localization_map, path)
     at = [[-5.0, 0, 1], [1, 0.5, 1], [3.5, 2, 1], [5, 2.9, 3]]
     np.testing.assert_allclose(scorer.headings(at), [[1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     np.testing.assert_allclose(scorer.score(poses_looking_along(at, np.tile([0.0, 1, 0], (4, 1)))), [0.5, 0.5, 1, 0.5])
-    by_name = make_scorer("forward", localization_map, heading=tuple(map(tuple, path)))  # type: ignore[arg-type]
-    np.testing.assert_allclose(by_name.headings(at), scorer.headings(at))  # type: ignore[attr-defined]
+    by_name = make_scorer("forward", localization_map, heading=tuple(map(tuple, path)))
+    np.testing.assert_allclose(by_name.headings(at), scorer.headings(at))
 
 
-def test_without_a_heading_one_is_drawn_for_each_location(localization_map: LocalizationMap) -> None:
+def test_without_a_heading_one_is_drawn_for_each_location(localization_map):
     at = np.random.default_rng(0).uniform(-5, 5, (4000, 3))
     headings = ForwardScorer(localization_map, seed=1).headings(at)
     np.testing.assert_allclose(np.linalg.norm(headings, axis=1), 1)
@@ -55,6 +53,6 @@ def test_without_a_heading_one_is_drawn_for_each_location(localization_map: Loca
 @pytest.mark.parametrize(
     "heading", [(0.0, 0, 0), (np.nan, 0, 1), (np.inf, 0, 0), (1.0, 0), [[1.0, 0, 0]], [[1.0, 0, 0], [1, 0, 0]]]
 )
-def test_invalid_headings(heading: tuple[float, ...], localization_map: LocalizationMap) -> None:
+def test_invalid_headings(heading, localization_map):
     with pytest.raises(ValueError):
         ForwardScorer(localization_map, heading)

@@ -1,9 +1,6 @@
 """Every method against hand-counted views, and the contract that all of them keep."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +9,7 @@ import torch
 from learning_options import save_network
 from synthetic_dataset import CAMERA, make_landmarks, make_mapping_poses
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.bins import BinnedViews
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
 from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber
@@ -33,17 +30,17 @@ from wheretolook_paper.scorers.pooled_features import pool
 from wheretolook_paper.scorers.sphere import SphereConfig
 from wheretolook_paper.scorers.sphere.network import SphereNetwork
 from wheretolook_paper.scorers.trees import TreesConfig
-from wheretolook_paper.scorers.trees.learn import BoostedTrees, PooledViews, fit_trees
+from wheretolook_paper.scorers.trees.learn import PooledViews, fit_trees
 
 
 @pytest.fixture
-def localization_map() -> LocalizationMap:
+def localization_map():
     landmarks = make_landmarks(np.random.default_rng(0), 200)
     return LocalizationMap(landmarks, CAMERA, mapping_poses=make_mapping_poses(0))
 
 
 @pytest.fixture
-def views() -> Float:
+def views():
     rng = np.random.default_rng(1)
     return poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (40, 3)), rng.normal(size=(40, 3)))
 
@@ -51,7 +48,7 @@ def views() -> Float:
 NO_STATISTICS = FeatureStatistics(ATTRIBUTES, (0.0,) * len(ATTRIBUTES), (1.0,) * len(ATTRIBUTES))
 
 
-def some_trees(localization_map: LocalizationMap) -> BoostedTrees:
+def some_trees(localization_map):
     """Trees whose scores differ from view to view."""
     rng = np.random.default_rng(2)
     directions = poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (300, 3)), rng.normal(size=(300, 3)))
@@ -61,7 +58,7 @@ def some_trees(localization_map: LocalizationMap) -> BoostedTrees:
     return fit_trees(views, views, CAMERA, TreesConfig(max_trees=10, max_leaves=15, min_leaf=3))[0]
 
 
-def weights_of(method: str, path: Path, localization_map: LocalizationMap) -> Path:
+def weights_of(method, path, localization_map):
     """Write untrained weights of a method, whose scores differ from view to view."""
     if method == "trees":
         some_trees(localization_map).save(path, {})
@@ -85,14 +82,12 @@ def weights_of(method: str, path: Path, localization_map: LocalizationMap) -> Pa
 
 
 @pytest.fixture
-def weights(tmp_path: Path, localization_map: LocalizationMap) -> Path:
+def weights(tmp_path, localization_map):
     return weights_of("mlp-2d+3d", tmp_path / "mlp.safetensors", localization_map)
 
 
 @pytest.mark.parametrize("name", scorers())
-def test_scorers_keep_their_contract(
-    name: str, localization_map: LocalizationMap, views: Float, weights: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_scorers_keep_their_contract(name, localization_map, views, weights, monkeypatch):
     needed = scorers()[name].weights
     if needed:
         weights = weights_of(needed, weights.with_name(f"{needed}.safetensors"), localization_map)
@@ -126,13 +121,13 @@ def test_scorers_keep_their_contract(
         scorer.score_directions(np.array([[0.0, np.inf, 1]]), np.array([[1.0, 0, 0]]))
 
 
-def _binned(counts: list[list[int]]) -> BinnedViews:
+def _binned(counts):
     """Views of 2 x 2 bins with so many landmarks each."""
     array = np.array(counts, dtype=np.int32).reshape(-1, 2, 2)
     return BinnedViews(np.zeros((len(array), len(CHANNELS), 2, 2), dtype=np.float32), array, CHANNELS)
 
 
-def test_counting_scorers_on_hand_counted_bins(localization_map: LocalizationMap) -> None:
+def test_counting_scorers_on_hand_counted_bins(localization_map):
     binned = _binned([[0, 0, 0, 0], [9, 0, 0, 0], [1, 1, 0, 0], [1, 2, 0, 0], [1, 1, 1, 1], [50, 50, 50, 50]])
     np.testing.assert_allclose(
         VisibleScorer(localization_map, bins=2).score_bins(binned) * 200, [0, 9, 2, 3, 4, 200], rtol=1e-12
@@ -144,7 +139,7 @@ def test_counting_scorers_on_hand_counted_bins(localization_map: LocalizationMap
     assert by_bins.max() < 1
 
 
-def test_random_scores_are_uniform_and_depend_on_the_seed(localization_map: LocalizationMap) -> None:
+def test_random_scores_are_uniform_and_depend_on_the_seed(localization_map):
     rng = np.random.default_rng(0)
     views = poses_looking_along(np.zeros((20000, 3)), rng.normal(size=(20000, 3)))
     a, b = (make_scorer("random", localization_map, seed=seed).score(views) for seed in (0, 1))
@@ -152,9 +147,7 @@ def test_random_scores_are_uniform_and_depend_on_the_seed(localization_map: Loca
     assert abs(np.corrcoef(a, b)[0, 1]) < 0.03
 
 
-def test_learned_scores_equal_the_network_by_hand(
-    localization_map: LocalizationMap, views: Float, weights: Path
-) -> None:
+def test_learned_scores_equal_the_network_by_hand(localization_map, views, weights):
     scorer = load_scorer(weights, localization_map)
     assert scorer.name == "mlp-2d+3d"
     binned = localization_map.bin_views(views)
@@ -169,9 +162,7 @@ def test_learned_scores_equal_the_network_by_hand(
     np.testing.assert_allclose(scorer.score(views), 1 / (1 + np.exp(-logits[:, 0])), rtol=1e-5)
 
 
-def test_another_resolution_of_the_same_field_of_view_scores_the_same(
-    localization_map: LocalizationMap, views: Float, weights: Path
-) -> None:
+def test_another_resolution_of_the_same_field_of_view_scores_the_same(localization_map, views, weights):
     double = PinholeCamera(2 * CAMERA.width, 2 * CAMERA.height, 2 * CAMERA.focal_px)
     scores = load_scorer(weights, LocalizationMap(localization_map.landmarks, double)).score(views)
     np.testing.assert_allclose(scores, load_scorer(weights, localization_map).score(views), rtol=1e-5)
@@ -181,9 +172,7 @@ def test_another_resolution_of_the_same_field_of_view_scores_the_same(
     ("method", "focal_scale", "error"),
     [("oracle", 1, ConfigError), ("mlp", 1, ConfigError), ("set", 1, WeightsError), ("mlp-2d+3d", 2, CameraError)],
 )
-def test_invalid_requests(
-    method: str, focal_scale: float, error: type[Exception], localization_map: LocalizationMap, weights: Path
-) -> None:
+def test_invalid_requests(method, focal_scale, error, localization_map, weights):
     camera = PinholeCamera(CAMERA.width, CAMERA.height, focal_scale * CAMERA.focal_px)
     with pytest.raises(error):
         make_scorer(method, localization_map.of_camera(camera), weights=None if method == "mlp" else weights)

@@ -1,7 +1,5 @@
 """Free space of rooms whose free space is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

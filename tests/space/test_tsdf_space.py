@@ -1,7 +1,5 @@
 """Free space from depth images, compared with that from the mesh they were rendered from."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -16,21 +14,21 @@ VOXEL_M = 0.03
 CLEARANCE_M = 0.2
 
 
-def space_of(images: list[DepthImage]) -> TsdfSpace:
+def space_of(images):
     volume = TsdfVolume.from_images(images, TsdfConfig(voxel_size_m=VOXEL_M), progress=False)
     return TsdfSpace(volume, images, FreeSpaceConfig(clearance_m=CLEARANCE_M), progress=False)
 
 
 @pytest.fixture(scope="module")
-def images() -> list[DepthImage]:
+def images():
     return depth_images(room(), seed=1, n=150)  # enough to see all surfaces
 
 
-def random_points(n: int, seed: int = 0, beyond_m: float = 0.5) -> np.ndarray:
+def random_points(n, seed=0, beyond_m=0.5):
     return np.random.default_rng(seed).uniform(-beyond_m, ROOM + beyond_m, (n, 3))
 
 
-def test_a_camera_is_free_where_it_is_by_the_mesh_but_never_near_a_surface(images: list[DepthImage]) -> None:
+def test_a_camera_is_free_where_it_is_by_the_mesh_but_never_near_a_surface(images):
     points = random_points(6000)
     free = space_of(images).is_free(points)
     distance = MeshRaycaster(room()).distance_to_surface(points, 1.0)
@@ -41,7 +39,7 @@ def test_a_camera_is_free_where_it_is_by_the_mesh_but_never_near_a_surface(image
     assert free[away & by_mesh].mean() > 0.995
 
 
-def test_what_no_image_saw_is_not_free(images: list[DepthImage]) -> None:
+def test_what_no_image_saw_is_not_free(images):
     """The cameras are on one side of the wall, from where a part of the other side is hidden."""
     west = [image for image in images if -image.cam_from_world[:, :3].T[0] @ image.cam_from_world[:, 3] < 1.8]
     points = random_points(6000, beyond_m=0.0)
@@ -55,7 +53,7 @@ def test_what_no_image_saw_is_not_free(images: list[DepthImage]) -> None:
     assert space.is_free(start[:1]).all() and not space.segments_are_free(start, points[hidden]).any()
 
 
-def test_an_image_sees_up_to_its_readings() -> None:
+def test_an_image_sees_up_to_its_readings():
     depth = np.full((CAMERA.height, CAMERA.width), 2.0, dtype=np.float32)
     depth[:, : CAMERA.width // 2] = 0
     image = DepthImage(depth, CAMERA, poses_looking_along([[0.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])[0])

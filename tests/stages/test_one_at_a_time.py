@@ -9,7 +9,7 @@ import pytest
 
 from learning_options import train_config
 from synthetic_dataset import make_dataset
-from wheretolook.cli import load_command, main, option_types
+from wheretolook.cli import command_options, load_command, main
 from wheretolook.commands.train import train_methods
 from wheretolook.dataset.dataset_lock import changing, reading
 from wheretolook.dataset.layout import Dataset
@@ -30,7 +30,7 @@ def run(dataset: Dataset, stage: str, *options: str) -> int:
     root = dataset.root
     camera = ["--camera.width", "160", "--camera.height", "120", "--camera.focal_px", "80", "--camera.fov_deg", "null"]
     where = ["--name", root.name, "--data", str(root.parent)]
-    if "tracking.folder" in option_types(load_command(stage)):
+    if "tracking.folder" in command_options(load_command(stage)):
         where += ["--tracking.folder", str(root.parent / "mlruns")]
     return main([stage, *where, "--device", "cpu", *camera, *options])
 

@@ -17,7 +17,7 @@ from wheretolook.planning.scene_map import build_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.scorers.weights import resolve_weights
-from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.utils.package import WEIGHTS, shipped
 
 LANDMARKS = room_landmarks(200)
 RELEASED = Path(__file__).parents[2] / "data" / "release" / "weights"

@@ -1,13 +1,10 @@
 """MLflow stores that cannot be used: one error within seconds, before work starts."""
 
-from __future__ import annotations
-
 import os
 import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -22,27 +19,27 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(autouse=True)
-def own_uri(monkeypatch: pytest.MonkeyPatch) -> None:
+def own_uri(monkeypatch):
     """Stores are made here as they are made for users, not as copies of one that is there."""
     monkeypatch.setattr(TrackingConfig, "uri", property(lambda tracking: f"sqlite:///{tracking.root / 'mlflow.db'}"))
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory, migrated_stores: None) -> bytes:
+def made(tmp_path_factory, migrated_stores):
     tracking = TrackingConfig(str(tmp_path_factory.mktemp("made")))
     client(tracking)
     return (tracking.root / "mlflow.db").read_bytes()
 
 
 @pytest.fixture
-def store(tmp_path: Path, made: bytes) -> TrackingConfig:
+def store(tmp_path, made):
     tracking = TrackingConfig(str(tmp_path / "mlruns"))
     tracking.root.mkdir()
     (tracking.root / "mlflow.db").write_bytes(made)
     return tracking
 
 
-def refused(tracking: TrackingConfig) -> TrackingError:
+def refused(tracking):
     """The error of a store, which comes soon and is one line."""
     start = time.monotonic()
     with pytest.raises(TrackingError) as raised:
@@ -54,13 +51,13 @@ def refused(tracking: TrackingConfig) -> TrackingError:
 
 
 @pytest.mark.parametrize("name", ["a%41b", "what?", "50%aF"])
-def test_a_path_that_mlflow_misreads_is_refused(name: str, tmp_path: Path) -> None:
+def test_a_path_that_mlflow_misreads_is_refused(name, tmp_path):
     refused(TrackingConfig(str(tmp_path / name)))
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ["50% off", "a b#c;d&e", "ä'\"[x]"])
-def test_any_other_path_serves(name: str, tmp_path: Path, made: bytes) -> None:
+def test_any_other_path_serves(name, tmp_path, made):
     tracking = TrackingConfig(str(tmp_path / name))
     tracking.root.mkdir()
     (tracking.root / "mlflow.db").write_bytes(made)
@@ -74,19 +71,19 @@ def test_any_other_path_serves(name: str, tmp_path: Path, made: bytes) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {name, "a.txt"}
 
 
-def test_another_programs_database_is_refused(tmp_path: Path) -> None:
+def test_another_programs_database_is_refused(tmp_path):
     (tmp_path / "mlflow.db").write_text("no database, but a text that is longer than any header of one " * 5)
     refused(TrackingConfig(str(tmp_path)))
 
 
-def test_a_store_of_another_version_of_mlflow_is_refused(store: TrackingConfig) -> None:
+def test_a_store_of_another_version_of_mlflow_is_refused(store):
     with sqlite3.connect(store.root / "mlflow.db") as connection:
         connection.execute("UPDATE alembic_version SET version_num = '451aebb31d03'")
     connection.close()
     refused(store)
 
 
-def test_a_disk_without_room_is_found_before_work_starts_and_can_be_read(tmp_path: Path, made: bytes) -> None:
+def test_a_disk_without_room_is_found_before_work_starts_and_can_be_read(tmp_path, made):
     with small_disk(tmp_path / "disk", 8 * 2**20) as disk:
         new = TrackingConfig(str(disk / "new"))
         old = TrackingConfig(str(disk / "old"))
@@ -116,15 +113,15 @@ with start_run(TrackingConfig(sys.argv[1]), "a", "train", {"dataset": "d"}):
 """
 
 
-def _starting(folder: Path) -> subprocess.Popen[str]:
+def _starting(folder):
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     return subprocess.Popen([sys.executable, "-c", MAKE, str(folder)], env=environment, text=True, **pipes)
 
 
 @pytest.fixture
-def begun() -> Iterator[list[subprocess.Popen[str]]]:
-    processes: list[subprocess.Popen[str]] = []
+def begun():
+    processes = []
     yield processes
     for process in processes:
         process.kill()
@@ -132,7 +129,7 @@ def begun() -> Iterator[list[subprocess.Popen[str]]]:
 
 
 @pytest.mark.slow
-def test_two_first_runs_at_once_make_one_store(tmp_path: Path, begun: list[subprocess.Popen[str]]) -> None:
+def test_two_first_runs_at_once_make_one_store(tmp_path, begun):
     begun += [_starting(tmp_path / "mlruns") for _ in range(3)]
     for process in begun:
         assert process.stdout is not None and process.stdout.readline() == "ready\n"

@@ -1,7 +1,5 @@
 """Loss, class weights and regularization against closed forms."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -15,13 +13,13 @@ from wheretolook.training.data import class_weights
 from wheretolook.training.fit import weight_penalty, weighted_bce
 
 
-def test_loss_equals_a_hand_computation() -> None:
+def test_loss_equals_a_hand_computation():
     logits = torch.tensor([0.0, 2.0, -1.0, 0.5])
     labels = torch.tensor([1.0, 1.0, 0.0, 0.0])
     negative = 0.75
     positive = 1.5
 
-    def p(logit: float) -> float:
+    def p(logit):
         return 1 / (1 + math.exp(-logit))
 
     by_hand = -(
@@ -33,19 +31,19 @@ def test_loss_equals_a_hand_computation() -> None:
     assert weighted_bce(logits, labels, (negative, positive)).item() == pytest.approx(by_hand / 4, rel=1e-6)
 
 
-def test_loss_stays_finite_where_a_sigmoid_would_round_to_zero() -> None:
+def test_loss_stays_finite_where_a_sigmoid_would_round_to_zero():
     loss = weighted_bce(torch.tensor([200.0, -200.0]), torch.tensor([0.0, 1.0]), (1.0, 1.0))
     assert loss.item() == pytest.approx(200.0)
 
 
-def test_class_weights_balance_the_classes() -> None:
+def test_class_weights_balance_the_classes():
     negative, positive = class_weights(np.repeat([True, False], [3, 9]))
     assert (negative, positive) == pytest.approx((12 / 18, 12 / 6))
     assert 9 * negative == pytest.approx(3 * positive)
     assert (9 * negative + 3 * positive) / 12 == pytest.approx(1.0)
 
 
-def test_penalty_sums_squared_weights_and_leaves_biases_out() -> None:
+def test_penalty_sums_squared_weights_and_leaves_biases_out():
     network = nn.Sequential(nn.Linear(2, 2), nn.ReLU(), nn.Linear(2, 1))
     with torch.no_grad():
         network[0].weight.copy_(torch.tensor([[1.0, -2.0], [3.0, 0.5]]))
@@ -59,7 +57,7 @@ def test_penalty_sums_squared_weights_and_leaves_biases_out() -> None:
     torch.testing.assert_close(network[2].weight.grad, 2 * network[2].weight.detach())
 
 
-def test_noise_has_the_asked_scale_and_only_on_filled_bins() -> None:
+def test_noise_has_the_asked_scale_and_only_on_filled_bins():
     torch.manual_seed(0)
     means = torch.zeros(200, len(CHANNELS), 10, 10)
     filled = torch.zeros(200, 10, 10, dtype=torch.bool)

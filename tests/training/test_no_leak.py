@@ -1,9 +1,6 @@
 """Nothing that is known only after localization reaches a score: learners see the map, the poses and the labels."""
 
-from __future__ import annotations
-
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -37,11 +34,11 @@ CONFIG = train_config(
 
 
 @pytest.fixture(scope="module")
-def tracking(tmp_path_factory: pytest.TempPathFactory) -> TrackingConfig:
+def tracking(tmp_path_factory):
     return TrackingConfig(folder=str(tmp_path_factory.mktemp("mlruns")))
 
 
-def same_labels_other_outcomes(source: Dataset, root: Path) -> Dataset:
+def same_labels_other_outcomes(source, root):
     """The dataset with the same labels, but other errors, other failures and other numbers of inliers."""
     shutil.copytree(source.root, root, ignore=shutil.ignore_patterns("weights", "results"))
     dataset = Dataset.load(root)
@@ -62,7 +59,7 @@ def same_labels_other_outcomes(source: Dataset, root: Path) -> Dataset:
     return dataset
 
 
-def test_only_the_labels_reach_a_learner(tmp_path: Path, tracking: TrackingConfig) -> None:
+def test_only_the_labels_reach_a_learner(tmp_path, tracking):
     one = make_dataset(tmp_path / "one", n_locations=12, n_directions=12)
     other = same_labels_other_outcomes(one, tmp_path / "other")
     assert other.fingerprint() != one.fingerprint()

@@ -1,7 +1,5 @@
 """The range of the training views, and views outside it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -21,14 +19,14 @@ from wheretolook.training.trained_network import (
 CAMERA = PinholeCamera()
 
 
-def views_at(distances_m: list[list[float]], camera: PinholeCamera = CAMERA) -> np.ndarray:
+def views_at(distances_m, camera=CAMERA):
     counts = torch.tensor([0, *map(len, distances_m)])
     values = torch.tensor([np.log(one) for view in distances_m for one in view], dtype=torch.float32)[:, None]
     landmarks = ViewLandmarks(counts.cumsum(0), torch.zeros(len(values), dtype=torch.int64), values, ("distance",))
     return view_quantities(landmarks, counts[1:], camera_quantities(camera))
 
 
-def test_views_by_hand() -> None:
+def test_views_by_hand():
     distance, depth, in_view, across, down, focal = views_at([[1.0, 4.0], [], [3.0]]).T
     np.testing.assert_allclose(distance, [2.0, np.nan, 3.0], rtol=1e-6)
     np.testing.assert_array_equal(in_view, [2, np.nan, 1])
@@ -38,7 +36,7 @@ def test_views_by_hand() -> None:
     assert not np.isfinite(views_at([[], []])[:, :3]).any()
 
 
-def test_most_training_views_are_in_range() -> None:
+def test_most_training_views_are_in_range():
     rng = np.random.default_rng(0)
     views = views_at([rng.uniform(1, 4, rng.integers(0, 60)).tolist() for _ in range(2000)])
     known = TrainingRange.of(views)
@@ -67,14 +65,14 @@ def test_most_training_views_are_in_range() -> None:
         (PinholeCamera.of_field_of_view(110, 640, 480), False),
     ],
 )
-def test_where_only_the_camera_is_known(camera: PinholeCamera, inside: bool) -> None:
+def test_where_only_the_camera_is_known(camera, inside):
     known = TrainingRange.of_camera(CAMERA)
     assert known.contains(views_at([[1.0], [], [900.0] * 4000], camera)).tolist() == [inside] * 3
     assert bool(known.complaint(views_at([[1.0]], camera))) != inside
     assert TrainingRange.of_camera(None).contains(views_at([[1.0]], camera)).all()
 
 
-def test_a_finer_accuracy_is_in_range_at_distances_as_many_times_shorter() -> None:
+def test_a_finer_accuracy_is_in_range_at_distances_as_many_times_shorter():
     known = TrainingRange({"distance_m": (0.4, 15.0), "in_view": (1.0, 100.0)})
     assert known.at_accuracy(1.0) == known.at_accuracy(5.0) == known
     assert known.at_accuracy(0.2).bounds == {"distance_m": (0.4, 3.0), "in_view": (1.0, 100.0)}
@@ -85,7 +83,7 @@ def test_a_finer_accuracy_is_in_range_at_distances_as_many_times_shorter() -> No
     assert "3.1 m (in range: 0.4 to 3)" in known.at_accuracy(0.2).complaint(views[:2])
 
 
-def test_views_without_landmarks_have_no_range() -> None:
+def test_views_without_landmarks_have_no_range():
     assert TrainingRange.of(views_at([[], []])).bounds == {}
     with pytest.raises((TypeError, IndexError, ValueError)):
         TrainingRange.of_record({"in_view": [1.0]})

@@ -1,16 +1,13 @@
 """Plain versions of joint sums and of the selection of view sets."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np
 
-from wheretolook.geometry.poses import Float
-from wheretolook.looks.selection import N_SUMS, CandidateViews, Rotations, SetScore, ViewSet, score_of_set
+from wheretolook.looks.selection import N_SUMS, ViewSet, score_of_set
 
 
-def joint_sums(views: CandidateViews, rows: list[int]) -> Float:
+def joint_sums(views, rows):
     """`CandidateViews.joint_sums`, landmark by landmark."""
     sums = np.zeros(N_SUMS)
     for landmark, terms in enumerate(views.terms):
@@ -21,7 +18,7 @@ def joint_sums(views: CandidateViews, rows: list[int]) -> Float:
     return sums
 
 
-def best_of_all_sets(views: CandidateViews, set_score: SetScore, n: int, rotations: Rotations) -> ViewSet:
+def best_of_all_sets(views, set_score, n, rotations):
     """The best of all sets of n views, which `select_views` approximates."""
     sets = []
     for rows in combinations(range(len(views)), n):

@@ -1,14 +1,11 @@
 """The plain reference renderer: Open3D finds the hits, NumPy looks up the colours."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
-from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.camera import ColmapCamera
 from wheretolook.geometry.poses import check_poses
 from wheretolook.geometry.similarity import poses_from
 from wheretolook.rendering.textures import MAX_ANISOTROPY, build_pyramids, texel_gradients
@@ -17,27 +14,27 @@ from wheretolook.rendering.warp_renderer import Rendering, camera_rays, render_d
 Float = NDArray[np.floating[Any]]
 
 
-def raycasting_scene(mesh: TexturedMesh) -> Any:
+def raycasting_scene(mesh):
     """The mesh about its own origin as an `open3d.t.geometry.RaycastingScene`."""
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.triangles.astype(np.uint32)))  # type: ignore[call-overload]
+    scene.add_triangles(o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.triangles.astype(np.uint32)))
     return scene
 
 
 class Open3DRenderer:
     """The twin of `WarpRenderer`, with `open3d.t.geometry.RaycastingScene` and NumPy on the CPU."""
 
-    def __init__(self, mesh: TexturedMesh) -> None:
+    def __init__(self, mesh):
         self.mesh = mesh
         self._scene = raycasting_scene(mesh)
         self._pyramids = build_pyramids(mesh.textures)
         self._texel_gradients = texel_gradients(mesh)
 
-    def render(self, camera: Camera, cam_from_world: ArrayLike) -> Rendering:
+    def render(self, camera, cam_from_world):
         """Render poses (B, 3, 4); see `Renderer.render`."""
-        poses: Float = check_poses(cam_from_world)
+        poses = check_poses(cam_from_world)
         if isinstance(camera, ColmapCamera):
             return render_distorted(self, camera, poses)
         poses = poses_from(poses, self.mesh.origin)
@@ -48,7 +45,7 @@ class Open3DRenderer:
             rgb[i], depth_m[i] = self._render_one(camera, poses[i : i + 1])
         return Rendering(rgb, depth_m)
 
-    def _render_one(self, camera: PinholeCamera, pose: Float) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    def _render_one(self, camera, pose):
         """Image (H, W, 3) and depth (H, W) of a pose (1, 3, 4)."""
         import open3d as o3d
 
@@ -56,7 +53,7 @@ class Open3DRenderer:
         x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         directions = np.stack([x, y, np.ones_like(x)], axis=-1) @ ray_from_pixel.T
         rays = np.concatenate([np.broadcast_to(center, directions.shape), directions], axis=-1)
-        hits = self._scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))  # type: ignore[call-overload]
+        hits = self._scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))
         depth_m = hits["t_hit"].numpy()
         hit = np.isfinite(depth_m)
 
@@ -75,9 +72,7 @@ class Open3DRenderer:
         rgb[hit] = np.clip(np.floor(colors + 0.5), 0, 255).astype(np.uint8)
         return rgb, np.where(hit, depth_m, 0).astype(np.float32)
 
-    def _footprint(
-        self, face: NDArray[np.int64], t: Float, normals: Float, rays: Float, ray_from_pixel: Float
-    ) -> Float:
+    def _footprint(self, face, t, normals, rays, ray_from_pixel):
         """How far a hit moves on the texture as the pixel moves by one in x and in y (columns), (N, 2, 2) texels."""
         slant = np.einsum("nd,nd->n", normals, rays)
         slant = np.where(np.abs(slant) < 1e-4, np.where(slant < 0, -1e-4, 1e-4), slant)
@@ -85,7 +80,7 @@ class Open3DRenderer:
         steps = t[:, None, None] * (by_pixel - rays[:, :, None] * (normals @ by_pixel / slant[:, None])[:, None])
         return self._texel_gradients[face] @ steps
 
-    def _filter(self, texture: NDArray[np.int32], uv: Float, footprint: Float) -> Float:
+    def _filter(self, texture, uv, footprint):
         """Average of the texture over each pixel's footprint, (N, 3) in 0..255."""
         # The footprint of a round pixel is an ellipse; its axes are the left singular vectors of the footprint matrix.
         axes, lengths, _ = np.linalg.svd(footprint)
@@ -108,7 +103,7 @@ class Open3DRenderer:
             colors[on] += sample / n_taps[on][:, None]
         return colors
 
-    def _bilinear(self, texture: NDArray[np.int32], level: NDArray[np.int64], uv: Float) -> Float:
+    def _bilinear(self, texture, level, uv):
         """Colours (N, 3) at uv in one mip level each, the texture repeated."""
         width, height = np.maximum(1, self._pyramids.size[texture, :2] >> level[:, None]).T
         x = uv[:, 0] % 1 * width - 0.5

@@ -1,17 +1,11 @@
 """Plain versions of the kernels in `wheretolook.visibility`."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.camera import Camera
 from wheretolook.visibility import frustum
 
 
-def count_plain(
-    camera: Camera, rotations: ArrayLike, locations: ArrayLike, points: ArrayLike, unoccluded: NDArray[np.bool_]
-) -> NDArray[np.int32]:
+def count_plain(camera, rotations, locations, points, unoccluded):
     """What `FrustumCounter.count` computes, (L, D): every landmark (N, 3) is tested against every orientation."""
     rotations = np.asarray(rotations)
     points = np.asarray(points)
@@ -22,9 +16,7 @@ def count_plain(
     return counts
 
 
-def count_pixels_plain(
-    camera: Camera, rotations: ArrayLike, locations: ArrayLike, points: ArrayLike, unoccluded: NDArray[np.bool_]
-) -> NDArray[np.int32]:
+def count_pixels_plain(camera, rotations, locations, points, unoccluded):
     """What `PixelCounter.count` computes, (L, D): pixels with an unoccluded (L, N) landmark (N, 3)."""
     axes = np.asarray(rotations)
     positions = np.asarray(points)

@@ -1,15 +1,14 @@
 import json
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from wheretolook.dataset.layout import SceneFolder
-from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
+from wheretolook.utils.files import ArtifactCache, cache_key
 
 
-def test_results_are_loaded_for_the_same_key_only(tmp_path: Path) -> None:
+def test_results_are_loaded_for_the_same_key_only(tmp_path):
     results = {"a.json": [1, 2], "b.npz": {"x": np.arange(3)}, "c.parquet": pd.DataFrame({"y": [1.5]})}
     cache = ArtifactCache(tmp_path / "work", cache_key("settings", 1))
     assert cache.load(*results) is None
@@ -23,7 +22,7 @@ def test_results_are_loaded_for_the_same_key_only(tmp_path: Path) -> None:
     assert cache.load("a.json") is not None and cache.load("b.npz") is None
 
 
-def test_a_stage_invalidates_later_ones(tmp_path: Path) -> None:
+def test_a_stage_invalidates_later_ones(tmp_path):
     scene = SceneFolder(tmp_path, "train")
     for stage in ("scenes", "map", "label"):
         scene.stage_cache(stage, stage).store()
@@ -36,7 +35,7 @@ def test_a_stage_invalidates_later_ones(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", ["5", "[]", '{"map": 5}', "{", ""])
-def test_a_damaged_manifest_counts_as_missing(content: str, tmp_path: Path) -> None:
+def test_a_damaged_manifest_counts_as_missing(content, tmp_path):
     cache = SceneFolder(tmp_path, "train").stage_cache("map", "a")
     (tmp_path / "stages.json").write_text(content)
     assert not cache.is_current()

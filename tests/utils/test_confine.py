@@ -1,7 +1,5 @@
 """Names from files and options stay within the folder that they are names in."""
 
-from pathlib import Path
-
 import pytest
 
 from wheretolook.commands.options import Experiment
@@ -15,21 +13,21 @@ OUTSIDE = ["../victim", "/victim", "a/../../victim", "..", ".", "", "a/b", "a\0b
 
 
 @pytest.mark.parametrize("name", [*OUTSIDE, 5, None])
-def test_a_name_is_one_entry_of_its_folder(name: object, tmp_path: Path) -> None:
+def test_a_name_is_one_entry_of_its_folder(name, tmp_path):
     with pytest.raises(ConfigError):
         safe_child(tmp_path, name, "a name")
     assert safe_child(tmp_path, "my scene.1", "a name") == tmp_path / "my scene.1"
 
 
 @pytest.mark.parametrize("name", ["../1.jpg", "a/../../1.jpg", "/1.jpg", "", "1\0.jpg"])
-def test_a_path_within_a_folder_does_not_go_up(name: str, tmp_path: Path) -> None:
+def test_a_path_within_a_folder_does_not_go_up(name, tmp_path):
     with pytest.raises(ConfigError):
         path_within(tmp_path, name, "a photograph's name")
     assert path_within(tmp_path, "left/1.jpg", "a photograph's name") == tmp_path / "left" / "1.jpg"
 
 
 @pytest.mark.parametrize("name", ["../victim", "/victim"])
-def test_datasets_scenes_and_releases_are_in_their_folders(name: str, tmp_path: Path) -> None:
+def test_datasets_scenes_and_releases_are_in_their_folders(name, tmp_path):
     root = tmp_path / "data" / "set"
     write_json(root / "dataset.json", {"camera": PinholeCamera().record(), "scenes": [{"name": name, "split": "test"}]})
     with pytest.raises(TableError):
@@ -43,7 +41,7 @@ def test_datasets_scenes_and_releases_are_in_their_folders(name: str, tmp_path: 
 @pytest.mark.parametrize(
     "text", ["", "[1]", "{}", '{"mapped_floor": 3}', '{"mapped_floor": [[1, 2]]}', '{"mapped_floor": ["abcd"]}']
 )
-def test_a_damaged_description_of_a_scene_is_reported(text: str, tmp_path: Path) -> None:
+def test_a_damaged_description_of_a_scene_is_reported(text, tmp_path):
     (tmp_path / "scene.json").write_text(text)
     with pytest.raises(TableError):
         SceneFolder(tmp_path, "test").mapped_floor()

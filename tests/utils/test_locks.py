@@ -1,31 +1,28 @@
 """Locks keep processes apart, and do not outlive who held them."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
 from wheretolook.utils.errors import InUseError, LockWarning
-from wheretolook.utils.locks import hold
+from wheretolook.utils.processes import hold
 
 HOLDER = """
 import sys
 from pathlib import Path
-from wheretolook.utils.locks import hold
+from wheretolook.utils.processes import hold
 with hold(Path(sys.argv[1]), sys.argv[2], shared=sys.argv[3] == "shared"):
     print("held", flush=True)
     sys.stdin.read()
 """
 
 
-def holder(lock: Path, what: str = "label", shared: bool = False) -> subprocess.Popen[str]:
+def holder(lock, what="label", shared=False):
     """Another process that holds the lock until its input ends."""
     arguments = [sys.executable, "-c", HOLDER, str(lock), what, "shared" if shared else "alone"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
@@ -34,7 +31,7 @@ def holder(lock: Path, what: str = "label", shared: bool = False) -> subprocess.
     return process
 
 
-def test_the_holder_is_named_and_a_killed_one_blocks_nobody(tmp_path: Path) -> None:
+def test_the_holder_is_named_and_a_killed_one_blocks_nobody(tmp_path):
     lock = tmp_path / "new" / "lock"
     other = holder(lock)
     start = time.monotonic()
@@ -49,7 +46,7 @@ def test_the_holder_is_named_and_a_killed_one_blocks_nobody(tmp_path: Path) -> N
     assert not lock.exists()
 
 
-def test_readers_share_and_shut_writers_out(tmp_path: Path) -> None:
+def test_readers_share_and_shut_writers_out(tmp_path):
     lock = tmp_path / "lock"
     other = holder(lock, "evaluate", shared=True)
     with hold(lock, "train", shared=True), pytest.raises(InUseError), hold(lock, "label"):
@@ -61,12 +58,12 @@ def test_readers_share_and_shut_writers_out(tmp_path: Path) -> None:
         pass
 
 
-def test_removing_the_file_lets_no_two_in(tmp_path: Path) -> None:
+def test_removing_the_file_lets_no_two_in(tmp_path):
     """Three processes add to a number 100 times each."""
     script = """
 import sys
 from pathlib import Path
-from wheretolook.utils.locks import hold
+from wheretolook.utils.processes import hold
 number = Path(sys.argv[1]) / "number"
 for _ in range(100):
     with hold(Path(sys.argv[1]) / "lock", "count", wait_s=60):
@@ -79,8 +76,8 @@ for _ in range(100):
     assert (tmp_path / "number").read_text() == "300"
 
 
-def test_without_locks_it_warns_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def none(file: int, kind: int) -> None:
+def test_without_locks_it_warns_and_goes_on(tmp_path, monkeypatch):
+    def none(file, kind):
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
     monkeypatch.setattr(fcntl, "flock", none)

@@ -3,7 +3,7 @@
 from wheretolook.utils.texts import counted
 
 
-def test_counted() -> None:
+def test_counted():
     assert [counted(n, "view") for n in (0, 0.8, 1, 2.2, 1260)] == [
         "0 views",
         "1 view",

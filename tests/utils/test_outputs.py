@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -23,23 +22,23 @@ from wheretolook.utils.errors import ConfigError, MapError, StorageError, TableE
 from wheretolook.utils.files import check_folder_name, check_output, read_text, write_text
 
 
-def _fifo(folder: Path) -> Path:
+def _fifo(folder):
     os.mkfifo(folder / "fifo")
     return folder / "fifo"
 
 
-def _link(folder: Path) -> Path:
+def _link(folder):
     (folder / "real").write_text("kept")
     (folder / "link").symlink_to("real")
     return folder / "link"
 
 
-def _loop(folder: Path) -> Path:
+def _loop(folder):
     (folder / "loop").symlink_to("loop")
     return folder / "loop"
 
 
-def _in_dataset(folder: Path) -> Path:
+def _in_dataset(folder):
     (folder / "dataset.json").touch()
     return folder / "room" / "map" / "views.csv"
 
@@ -48,19 +47,19 @@ def _in_dataset(folder: Path) -> Path:
     "make",
     [_fifo, _link, _loop, _in_dataset, lambda _: Path("/dev/null"), lambda f: f / "in", lambda f: f / "in/images.txt"],
 )
-def test_outputs_that_would_destroy_something(make: Callable[[Path], Path], tmp_path: Path) -> None:
+def test_outputs_that_would_destroy_something(make, tmp_path):
     with pytest.raises(ConfigError):
         check_output(make(tmp_path), [tmp_path / "in"])
 
 
-def test_usual_outputs(tmp_path: Path) -> None:
+def test_usual_outputs(tmp_path):
     (tmp_path / "real").mkdir()
     (tmp_path / "linked").symlink_to("real")
     for name in ("new.csv", "real", "linked", "in/views.csv"):
         check_output(tmp_path / name, [tmp_path / "in"])
 
 
-def test_commands_check_their_outputs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_check_their_outputs(tmp_path, capsys):
     waypoints = tmp_path / "at.csv"
     waypoints.write_text("1,2,3\n")
     assert main(["select", "--map", str(tmp_path), "--at", str(waypoints), "--out", str(waypoints)]) == 2
@@ -92,7 +91,7 @@ def test_commands_check_their_outputs(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize("command", ["map", "check", "adapt"])
-def test_a_failed_import_leaves_no_folders(command: str, tmp_path: Path) -> None:
+def test_a_failed_import_leaves_no_folders(command, tmp_path):
     for name in ("cameras", "images", "points3D"):
         (tmp_path / f"{name}.txt").write_text("no model\n")
     data = tmp_path / "data"
@@ -102,7 +101,7 @@ def test_a_failed_import_leaves_no_folders(command: str, tmp_path: Path) -> None
     assert not data.exists()
 
 
-def test_scene_names() -> None:
+def test_scene_names():
     for name in ("Büro 2. Stock", "Bu\u0308ro", "room-1"):
         check_folder_name("a name", name)
     for name in ("", " a", "a ", ".a", "a/b", "a\n", "a*"):
@@ -110,7 +109,7 @@ def test_scene_names() -> None:
             check_folder_name("a name", name)
 
 
-def test_waypoints_from_pipes_and_with_byte_order_marks(tmp_path: Path) -> None:
+def test_waypoints_from_pipes_and_with_byte_order_marks(tmp_path):
     reading, writing = os.pipe()
     os.write(writing, b"x,y,z\n1,2,3\n")
     os.close(writing)
@@ -123,7 +122,7 @@ def test_waypoints_from_pipes_and_with_byte_order_marks(tmp_path: Path) -> None:
     assert read_text(tmp_path / "bom.csv").startswith("x")
 
 
-def test_permission_denied_is_not_damage() -> None:
+def test_permission_denied_is_not_damage():
     try:
         try:
             raise ValueError("unreadable") from PermissionError(13, "Permission denied", "a.npz")
@@ -134,7 +133,7 @@ def test_permission_denied_is_not_damage() -> None:
         assert "Remove" not in str(error)
 
 
-def test_links_of_the_user_are_kept(tmp_path: Path) -> None:
+def test_links_of_the_user_are_kept(tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / "a.partial").touch()
     deep = tmp_path / "set" / "room" / "map"
@@ -151,13 +150,13 @@ def test_links_of_the_user_are_kept(tmp_path: Path) -> None:
 START_WARP = "from wheretolook.utils.warp import start_warp; start_warp()"
 
 
-def _started_warp(home: str) -> subprocess.CompletedProcess[str]:
+def _started_warp(home):
     environment = {k: v for k, v in os.environ.items() if k not in ("WARP_CACHE_PATH", "XDG_CACHE_HOME")}
     run = [sys.executable, "-c", START_WARP]
     return subprocess.run(run, env=environment | {"HOME": home}, capture_output=True, text=True)
 
 
-def test_an_unwritable_home_names_the_variable_to_set(tmp_path: Path) -> None:
+def test_an_unwritable_home_names_the_variable_to_set(tmp_path):
     done = _started_warp("/dev/null/x")
     assert "ConfigError" in done.stderr and "WARP_CACHE_PATH" in done.stderr
     with small_disk(tmp_path / "disk", 8 * 2**20) as disk:
@@ -167,8 +166,8 @@ def test_an_unwritable_home_names_the_variable_to_set(tmp_path: Path) -> None:
     assert "ConfigError" in done.stderr and "WARP_CACHE_PATH" in done.stderr
 
 
-def test_a_read_only_folder_is_found_before_scenes_are_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_work(*arguments: object) -> None:
+def test_a_read_only_folder_is_found_before_scenes_are_made(tmp_path, monkeypatch):
+    def no_work(*arguments):
         raise AssertionError("a scene is made that cannot be written")
 
     monkeypatch.setattr(scenes, "save_scene", no_work)

@@ -1,23 +1,20 @@
 """Parquet files that would overflow the stack are refused, and those that pandas writes are read."""
 
-from __future__ import annotations
-
 import struct
 import time
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pytest
 
-from wheretolook.utils.parquet_files import read_parquet
+from wheretolook.utils.files import read_parquet
 
 
-def _nested(path: Path, depth: int) -> None:
+def _nested(path, depth):
     """No rows of a column nested in so many groups."""
 
-    def number(value: int) -> bytes:
+    def number(value):
         parts = []
         while value >= 0x80:
             parts.append(value & 0x7F | 0x80)
@@ -31,7 +28,7 @@ def _nested(path: Path, depth: int) -> None:
     path.write_bytes(b"PAR1" + description + struct.pack("<I", len(description)) + b"PAR1")
 
 
-def test_deeply_nested_columns_are_refused(tmp_path: Path) -> None:
+def test_deeply_nested_columns_are_refused(tmp_path):
     path = tmp_path / "a.parquet"
     _nested(path, 100_000)
     before = pa.default_memory_pool().max_memory() or 0
@@ -42,7 +39,7 @@ def test_deeply_nested_columns_are_refused(tmp_path: Path) -> None:
     assert (pa.default_memory_pool().max_memory() or 0) < max(before, 2**30)
 
 
-def test_what_pandas_writes_is_read(tmp_path: Path) -> None:
+def test_what_pandas_writes_is_read(tmp_path):
     rng = np.random.default_rng(0)
     n = 30_000
     table = pd.DataFrame({"method": rng.choice(["set", "bins"], n), "x": rng.normal(size=n), "n": np.arange(n)})

@@ -1,7 +1,5 @@
 """A pool whose process is killed says so in the project's own words."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import signal
@@ -19,25 +17,25 @@ from wheretolook.utils.errors import WorkerError
 from wheretolook.utils.processes import WorkerPool
 
 
-def die(item: int) -> int:
+def die(item):
     if item == 2:
         os.kill(os.getpid(), signal.SIGKILL)
     return item
 
 
-def test_a_killed_process_is_a_typed_error() -> None:
+def test_a_killed_process_is_a_typed_error():
     with WorkerPool(2) as processes, pytest.raises(WorkerError):
         list(processes.map(die, range(6)))
 
 
-def pid_after(seconds: float) -> int:
+def pid_after(seconds):
     time.sleep(seconds)
     return os.getpid()
 
 
 @pytest.mark.slow
-def test_processes_outlive_the_thread_that_started_them() -> None:
-    first: list[int] = []
+def test_processes_outlive_the_thread_that_started_them():
+    first = []
     with WorkerPool(2) as processes:
         pids = processes.map(pid_after, [0.1] * 10)
         thread = threading.Thread(target=lambda: first.append(next(pids)))
@@ -46,14 +44,14 @@ def test_processes_outlive_the_thread_that_started_them() -> None:
         assert len([*first, *pids]) == 10
 
 
-def hold_the_interpreter(seconds: int) -> None:
+def hold_the_interpreter(seconds):
     """As a compiled function does that lets no other thread run."""
     ctypes.PyDLL(None).sleep(seconds)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the kernel ends them on Linux")
 @pytest.mark.slow
-def test_a_process_ends_with_the_killed_one_that_started_it_whatever_it_does(tmp_path: Path) -> None:
+def test_a_process_ends_with_the_killed_one_that_started_it_whatever_it_does(tmp_path):
     script = tmp_path / "parent.py"
     script.write_text(
         "from utils.test_processes import hold_the_interpreter\n"
@@ -71,7 +69,7 @@ def test_a_process_ends_with_the_killed_one_that_started_it_whatever_it_does(tmp
     wait_until(lambda: not any(map(is_running, workers)), seconds=20)
 
 
-def _sleeps_long(pid: int) -> bool:
+def _sleeps_long(pid):
     """Whether a process has imported all and is in the function: its main thread has waited for a second."""
     stat = Path(f"/proc/{pid}/stat")
     before = stat.read_text().split()[13:15]

@@ -5,18 +5,16 @@ import json
 import resource
 import time
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
-from wheretolook.utils.files import MAX_TEXT_BYTES, read_json, read_json_object, read_yaml
-from wheretolook.utils.npz_files import load_npy, load_npz, save_npz
+from wheretolook.utils.files import MAX_TEXT_BYTES, load_npy, load_npz, read_json, read_json_object, read_yaml, save_npz
 
 
-def npz_bomb(path: Path) -> None:
+def npz_bomb(path):
     """A megabyte that expands to 200 MB of zeros."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file, file.open("a.npy", "w") as member:
         header = {"descr": "|u1", "fortran_order": False, "shape": (200_000_000,)}
@@ -25,30 +23,30 @@ def npz_bomb(path: Path) -> None:
             member.write(bytes(1_000_000))
 
 
-def npz_of_wrong_size(path: Path) -> None:
+def npz_of_wrong_size(path):
     """Only the header of an array of 4 GB."""
     with zipfile.ZipFile(path, "w") as file, file.open("a.npy", "w") as member:
         header = {"descr": "<f8", "fortran_order": False, "shape": (500_000_000,)}
         np.lib.format.write_array_header_1_0(member, header)
 
 
-def npy_of_wrong_size(path: Path) -> None:
+def npy_of_wrong_size(path):
     header = {"descr": "<f8", "fortran_order": False, "shape": (1_000_000_000_000,)}
     with path.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, header)
 
 
-def pickled(path: Path) -> None:
+def pickled(path):
     content = io.BytesIO()
     np.savez(content, a=np.array([{}], dtype=object))
     path.write_bytes(content.getvalue())
 
 
-def text(content: str) -> Callable[[Path], object]:
+def text(content):
     return lambda path: path.write_text(content)
 
 
-INVALID: list[tuple[Callable[[Path], object], Callable[[Path], object]]] = [
+INVALID = [
     (load_npz, npz_bomb),
     (load_npz, npz_of_wrong_size),
     (load_npz, pickled),
@@ -66,9 +64,7 @@ INVALID: list[tuple[Callable[[Path], object], Callable[[Path], object]]] = [
 
 
 @pytest.mark.parametrize(("read", "write"), INVALID)
-def test_invalid_files_are_refused_within_seconds_and_200_mb(
-    read: Callable[[Path], object], write: Callable[[Path], object], tmp_path: Path
-) -> None:
+def test_invalid_files_are_refused_within_seconds_and_200_mb(read, write, tmp_path):
     path = tmp_path / "file"
     write(path)
     start = time.process_time()
@@ -79,7 +75,7 @@ def test_invalid_files_are_refused_within_seconds_and_200_mb(
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200 * 1024
 
 
-def test_good_files_are_read_as_they_were_written(tmp_path: Path) -> None:
+def test_good_files_are_read_as_they_were_written(tmp_path):
     path = tmp_path / "file"
     content = {"a": [1, 2.5, None, {"b": "ü"}], "c": list(range(100_000))}
     path.write_text(json.dumps(content))

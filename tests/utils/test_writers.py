@@ -1,8 +1,5 @@
 """Every writer of a file, on a disk that fails: the error names the file, no part of it stays, what was there does."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -21,8 +18,7 @@ from wheretolook.mapping.colmap_model import colmap_poses, write_model
 from wheretolook.scenes.loading import save_glb
 from wheretolook.training.weights import write_weights
 from wheretolook.utils.errors import StorageError
-from wheretolook.utils.files import copy_file, write_text
-from wheretolook.utils.npz_files import save_npy, save_npz
+from wheretolook.utils.files import copy_file, save_npy, save_npz, write_text
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_paper.figures.animation import save_moving
 
@@ -31,27 +27,27 @@ NOISE = RNG.random(30_000)
 LIMIT = 8192  # all that is written is larger
 
 
-def _figure(path: Path) -> None:
+def _figure(path):
     figure = Figure()
     figure.subplots().plot(NOISE[:3000])
     save_figure(figure, path)
 
 
-def _film(path: Path) -> None:
+def _film(path):
     save_moving(iter(RNG.integers(0, 255, (4, 120, 160, 3), np.uint8)), 125, path)
 
 
-def _table(path: Path) -> None:
+def _table(path):
     columns = {field.name: NOISE[:4000] for field in SCHEMA if field.name != "status"}
     types = {field.name: field.type.to_pandas_dtype() for field in SCHEMA if field.name != "status"}
     write_table(pd.DataFrame({**columns, "status": "localized"}).astype(types), path)
 
 
-def _occlusion(path: Path) -> None:
+def _occlusion(path):
     StoredOcclusion.from_mask(RNG.random((400, 3)), RNG.random((400, 500)) < 0.5).save(path)
 
 
-WRITERS: dict[str, Callable[[Path], None]] = {
+WRITERS = {
     "a.txt": lambda path: write_text(path, "text " * 10_000),
     "copy.py": lambda path: copy_file(Path(pd.__file__).with_name("conftest.py"), path),
     "a.npz": lambda path: save_npz(path, {"noise": NOISE, "more": NOISE}),
@@ -67,7 +63,7 @@ WRITERS: dict[str, Callable[[Path], None]] = {
 
 @pytest.mark.parametrize("name", WRITERS)
 @pytest.mark.parametrize("disk", ["limited", "full", "read-only"])
-def test_a_writer_that_fails_names_the_file_and_leaves_no_part(name: str, disk: str, tmp_path: Path) -> None:
+def test_a_writer_that_fails_names_the_file_and_leaves_no_part(name, disk, tmp_path):
     write = WRITERS[name]
     with ExitStack() as stack:
         folder = tmp_path / "disk"
@@ -96,7 +92,7 @@ def test_a_writer_that_fails_names_the_file_and_leaves_no_part(name: str, disk: 
         assert path.read_bytes() == before
 
 
-def _model(n_images: int):  # type: ignore[no-untyped-def]  # a pycolmap.Reconstruction
+def _model(n_images):  # a pycolmap.Reconstruction
     import pycolmap
 
     model = pycolmap.Reconstruction()
@@ -107,7 +103,7 @@ def _model(n_images: int):  # type: ignore[no-untyped-def]  # a pycolmap.Reconst
     return model
 
 
-def test_a_model_that_colmap_wrote_in_part_is_an_error(tmp_path: Path) -> None:
+def test_a_model_that_colmap_wrote_in_part_is_an_error(tmp_path):
     model = _model(400)
     write_model(model, tmp_path / "whole")
     assert len(colmap_poses(tmp_path / "whole")) == 400

@@ -1,11 +1,8 @@
 """What is in view: by hand, at the border, and the kernel that collects it against its plain twin."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from conftest import RandomViews
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import rotation_looking_along, transform
 from wheretolook.visibility import frustum
@@ -45,7 +42,7 @@ CAMERA = PinholeCamera(640, 480, 320.0)  # in single precision its sides pass ex
         ((1e300, 0, 1e300), False),
     ],
 )
-def test_behind_on_the_border_at_zero_depth_not_a_number(point: tuple[float, ...], seen: bool, device: str) -> None:
+def test_behind_on_the_border_at_zero_depth_not_a_number(point, seen, device):
     points = np.array([point], dtype=np.float64)
     with np.errstate(over="ignore"):
         assert in_view(CAMERA, IDENTITY, points.astype(np.float32)).tolist() == [[seen]]
@@ -56,7 +53,7 @@ def test_behind_on_the_border_at_zero_depth_not_a_number(point: tuple[float, ...
     assert counter.count(np.zeros((1, 3)), DevicePoints(points, device).double).numpy().tolist() == [[int(seen)]]
 
 
-def test_the_test_is_the_projection(random_views: RandomViews) -> None:
+def test_the_test_is_the_projection(random_views):
     """Against `PinholeCamera.project` in double precision, but for landmarks within 1e-3 pixels of the border."""
     v = random_views
     rotations = rotation_looking_along(v.directions)
@@ -72,9 +69,7 @@ def test_the_test_is_the_projection(random_views: RandomViews) -> None:
 
 
 @pytest.mark.parametrize("at_once", [frustum.CANDIDATES_AT_ONCE, 1000, 1])
-def test_collected_landmarks_are_those_of_the_plain_twin(
-    random_views: RandomViews, at_once: int, device: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_collected_landmarks_are_those_of_the_plain_twin(random_views, at_once, device, monkeypatch):
     monkeypatch.setattr(frustum, "CANDIDATES_AT_ONCE", at_once)  # the views of a CPU in blocks
     v = random_views
     arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
@@ -87,7 +82,7 @@ def test_collected_landmarks_are_those_of_the_plain_twin(
         assert v.mask[v.location_rows[view], plain[view]].all()
 
 
-def test_a_distorted_camera_collects_what_it_projects_into_its_image(random_views: RandomViews) -> None:
+def test_a_distorted_camera_collects_what_it_projects_into_its_image(random_views):
     v = random_views
     camera = ColmapCamera("OPENCV", 640, 480, (300.0, 300.0, 330.0, 235.0, -0.2, 0.05, 1e-3, -1e-3))
     found = landmarks_in_view(PosedViews(camera, v.cam_from_world, v.points, v.visible, v.location_rows))

@@ -1,7 +1,5 @@
 """Hidden-point removal against closed forms, a linear program, an independent library and a mesh."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.optimize import linprog
@@ -24,7 +22,7 @@ from wheretolook.visibility.occlusion import CachedOcclusion
 ORIGIN = np.zeros((1, 3))
 
 
-def hull_length_plain(points: np.ndarray, direction: np.ndarray) -> float:
+def hull_length_plain(points, direction):
     """Largest t with t * direction = sum of w_i points_i, w_i >= 0, sum of w_i <= 1 (the rest is the origin's)."""
     equations = np.column_stack([points.T, -direction])
     shares = np.append(np.ones(len(points)), 0)[None]
@@ -33,7 +31,7 @@ def hull_length_plain(points: np.ndarray, direction: np.ndarray) -> float:
     return float(found.x[-1])
 
 
-def free_plain(location: np.ndarray, points: np.ndarray, radius: float, margin_m: float) -> np.ndarray:
+def free_plain(location, points, radius, margin_m):
     """The definition: no mix of flipped landmarks and the location reaches farther out than the landmark's own."""
     lines = points - location
     distance = np.linalg.norm(lines, axis=1)
@@ -43,7 +41,7 @@ def free_plain(location: np.ndarray, points: np.ndarray, radius: float, margin_m
     return reach <= 2 * big - distance + margin_m + 1e-9 * big
 
 
-def surfaces(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
+def surfaces(seed, n):
     """Points on the furnished room's surfaces, 5 mm off, and locations inside it."""
     rng = np.random.default_rng(seed)
     mesh = furnished_room()
@@ -56,12 +54,12 @@ def surfaces(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("radius", [1.0, 10.0, 1e3, 1e6])
-def test_a_sphere_is_seen_from_its_centre(radius: float) -> None:
+def test_a_sphere_is_seen_from_its_centre(radius):
     points = 3 * fibonacci_sphere(500)
     assert HiddenPointRemoval(radius).unoccluded(ORIGIN, points).all()
 
 
-def test_few_landmarks() -> None:
+def test_few_landmarks():
     model = HiddenPointRemoval(margin_m=0)
     assert model.unoccluded(ORIGIN, np.array([[1.0, 2, 3]])).tolist() == [[True]]
     ray = np.array([[2.0, 0, 0], [1, 0, 0], [-3, 0, 0], [-2, 0, 0]])
@@ -71,7 +69,7 @@ def test_few_landmarks() -> None:
     assert model.unoccluded(np.zeros((0, 3)), np.eye(3)).shape == (0, 3)
 
 
-def test_landmarks_in_one_plane_with_the_location() -> None:
+def test_landmarks_in_one_plane_with_the_location():
     """A ring in a tilted plane hides a ring outside it, and a third one is nearer than the margin behind the first."""
     turn = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     ring = np.column_stack([np.cos(turn), np.sin(turn), 0 * turn]) @ Rotation.from_rotvec([0.4, 1.1, 0.2]).as_matrix()
@@ -82,7 +80,7 @@ def test_landmarks_in_one_plane_with_the_location() -> None:
 
 
 @pytest.mark.parametrize("radius, margin_m", [(1.0, 0.0), (3.0, 0.05), (100.0, 0.0), (100.0, 0.05)])
-def test_agrees_with_the_definition(radius: float, margin_m: float) -> None:
+def test_agrees_with_the_definition(radius, margin_m):
     points = surfaces(1, 45)[0]
     locations = np.array([[2.0, 3, 1.5], [0.5, 4, 2.2], [9, 2, 1], [40, 50, -30]])  # the last two see it from outside
     seen = HiddenPointRemoval(radius, margin_m).unoccluded(locations, points)
@@ -91,7 +89,7 @@ def test_agrees_with_the_definition(radius: float, margin_m: float) -> None:
     assert 0.05 < seen.mean() < 0.95 or radius == 100
 
 
-def test_climbing_finds_the_facet_that_a_search_of_all_finds() -> None:
+def test_climbing_finds_the_facet_that_a_search_of_all_finds():
     """Also where many facets lie in one plane: the points of a lattice in a cube, from its middle."""
     lattice = np.stack(np.meshgrid(*[np.arange(-2.0, 3)] * 3), axis=-1).reshape(-1, 3)
     for points in (surfaces(3, 3000)[0] - np.array(ROOM) / 2, lattice[np.any(lattice != 0, axis=1)]):
@@ -103,7 +101,7 @@ def test_climbing_finds_the_facet_that_a_search_of_all_finds() -> None:
         np.testing.assert_allclose(hull_length(hull, directions), expected, rtol=1e-12)
 
 
-def test_scale_turn_shift_and_number_of_threads_change_nothing() -> None:
+def test_scale_turn_shift_and_number_of_threads_change_nothing():
     points, locations = surfaces(5, 2000)
     seen = HiddenPointRemoval(20, 0.05, threads=1).unoccluded(locations, points)
     turn = Rotation.from_rotvec([0.3, -2.0, 1.0]).as_matrix()
@@ -115,7 +113,7 @@ def test_scale_turn_shift_and_number_of_threads_change_nothing() -> None:
         np.testing.assert_array_equal(HiddenPointRemoval(20, 0.05, threads).unoccluded(locations, points), seen)
 
 
-def seen_from(points: np.ndarray, at: np.ndarray, radius: float = 50.0) -> tuple[np.ndarray, np.ndarray, float]:
+def seen_from(points, at, radius=50.0):
     """Directions and lengths of the hull's points, and 5 cm, as the model has them."""
     lines = points - at
     distance = np.linalg.norm(lines, axis=1)
@@ -124,7 +122,7 @@ def seen_from(points: np.ndarray, at: np.ndarray, radius: float = 50.0) -> tuple
 
 
 @pytest.mark.parametrize("radius", [1.0, 50.0])
-def test_a_building_of_many_landmarks_has_the_hull_of_all(radius: float) -> None:
+def test_a_building_of_many_landmarks_has_the_hull_of_all(radius):
     rng = np.random.default_rng(0)
     size = np.array([30.0, 20.0, 6.0])
     room = np.array([6.0, 5.0, 3.0])
@@ -154,14 +152,12 @@ def test_a_building_of_many_landmarks_has_the_hull_of_all(radius: float) -> None
         (ConfigError, {"threads": -1}, (0, 0, 0), np.eye(3)),
     ],
 )
-def test_invalid_input(
-    error: type[Exception], options: dict[str, float], location: tuple[float, ...], points: np.ndarray
-) -> None:
+def test_invalid_input(error, options, location, points):
     with pytest.raises(error):
-        HiddenPointRemoval(**options).unoccluded(np.array([location], dtype=float), points)  # type: ignore[arg-type]
+        HiddenPointRemoval(**options).unoccluded(np.array([location], dtype=float), points)
 
 
-def test_cached_results_are_those_of_the_same_landmarks() -> None:
+def test_cached_results_are_those_of_the_same_landmarks():
     rng = np.random.default_rng(0)
     points = rng.normal(size=(300, 3)) * 3
     location = np.zeros((1, 3))

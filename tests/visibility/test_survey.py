@@ -1,7 +1,5 @@
 """The survey of all locations: blocks, threads, the best K, stored occlusion and what it refuses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -9,12 +7,10 @@ import pytest
 import warp as wp
 
 from box_scenes import box_quads, quads_mesh, random_texture
-from conftest import RandomViews
 from twins.visibility import count_plain
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
-from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import Float, rotation_looking_along
+from wheretolook.geometry.poses import rotation_looking_along
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.utils.warp import start_warp
@@ -24,24 +20,24 @@ from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion, Occlusi
 from wheretolook.visibility.survey import SurveyOptions, survey
 
 
-def boxes(*quads: np.ndarray) -> TexturedMesh:
+def boxes(*quads):
     return quads_mesh(np.concatenate(quads), [random_texture(np.random.default_rng(0), 4, 4)])
 
 
 class Given(OcclusionModel):
     """A mask that is known."""
 
-    def __init__(self, locations: Float, mask: np.ndarray) -> None:
+    def __init__(self, locations, mask):
         self.locations = locations
         self.mask = mask
 
-    def unoccluded(self, locations: Float, points: Float) -> np.ndarray:
+    def unoccluded(self, locations, points):
         rows = [int(np.flatnonzero((self.locations == location).all(1))[0]) for location in locations]
         return self.mask[rows]
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_a_survey_is_what_its_plain_parts_say(random_views: RandomViews, threads: int, device: str) -> None:
+def test_a_survey_is_what_its_plain_parts_say(random_views, threads, device):
     v = random_views
     rotations = rotation_looking_along(v.directions)
     options = SurveyOptions(keep=6, device=device, threads=threads)
@@ -57,7 +53,7 @@ def test_a_survey_is_what_its_plain_parts_say(random_views: RandomViews, threads
 
 
 @pytest.mark.parametrize(("directions", "keep"), [(1, 1), (40, 40), (300, 7)])
-def test_the_best_directions_are_those_of_a_stable_sort(directions: int, keep: int, device: str) -> None:
+def test_the_best_directions_are_those_of_a_stable_sort(directions, keep, device):
     counts = np.random.default_rng(0).integers(0, 9, (6, directions)).astype(np.int32)
     best = wp.empty((6, keep), dtype=wp.int32, device=start_warp(device))
     wp.launch(best_kernel, counts.shape, [wp.array(counts, device=device), directions, keep], [best], device=device)
@@ -65,9 +61,7 @@ def test_the_best_directions_are_those_of_a_stable_sort(directions: int, keep: i
 
 
 @pytest.mark.parametrize("n_points", [1, 7, 8, 9, 800])
-def test_masks_of_every_length_are_packed_as_numpy_packs_them(
-    n_points: int, random_views: RandomViews, device: str
-) -> None:
+def test_masks_of_every_length_are_packed_as_numpy_packs_them(n_points, random_views, device):
     v = random_views
     mask = v.mask[:, :n_points]
     points = v.points[:n_points]
@@ -78,7 +72,7 @@ def test_masks_of_every_length_are_packed_as_numpy_packs_them(
         np.testing.assert_array_equal(seen.occlusion.packed, np.packbits(expected, axis=1))
 
 
-def test_a_mesh_hides_what_is_behind_it_on_the_device_too(device: str) -> None:
+def test_a_mesh_hides_what_is_behind_it_on_the_device_too(device):
     raycaster = MeshRaycaster(boxes(box_quads((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))), device)
     rng = np.random.default_rng(0)
     points = rng.uniform(-4, 4, (600, 3))
@@ -92,20 +86,18 @@ def test_a_mesh_hides_what_is_behind_it_on_the_device_too(device: str) -> None:
     np.testing.assert_array_equal(seen.counts, count_plain(PinholeCamera(), rotations, locations, points, mask))
 
 
-def test_blocks_keep_to_the_memory_allowed(
-    random_views: RandomViews, device: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_blocks_keep_to_the_memory_allowed(random_views, device, monkeypatch):
     v = random_views
     rotations = rotation_looking_along(random_views.directions)
     locations = np.random.default_rng(0).uniform(-2, 2, (40, 3))
     options = SurveyOptions(device=device)
     whole = survey(v.camera, rotations, locations, v.points, NoOcclusion(), options)
-    blocks: list[int] = []
+    blocks = []
     original = FrustumCounter.count
 
-    def spy(self: FrustumCounter, at: Float, *rest: object) -> object:
+    def spy(self, at, *rest):
         blocks.append(len(at))
-        return original(self, at, *rest)  # type: ignore[arg-type]
+        return original(self, at, *rest)
 
     monkeypatch.setattr(FrustumCounter, "count", spy)
     one = FrustumCounter(v.camera, rotations, len(v.points), device).bytes_per_location(len(v.points)) + len(v.points)
@@ -126,13 +118,13 @@ def test_blocks_keep_to_the_memory_allowed(
         (ConfigError, np.zeros((1, 3)), np.ones((5, 3)), {"memory_bytes": 100}),
     ],
 )
-def test_invalid_input(error: type[Exception], locations: Float, points: Float, options: dict[str, int]) -> None:
+def test_invalid_input(error, locations, points, options):
     with pytest.raises(error):
         survey(PinholeCamera(), np.eye(3)[None], locations, points, NoOcclusion(), SurveyOptions(**options))
 
 
 @pytest.mark.parametrize("two_sided", [False, True])
-def test_a_location_inside_geometry_is_refused(two_sided: bool, device: str) -> None:
+def test_a_location_inside_geometry_is_refused(two_sided, device):
     room = box_quads((-3, -3, -3), (3, 3, 3), inward=True)
     occlusion = MeshOcclusion(MeshRaycaster(boxes(room, box_quads((0, 0, 0), (1, 1, 1))), device), two_sided=two_sided)
     points = np.ones((5, 3))

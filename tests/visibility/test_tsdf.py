@@ -1,13 +1,10 @@
 """Occlusion by fused depth images against the exact mesh they were rendered from."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from depth_room import CAMERA, depth_images, free_points, room
 from mask_agreement import MaskAgreement
-from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.tsdf import DepthImage, TsdfVolume
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import SceneError
@@ -15,7 +12,7 @@ from wheretolook.visibility.occlusion import MeshOcclusion
 from wheretolook.visibility.tsdf import TsdfOcclusion
 
 
-def lines_of_sight(mesh: TexturedMesh, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def lines_of_sight(mesh, seed):
     """Locations (30, 3), landmarks (3000, 3) on surfaces, 3 mm off, and which are free by the mesh."""
     rng = np.random.default_rng(seed)
     raycaster = MeshRaycaster(mesh)
@@ -29,21 +26,21 @@ def lines_of_sight(mesh: TexturedMesh, seed: int) -> tuple[np.ndarray, np.ndarra
 
 
 @pytest.fixture(scope="module")
-def images() -> list[DepthImage]:
+def images():
     return depth_images(room(), seed=1, n=70)
 
 
 @pytest.fixture(scope="module")
-def volume(images: list[DepthImage]) -> TsdfVolume:
+def volume(images):
     return TsdfVolume.from_images(images, progress=False)
 
 
 @pytest.fixture(scope="module")
-def occlusion(volume: TsdfVolume) -> TsdfOcclusion:
+def occlusion(volume):
     return TsdfOcclusion(volume)
 
 
-def test_agrees_with_the_mesh_at_2_cm(occlusion: TsdfOcclusion) -> None:
+def test_agrees_with_the_mesh_at_2_cm(occlusion):
     locations, points, truth = lines_of_sight(room(), seed=2)
     agreement = MaskAgreement.between(occlusion.unoccluded(locations, points), truth)
     assert 0.4 < truth.mean() < 0.8
@@ -52,7 +49,7 @@ def test_agrees_with_the_mesh_at_2_cm(occlusion: TsdfOcclusion) -> None:
 
 
 @pytest.mark.parametrize(("wall_m", "precision", "recall"), [(0.05, 0.98, 0.98), (0.0, 0.95, 0.92)])
-def test_thin_walls_seen_from_both_sides(wall_m: float, precision: float, recall: float) -> None:
+def test_thin_walls_seen_from_both_sides(wall_m, precision, recall):
     # Within the truncation the two sides of a wall without thickness cancel: it has some holes, and hides some of the
     # landmarks on itself. With two voxels and a half between them, they hardly touch.
     mesh = room(wall_m)
@@ -64,14 +61,14 @@ def test_thin_walls_seen_from_both_sides(wall_m: float, precision: float, recall
     assert agreement.recall >= recall
 
 
-def test_what_nothing_has_seen_hides_nothing() -> None:
+def test_what_nothing_has_seen_hides_nothing():
     wall = DepthImage(np.full((240, 320), 2.0), CAMERA, np.eye(4)[:3])  # the plane z = 2 m, about 4 m wide
     occlusion = TsdfOcclusion(TsdfVolume.from_images([wall], progress=False))
     points = np.array([[0, 0, 1.9], [0, 0, 2.03], [0, 0, 3], [0, 0, -3], [9, 0, 3.0]])
     assert occlusion.unoccluded(np.zeros((1, 3)), points).tolist() == [[True, True, False, True, True]]
 
 
-def test_a_location_inside_geometry_is_refused(occlusion: TsdfOcclusion) -> None:
+def test_a_location_inside_geometry_is_refused(occlusion):
     free = free_points(np.random.default_rng(7), 200, clearance_m=0.1)
     occlusion.check(free, free)
     occlusion.check(free[:0], free)

@@ -31,10 +31,18 @@ from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
 from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.scorers.weights import load_scorer, resolve_weights
 from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
-from wheretolook.utils.errors import ConfigError, MapError, OutOfRangeWarning, SceneError, TableError
+from wheretolook.utils.errors import (
+    ConfigError,
+    MapError,
+    OutOfRangeWarning,
+    SceneError,
+    TableError,
+    check_positive,
+    check_range,
+    reject,
+)
 from wheretolook.utils.files import fingerprint, missing_folders, remove_if_empty, storage_errors, write_text
-from wheretolook.utils.locks import hold
-from wheretolook.utils.validation import check_positive, check_range, reject
+from wheretolook.utils.processes import hold
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -12,10 +12,8 @@ from wheretolook.commands.options import LabelOptions, OcclusionOptions, ScorerO
 from wheretolook.dataset.config import LOCK, checked_accuracy
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.mapping.config import FrameOptions, place_name
-from wheretolook.utils.errors import MapError
-from wheretolook.utils.locks import hold
-from wheretolook.utils.processes import cores
-from wheretolook.utils.validation import check_range, reject
+from wheretolook.utils.errors import MapError, check_range, reject
+from wheretolook.utils.processes import cores, hold
 
 if TYPE_CHECKING:
     from wheretolook.dataset.layout import SceneFolder

@@ -24,11 +24,9 @@ from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.scorers.weights import resolve_weights
 from wheretolook.tracking.runs import ui_command
 from wheretolook.tracking.store import check_store
-from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.extras import reports
-from wheretolook.utils.files import fingerprint
-from wheretolook.utils.version import VERSION
+from wheretolook.utils.files import ArtifactCache, cache_key, fingerprint
+from wheretolook.utils.package import VERSION, reports
 
 SECONDS = {"scenes": 5.0, "map": 15.0, "sample": 1.0, "label": 75.0, "train": 25.0, "evaluate": 6.0}
 """Rough cost of a stage on two cores (the first four for each scene), from which the share done is estimated."""

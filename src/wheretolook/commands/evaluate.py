@@ -22,8 +22,8 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import MapError
-from wheretolook.utils.extras import reports
 from wheretolook.utils.files import write_text
+from wheretolook.utils.package import reports
 from wheretolook.visibility.config import OcclusionConfig
 
 if TYPE_CHECKING:

@@ -9,9 +9,8 @@ from typing import ClassVar
 from wheretolook.commands.options import CameraOptions
 from wheretolook.dataset.config import checked_accuracy
 from wheretolook.mapping.config import FrameOptions
-from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.shipped import or_shipped
-from wheretolook.utils.validation import check_positive
+from wheretolook.utils.errors import ConfigError, check_positive
+from wheretolook.utils.package import or_shipped
 
 MAX_LOCATIONS = 20_000
 

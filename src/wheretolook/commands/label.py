@@ -32,10 +32,9 @@ from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.tracking.runs import log as log_to_run
 from wheretolook.tracking.runs import start_run
 from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
-from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.errors import MapError, SceneError, TableError
-from wheretolook.utils.extras import reports
-from wheretolook.utils.files import read_json_object, write_json, write_text
+from wheretolook.utils.files import cache_key, read_json_object, write_json, write_text
+from wheretolook.utils.package import reports
 
 if TYPE_CHECKING:
     import pandas as pd

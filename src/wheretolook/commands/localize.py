@@ -13,8 +13,7 @@ from wheretolook.dataset.config import checked_accuracy
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.figures import KINDS
 from wheretolook.mapping.config import FrameOptions
-from wheretolook.utils.errors import ConfigError, MapError, WhereToLookError
-from wheretolook.utils.validation import check_choice
+from wheretolook.utils.errors import ConfigError, MapError, WhereToLookError, check_choice
 
 if TYPE_CHECKING:
     from wheretolook.select.image_localizer import ImageLocalizer

@@ -35,10 +35,8 @@ from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapCon
 from wheretolook.mapping.georeference import read_scale
 from wheretolook.mapping.map_frame import read_frame
 from wheretolook.mapping.mapped_images import source_of_map
-from wheretolook.utils.artifact_cache import cache_key
-from wheretolook.utils.errors import ConfigError, MapError, SceneError
-from wheretolook.utils.files import check_folder_name, fingerprint, path_within, size_and_time
-from wheretolook.utils.validation import reject
+from wheretolook.utils.errors import ConfigError, MapError, SceneError, reject
+from wheretolook.utils.files import cache_key, check_folder_name, fingerprint, path_within, size_and_time
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,7 @@ from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.tracking.store import TrackingConfig
 from wheretolook.utils.devices import check_device_name, usable_device
-from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError
+from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError, from_record, reject
 from wheretolook.utils.files import (
     check_folder_name,
     check_output,
@@ -31,7 +31,6 @@ from wheretolook.utils.files import (
 )
 from wheretolook.utils.processes import cores
 from wheretolook.utils.texts import LOG
-from wheretolook.utils.validation import from_record, reject
 from wheretolook.visibility.config import OcclusionConfig
 
 if TYPE_CHECKING:
@@ -162,6 +161,8 @@ class Command:
     """Bundled configuration that is read unless `--config` names another, such as demo."""
     SHORT: ClassVar[Mapping[str, str]] = {}
     """Shorter names of options, as the command line writes them, without `--`."""
+    GROUPS: ClassVar[Mapping[str, str]] = {}
+    """What precedes the names of options in a field that is a dataclass, if it is not the field's name and a point."""
     POSITIONAL: ClassVar[str] = "config"
     """Option of the values before the first option."""
     WRITES: ClassVar[str] = ""

@@ -19,9 +19,9 @@ from wheretolook.tracking.runs import joined, start_run
 from wheretolook.tracking.runs import log as log_to_run
 from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.extras import reports
 from wheretolook.utils.files import write_text
-from wheretolook.utils.locks import hold
+from wheretolook.utils.package import reports
+from wheretolook.utils.processes import hold
 from wheretolook.utils.texts import score_text
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ class Plan(SceneOrMapOptions):
             TrackingError: the tracking store cannot be used.
         """
         from wheretolook.planning.method_paths import path_views, plan_by_methods
-        from wheretolook.utils.extras import require
+        from wheretolook.utils.package import require
 
         dataset = load_dataset(self, "map")
         config = self.plan

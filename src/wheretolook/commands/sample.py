@@ -14,8 +14,8 @@ from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.geometry.camera import Camera, draw_camera, write_cameras
-from wheretolook.utils.artifact_cache import cache_key
 from wheretolook.utils.errors import MapError, SceneError
+from wheretolook.utils.files import cache_key
 
 
 @dataclass(frozen=True, kw_only=True)

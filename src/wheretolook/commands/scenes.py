@@ -23,9 +23,8 @@ from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, MappedFloor, SceneFolder
 from wheretolook.dataset.sampling_config import Split
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
-from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.errors import ConfigError, SceneError, TableError
-from wheretolook.utils.files import storage_errors
+from wheretolook.utils.files import ArtifactCache, cache_key, storage_errors
 
 if TYPE_CHECKING:
     from pathlib import Path

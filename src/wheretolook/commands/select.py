@@ -14,8 +14,7 @@ from wheretolook.dataset.config import checked_accuracy
 from wheretolook.figures import KINDS
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.select.waypoints import SelectionRequest
-from wheretolook.utils.errors import ConfigError, MapWarning
-from wheretolook.utils.validation import check_choice
+from wheretolook.utils.errors import ConfigError, MapWarning, check_choice
 
 if TYPE_CHECKING:
     from wheretolook.geometry.camera import Camera

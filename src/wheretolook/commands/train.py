@@ -111,7 +111,7 @@ def _train(
     from wheretolook.training.learner import TrainingJob
     from wheretolook.training.provenance import NOT_LOGGED, TrainedModel, kept_metrics, params_of, weights_path
 
-    assert method.learn is not None
+    assert method.learner is not None
     path = weights_path(dataset, method.name)  # the title is that of its progress bar
     title = f"train {method.name}"
     devices = {"devices": config.devices}
@@ -121,7 +121,9 @@ def _train(
             seed_everything(config.seed, verbose=False)
             options = config.options_of(method)
             run_log = RunLog(tracking, run_id)
-            result = method.learn(TrainingJob(dataset, method.name, config, options, title, run_log=run_log, **shared))
+            result = method.learner.learn(
+                TrainingJob(dataset, method.name, config, options, title, run_log=run_log, **shared)
+            )
             result.model.save(path, about)
             history = "" if result.history is None else result.history.to_csv(index=False)
             unlogged = {NOT_LOGGED: {"params": devices | result.counts, "history": history}}

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 
 from wheretolook.commands.options import CameraOptions
 from wheretolook.mapping.config import FrameOptions
-from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.extras import reports
-from wheretolook.utils.validation import reject
+from wheretolook.utils.errors import ConfigError, reject
+from wheretolook.utils.package import reports
 
 if TYPE_CHECKING:
     from wheretolook.view.state import ViewState
@@ -153,7 +152,7 @@ class View(CameraOptions, FrameOptions):
 
         if self.scene is not None and self.data.is_dir():
             find_scene(self.data, self.scene, self.name)
-        from wheretolook.utils.extras import require
+        from wheretolook.utils.package import require
         from wheretolook.view.server import check_port
 
         if self.record is not None:

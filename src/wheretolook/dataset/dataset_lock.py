@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from wheretolook.dataset.config import LOCK
-from wheretolook.utils.locks import hold
+from wheretolook.utils.processes import hold
 
 P = ParamSpec("P")
 R = TypeVar("R")

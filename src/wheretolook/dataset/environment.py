@@ -20,8 +20,7 @@ from wheretolook.mapping.georeference import read_scale
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame, has_photographs, read_frame
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.utils.devices import usable_device
-from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.validation import check_positive
+from wheretolook.utils.errors import ConfigError, check_positive
 from wheretolook.visibility.config import OCCLUSION_MODELS, OcclusionConfig, check_occlusion_names
 
 if TYPE_CHECKING:  # pandas and Warp are imported when first needed

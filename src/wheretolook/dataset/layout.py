@@ -16,10 +16,8 @@ from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of_record,
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import CAMERAS_FILE, load_mapping_poses
 from wheretolook.mapping.georeference import read_scale
-from wheretolook.utils.artifact_cache import ArtifactCache
-from wheretolook.utils.errors import ConfigError, TableError
-from wheretolook.utils.files import fingerprint, read_json_object, safe_child, write_json
-from wheretolook.utils.validation import check_choice
+from wheretolook.utils.errors import ConfigError, TableError, check_choice
+from wheretolook.utils.files import ArtifactCache, fingerprint, read_json_object, safe_child, write_json
 
 if TYPE_CHECKING:
     import pandas as pd

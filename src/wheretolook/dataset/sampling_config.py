@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from wheretolook.geometry.lattices import ViewLattice
-from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.validation import check_range
+from wheretolook.utils.errors import ConfigError, check_range
 
 Split = Literal["train", "val", "test"]  # scenes for training, validation and testing
 

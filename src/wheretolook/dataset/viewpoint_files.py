@@ -17,8 +17,7 @@ from wheretolook.dataset.viewpoint_table import APPEARANCE, CAMERA_ID, CHANGES, 
 from wheretolook.geometry.poses import Float, camera_centers, rotation_from_quaternion
 from wheretolook.io.poses import POSE_COLUMNS, QUATERNION_COLUMNS, TRANSLATION_COLUMNS
 from wheretolook.utils.errors import TableError
-from wheretolook.utils.files import atomic_write
-from wheretolook.utils.parquet_files import open_parquet
+from wheretolook.utils.files import atomic_write, open_parquet
 
 CENTER_COLUMNS = ("x_m", "y_m", "z_m")
 

@@ -11,9 +11,8 @@ import numpy as np
 
 from wheretolook.dataset.config import THRESHOLDS
 from wheretolook.scorers.registry import methods_named, scorers
-from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.shipped import or_shipped
-from wheretolook.utils.validation import check_choice, check_positive, check_range
+from wheretolook.utils.errors import ConfigError, check_choice, check_positive, check_range
+from wheretolook.utils.package import or_shipped
 from wheretolook.visibility.config import check_occlusion_names
 
 

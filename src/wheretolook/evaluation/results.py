@@ -46,8 +46,8 @@ from wheretolook.evaluation.ranking import (
 )
 from wheretolook.evaluation.statistics import ClusterBootstrap, divide, expected_calibration_error, scale_probability
 from wheretolook.geometry.poses import Float
-from wheretolook.scorers.registry import find, is_probability, methods_named, scorers
-from wheretolook.scorers.styles import ORACLE, method_group, method_style
+from wheretolook.scorers.random import RandomScorer
+from wheretolook.scorers.registry import is_probability
 from wheretolook.tracking.runs import (
     ALL_METHODS,
     AUC,
@@ -66,9 +66,11 @@ from wheretolook.tracking.runs import (
     start_run,
 )
 from wheretolook.tracking.store import TrackingConfig
+from wheretolook.utils.errors import check_choice
 from wheretolook.utils.files import fingerprint, temporary_folder
-from wheretolook.utils.validation import check_choice
 from wheretolook.visibility.config import OcclusionConfig
+
+ORACLE = "oracle"  # the best views by their labels, as a method of tables
 
 PHOTOGRAPHS = "photographs"  # value of the column `candidates` in rows of held-out photographs
 
@@ -112,7 +114,7 @@ def reference_of(scores: pd.DataFrame) -> str:
 
 def is_random(method: str) -> bool:
     """Whether a method chooses at random, so that its rows hold exact expectations."""
-    return bool(getattr(find(method), "is_random_baseline", False))
+    return method.partition(" ")[0] == RandomScorer.name
 
 
 def best_in_words(scores: pd.DataFrame) -> str:
@@ -124,13 +126,13 @@ def best_in_words(scores: pd.DataFrame) -> str:
     key = threshold_keys(scores)[0]
     pooled = main[(main["scene"] == ALL) & (main["top_n"] == main["top_n"].iloc[0])]
     rows: dict[str, Mapping[str, Any]] = {row["method"]: row for row in pooled.to_dict("records")}
-    methods = [name for name in rows if name != ORACLE and method_group(name) != "probes"]
+    methods = [name for name in rows if name != ORACLE]
     ranked = [name for name in methods if not is_random(name)]
     ranked.sort(key=lambda name: -rows[name][f"raw_{key}"])
     n_views, n_locations = (int(rows[ORACLE][name]) for name in ("n_views", "n_locations"))
 
     def times(name: str) -> str:
-        return f"{method_style(name).label} {rows[name][f'raw_{key}'] * n_views:.1f}".removesuffix(".0")
+        return f"{name} {rows[name][f'raw_{key}'] * n_views:.1f}".removesuffix(".0")
 
     others = [*ranked[1:2], *(name for name in methods if is_random(name)), ORACLE]
     text = f"Views that localize within {threshold_label(key)}, among {n_views} chosen at {n_locations} locations: "
@@ -184,8 +186,12 @@ def reference_method(methods: Iterable[str], name: str) -> str:
     if name:
         check_choice("reference among the methods evaluated", name, methods)
         return name
-    learned = {method: record for method in methods if (record := find(method)) is not None and record.probability}
-    return max(learned, key=lambda method: learned[method].reference, default="")
+    learned = [method for method in methods if is_probability(method)]
+    for preferred in ("set", "mlp-2d+3d"):
+        for method in learned:
+            if method.partition(" ")[0] == preferred:
+                return method
+    return learned[0] if learned else ""
 
 
 def score_table(
@@ -464,9 +470,6 @@ def log_evaluation(
     params = {name: value for name, value in params.items() if value or name not in ("anywhere", "photographs")}
     if config.occlusions:
         params |= {f"occlusion_{name}": value for name, value in asdict(occlusion).items() if name != "model"}
-    if len(dataset.cameras) == 1:
-        for method in methods_named(config.methods, scorers()):
-            params |= method.params(dataset.camera)
     mark = fingerprint_of(params, evaluation.table.to_csv(index=False), evaluation.calibration.to_csv(index=False))
     if logged_last(tracking, "evaluate", dataset.name, mark, SCORES_CSV) is not None:
         return

@@ -27,7 +27,7 @@ from wheretolook.training.provenance import TrainedModel, was_trained_on, weight
 from wheretolook.training.weights import method_of_weights, read_training
 from wheretolook.utils.errors import TableError, WeightsError
 from wheretolook.utils.files import fingerprint
-from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.utils.package import WEIGHTS, shipped
 from wheretolook.visibility.config import OcclusionConfig
 
 BATCH = 4096  # views binned and scored at a time

@@ -13,7 +13,7 @@ from scipy.optimize import minimize_scalar
 from scipy.special import expit
 
 from wheretolook.geometry.poses import Float
-from wheretolook.utils.probability import finite_log_odds
+from wheretolook.scorers.adapted.calibration import finite_log_odds
 
 _PERCENTILES = (2.5, 97.5)  # ends of a 95 % interval
 

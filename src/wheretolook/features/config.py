@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from wheretolook.features.extractor import Extraction, Keypoints
 from wheretolook.features.opencv_sift import EDGE_THRESHOLD, MAX_KEYPOINTS, PEAK_THRESHOLD
 from wheretolook.features.registry import all_extractors, runnable_extractors
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.errors import ConfigError, check_choice, check_positive, check_range
 from wheretolook.utils.files import sha256
 from wheretolook.utils.processes import WorkerPool
-from wheretolook.utils.validation import check_choice, check_positive, check_range
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from wheretolook.features.extractor import (
     unit_descriptors,
 )
 from wheretolook.features.opencv_sift import RootSift
-from wheretolook.utils.extras import quiet_colmap
+from wheretolook.utils.texts import quiet_colmap
 
 SIFT = DescriptorKind("sift", 128, "uint8", colmap_type=0)
 

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.poses import Float
-from wheretolook.utils.errors import ConfigError, MapError, TableError
+from wheretolook.utils.errors import ConfigError, MapError, TableError, check_choice
 from wheretolook.utils.files import write_text
-from wheretolook.utils.validation import check_choice
 
 if TYPE_CHECKING:
     import pycolmap

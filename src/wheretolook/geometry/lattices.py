@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.devices import fitting
-from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.validation import check_choice
+from wheretolook.utils.errors import ConfigError, check_choice
 
 GOLDEN_ANGLE = np.pi * (1 + np.sqrt(5))  # radians between neighbours of the spiral: the paper's i * pi * (1 + sqrt 5)
 BYTES_PER_VOXEL = 160  # while the locations of a grid are computed, and which of them are free

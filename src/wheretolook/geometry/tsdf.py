@@ -18,8 +18,7 @@ from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.geometry.similarity import local_origin, poses_from
 from wheretolook.utils.devices import fitting
-from wheretolook.utils.errors import ConfigError, SceneError
-from wheretolook.utils.validation import check_positive, check_range
+from wheretolook.utils.errors import ConfigError, SceneError, check_positive, check_range
 
 BLOCK_VOXELS = 8  # voxels along the side of a block
 BYTES_PER_BLOCK = 24 * 1024  # peak memory for each block, from fusion to ray casting: 19 to 23 KiB on three scenes

@@ -26,8 +26,8 @@ from wheretolook.localization.localizer import Localizer, localization_errors
 from wheretolook.mapping.colmap_model import observation_matrix, read_model, write_model
 from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
-from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.errors import MapError, MapWarning
+from wheretolook.utils.files import ArtifactCache, cache_key
 from wheretolook.utils.processes import WorkerPool
 
 PARTS = 8  # blocks that partition the photographs

@@ -26,9 +26,8 @@ from wheretolook.mapping.georeference import DEPTH_M, median_depths
 from wheretolook.mapping.landmarks import load_colmap_landmarks
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame, find_frame, has_photographs
 from wheretolook.mapping.mapped_images import MappedImages, find_features, find_photographs
-from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning
-from wheretolook.utils.files import fingerprint, safe_child, size_and_time
+from wheretolook.utils.files import ArtifactCache, cache_key, fingerprint, safe_child, size_and_time
 from wheretolook.utils.texts import LOG
 
 PANS = (0.0, -1.0, 1.0)  # of the crops of a photograph: the middle one, and those at its left and right side

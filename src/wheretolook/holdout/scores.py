@@ -23,7 +23,7 @@ from wheretolook.mapping.colmap_model import compact_poses
 from wheretolook.mapping.landmarks import load_colmap_landmarks
 from wheretolook.mapping.map_frame import IDENTITY
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.registry import find, make_scorer
+from wheretolook.scorers.registry import make_scorer
 from wheretolook.scorers.weights import load_scorer, resolve_weights
 from wheretolook.training.weights import method_of_weights
 from wheretolook.utils.errors import MapWarning, OutOfRangeWarning
@@ -78,8 +78,7 @@ def check_place(source: PhotographedMap, scoring: Scoring, device: str) -> None:
     The whole map is tested, as the map without a block may lack most of the landmarks that identify the scene.
     """
     chosen = scoring.chosen
-    method = find(method_of_weights(chosen)) if chosen is not None else None
-    if method is not None and method.one_place and not scoring.anywhere:
+    if chosen is not None and method_of_weights(chosen) == "adapted" and not scoring.anywhere:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MapWarning)
             landmarks = load_colmap_landmarks(source.path, reconstruction=source.model, progress=False)

@@ -17,7 +17,7 @@ from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame, has_photographs, warn_of_mesh
 from wheretolook.mapping.mapped_images import MappedImages, open_colmap
-from wheretolook.utils.validation import check_positive
+from wheretolook.utils.errors import check_positive
 from wheretolook.visibility import frustum
 from wheretolook.visibility.counting import in_view_by_table
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews, landmarks_in_view

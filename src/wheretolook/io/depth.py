@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.utils.errors import SceneError
-from wheretolook.utils.images import MAX_DEPTH_PIXELS, read_image
-from wheretolook.utils.npz_files import load_npy
+from wheretolook.utils.files import MAX_DEPTH_PIXELS, load_npy, read_image
 
 NO_READING = np.iinfo(np.uint16).max  # in 16-bit images of several cameras, as 0 in all
 

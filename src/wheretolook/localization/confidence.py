@@ -12,24 +12,59 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.dataset.config import ACCURACY, Accuracy
 from wheretolook.geometry.poses import Float
-from wheretolook.localization.estimation import log_ratio
+from wheretolook.utils.errors import WeightsError
 from wheretolook.utils.files import read_json_object
-from wheretolook.utils.shipped import LogisticRegression
 
 if TYPE_CHECKING:
     from wheretolook.localization.rig_localization import JointLocalization
 
+
+@dataclass(frozen=True)
+class LogisticRegression:
+    """Base class: a subclass names its features, what it predicts (`about`) and its bundled file."""
+
+    names: ClassVar[tuple[str, ...]]
+    about: ClassVar[str]
+    file: ClassVar[Path]
+
+    weights: tuple[float, ...]
+    bias: float
+
+    @classmethod
+    @cache
+    def bundled(cls) -> Self:
+        """Return the bundled model, fitted on validation scenes."""
+        return cls.load(cls.file)
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a JSON file of weights by name and a bias. Raises a WeightsError if it is damaged."""
+        try:
+            stored = read_json_object(path)
+            model = cls(tuple(float(stored["weights"][name]) for name in cls.names), float(stored["bias"]))
+            if not np.isfinite([*model.weights, model.bias]).all():
+                raise ValueError("a weight is not finite")
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise WeightsError(f"a damaged file of {cls.about}: {error}", path=path, fix="Fit it again.") from error
+        return model
+
+    def predict_proba(self, features: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+        """Return probabilities (...,) for feature vectors (..., K) in the order of `names`."""
+        return np.asarray(1 / (1 + np.exp(-np.clip(features @ np.asarray(self.weights) + self.bias, -60, 60))))
+
+
 FEATURE_NAMES = ("log_elsewhere", "log_share", "log_own", "log_deviation_deg")
 """log(1 + support of the best competing pose), log of the inlier ratio of the matches, log of the ratio of this pose's
-unique support to that of its strongest rival (`pose_ambiguity.log_ratio`), log of one standard deviation of the
+unique support to that of its strongest rival (`log_ratio`), log of one standard deviation of the
 orientation (degrees)."""
 
 RIGHT_PLACE: Accuracy = (math.inf, math.inf)
@@ -40,6 +75,18 @@ RIGHT_PLACE_LIMITS: Accuracy = (0.5, 5.0)
 MIN_INLIERS = 10  # with fewer, the localizer itself rejects a pose
 MIN_DEVIATION_DEG = 1e-4
 MAX_DEVIATION_DEG = 10.0
+
+
+PSEUDOCOUNT = 10.0
+"""Additive smoothing of both counts of a comparison: 1 against 0 is not decisive."""
+
+
+def log_ratio(unique: ArrayLike, rival_unique: ArrayLike) -> Float:
+    """Damped log ratio of the unique support (...,) of two poses."""
+    return np.log(
+        (np.asarray(unique, dtype=np.float64) + PSEUDOCOUNT)
+        / (np.asarray(rival_unique, dtype=np.float64) + PSEUDOCOUNT)
+    )
 
 
 def confidence_features(

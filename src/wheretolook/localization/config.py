@@ -8,10 +8,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.errors import ConfigError, check_choice, check_positive, check_range
 from wheretolook.utils.files import sha256
-from wheretolook.utils.validation import check_choice, check_positive, check_range
-from wheretolook.utils.version import VERSION
+from wheretolook.utils.package import VERSION
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.pose_information import N_NUMBERS, bearing_numbers, information_matrices
 from wheretolook.geometry.poses import Float, camera_centers, compose_poses, invert_poses, pose_error, transform
 from wheretolook.geometry.similarity import local_origin, poses_from
+from wheretolook.localization.confidence import log_ratio
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.rig import Look
 
@@ -420,8 +421,6 @@ points are triangulated on two copies of an object."""
 VOXEL_SIZE_M = 0.25
 """Landmarks in one cube of this edge count once: landmarks on one object are matched or mismatched jointly."""
 
-PSEUDOCOUNT = 10.0
-"""Additive smoothing of both counts of a comparison: 1 against 0 is not decisive."""
 
 SUPPORT_POWER = 0.2
 """Power of the ratio of two poses' support that counts in addition to that of their unique support."""
@@ -453,14 +452,6 @@ class PoseAmbiguity:
         """Count voxels (cubes of `VOXEL_SIZE_M`) with landmarks, rows (M,)."""
         cells = np.floor(self.points[rows] / VOXEL_SIZE_M).astype(np.int64)
         return len(np.unique(cells @ _CELL_STRIDES))  # of one number each: unique rows take ten times as long
-
-
-def log_ratio(unique: ArrayLike, rival_unique: ArrayLike) -> Float:
-    """Damped log ratio of the unique support (...,) of two poses."""
-    return np.log(
-        (np.asarray(unique, dtype=np.float64) + PSEUDOCOUNT)
-        / (np.asarray(rival_unique, dtype=np.float64) + PSEUDOCOUNT)
-    )
 
 
 def _preferences(unique: NDArray[np.int64], support: ArrayLike) -> Float:

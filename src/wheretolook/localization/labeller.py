@@ -24,8 +24,8 @@ from wheretolook.dataset.viewpoint_table import CAMERA_ID, LABELS
 from wheretolook.localization.config import LabelConfig, versions
 from wheretolook.localization.shard import LabelledShard, SceneJob, Shard, ShardWorker, run_local
 from wheretolook.utils.errors import ConfigError, TableError, WhereToLookError, WorkerError
-from wheretolook.utils.extras import require
 from wheretolook.utils.files import atomic_write, fingerprint, sha256, write_json
+from wheretolook.utils.package import require
 from wheretolook.utils.processes import cores
 
 MANIFEST = "manifest.json"

@@ -31,7 +31,7 @@ from wheretolook.localization.estimation import (
     turn_errors,
 )
 from wheretolook.localization.rig import Look
-from wheretolook.utils.validation import check_range
+from wheretolook.utils.errors import check_range
 
 POSES_OF_A_VIEW = 2
 """Hypotheses from each view of a rig as a single image."""

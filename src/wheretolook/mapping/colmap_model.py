@@ -26,9 +26,8 @@ from wheretolook.geometry.camera import MAX_SIDE_PX, Camera, cameras_by_id, mean
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.geometry.similarity import local_origin
 from wheretolook.utils.errors import MapError, MapWarning, StorageError
-from wheretolook.utils.extras import quiet_colmap
-from wheretolook.utils.files import STORAGE_FIX, storage_errors, temporary_folder
-from wheretolook.utils.npz_files import load_npz, save_npz
+from wheretolook.utils.files import STORAGE_FIX, load_npz, save_npz, storage_errors, temporary_folder
+from wheretolook.utils.texts import quiet_colmap
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array

@@ -9,8 +9,7 @@ from typing import Any
 
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig
-from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.validation import check_positive, check_range, reject
+from wheretolook.utils.errors import ConfigError, check_positive, check_range, reject
 
 # The walk of a person with a camera through a scene.
 COVERAGE = 0.7  # share of the reachable floor that is visited; the walk ends there

@@ -15,8 +15,7 @@ from wheretolook.geometry.poses import transform
 from wheretolook.geometry.tsdf import DepthImage
 from wheretolook.io.depth import read_depth
 from wheretolook.mapping.colmap_model import read_model
-from wheretolook.utils.errors import SceneError
-from wheretolook.utils.validation import check_positive
+from wheretolook.utils.errors import SceneError, check_positive
 
 MAX_MEASURED = 50  # images that the scale is measured in
 

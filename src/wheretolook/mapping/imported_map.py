@@ -25,8 +25,7 @@ from wheretolook.mapping.map_frame import IDENTITY, find_frame
 from wheretolook.mapping.photograph_map import PhotographFeatures, photograph_features
 from wheretolook.mapping.triangulation import choose_pairs, triangulate_model
 from wheretolook.utils.errors import ConfigError, MapError
-from wheretolook.utils.files import path_within
-from wheretolook.utils.images import image_size
+from wheretolook.utils.files import image_size, path_within
 
 _EITHER = "Leave --database out to triangulate again, or --images to keep the model's landmarks."
 _FIX = "Raise mapping.existing.max_reprojection_error_px, or check the model's poses and intrinsics."

@@ -19,7 +19,7 @@ from wheretolook.geometry.similarity import local_origin
 from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, read_model, select_points
 from wheretolook.mapping.feature_files import read_descriptors
 from wheretolook.utils.errors import MapError, MapWarning
-from wheretolook.utils.npz_files import load_npz, save_npz
+from wheretolook.utils.files import load_npz, save_npz
 
 if TYPE_CHECKING:
     import pycolmap

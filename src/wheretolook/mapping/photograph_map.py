@@ -31,10 +31,9 @@ from wheretolook.mapping.photographs import (
     reduce_photograph,
 )
 from wheretolook.mapping.triangulation import extract_with_colors, fill_database, match_pairs, write_matches
-from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.errors import ConfigError, MapError
-from wheretolook.utils.extras import quiet_colmap, storing_in_database
-from wheretolook.utils.files import temporary_folder
+from wheretolook.utils.files import ArtifactCache, cache_key, storing_in_database, temporary_folder
+from wheretolook.utils.texts import quiet_colmap
 
 _MIN_IMAGES = 3  # of a model: two photographs do not determine a camera
 _MANIFEST = "steps.json"

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from wheretolook.geometry.camera import ColmapCamera
 from wheretolook.mapping.config import PhotographsConfig
 from wheretolook.utils.errors import ConfigError, MapError
-from wheretolook.utils.extras import quiet_colmap
-from wheretolook.utils.images import read_image
-from wheretolook.utils.texts import LOG
+from wheretolook.utils.files import read_image
+from wheretolook.utils.texts import LOG, quiet_colmap
 
 if TYPE_CHECKING:
     import pycolmap

@@ -22,9 +22,9 @@ from wheretolook.geometry.similarity import local_origin
 from wheretolook.mapping.config import MAX_EPIPOLAR_ERROR_PX, MIN_TRIANGULATION_ANGLE_DEG
 from wheretolook.mapping.feature_files import name_kind
 from wheretolook.mapping.map_folder import MapRun, color_points
-from wheretolook.utils.extras import quiet_colmap, storing_in_database
-from wheretolook.utils.files import temporary_folder
+from wheretolook.utils.files import storing_in_database, temporary_folder
 from wheretolook.utils.processes import WorkerPool
+from wheretolook.utils.texts import quiet_colmap
 
 _SAMPLES_ACROSS = 16  # surface points taken from an image, in x
 DEPTH_STRIDE = 4  # of the pixels of depth images that are used, at index 2 of each 4 x 4 block

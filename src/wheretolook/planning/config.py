@@ -10,8 +10,7 @@ from typing import Literal
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.looks.selection import MAX_VIEWS
 from wheretolook.scorers.forward import ForwardScorer
-from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.validation import check_choice, check_pitch, check_positive, check_range
+from wheretolook.utils.errors import ConfigError, check_choice, check_pitch, check_positive, check_range
 
 FORWARD = ForwardScorer.name
 """The method that needs no map: the shortest path, looking ahead. Others are compared with it."""

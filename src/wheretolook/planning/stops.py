@@ -24,10 +24,10 @@ from wheretolook.looks.selection import (
 )
 from wheretolook.planning.config import PathConfig, StopConfig
 from wheretolook.planning.routes import Stop, turning_deg
+from wheretolook.scorers.adapted.calibration import finite_log_odds
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import is_probability
 from wheretolook.utils.errors import ConfigError, PlanningError
-from wheretolook.utils.probability import finite_log_odds
 
 COMPASS = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=1)
 """Steps (8, 2) in the plane that touches the sphere at the current axis."""

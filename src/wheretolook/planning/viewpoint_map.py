@@ -17,9 +17,8 @@ from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.looks.selection import best_views
 from wheretolook.utils.errors import ConfigError, MapFormatError
-from wheretolook.utils.files import atomic_folder, read_json, sha256, write_json, write_text
-from wheretolook.utils.locks import hold
-from wheretolook.utils.npz_files import save_npy
+from wheretolook.utils.files import atomic_folder, read_json, save_npy, sha256, write_json, write_text
+from wheretolook.utils.processes import hold
 
 if TYPE_CHECKING:
     from wheretolook.scorers.base import Scorer

@@ -31,9 +31,8 @@ from wheretolook.scorers.set.network import CELLS, SetNetwork
 from wheretolook.scorers.set.score import MAX_LANDMARKS, for_map
 from wheretolook.training.trained_network import TrainedNetwork, camera_quantities
 from wheretolook.utils.errors import CameraError, MapError
-from wheretolook.utils.files import atomic_write, copy_file, sha256, write_bytes, write_json, write_text
-from wheretolook.utils.npz_files import save_npz
-from wheretolook.utils.version import VERSION
+from wheretolook.utils.files import atomic_write, copy_file, save_npz, sha256, write_bytes, write_json, write_text
+from wheretolook.utils.package import VERSION
 
 OPSET = 17  # of 2022: onnxruntime 1.12 and later reads the file
 IR_VERSION = 8

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from wheretolook.utils.validation import check_positive, check_range
+from wheretolook.utils.errors import check_positive, check_range
 
 SceneKind = Literal["apartment", "hall", "court", "office", "building"]
 

@@ -18,9 +18,8 @@ from PIL import Image
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.similarity import local_origin
 from wheretolook.scenes.mesh_checks import check_mesh_file
-from wheretolook.utils.errors import SceneError
+from wheretolook.utils.errors import SceneError, check_choice, check_range
 from wheretolook.utils.files import write_bytes
-from wheretolook.utils.validation import check_choice, check_range
 
 # Rotations that turn the named axis of a file into the world's z axis.
 _Z_UP_FROM = {

@@ -16,8 +16,7 @@ from typing import Any
 
 from wheretolook.utils.devices import fitting
 from wheretolook.utils.errors import SceneError
-from wheretolook.utils.files import max_expanded_bytes, parse_json_object, read_text
-from wheretolook.utils.images import image_size
+from wheretolook.utils.files import image_size, max_expanded_bytes, parse_json_object, read_text
 
 MAX_PLY_HEADER = 1 << 16  # bytes
 MAX_MTL_BYTES = 16_000_000

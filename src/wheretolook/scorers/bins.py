@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float
 from wheretolook.scorers.base import CountingScorer
-from wheretolook.scorers.registry import MethodStyle, rule
+from wheretolook.scorers.registry import rule
 
 
 class BinsScorer(CountingScorer):
@@ -24,6 +24,4 @@ class BinsScorer(CountingScorer):
         return (n_filled + seen / (1 + seen)) / (self.bins**2 + 1)
 
 
-METHODS = (
-    rule(BinsScorer, MethodStyle("reprojections with bins", "#009E73", "D", "-."), position=30, of_the_few=True),
-)
+METHODS = (rule(BinsScorer),)

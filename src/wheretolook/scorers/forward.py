@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.random import uniform
-from wheretolook.scorers.registry import BuildOptions, MethodStyle, rule
+from wheretolook.scorers.registry import BuildOptions, rule
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
@@ -61,4 +61,4 @@ def _build(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
     return ForwardScorer(localization_map, heading, options.seed)
 
 
-METHODS = (rule(ForwardScorer, MethodStyle("forward", "#6B6B6B", ">", (0, (6, 2))), build=_build, position=10),)
+METHODS = (rule(ForwardScorer, build=_build),)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.registry import BuildOptions, MethodStyle, rule
+from wheretolook.scorers.registry import BuildOptions, rule
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
@@ -52,13 +52,4 @@ def _build(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
     return RandomScorer(localization_map, options.seed)
 
 
-METHODS = (
-    rule(
-        RandomScorer,
-        MethodStyle("random", "#999999", "x", ":"),
-        build=_build,
-        position=0,
-        is_random_baseline=True,
-        of_the_few=True,
-    ),
-)
+METHODS = (rule(RandomScorer, build=_build),)

@@ -12,31 +12,15 @@ from inspect import getdoc
 from pathlib import Path
 from pkgutil import resolve_name
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from wheretolook.utils.errors import CameraError, ConfigError, OutOfRangeWarning, WeightsError
-from wheretolook.utils.shipped import WEIGHTS, or_shipped
-from wheretolook.utils.validation import did_you_mean
+from wheretolook.utils.errors import CameraError, ConfigError, OutOfRangeWarning, WeightsError, did_you_mean
+from wheretolook.utils.package import WEIGHTS, or_shipped
 
 if TYPE_CHECKING:
-    from wheretolook.geometry.camera import Camera
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.scorers.base import Scorer
     from wheretolook.training.learner import TrainingJob, TrainingResult
-
-
-Group = Literal["learned", "rules", "Fisher", "probes"]
-"""Groups of methods in figures. Probes test a Fisher field: they choose the views that it ranks last."""
-
-
-@dataclass(frozen=True)
-class MethodStyle:
-    """How a method is named and drawn in every figure and table."""
-
-    label: str  # display name
-    color: str = "#7F3C8D"  # from the palette of Okabe and Ito (2008), or a shade of one of its colours
-    marker: str = "3"  # Matplotlib marker
-    dashes: Any = (0, (2, 1))  # Matplotlib line style
 
 
 @dataclass(frozen=True)
@@ -49,9 +33,13 @@ class BuildOptions:
     anywhere: bool = False  # whether weights adapted to one scene may score in another
 
 
-def no_params(camera: Camera) -> dict[str, Any]:
-    """Return no parameters to log."""
-    return {}
+@dataclass(frozen=True)
+class Learner:
+    """How a method is trained."""
+
+    learn: Callable[[TrainingJob], TrainingResult]
+    config: type  # frozen dataclass of its training options, with defaults
+    settings: Mapping[str, Any] = field(default_factory=dict)  # options it overrides
 
 
 @dataclass(frozen=True)
@@ -65,34 +53,25 @@ class Method:
 
     name: str  # in options, tables, runs, and of its weights file
     about: str  # one sentence, for `wheretolook evaluate --list-methods`
-    style: MethodStyle
-    group: Group = "rules"
     # builds its scorer; weights are given and of the right method if it needs any. None if it scores no views by itself
     build: Callable[[LocalizationMap, BuildOptions], Scorer] | None = None
     weights: str = ""  # name of the learned method whose weights it scores with; "" if it needs none
-    position: int = 1000  # in tables and lists
-    family: str = ""  # name that stands for all methods of the family in options
+    family: str = ""  # name that stands for all methods of a family, which share training options
     probability: bool = False  # whether its score is the probability that a view localizes
-    is_random_baseline: bool = False  # whether it is a random baseline, evaluated by its exact expectation
     only_if_named: bool = False  # whether an evaluation includes it only by name
-    of_the_few: bool = False  # whether summary figures show it: of a family, the first that is evaluated
-    reference: int = 0  # of the learned methods evaluated, the highest is the one others are compared with
-    learn: Callable[[TrainingJob], TrainingResult] | None = None  # trains it
-    config: type | None = None  # frozen dataclass of its training options, with defaults
-    folder: str = ""  # group of these options in `train`; methods with the same folder share them
-    settings: Mapping[str, Any] = field(default_factory=dict)  # options it overrides
-    trained_unasked: bool = False  # whether the train command trains it by default
-    one_place: bool = False  # whether its weights serve only the scene that they were adapted to
     one_camera: bool = False  # whether its weights serve only the field of view of their training views
-    # whether a release may ship it: as the best of all, as the paper's network (in half precision), or never
-    ships: Literal["best", "network", "never"] = "best"
-    params: Callable[[Camera], dict[str, Any]] = no_params  # logged by an evaluation, by the camera
+    learner: Learner | None = None  # of a method that can be trained
+
+    @property
+    def folder(self) -> str:
+        """Group of its training options, `train.<folder>`."""
+        return self.family or self.name
 
 
-def rule(scorer: type[Scorer], style: MethodStyle, **fields: Any) -> Method:
+def rule(scorer: type[Scorer], **fields: Any) -> Method:
     """Return the record of a method that is built from a map alone, described by its class's docstring."""
     about = " ".join((getdoc(scorer) or "").partition("\n\n")[0].split())
-    return Method(scorer.name, about, style, **{"build": lambda map, options: scorer(map), **fields})
+    return Method(scorer.name, about, **{"build": lambda map, options: scorer(map), **fields})
 
 
 def imported(reference: str) -> Callable[..., Any]:
@@ -129,7 +108,7 @@ DISK and XFeat (docs/features.md), assumed for SuperPoint."""
 
 @cache
 def all_methods() -> Mapping[str, Method]:
-    """Return every method by its name, in the order of tables.
+    """Return every method by its name, those of other packages last.
 
     Raises a ConfigError if what another package registers cannot be loaded, is no method, or has the name of another.
     """
@@ -147,7 +126,7 @@ def all_methods() -> Mapping[str, Method]:
         except Exception as error:  # whatever a foreign module raises
             problem = f"a method of another package cannot be used: {type(error).__name__}: {error}"
             raise ConfigError(problem, value=source, fix="Fix or uninstall it.") from error
-    return MappingProxyType(dict(sorted(methods.items(), key=lambda item: item[1].position)))
+    return MappingProxyType(methods)
 
 
 def _check(method: Method, methods: Mapping[str, Method]) -> None:
@@ -158,8 +137,6 @@ def _check(method: Method, methods: Mapping[str, Method]) -> None:
         raise ValueError(f"two methods have the name {method.name}")
     if " " in method.name or not method.name:
         raise ValueError(f"a method's name is one word, not {method.name!r}")
-    if (method.learn is None) != (method.config is None) or (method.learn is not None and not method.folder):
-        raise ValueError(f"{method.name} needs learn, config and folder, or none of them")
 
 
 def find(name: str) -> Method | None:
@@ -179,7 +156,7 @@ def scorers() -> dict[str, Method]:
 
 def learned() -> dict[str, Method]:
     """Return the methods that can be trained, by name."""
-    return {name: method for name, method in all_methods().items() if method.learn is not None}
+    return {name: method for name, method in all_methods().items() if method.learner is not None}
 
 
 def members(name: str, among: Mapping[str, Method]) -> list[Method]:

@@ -10,13 +10,9 @@ from wheretolook.training.config import SharedConfig
 from wheretolook.utils.errors import ConfigError
 
 
-def _default_methods() -> tuple[str, ...]:
-    return tuple(name for name, method in learned().items() if method.trained_unasked)
-
-
 @dataclass(frozen=True)
 class _NamedMethods(SharedConfig):
-    methods: tuple[str, ...] = field(default_factory=_default_methods)
+    methods: tuple[str, ...] = ("mlp-2d", "mlp-2d+z", "mlp-2d+3d", "set")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -28,19 +24,21 @@ class _NamedMethods(SharedConfig):
 
     def options_of(self, method: Method) -> Any:
         """Return the options of a method: those of its group, with its own `settings`."""
-        return replace(getattr(self, method.folder), **method.settings)
+        assert method.learner is not None
+        return replace(getattr(self, method.folder), **method.learner.settings)
 
 
 def _train_config() -> type:
     """Make `SharedConfig` with a field for the options of each folder of learned methods."""
     groups: dict[str, type] = {}
     for method in learned().values():
-        assert method.config is not None
-        if groups.setdefault(method.folder, method.config) is not method.config:
-            fix = "Give all methods of a folder the same class of options."
-            raise ConfigError("methods of one folder have different classes of options", value=method.folder, fix=fix)
+        assert method.learner is not None
+        config = method.learner.config
+        if groups.setdefault(method.folder, config) is not config:
+            fix = "Give all methods of a family the same class of options."
+            raise ConfigError("methods of one family have different classes of options", value=method.folder, fix=fix)
     if reserved := {*groups} & {own.name for own in fields(_NamedMethods)}:
-        raise ConfigError("a learned method's folder has the name of an option", value=min(reserved), fix="Rename it.")
+        raise ConfigError("a learned method has the name of an option", value=min(reserved), fix="Rename it.")
     own = [(name, config, field(default_factory=config)) for name, config in groups.items()]
     made = make_dataclass("TrainConfig", own, bases=(_NamedMethods,), frozen=True)
     made.__module__ = __name__  # so that training processes can unpickle it

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float
 from wheretolook.scorers.base import CountingScorer
-from wheretolook.scorers.registry import MethodStyle, rule
+from wheretolook.scorers.registry import rule
 
 
 class VisibleScorer(CountingScorer):
@@ -20,4 +20,4 @@ class VisibleScorer(CountingScorer):
         return n_visible / max(1, len(self.localization_map.landmarks.points))
 
 
-METHODS = (rule(VisibleScorer, MethodStyle("most visible landmarks", "#E69F00", "s", "--"), position=20),)
+METHODS = (rule(VisibleScorer),)

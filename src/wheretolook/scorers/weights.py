@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, overload
 from wheretolook.scorers.registry import SUBSTITUTES, BuildOptions, build_scorer, check_method, members, scorers
 from wheretolook.training.weights import method_of_weights, preference, read_training, read_weights
 from wheretolook.utils.errors import ConfigError, WeightsError
-from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped
+from wheretolook.utils.package import WEIGHTS, or_shipped, shipped
 
 if TYPE_CHECKING:
     from wheretolook.dataset.layout import Dataset

@@ -33,9 +33,8 @@ from wheretolook.mapping.map_folder import LANDMARKS_FILE
 from wheretolook.mapping.map_frame import MapFrame, find_frame
 from wheretolook.mapping.mapped_images import find_features
 from wheretolook.select.localized import Localized, QueryImage, QueryImages, distinct_names
-from wheretolook.utils.errors import ConfigError, MapError, PoseError, TableError
+from wheretolook.utils.errors import ConfigError, MapError, PoseError, TableError, from_record
 from wheretolook.utils.files import path_ends, read_json_object, read_text
-from wheretolook.utils.validation import from_record
 
 MAX_BYTES = 2**28
 

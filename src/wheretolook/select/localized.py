@@ -21,8 +21,8 @@ from wheretolook.mapping.colmap_model import camera_of_model, registered_names
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame
 from wheretolook.mapping.photographs import read_photograph, reduce_photograph
 from wheretolook.utils.errors import ConfigError, PoseError
-from wheretolook.utils.extras import quiet_colmap
 from wheretolook.utils.files import path_ends, write_json, write_text
+from wheretolook.utils.texts import quiet_colmap
 
 if TYPE_CHECKING:
     import pandas as pd

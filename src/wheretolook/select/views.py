@@ -18,9 +18,8 @@ from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation
 from wheretolook.io.poses import images_text, pose_texts, tum_text
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame
-from wheretolook.utils.errors import ConfigError, StorageError
+from wheretolook.utils.errors import ConfigError, StorageError, check_choice
 from wheretolook.utils.files import check_output_folder, write_json, write_text
-from wheretolook.utils.validation import check_choice
 
 FORMATS = {
     "csv": "a table; position of the camera in the world, quaternion camera-to-world (wxyz, and xyzw in one cell)",

@@ -22,8 +22,7 @@ from wheretolook.io.poses import (
     read_named_rows,
 )
 from wheretolook.looks.selection import MAX_VIEWS
-from wheretolook.utils.errors import ConfigError, SceneError, TableError
-from wheretolook.utils.validation import check_limits, check_pitch, check_range, reject
+from wheretolook.utils.errors import ConfigError, SceneError, TableError, check_limits, check_pitch, check_range, reject
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from wheretolook.utils.validation import check_positive, check_range
+from wheretolook.utils.errors import check_positive, check_range
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 from wheretolook.tracking.store import TrackingConfig, client
 from wheretolook.utils.errors import MissingRunError, TrackingError
-from wheretolook.utils.version import VERSION
+from wheretolook.utils.package import VERSION
 
 if TYPE_CHECKING:
     import pandas as pd

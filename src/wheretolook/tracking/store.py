@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from wheretolook.utils.errors import StorageError, TrackingError, TrackingWarning
 from wheretolook.utils.files import copy_file, storage_errors, temporary_folder, write_json
-from wheretolook.utils.locks import hold
+from wheretolook.utils.processes import hold
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

@@ -17,7 +17,7 @@ from wheretolook.training.config import DECIDING, SharedConfig
 from wheretolook.training.scenes import with_also
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.utils.files import fingerprint, read_json_object, sha256
-from wheretolook.utils.version import VERSION
+from wheretolook.utils.package import VERSION
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -1,21 +1,30 @@
-"""Read and write files: atomic writes, checked outputs, confined names, JSON and YAML with typed errors."""
+"""Read and write files: atomic writes, checked outputs, confined names, size limits and typed errors; cached results."""
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 import re
 import shutil
 import stat
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator
+import warnings
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePath, PurePosixPath
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from wheretolook.utils.errors import ConfigError, StorageError
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow.parquet as pq
 
 STORAGE_FIX = "Free disk space, fix permissions or name another folder, then run again; finished work is kept."
 MAP_FILES = ("cameras", "images", "points3D", "rigs", "frames", "landmarks")  # without endings
@@ -149,6 +158,19 @@ def storage_errors(path: Path, partial: Path | None = None) -> Iterator[None]:
 
 
 @contextmanager
+def storing_in_database(database: Path) -> Iterator[None]:
+    """Re-raise COLMAP's errors about a database that cannot be written as StorageError."""
+    try:
+        yield
+    except RuntimeError as error:
+        match = re.search(r"SQLite error: (.*)|No registered database factory succeeded", str(error))
+        if not match:
+            raise
+        reason = match[1] or "SQLite cannot make it"
+        raise StorageError(f"cannot be written: {reason}", path=database, fix=STORAGE_FIX) from error
+
+
+@contextmanager
 def temporary_folder(suffix: str = "", parent: Path | None = None) -> Iterator[Path]:
     """Yield a new folder, among the system's temporary files or in `parent`, which is removed with its content."""
     with TemporaryDirectory(suffix, "wheretolook-", parent, ignore_cleanup_errors=True) as name:
@@ -279,3 +301,224 @@ def read_yaml(path: Path) -> Any:
         return UniqueKeys(read_text(path, MAX_YAML_BYTES)).get_single_data()
     except (yaml.YAMLError, RecursionError, TypeError, OverflowError) as error:
         raise ValueError(" ".join(str(error).split())) from error
+
+
+MAX_PIXELS = 150_000_000
+"""Limit for photographs; three bytes per pixel and a copy take 900 MB."""
+
+MAX_DEPTH_PIXELS = 25_000_000
+"""Limit for depth images; those of phones have half of it."""
+
+
+def image_size(image: Path | bytes, at_most: int = MAX_PIXELS) -> tuple[int, int]:
+    """Return width and height of an image file, or of its content.
+
+    Raises ValueError if it is no image or has more pixels than `at_most`, OSError if it is missing.
+    """
+    from PIL import Image
+
+    if isinstance(image, Path):
+        check_file(image)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit is ours
+            with Image.open(image if isinstance(image, Path) else io.BytesIO(image)) as opened:
+                width, height = opened.size
+    except Exception as error:  # decoders raise errors of many kinds
+        raise ValueError(f"this is no image: {error}") from error
+    if width * height > at_most:
+        raise ValueError(f"its {width} x {height} pixels are more than {at_most:,}")
+    return width, height
+
+
+def read_image(path: Path, flags: int, at_most: int = MAX_PIXELS) -> NDArray[Any]:
+    """Read an image with `cv2.imread`. Raises ValueError if that fails, and as `image_size`."""
+    import cv2
+
+    image_size(path, at_most)
+    try:
+        image = None if _is_cut_jpeg(path.read_bytes()) else cv2.imread(str(path), flags)
+    except cv2.error as error:
+        raise ValueError(error.err) from error
+    if image is None:
+        raise ValueError("this is no image, or not a whole one")
+    return image
+
+
+def _is_cut_jpeg(data: bytes) -> bool:
+    """Return whether a JPEG lacks its end, the marker FFD9 after the first scan: OpenCV fills the missing part with grey.
+
+    A thumbnail in the header has an end of its own, so segments are skipped by their lengths; fill bytes FF may precede
+    a marker.
+    """
+    at = 2
+    while data[at : at + 1] == b"\xff" and data[at + 1 : at + 2] != b"\xda":
+        is_fill = data[at + 1 : at + 2] == b"\xff"
+        at += 1 if is_fill else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return data.startswith(b"\xff\xd8") and data.find(b"\xff\xd9", at) < 0
+
+
+def save_npz(path: Path, arrays: Mapping[str, NDArray[Any]], compress: bool = False) -> None:
+    """Write arrays by name, atomically. The same arrays give the same bytes."""
+    write: Any = np.savez_compressed if compress else np.savez
+    with atomic_write(path) as partial, partial.open("wb") as file:
+        write(file, **arrays)
+
+
+def save_npy(path: Path, array: NDArray[Any]) -> None:
+    """Write an array, atomically."""
+    with atomic_write(path) as partial, partial.open("wb") as file:
+        np.save(file, array, allow_pickle=False)
+
+
+def load_npz(path: Path, only: Collection[str] | None = None) -> dict[str, NDArray[Any]]:
+    """Read the arrays of an NPZ file by name, all or `only` some.
+
+    Raises ValueError if the file is missing, damaged, or expands to far more than its size. An array whose header
+    claims more values than follow touches no more memory than these take.
+    """
+    try:
+        n_bytes = check_file(path).st_size
+        with np.load(path, allow_pickle=False) as stored:
+            expanded = sum(member.file_size for member in stored.zip.infolist())
+            if expanded > max_expanded_bytes(n_bytes):
+                raise ValueError(f"its {n_bytes:,} bytes expand to {expanded:,}")
+            arrays = {name: stored[name] for name in stored.files if only is None or name in only}
+        if not all(isinstance(array, np.ndarray) for array in arrays.values()):  # other members are read as bytes
+            raise ValueError("a file in it is no array")
+        return arrays
+    except Exception as error:  # a damaged zip raises many kinds of errors
+        raise ValueError(f"not a readable NPZ file: {error}") from error
+
+
+def load_npy(path: Path) -> NDArray[Any]:
+    """Read the array of an NPY file. Raises ValueError if it is missing, damaged, or shorter than its header claims."""
+    try:
+        check_file(path)
+        return np.array(np.load(path, mmap_mode="r", allow_pickle=False))
+    except Exception as error:  # a damaged header raises many kinds of errors
+        raise ValueError(f"not a readable array: {error}") from error
+
+
+@contextmanager
+def open_parquet(path: Path, **options: Any) -> Iterator[pq.ParquetFile]:
+    """Open a Parquet file with options of `pyarrow.parquet.ParquetFile`.
+
+    Raises ValueError if it is none, expands to far more than its size, or Arrow raises an error in the block.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    limit = max_expanded_bytes(check_file(path).st_size)
+    limits = {"thrift_container_size_limit": 2000}  # Arrow overflows the stack at 10,000 nested columns
+    try:
+        with pq.ParquetFile(path, **limits, **options) as file:
+            groups = range(file.num_row_groups)
+            expanded = sum(file.metadata.row_group(number).total_byte_size for number in groups)
+            if expanded > limit:
+                raise ValueError(f"it expands to {expanded:,} bytes, more than {limit:,}")
+            yield file
+    except (pa.ArrowException, OSError, KeyError, UnicodeDecodeError) as error:
+        raise ValueError(str(error)) from error
+
+
+def read_parquet(path: Path) -> pd.DataFrame:
+    """Read a Parquet file as a table. Raises ValueError as `open_parquet`."""
+    with open_parquet(path, page_checksum_verification=True) as file:
+        table: pd.DataFrame = file.read().to_pandas()
+        return table
+
+
+def cache_key(*parts: Any) -> str:
+    """Hash the inputs of a computation to 16 hexadecimal digits; values that JSON lacks are hashed by their text."""
+    text = json.dumps(parts, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+class ArtifactCache:
+    """Results of one step of work, valid while `key`, which `cache_key` computes from the inputs, stays the same.
+
+    The manifest, a JSON file in the folder, maps each finished step to its key. With `steps` in their order of work,
+    storing or clearing one invalidates the later ones. An unreadable manifest or result counts as missing.
+
+    Results are tables (`.parquet`), named arrays (`.npz`) or JSON values (`.json`), by the ending of their names:
+
+        cache = ArtifactCache(folder, cache_key(settings, fingerprint(path)))
+        results = cache.load("views.parquet")
+        if results is None:
+            results = cache.store({"views.parquet": compute()})
+    """
+
+    def __init__(
+        self, folder: Path, key: str = "", step: str = "key", manifest: str = "manifest.json", steps: Sequence[str] = ()
+    ) -> None:
+        self.folder = folder
+        self.key = key
+        self.step = step
+        self.manifest = folder / manifest
+        self.steps = steps
+
+    @property
+    def stored_key(self) -> str | None:
+        """The key that the step was finished with; None if it was not."""
+        return self._keys().get(self.step)
+
+    def is_current(self, *files: Path) -> bool:
+        """Return whether the step was finished with this key and the files still exist."""
+        return self.stored_key == self.key and all(file.exists() for file in files)
+
+    def load(self, *names: str) -> dict[str, Any] | None:
+        """Read the named results; None if they are of another key, missing or unreadable."""
+        if not self.is_current():
+            return None
+        try:
+            return {name: _read(self.folder / name) for name in names}
+        except (OSError, ValueError):
+            return None
+
+    def store(self, results: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """Write named results, then the key; without results, files that the caller wrote. Returns the results."""
+        if results:
+            self.clear()  # so that no key describes files of different runs
+        for name, value in (results or {}).items():
+            _write(self.folder / name, value)
+        write_json(self.manifest, {**self._valid(self._keys()), self.step: self.key})
+        return dict(results or {})
+
+    def clear(self) -> None:
+        """Remove the key of this step and of later ones; files stay."""
+        keys = self._keys()
+        valid = self._valid(keys)
+        if valid != keys:
+            write_json(self.manifest, valid)
+
+    def _keys(self) -> dict[str, str]:
+        try:
+            return read_json_object(self.manifest)
+        except (OSError, ValueError):
+            return {}
+
+    def _valid(self, keys: dict[str, str]) -> dict[str, str]:
+        """The keys that do not depend on this step."""
+        outdated = self.steps[self.steps.index(self.step) :] if self.steps else [self.step]
+        return {step: key for step, key in keys.items() if step not in outdated}
+
+
+def _read(path: Path) -> Any:
+    if path.suffix == ".json":
+        return read_json(path)
+    if path.suffix == ".npz":
+        return load_npz(path)
+
+    return read_parquet(path)
+
+
+def _write(path: Path, value: Any) -> None:
+    if path.suffix == ".json":
+        write_json(path, value)
+    elif path.suffix == ".npz":
+        save_npz(path, value)
+    else:
+        table: pd.DataFrame = value
+        with atomic_write(path) as partial:
+            table.to_parquet(partial, index=False, write_page_checksum=True)

@@ -1,11 +1,13 @@
-"""Tables in Markdown, numbers of things, and logged warnings."""
+"""Tables in Markdown, numbers of things, and the logs of this package and of libraries."""
 
 from __future__ import annotations
 
 import logging
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Literal
 
 from wheretolook.utils.errors import LockWarning, MapWarning, OutOfRangeWarning, TrackingWarning
 
@@ -53,3 +55,16 @@ def quiet_libraries() -> None:
     warnings.formatwarning = lambda message, *_, **__: f"wheretolook: warning: {message}\n"
     for name in ("lightning", "lightning.pytorch", "lightning.fabric", "mlflow", "alembic"):
         logging.getLogger(name).setLevel(logging.ERROR)
+
+
+@contextmanager
+def quiet_colmap(least: Literal["WARNING", "ERROR"] = "WARNING") -> Iterator[None]:
+    """Silence COLMAP's log below a level: it would interrupt progress bars."""
+    import pycolmap
+
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = max(level, getattr(pycolmap.logging.Level, least).value)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level

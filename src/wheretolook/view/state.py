@@ -169,7 +169,7 @@ def looking_ahead(positions: Float) -> Float:
 def _compared_paths(path: Path, pair: int) -> Paths:
     """Read the paths that every method planned, or its views along the given path if any method planned none."""
     from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses
-    from wheretolook.utils.parquet_files import read_parquet
+    from wheretolook.utils.files import read_parquet
 
     try:
         table = read_parquet(path)

@@ -24,7 +24,7 @@ from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.utils.errors import MapError, TableError, WhereToLookError
-from wheretolook.utils.shipped import WEIGHTS, or_shipped, shipped
+from wheretolook.utils.package import WEIGHTS, or_shipped, shipped
 from wheretolook.view import drawing
 from wheretolook.view.state import Paths, ViewState
 
@@ -203,7 +203,7 @@ class AvailableWeights:
         usable = [
             name
             for name, method in scorers().items()
-            if method.group != "probes" and name != "random" and (not method.weights or method.weights in self.files)
+            if name != "random" and (not method.weights or method.weights in self.files)
         ]
         first = next(iter(self.files), "")
         return tuple(sorted(usable, key=lambda name: (scorers()[name].weights != first, name != first)))

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.validation import check_positive, check_range
+from wheretolook.utils.errors import ConfigError, check_positive, check_range
 
 DEFAULT_RADIUS = 50.0
 """Greatest mean F1 against the meshes of six mapped scenes. It is flat: from

@@ -11,9 +11,8 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.devices import in_threads
-from wheretolook.utils.errors import MapError, SceneError
+from wheretolook.utils.errors import MapError, SceneError, check_range
 from wheretolook.utils.processes import cores
-from wheretolook.utils.validation import check_range
 from wheretolook.visibility.config import DEFAULT_RADIUS
 from wheretolook.visibility.frustum import cells_of, octahedral_directions
 from wheretolook.visibility.occlusion import OcclusionInputs, OcclusionModel

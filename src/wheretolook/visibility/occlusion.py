@@ -16,9 +16,8 @@ from scipy.spatial import cKDTree
 
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float
-from wheretolook.utils.errors import MapError, SceneError, TableError
-from wheretolook.utils.npz_files import load_npz, save_npz
-from wheretolook.utils.validation import check_range
+from wheretolook.utils.errors import MapError, SceneError, TableError, check_range
+from wheretolook.utils.files import load_npz, save_npz
 from wheretolook.utils.warp import start_warp, vec3_array
 
 if TYPE_CHECKING:

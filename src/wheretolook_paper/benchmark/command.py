@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from wheretolook.commands.options import Command
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.errors import ConfigError, check_range
 from wheretolook.utils.processes import cores
-from wheretolook.utils.validation import check_range
 
 if TYPE_CHECKING:
     from wheretolook_paper.benchmark.report import Result

@@ -21,7 +21,7 @@ from wheretolook.mapping.triangulation import (
     triangulate_model,
 )
 from wheretolook.utils.errors import MapError
-from wheretolook.utils.images import read_image
+from wheretolook.utils.files import read_image
 from wheretolook.utils.processes import WorkerPool
 from wheretolook_paper.benchmark.folder import DRAWN_CAMERA, BenchmarkScene
 

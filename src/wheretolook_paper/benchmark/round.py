@@ -16,10 +16,9 @@ from wheretolook.geometry.lattices import Lattice
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.select.waypoints import Waypoints, read_waypoints
-from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
 from wheretolook.utils.errors import MapError, SceneError, StorageError, TableError
-from wheretolook.utils.files import atomic_folder, fingerprint, write_bytes
-from wheretolook.utils.version import VERSION
+from wheretolook.utils.files import ArtifactCache, atomic_folder, cache_key, fingerprint, write_bytes
+from wheretolook.utils.package import VERSION
 from wheretolook_paper.benchmark.actloc_baseline import ACTLOC, ACTLOC_FIXED, MAX_ERROR_PX, actloc_views
 from wheretolook_paper.benchmark.files import IMAGE_ENDING, PoseFile, read_errors, read_poses, write_errors, write_poses
 from wheretolook_paper.benchmark.folder import CAMERA, DRAWN_CAMERA, BenchmarkScene

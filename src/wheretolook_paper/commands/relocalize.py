@@ -20,9 +20,8 @@ from wheretolook.commands.options import (
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
-from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.errors import ConfigError, SceneError, check_choice, check_range
 from wheretolook.utils.files import atomic_write, fingerprint, write_text
-from wheretolook.utils.validation import check_choice, check_range
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -152,7 +151,7 @@ class Relocalize(SceneOptions):
     def _simulated(self, dataset: Dataset, files: SceneFolder, log: Log) -> pd.DataFrame:
         """Simulate in a scene, or read the cached result."""
         from wheretolook.scorers.weights import resolve_weights
-        from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
+        from wheretolook.utils.files import ArtifactCache, cache_key
 
         weights = resolve_weights(self.method, self.weights, dataset=dataset, log=log)
         inputs = [fingerprint(path) for path in (files.mesh, files.landmarks, files.table, weights) if path is not None]

@@ -52,7 +52,9 @@ def report_scores(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, 
     from wheretolook_paper.figures.calibration import calibration_figure
     from wheretolook_paper.figures.occlusion import occlusion_figure
     from wheretolook_paper.figures.scores import regret_figure, score_figure
+    from wheretolook_paper.styles import in_table_order
 
+    table = in_table_order(table)
     text = score_markdown(table, title)
     write_text(folder / SCORES_MD, text)
     save_figure(score_figure(table), folder / SCORES_PNG)
@@ -60,7 +62,7 @@ def report_scores(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, 
     for name in ("calibration.png", "occlusion.png"):
         (folder / name).unlink(missing_ok=True)
     if len(calibration):
-        save_figure(calibration_figure(calibration), folder / "calibration.png")
+        save_figure(calibration_figure(in_table_order(calibration)), folder / "calibration.png")
     rows = table
     if (folder / VARIANTS_CSV).is_file():  # a release has the rows of all inputs of the paper's network
         others = main_rows(read_scores(folder / VARIANTS_CSV))
@@ -109,7 +111,6 @@ def draw_overview(options: Demo, weights: Path) -> None:
     from wheretolook.commands.options import open_scene
     from wheretolook.figures.style import save_figure, scene_label
     from wheretolook.geometry.poses import camera_centers, poses_looking_along
-    from wheretolook.scorers.styles import method_style
     from wheretolook.scorers.weights import load_scorer
     from wheretolook_paper.figures.dollhouse import dollhouse
     from wheretolook_paper.figures.overview import (
@@ -120,6 +121,7 @@ def draw_overview(options: Demo, weights: Path) -> None:
         rendered_views,
         shares_good,
     )
+    from wheretolook_paper.styles import method_style
 
     scene = open_scene(options, Dataset.load(options.root).scenes[-1])
     table = scene.files.read_table()

@@ -7,8 +7,7 @@ from functools import partial
 import pandas as pd
 
 from wheretolook.dataset.config import ALL, threshold_label
-from wheretolook.evaluation.results import PHOTOGRAPHS, RELEASED_DIVISOR, main_rows, threshold_keys
-from wheretolook.scorers.styles import ORACLE, method_group
+from wheretolook.evaluation.results import ORACLE, PHOTOGRAPHS, RELEASED_DIVISOR, main_rows, threshold_keys
 from wheretolook_paper.evaluation.score_report import (
     Row,
     best_views,
@@ -18,6 +17,7 @@ from wheretolook_paper.evaluation.score_report import (
     score_text,
     share_text,
 )
+from wheretolook_paper.styles import method_group
 
 _CANDIDATES = (
     "To choose from there are all labelled directions of a location, or those of them that are among its best K by the "

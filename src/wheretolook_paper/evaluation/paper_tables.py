@@ -10,10 +10,10 @@ import pandas as pd
 
 from wheretolook.dataset.config import ALL, THRESHOLDS, threshold_key, threshold_label
 from wheretolook.evaluation.results import RELEASED_DIVISOR, main_rows, methods_of
-from wheretolook.scorers.styles import method_style
 from wheretolook.utils.files import write_text
 from wheretolook.utils.texts import markdown_table
 from wheretolook_paper.evaluation.comparisons import comparisons_markdown
+from wheretolook_paper.styles import method_style
 
 KEYS = tuple(map(threshold_key, THRESHOLDS))  # the paper's thresholds
 

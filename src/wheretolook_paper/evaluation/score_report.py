@@ -19,8 +19,8 @@ from wheretolook.evaluation.results import (
     signed_points,
     threshold_keys,
 )
-from wheretolook.scorers.styles import method_group, method_style
 from wheretolook.utils.texts import markdown_table
+from wheretolook_paper.styles import method_group, method_style
 
 Row = Mapping[Any, Any]  # a row of a score table by its columns' names
 

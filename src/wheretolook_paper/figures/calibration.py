@@ -9,7 +9,7 @@ from matplotlib.style import context
 
 from wheretolook.evaluation.results import main_rows, methods_of
 from wheretolook.figures.style import GREY, INK, RC, Style, new_figure
-from wheretolook.scorers.styles import method_style
+from wheretolook_paper.styles import method_style
 
 
 def calibration_figure(table: pd.DataFrame) -> Figure:

@@ -12,10 +12,10 @@ from matplotlib.lines import Line2D
 from matplotlib.style import context
 
 from wheretolook.dataset.config import ALL, threshold_label
-from wheretolook.evaluation.results import is_random, main_rows, methods_of, threshold_keys
+from wheretolook.evaluation.results import ORACLE, is_random, main_rows, methods_of, threshold_keys
 from wheretolook.figures.style import INK, RC, new_figure
-from wheretolook.scorers.styles import ORACLE, method_style
 from wheretolook_paper.figures.scores import methods_to_show
+from wheretolook_paper.styles import method_style
 
 _LABELS = {"mesh": "mesh rays", "tsdf": "TSDF", "hidden-points": "hidden-point removal", "none": "none: through walls"}
 _MARKERS = ("o", "s", "^", "D")

@@ -13,9 +13,9 @@ from wheretolook.figures.style import INK, RC, Style, frame, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook.planning.routes import PathView
 from wheretolook.planning.view_sequence import lengths_along
-from wheretolook.scorers.styles import method_style
 from wheretolook.utils.texts import counted, score_text
 from wheretolook_paper.figures.animation import Pixels, pixels_of
+from wheretolook_paper.styles import method_style
 
 PATH = "#CC3311"
 LANDMARKS = "#EE9900"

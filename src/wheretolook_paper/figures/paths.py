@@ -11,7 +11,7 @@ from matplotlib.style import context
 
 from wheretolook.dataset.config import ALL
 from wheretolook.figures.style import INK, RC, Style, new_figure, scene_label
-from wheretolook.scorers.styles import method_style
+from wheretolook_paper.styles import method_style
 
 FILLED = {"greedy": "full", "with stops": "left"}
 """Fill of markers by the suffix of a method's name."""

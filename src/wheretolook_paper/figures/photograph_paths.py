@@ -17,10 +17,10 @@ from wheretolook.figures.style import BLUE, GREY, RC, VERMILION, frame, new_figu
 from wheretolook.geometry.poses import Float
 from wheretolook.planning.routes import PathView
 from wheretolook.planning.view_sequence import lengths_along
-from wheretolook.scorers.styles import method_style
 from wheretolook.utils.errors import MissingRunError
 from wheretolook.utils.texts import markdown_table
 from wheretolook_paper.figures.path_film import PATH, draw_path
+from wheretolook_paper.styles import method_style
 
 PATHS_CSV = "plan_photographs.csv"
 LANDMARKS_CSV = "plan_photographs_landmarks.csv"

@@ -14,10 +14,10 @@ from matplotlib.style import context
 from matplotlib.ticker import MaxNLocator
 
 from wheretolook.dataset.config import ALL, threshold_label
-from wheretolook.evaluation.results import is_random, main_rows, reference_of, threshold_keys
+from wheretolook.evaluation.results import ORACLE, is_random, main_rows, reference_of, threshold_keys
 from wheretolook.figures.style import INK, RC, Style, new_figure
 from wheretolook.geometry.poses import Float
-from wheretolook.scorers.styles import ORACLE, method_group, method_style
+from wheretolook_paper.styles import method_group, method_style
 
 _MAX_METHODS = {"Fisher": 3, "probes": 0}  # the best methods of a group that a figure shows; all of other groups
 _WRAP = 36  # characters; longer labels are broken into two lines

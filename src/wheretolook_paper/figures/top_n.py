@@ -12,11 +12,11 @@ from matplotlib.lines import Line2D
 from matplotlib.style import context
 
 from wheretolook.dataset.config import ALL, threshold_label
-from wheretolook.evaluation.results import main_rows, methods_of, threshold_keys
+from wheretolook.evaluation.results import ORACLE, main_rows, methods_of, threshold_keys
 from wheretolook.figures.style import GREY, PRINT, TWO_COLUMNS_IN, Style, new_figure
-from wheretolook.scorers.registry import all_methods, find
-from wheretolook.scorers.styles import ORACLE, method_style
+from wheretolook.scorers.registry import find
 from wheretolook_paper.evaluation.paper_tables import PAPER
+from wheretolook_paper.styles import STYLES, method_style
 
 ROWS = {
     "normalized": "good ones among the best N\n(% of the oracle's share)",
@@ -85,13 +85,13 @@ def top_n_table(scores: pd.DataFrame) -> pd.DataFrame:
 
 
 def _the_few(pooled: pd.DataFrame) -> list[str]:
-    """Return the methods of a table that summary figures show (`Method.of_the_few`), the last registered first."""
+    """Return the methods of a table that summary figures show (`MethodStyle.summary`), the last registered first."""
     first: dict[str, str] = {}
     for name in methods_of(pooled):
         known = find(name)
-        if known and known.of_the_few:
-            first.setdefault(known.family or known.name, name)
-    order = list(all_methods())
+        if known and method_style(name).summary:
+            first.setdefault(known.folder, name)
+    order = list(STYLES)
     return sorted(first.values(), key=lambda name: order.index(name.partition(" ")[0]), reverse=True)
 
 

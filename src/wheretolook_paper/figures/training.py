@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 
 from wheretolook.figures.style import RC, Style, new_figure
-from wheretolook.scorers.styles import method_style
+from wheretolook_paper.styles import method_style
 
 
 def training_figure(histories: Mapping[str, pd.DataFrame]) -> Figure:

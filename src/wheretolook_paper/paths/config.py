@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from wheretolook.planning.config import FORWARD, MappedLattice, PathConfig, StopConfig
-from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.validation import check_positive, check_range
+from wheretolook.utils.errors import ConfigError, check_positive, check_range
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,7 @@ from wheretolook.localization.shard import SceneJob
 from wheretolook.planning.config import FORWARD
 from wheretolook.planning.scene_map import planner_map, scene_scorer
 from wheretolook.scorers.registry import is_probability
-from wheretolook.utils.artifact_cache import ArtifactCache, cache_key
-from wheretolook.utils.files import fingerprint, read_json_object
+from wheretolook.utils.files import ArtifactCache, cache_key, fingerprint, read_json_object
 from wheretolook_paper.evaluation.joint_labels import label_sets
 from wheretolook_paper.paths.config import PathsConfig
 from wheretolook_paper.paths.joint_localization import (

@@ -16,7 +16,6 @@ from wheretolook.dataset.viewpoint_table import POSITIVE, label_shares, pooled_l
 from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV, read_scores
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.registry import learned
-from wheretolook.scorers.styles import method_style
 from wheretolook.training.config import DECIDING
 from wheretolook.utils.errors import TableError, WeightsError
 from wheretolook.utils.files import read_json_object, sha256
@@ -26,6 +25,7 @@ from wheretolook_paper.evaluation.comparisons import comparisons_markdown
 from wheretolook_paper.evaluation.score_report import score_markdown
 from wheretolook_paper.release.copy import read_about, size_text, sizes
 from wheretolook_paper.release.training_histories import records
+from wheretolook_paper.styles import PAPER_NETWORKS, method_style
 
 GENERALIZATION_CSV = "generalization.csv"
 GENERALIZATION_MD = "generalization.md"
@@ -162,7 +162,7 @@ def _difference(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[
 def _weights(release: Dataset) -> dict[str, Any]:
     """Describe the shipped weights and the training of the paper's network and of the other learners."""
     files = {path.stem: path for path in _weight_files(release)}
-    networks = [name for name, method in learned().items() if method.ships == "network" and name in files]
+    networks = [name for name in PAPER_NETWORKS if name in files]
     if len(networks) != 1:
         fix = f"Run `wheretolook release --config configs/{release.name}.yaml`."
         problem = "a release ships the weights of one of the paper's networks"

@@ -19,7 +19,6 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.results import CALIBRATION_CSV, SCORES_CSV, read_scores
 from wheretolook.evaluation.statistics import read_calibration
 from wheretolook.figures.style import save_figure
-from wheretolook.scorers.registry import learned
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.tracking.runs import artifact, finished_runs
 from wheretolook.tracking.store import TrackingConfig, client, kept_if_not_logged
@@ -61,6 +60,7 @@ from wheretolook_paper.release.showcase_figures import (
     sampling_of,
 )
 from wheretolook_paper.release.training_histories import histories, method_of_run, train_runs
+from wheretolook_paper.styles import PAPER_NETWORKS
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -232,7 +232,7 @@ def _lattices(source: Source) -> Figure:
 @item("architecture", "Table 1", "layers of the network", "04_training", **_WIDEST)
 def _architecture(source: Source) -> Texts:
     params = {method_of_run(run): run.data.params for run in source.runs}
-    networks = [params[name] for name, method in learned().items() if method.ships == "network" and name in params]
+    networks = [params[name] for name in PAPER_NETWORKS if name in params]
     if not networks:
         raise ConfigError("none of the paper's networks was trained")
     table = paper_architecture_table(networks[-1])  # that of most inputs, the paper's proposal

@@ -21,8 +21,9 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.registry import Method, learned, scorers
 from wheretolook.utils.errors import ConfigError, StorageError, WeightsError
 from wheretolook.utils.files import read_json_object, safe_child, sha256, write_json
-from wheretolook.utils.version import VERSION
+from wheretolook.utils.package import VERSION
 from wheretolook.visibility.occlusion import StoredOcclusion
+from wheretolook_paper.styles import PAPER_NETWORKS, may_ship
 
 CARD = "README.md"
 
@@ -120,11 +121,11 @@ def choose_weights_to_ship(release: Dataset) -> Choice:
         if record["about"] != training or not was_trained_on(release, training):
             raise WeightsError("these weights were not trained on this release", path=path, fix=fix)
         precision[path] = float(record["metrics"]["val_average_precision"])
-    networks = [path for path, method in methods.items() if method.ships == "network"]
+    networks = [path for path, method in methods.items() if method.name in PAPER_NETWORKS]
     if not networks:
         raise WeightsError("there are no weights to ship of the paper's network", path=folder, fix=fix)
     network = max(networks, key=lambda path: precision[path])
-    able = [path for path, method in methods.items() if path == network or method.ships == "best"]
+    able = [path for path, method in methods.items() if path == network or may_ship(method.name)]
     best = max(able, key=preference)
     shelved = tuple(path for path in precision if path not in (network, best))
     return Choice(network, best, shelved, {path.stem: value for path, value in precision.items()})

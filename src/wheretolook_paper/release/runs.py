@@ -39,7 +39,7 @@ from wheretolook.tracking.store import TrackingConfig
 from wheretolook.tracking.store import client as client_of
 from wheretolook.training.provenance import HISTORY_CSV, kept_metrics, params_of
 from wheretolook.utils.files import temporary_folder, write_text
-from wheretolook.utils.locks import hold
+from wheretolook.utils.processes import hold
 from wheretolook_paper.evaluation.looks import LOOKS_CSV, log_looks
 from wheretolook_paper.paths.path_report import PATHS_CSV, log_paths
 from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV, log_runtimes

@@ -23,8 +23,7 @@ from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.space.config import FreeSpaceConfig
-from wheretolook.utils.errors import SceneError
-from wheretolook.utils.validation import from_record
+from wheretolook.utils.errors import SceneError, from_record
 from wheretolook.visibility.config import OcclusionConfig
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_paper.figures.dollhouse import Dollhouse, dollhouse

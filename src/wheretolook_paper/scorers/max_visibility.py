@@ -9,7 +9,7 @@ import numpy as np
 from wheretolook.geometry.lattices import axes_of_angles, yaw_pitch_angles
 from wheretolook.geometry.poses import Float, check_poses, poses_looking_along
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.registry import MethodStyle, rule
+from wheretolook.scorers.registry import rule
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
@@ -77,11 +77,4 @@ class SwappedMaxVisibilityScorer(Scorer):
         return np.asarray((1 + np.einsum("bi,bi->b", poses[:, 2, :3], axes[rows])) / 2)
 
 
-METHODS = (
-    rule(MaxVisibilityScorer, MethodStyle("max visibility (ActLoc)", "#8F8500", "<", (0, (4, 1, 1, 1))), position=40),
-    rule(
-        SwappedMaxVisibilityScorer,
-        MethodStyle("max visibility, angles swapped (as shipped)", "#D6CA1E", "d", (0, (4, 1, 1, 1, 1, 1))),
-        position=40,
-    ),
-)
+METHODS = (rule(MaxVisibilityScorer), rule(SwappedMaxVisibilityScorer))

@@ -24,7 +24,7 @@ from wheretolook.dataset.viewpoint_table import CAMERA_ID, poses
 from wheretolook.evaluation.adaptation import compare_log_odds
 from wheretolook.scorers.adapted.calibration import calibrate
 from wheretolook.scorers.registry import make_scorer
-from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.utils.package import WEIGHTS, shipped
 from wheretolook_paper.scorers.gp_correction import adapt
 
 

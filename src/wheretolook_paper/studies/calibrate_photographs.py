@@ -22,12 +22,12 @@ from scipy.optimize import minimize_scalar
 from scipy.special import expit
 
 from wheretolook.evaluation.statistics import expected_calibration_error
+from wheretolook.scorers.adapted.calibration import finite_log_odds
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.weights import read_record, read_training
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import sha256, write_json
-from wheretolook.utils.probability import finite_log_odds
 
 Views = tuple[np.ndarray, np.ndarray]  # log-odds and labels (B,) of the views of a place
 

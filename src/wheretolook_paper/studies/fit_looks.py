@@ -26,7 +26,7 @@ from wheretolook.geometry.poses import camera_centers
 from wheretolook.looks import selection as set_score
 from wheretolook.looks.selection import candidate_views, log_position_variance
 from wheretolook.scorers.weights import load_scorer
-from wheretolook.utils.shipped import WEIGHTS, shipped
+from wheretolook.utils.package import WEIGHTS, shipped
 from wheretolook_paper.evaluation.joint_labels import label_sets
 
 VARIANCE = 0.375  # weight of the log of the position's variance, relative to the log-odds

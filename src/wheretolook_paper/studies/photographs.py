@@ -49,8 +49,8 @@ from wheretolook.mapping.triangulation import (
     write_matches,
 )
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.extras import quiet_colmap
 from wheretolook.utils.processes import WorkerPool
+from wheretolook.utils.texts import quiet_colmap
 
 FOCAL_PX = 525.0  # initial focal length of photographs with poses
 PARTNERS = 20  # that each photograph with a pose is matched with

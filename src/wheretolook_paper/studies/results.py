@@ -24,7 +24,7 @@ from wheretolook.evaluation.results import SCORES_CSV
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import copy_file, read_json_object, sha256, write_json, write_text
-from wheretolook.utils.version import VERSION
+from wheretolook.utils.package import VERSION
 from wheretolook_paper.evaluation.looks import LOOKS_CSV
 from wheretolook_paper.paths.path_report import PATHS_CSV
 from wheretolook_paper.release.card import GENERALIZATION_CSV

@@ -15,7 +15,6 @@ from wheretolook.cli import main
 from wheretolook.dataset.config import ALL
 from wheretolook.dataset.layout import Dataset
 from wheretolook.planning.config import PathConfig, PlanConfig
-from wheretolook.scorers.styles import method_style
 from wheretolook.tracking.runs import newest_artifact, newest_run
 from wheretolook.tracking.store import TrackingConfig
 from wheretolook_paper.figures.config import FiguresConfig
@@ -24,6 +23,7 @@ from wheretolook_paper.release.catalog import ITEMS, write_items
 from wheretolook_paper.release.runs import log_release
 from wheretolook_paper.release.showcase import open_showcase
 from wheretolook_paper.release.showcase_figures import planned_views
+from wheretolook_paper.styles import method_style
 
 RELEASE = Path(__file__).parents[3] / "data" / "release"
 OF_SCENES = {"pipeline", "learning", "viewpoint_generation", "planning", "planning_photographs", "inputs", "peaks"}

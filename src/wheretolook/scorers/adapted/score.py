@@ -10,6 +10,7 @@ from scipy.special import expit
 
 from wheretolook.geometry.poses import Float, check_locations
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.scorers.adapted.calibration import finite_log_odds
 from wheretolook.scorers.adapted.network import AdaptedNetwork
 from wheretolook.scorers.adapted.place import MIN_SHARE, share_of_place
 from wheretolook.scorers.base import Scorer, ViewReport
@@ -17,7 +18,6 @@ from wheretolook.scorers.registry import BuildOptions
 from wheretolook.scorers.set.score import SetScorer
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import WeightsError
-from wheretolook.utils.probability import finite_log_odds
 
 MIN_DISTANCE = 1e-12  # of probabilities from 0 and 1, so that their log-odds are finite
 

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.inputs.channels import ALL_CHANNELS, PAPER_VARIANTS
 from wheretolook.scorers.mlp.config import RELEASED_SETTINGS, MlpConfig
-from wheretolook.scorers.registry import Method, MethodStyle, imported, network_scorer
+from wheretolook.scorers.registry import Learner, Method, imported, network_scorer
 
 if TYPE_CHECKING:
     from wheretolook.training.learner import TrainingJob, TrainingResult
 
 
-def _network(inputs: str, style: MethodStyle, channels: tuple[str, ...], **fields: Any) -> Method:
+def _network(name: str, variant: str, channels: tuple[str, ...], settings: Mapping[str, Any] = {}) -> Method:
     def learn(task: TrainingJob) -> TrainingResult:
         result: TrainingResult = imported("wheretolook.scorers.mlp.learn:learn_mlp")(task, channels)
         return result
 
-    name = f"mlp-{inputs}"
-    variant = style.label.partition(", ")[2]
     return Method(
         name=name,
         about=f"The paper's classifier, {variant}: the predicted probability that a view localizes.",
-        style=style,
-        group="learned",
         build=network_scorer(
             "wheretolook.scorers.mlp.network:BinnedNetworkScorer",
             "wheretolook.scorers.mlp.network:ViewpointNetwork",
@@ -33,26 +30,14 @@ def _network(inputs: str, style: MethodStyle, channels: tuple[str, ...], **field
         family="mlp",
         probability=True,
         one_camera=True,
-        position=60,
-        of_the_few=True,
-        learn=learn,
-        config=MlpConfig,
-        folder="mlp",
-        **fields,
+        learner=Learner(learn, MlpConfig, settings),
     )
 
 
-def _of_paper(inputs: str, style: MethodStyle, reference: int = 0) -> Method:
-    channels = PAPER_VARIANTS[inputs]
-    return _network(inputs, style, channels, trained_unasked=True, ships="network", reference=reference)
-
-
-_RELEASED = MethodStyle("MLP, trained as the released code", "#F0A070", "p", (0, (2, 2)))
-
 METHODS = (
-    _of_paper("2d", MethodStyle("MLP, 2d", "#56B4E9", "v", (0, (5, 1)))),
-    _of_paper("2d+z", MethodStyle("MLP, 2d + z", "#0072B2", "^", (0, (3, 1, 1, 1)))),
-    _of_paper("2d+3d", MethodStyle("MLP, 2d + 3d", "#D55E00", "o", "-"), reference=1),
-    _network("2d+3d+landmark", MethodStyle("MLP, 2d + 3d + landmark", "#8C3A00", "H", (0, (6, 1, 1, 1))), ALL_CHANNELS),
-    _network("released", _RELEASED, PAPER_VARIANTS["2d+3d"], settings=RELEASED_SETTINGS, ships="never"),
+    _network("mlp-2d", "2d", PAPER_VARIANTS["2d"]),
+    _network("mlp-2d+z", "2d + z", PAPER_VARIANTS["2d+z"]),
+    _network("mlp-2d+3d", "2d + 3d", PAPER_VARIANTS["2d+3d"]),
+    _network("mlp-2d+3d+landmark", "2d + 3d + landmark", ALL_CHANNELS),
+    _network("mlp-released", "trained as the released code", PAPER_VARIANTS["2d+3d"], RELEASED_SETTINGS),
 )

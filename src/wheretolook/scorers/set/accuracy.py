@@ -27,11 +27,11 @@ from torch import Tensor
 
 from wheretolook.dataset.config import Accuracy
 from wheretolook.geometry.poses import Float
+from wheretolook.localization.confidence import LogisticRegression
 from wheretolook.scorers.set.network import ALL_STATISTICS, SetNetwork
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import WeightsError
 from wheretolook.utils.files import read_json_object
-from wheretolook.utils.shipped import LogisticRegression
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from wheretolook.scorers.registry import Method, MethodStyle, imported, network_scorer
+from wheretolook.scorers.registry import Learner, Method, imported, network_scorer
 from wheretolook.training.config import FittingConfig, check_range
 from wheretolook.utils.errors import ConfigError
 
@@ -33,11 +33,8 @@ class ConvConfig(FittingConfig):
 
 METHODS = (
     Method(
-        position=90,
         name="conv",
         about="Probability that a view localizes, by a convolutional network on binned landmarks and their attributes.",
-        style=MethodStyle("convolutional, landmark attributes", "#AA4499", "8", (0, (3, 1))),
-        group="learned",
         build=network_scorer(
             "wheretolook.scorers.mlp.network:BinnedNetworkScorer",
             "wheretolook_paper.scorers.conv.network:ConvNetwork",
@@ -46,8 +43,6 @@ METHODS = (
         weights="conv",
         probability=True,
         one_camera=True,
-        learn=imported("wheretolook_paper.scorers.conv.learn:learn_conv"),
-        config=ConvConfig,
-        folder="conv",
+        learner=Learner(imported("wheretolook_paper.scorers.conv.learn:learn_conv"), ConvConfig),
     ),
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from wheretolook.scorers.registry import Method, MethodStyle, imported, network_scorer
+from wheretolook.scorers.registry import Learner, Method, imported, network_scorer
 from wheretolook.training.config import FittingConfig, check_range
 from wheretolook.utils.errors import ConfigError
 
@@ -42,11 +42,8 @@ class SphereConfig(FittingConfig):
 
 METHODS = (
     Method(
-        position=110,
         name="sphere",
         about="Like ActLoc: one pass over a location's landmarks and the mapping cameras scores 6 x 18 directions.",
-        style=MethodStyle("whole sphere (manner of ActLoc)", "#6699CC", "H", (0, (3, 1))),
-        group="learned",
         build=network_scorer(
             "wheretolook_paper.scorers.sphere.score:SphereScorer",
             "wheretolook_paper.scorers.sphere.network:SphereNetwork",
@@ -55,8 +52,6 @@ METHODS = (
         weights="sphere",
         probability=True,
         one_camera=True,
-        learn=imported("wheretolook_paper.scorers.sphere.learn:learn_sphere"),
-        config=SphereConfig,
-        folder="sphere",
+        learner=Learner(imported("wheretolook_paper.scorers.sphere.learn:learn_sphere"), SphereConfig),
     ),
 )

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from wheretolook.scorers.registry import BuildOptions, Method, MethodStyle, imported
-from wheretolook.utils.validation import check_positive, check_range
+from wheretolook.scorers.registry import BuildOptions, Learner, Method, imported
+from wheretolook.utils.errors import check_positive, check_range
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
@@ -49,16 +49,11 @@ def _build(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
 
 METHODS = (
     Method(
-        position=80,
         name="trees",
         about="Probability that a view localizes, by boosted trees on positions and attributes of its visible landmarks.",
-        style=MethodStyle("boosted trees, landmark attributes", "#882255", "*", "-"),
-        group="learned",
         build=_build,
         weights="trees",
         probability=True,
-        learn=imported("wheretolook_paper.scorers.trees.learn:learn_trees"),
-        config=TreesConfig,
-        folder="trees",
+        learner=Learner(imported("wheretolook_paper.scorers.trees.learn:learn_trees"), TreesConfig),
     ),
 )

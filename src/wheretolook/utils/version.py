@@ -1,3 +1,0 @@
-"""The version of this package."""
-
-VERSION = "0.3.0"
